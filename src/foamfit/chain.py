@@ -1,0 +1,137 @@
+"""A chain of springs and masses under a drive: what is simulated, not how."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from foamfit.spring import BistableSpring, LinearSpring, Spring
+
+Array = NDArray[np.float64]
+
+
+def _finite(value: float, name: str, least: float, strict: bool) -> float:
+    number = float(value)
+    if not math.isfinite(number) or number < least or (strict and number == least):
+        wanted = f"greater than {least:g}" if strict else f"at least {least:g}"
+        raise ValueError(f"{name} = {number:g} is not admissible: it must be finite and {wanted}")
+    return number
+
+
+@dataclass(frozen=True, init=False)
+class Chain:
+    """Springs from the base up, with the masses between and above them.
+
+    Parameters
+    ----------
+    springs : sequence of BistableSpring or LinearSpring
+        Base first.
+    heights : sequence of float
+        Height h_i of each spring, m.
+    area : float
+        Cross-section A, m².
+    masses : sequence of float, optional
+        Mass above each spring, kg; 0 = massless. Left out = all massless.
+    site_damping : float
+        The onsite damper η_site of the paper on the top mass, Pa·s.
+
+    Raises
+    ------
+    ValueError
+        If something is not admissible; the message names it.
+    """
+
+    springs: tuple[Spring, ...]
+    heights: tuple[float, ...]
+    area: float
+    masses: tuple[float, ...] = ()
+    site_damping: float = 0.0
+
+    def __init__(
+        self,
+        springs: Sequence[Spring],
+        heights: Sequence[float],
+        area: float,
+        masses: Sequence[float] | None = None,
+        site_damping: float = 0.0,
+    ) -> None:
+        """Check and freeze the chain."""
+        n = len(springs)
+        if n == 0:
+            raise ValueError("springs is empty: a chain needs at least one spring")
+        for i, spring in enumerate(springs, start=1):
+            if not isinstance(spring, BistableSpring | LinearSpring):
+                raise ValueError(
+                    f"springs: spring {i} is a {type(spring).__name__}; "
+                    "it must be a BistableSpring or a LinearSpring"
+                )
+        masses = [0.0] * n if masses is None else masses
+        for name, values in (("heights", heights), ("masses", masses)):
+            if len(values) != n:
+                raise ValueError(
+                    f"{name} has {len(values)} values for {n} springs: give one per spring"
+                )
+        put = object.__setattr__
+        put(self, "springs", tuple(springs))
+        put(self, "heights", tuple(_finite(h, "heights", 0.0, True) for h in heights))
+        put(self, "area", _finite(area, "area", 0.0, True))
+        put(self, "masses", tuple(_finite(m, "masses", 0.0, False) for m in masses))
+        put(self, "site_damping", _finite(site_damping, "site_damping", 0.0, False))
+
+    @property
+    def height(self) -> float:
+        """Overall height H = Σ h_i, m."""
+        return math.fsum(self.heights)
+
+
+def _samples(values: ArrayLike, name: str) -> Array:
+    samples = np.array(values, dtype=np.float64)
+    if samples.ndim != 1 or samples.size == 0:
+        raise ValueError(f"{name} must be a one-dimensional array with at least one sample")
+    if not np.all(np.isfinite(samples)):
+        at = int(np.argmin(np.isfinite(samples)))
+        raise ValueError(f"{name} must be finite; sample {at} is {samples[at]}")
+    samples.setflags(write=False)
+    return samples
+
+
+@dataclass(frozen=True)
+class Impact:
+    """A striker of `mass` (kg) meets the top of the chain with `velocity` (m/s) at t = 0."""
+
+    mass: float
+    velocity: float
+
+    def __post_init__(self) -> None:
+        """Refuse what is not admissible, by name."""
+        object.__setattr__(self, "mass", _finite(self.mass, "mass", 0.0, True))
+        object.__setattr__(self, "velocity", _finite(self.velocity, "velocity", 0.0, True))
+
+
+@dataclass(frozen=True, eq=False)
+class StressDrive:
+    """A stress history (Pa), sampled at t and linear between samples, acts on the top, from rest."""
+
+    stress: Array
+
+    def __post_init__(self) -> None:
+        """Check and freeze the samples."""
+        object.__setattr__(self, "stress", _samples(self.stress, "stress"))
+
+
+@dataclass(frozen=True, eq=False)
+class DisplacementDrive:
+    """The displacement of the top (m), sampled at t and linear between samples, is prescribed."""
+
+    displacement: Array
+
+    def __post_init__(self) -> None:
+        """Check and freeze the samples."""
+        object.__setattr__(self, "displacement", _samples(self.displacement, "displacement"))
+
+
+Drive = Impact | StressDrive | DisplacementDrive

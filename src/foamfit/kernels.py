@@ -1,0 +1,356 @@
+"""The compiled loops: the law of a spring along a history, and a chain in equilibrium.
+
+A spring is one row of numbers (`Row`); a chain is an array of rows, base first. The branch that a
+spring is on is its whole memory: a and d belong to the paper's flag a, c and e to its flag c
+(eq. 3). Everything is SI. The integration in time is in `foamfit.taylor`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from foamfit.spring import BISTABLE, LINEAR, UNILATERAL, admissible, derived_points
+
+Array = NDArray[np.float64]
+Row = Array
+Branches = NDArray[np.int64]
+
+# Columns of a row.
+KIND, K0, KC, EPS_A, EPS_C, KH_PLUS, KH_MINUS, ETA = range(8)
+SIGMA_A, SIGMA_C, EPS_STAR, EPS_HAT_A, EPS_HAT_C, SIGMA_HAT_A, SIGMA_HAT_C, N_COLUMNS = range(8, 16)
+
+# Branches: of the bistable spring, of a linear one, and of a unilateral one out of contact.
+A, D, C, E, LINE, OPEN = range(6)
+BRANCH_NAMES = ("a", "d", "c", "e", "line", "open")
+
+_derived_points = njit(cache=True)(derived_points)
+_admissible = njit(cache=True)(admissible)
+
+
+@njit(cache=True)
+def fill_bistable(row, k0, kc, dsigma, eps_a, eps_c, kh_plus, kh_minus, eta):  # type: ignore[no-untyped-def]
+    """Write a bistable spring into `row`; false, and nothing written, if it is not admissible."""
+    if not (_admissible(k0, kc, dsigma, eps_a, eps_c, kh_plus, kh_minus) and eta >= 0.0):
+        return False
+    sigma_a, sigma_c, eps_star, hat_a, hat_c = _derived_points(
+        k0, kc, dsigma, eps_a, eps_c, kh_plus, kh_minus
+    )
+    row[KIND] = BISTABLE
+    row[K0], row[KC], row[EPS_A], row[EPS_C] = k0, kc, eps_a, eps_c
+    row[KH_PLUS], row[KH_MINUS], row[ETA] = kh_plus, kh_minus, eta
+    row[SIGMA_A], row[SIGMA_C], row[EPS_STAR] = sigma_a, sigma_c, eps_star
+    row[EPS_HAT_A], row[EPS_HAT_C] = hat_a, hat_c
+    row[SIGMA_HAT_A] = -math.inf if hat_a == -math.inf else k0 * hat_a / (1.0 - hat_a)
+    row[SIGMA_HAT_C] = sigma_a + kh_plus * (hat_c - eps_a)
+    return True
+
+
+@njit(cache=True)
+def fill_linear(row, k0, eta, unilateral):  # type: ignore[no-untyped-def]
+    """Write a linear spring into `row`; false, and nothing written, if it is not admissible."""
+    if not (0.0 < k0 < math.inf and eta >= 0.0):
+        return False
+    row[KIND] = UNILATERAL if unilateral else LINEAR
+    row[K0], row[ETA] = k0, eta
+    return True
+
+
+def bistable_row(*parameters: float) -> Row:
+    """Make the row of an admissible bistable spring from k0 … kh_minus, eta (SI)."""
+    row = np.zeros(N_COLUMNS)
+    fill_bistable(row, *parameters)
+    return row
+
+
+def linear_row(k0: float, eta: float, unilateral: bool) -> Row:
+    """Make the row of an admissible linear spring (SI)."""
+    row = np.zeros(N_COLUMNS)
+    fill_linear(row, k0, eta, unilateral)
+    return row
+
+
+# ---------------------------------------------------------------- the law of one spring
+
+
+@njit(cache=True)
+def branch_shape(row, branch):  # type: ignore[no-untyped-def]
+    """Return (curved, slope k, strain origin x0, stress origin s0) of a branch of eq. 2.
+
+    Curved (a and c): σ = k x/(1-x) with x = ε - x0. Straight (d, e, linear): σ = s0 + k (ε - x0).
+    """
+    if branch == A:
+        return True, row[K0], 0.0, 0.0
+    if branch == C:
+        return True, row[KC], row[EPS_STAR], 0.0
+    if branch == D:
+        return False, row[KH_PLUS], row[EPS_A], row[SIGMA_A]
+    if branch == E:
+        return False, row[KH_MINUS], row[EPS_C], row[SIGMA_C]
+    if branch == LINE:
+        return False, row[K0], 0.0, 0.0
+    return False, 0.0, 0.0, 0.0
+
+
+@njit(cache=True)
+def stress_on(row, branch, eps):  # type: ignore[no-untyped-def]
+    """Stress on a branch (eq. 2); infinite at or past the pole of a curved one."""
+    curved, k, x0, s0 = branch_shape(row, branch)
+    x = eps - x0
+    if not curved:
+        return s0 + k * x
+    return k * x / (1.0 - x) if x < 1.0 else math.inf
+
+
+@njit(cache=True)
+def strain_on(row, branch, sigma):  # type: ignore[no-untyped-def]
+    """Strain on a branch, the inverse of eq. 2; on a flat branch its end where it is entered."""
+    curved, k, x0, s0 = branch_shape(row, branch)
+    if curved:
+        return x0 + sigma / (k + sigma) if sigma > -k else -math.inf
+    return x0 + (sigma - s0) / k if k > 0.0 else x0
+
+
+@njit(cache=True)
+def slope_on(row, branch, eps):  # type: ignore[no-untyped-def]
+    """Slope dσ/dε of eq. 2 on a branch."""
+    curved, k, x0, _ = branch_shape(row, branch)
+    return k / (1.0 - (eps - x0)) ** 2 if curved else k
+
+
+@njit(cache=True)
+def interval(row, branch):  # type: ignore[no-untyped-def]
+    """Strains (low, high) at which a spring leaves a branch."""
+    if branch == A:
+        return -math.inf, row[EPS_A]
+    if branch == D:
+        return row[EPS_A], row[EPS_HAT_C]
+    if branch == C:
+        return row[EPS_C], math.inf
+    if branch == E:
+        return row[EPS_HAT_A], row[EPS_C]
+    if branch == LINE:
+        return (0.0 if row[KIND] == UNILATERAL else -math.inf), math.inf
+    return -math.inf, 0.0
+
+
+@njit(cache=True)
+def above(branch):  # type: ignore[no-untyped-def]
+    """Name the branch that a spring enters when it leaves `branch` upwards in strain."""
+    if branch == A:
+        return D
+    return C if branch == D or branch == E else LINE
+
+
+@njit(cache=True)
+def below(branch):  # type: ignore[no-untyped-def]
+    """Name the branch that a spring enters when it leaves `branch` downwards in strain."""
+    if branch == C:
+        return E
+    return A if branch == D or branch == E else OPEN
+
+
+@njit(cache=True)
+def first_branch(row):  # type: ignore[no-untyped-def]
+    """Branch of a spring at rest."""
+    return A if row[KIND] == BISTABLE else LINE
+
+
+@njit(cache=True)
+def branch_at_strain(row, branch, eps):  # type: ignore[no-untyped-def]
+    """Branch at strain `eps` of a spring that was last seen on `branch` (eqs. 2 and 3)."""
+    if row[KIND] == LINEAR:
+        return LINE
+    if row[KIND] == UNILATERAL:
+        return LINE if eps >= 0.0 else OPEN
+    if branch == A or branch == D:
+        if eps < row[EPS_A]:
+            return A
+        return D if eps <= row[EPS_HAT_C] else C
+    if eps > row[EPS_C]:
+        return C
+    return E if eps >= row[EPS_HAT_A] else A
+
+
+@njit(cache=True)
+def branch_at_stress(row, branch, sigma):  # type: ignore[no-untyped-def]
+    """Branch at stress `sigma` of a spring that was last seen on `branch` (eqs. 2 and 3)."""
+    if row[KIND] == LINEAR:
+        return LINE
+    if row[KIND] == UNILATERAL:
+        return LINE if sigma >= 0.0 else OPEN
+    if branch == A or branch == D:
+        if sigma < row[SIGMA_A]:
+            return A
+        if row[KH_PLUS] == 0.0:
+            return A if sigma == row[SIGMA_A] else C
+        return D if sigma <= row[SIGMA_HAT_C] else C
+    if sigma > row[SIGMA_C]:
+        return C
+    if row[KH_MINUS] == 0.0:
+        return C if sigma == row[SIGMA_C] else A
+    return E if sigma >= row[SIGMA_HAT_A] else A
+
+
+@njit(cache=True)
+def stress_along(row, eps):  # type: ignore[no-untyped-def]
+    """Stress and branch of one spring along a strain history, from rest."""
+    sigma = np.empty(eps.size)
+    branches = np.empty(eps.size, np.int64)
+    branch = first_branch(row)
+    for j in range(eps.size):
+        branch = branch_at_strain(row, branch, eps[j])
+        sigma[j] = stress_on(row, branch, eps[j])
+        branches[j] = branch
+    return sigma, branches
+
+
+@njit(cache=True)
+def strain_along(row, sigma):  # type: ignore[no-untyped-def]
+    """Strain and branch of one spring along a stress history, from rest; -inf if it cannot."""
+    eps = np.empty(sigma.size)
+    branches = np.empty(sigma.size, np.int64)
+    branch = first_branch(row)
+    for j in range(sigma.size):
+        branch = branch_at_stress(row, branch, sigma[j])
+        eps[j] = strain_on(row, branch, sigma[j]) if branch != OPEN else -math.inf
+        branches[j] = branch
+    return eps, branches
+
+
+@njit(cache=True)
+def tangent_along(row, eps, branches):  # type: ignore[no-untyped-def]
+    """Slope dσ/dε at each sample of a strain history whose branches are known."""
+    slope = np.empty(eps.size)
+    for j in range(eps.size):
+        slope[j] = slope_on(row, branches[j], eps[j])
+    return slope
+
+
+# ---------------------------------------------------------------- springs in series, in equilibrium
+
+
+@njit(cache=True)
+def _series_strain(rows, branches, heights, sigma, eps):  # type: ignore[no-untyped-def]
+    """Strains of springs in series under one stress; returns (elongation, compliance)."""
+    total = 0.0
+    compliance = 0.0
+    for i in range(rows.shape[0]):
+        branch = branch_at_stress(rows[i], branches[i], sigma)
+        if branch == OPEN:
+            eps[i] = -math.inf
+        else:
+            eps[i] = strain_on(rows[i], branch, sigma)
+            slope = slope_on(rows[i], branch, eps[i])
+            compliance += heights[i] / slope if slope > 0.0 else math.inf
+        total += heights[i] * eps[i]
+    return total, compliance
+
+
+@njit(cache=True)
+def _bracket(rows, branches, heights, elongation, sigma, eps):  # type: ignore[no-untyped-def]
+    """Stresses (low, high) between which springs in series reach `elongation`."""
+    step = 1e-3 * abs(sigma)
+    for i in range(rows.shape[0]):
+        step = max(step, 1e-6 * rows[i, K0])
+    low = high = sigma
+    for _ in range(200):
+        if _series_strain(rows, branches, heights, low, eps)[0] <= elongation:
+            break
+        high = low
+        low -= step
+        step *= 2.0
+    for _ in range(200):
+        if _series_strain(rows, branches, heights, high, eps)[0] >= elongation:
+            break
+        low = high
+        high += step
+        step *= 2.0
+    return low, high
+
+
+@njit(cache=True)
+def _split_jump(rows, branches, heights, elongation, low, high, eps):  # type: ignore[no-untyped-def]
+    """Share out an elongation that lies inside a jump (k_h± = 0) at one stress, base first."""
+    upper = np.empty(eps.size)
+    _series_strain(rows, branches, heights, high, upper)
+    rest = elongation - _series_strain(rows, branches, heights, low, eps)[0]
+    for i in range(eps.size):
+        if eps[i] == -math.inf:  # a gap that opens takes all of the tension-free elongation
+            eps[i] = 0.0
+            continue
+        gain = min(max(rest / heights[i], 0.0), upper[i] - eps[i])
+        eps[i] += gain
+        rest -= heights[i] * gain
+
+
+@njit(cache=True)
+def equilibrate(rows, branches, heights, elongation, sigma, eps):  # type: ignore[no-untyped-def]
+    """Common stress of undamped springs in series at a given elongation; fills their strains.
+
+    Along a monotone stretch each spring follows one monotone function of the common stress, so the
+    sum of their elongations has one root, whatever switches lie on the way. Newton's method inside
+    a shrinking bracket finds it. Where the root lies in a jump of that function (k_h± = 0), the
+    springs share it from the base up. `branches` is brought up to date.
+    """
+    low, high = _bracket(rows, branches, heights, elongation, sigma, eps)
+    sigma = min(max(sigma, low), high)
+    for _ in range(200):
+        total, compliance = _series_strain(rows, branches, heights, sigma, eps)
+        miss = total - elongation
+        if miss == 0.0:
+            break
+        if miss > 0.0:
+            high = sigma
+        else:
+            low = sigma
+        trial = sigma - miss / compliance
+        if not low < trial < high:
+            trial = 0.5 * (low + high)
+        if trial == sigma or abs(trial - sigma) <= 2e-16 * abs(sigma):
+            break
+        sigma = trial
+    total, compliance = _series_strain(rows, branches, heights, sigma, eps)
+    scale = abs(elongation)
+    for i in range(eps.size):
+        scale += heights[i] * abs(eps[i])
+    if not abs(total - elongation) <= 1e-12 * scale + 4e-16 * compliance * abs(sigma):
+        _split_jump(rows, branches, heights, elongation, low, high, eps)
+    for i in range(eps.size):
+        branches[i] = branch_at_strain(rows[i], branches[i], eps[i])
+    return sigma
+
+
+@njit(cache=True)
+def equilibrium_along(rows, heights, top):  # type: ignore[no-untyped-def]
+    """Springs in series, undamped and massless, along a history of the top's displacement (m).
+
+    Returns
+    -------
+    tuple of arrays
+        Common stress (n,), strains (springs, n), branches (springs, n).
+    """
+    count, n = rows.shape[0], top.size
+    sigma = np.empty(n)
+    eps = np.empty((count, n))
+    history = np.empty((count, n), np.int64)
+    branches = np.empty(count, np.int64)
+    now = np.empty(count)
+    for i in range(count):
+        branches[i] = first_branch(rows[i])
+    last = 0.0
+    for j in range(n):
+        if count == 1:
+            now[0] = top[j] / heights[0]
+            branches[0] = branch_at_strain(rows[0], branches[0], now[0])
+            last = stress_on(rows[0], branches[0], now[0])
+        else:
+            last = equilibrate(rows, branches, heights, top[j], last, now)
+        sigma[j] = last
+        for i in range(count):
+            eps[i, j] = now[i]
+            history[i, j] = branches[i]
+    return sigma, eps, history

@@ -1,0 +1,304 @@
+"""Forward simulation: a chain under a drive, by the least solver that the scene needs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from foamfit import kernels, taylor
+from foamfit.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
+from foamfit.errors import SimulationError
+
+Array = NDArray[np.float64]
+
+CLOSED_FORM, FIRST_ORDER, SECOND_ORDER = "closed form", "first order", "second order"
+MAX_STEPS = 2_000_000
+
+_OUTCOMES = {
+    taylor.TOO_MANY_STEPS: "the bound of {steps} steps was reached: the scene is too stiff for "
+    "explicit steps (a light mass or a heavy dashpot)",
+    taylor.STEP_UNDERFLOW: "the step shrank to nothing near t = {time:g} s: a strain comes too "
+    "close to the end of its branch",
+    taylor.FLAT_UNDER_STRESS: "a prescribed stress acts on a flat branch (kh_plus or kh_minus = 0) "
+    "that nothing slows; give the top a mass or the spring a dashpot",
+    taylor.NOT_FINITE: "a stress or strain is no longer finite: the drive goes past the end of a "
+    "branch (strain 1 on branch a, 1 + eps_star on branch c)",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """What a chain does under a drive.
+
+    Attributes
+    ----------
+    time : (n_t,) array
+        s.
+    displacement : (n_springs, n_t) array
+        Downward displacement w_i of the node above each spring, m.
+    base_stress : (n_t,) array
+        Stress at the sensor, Σ_1, Pa; zero outside contact.
+    strain : (n_t,) array
+        Overall strain w_N/H.
+    contact_end : float or None
+        When an impact's base stress returned to zero, s; None if it has not, or in other drives.
+    solver : str
+        "closed form", "first order" or "second order": the least that the scene needs.
+    switches : (m, 5) array
+        Time (s), spring (0 at the base), branch left, branch entered, strain of that spring.
+    steps : int
+        Steps of the integrator; 0 for the closed form.
+    """
+
+    time: Array
+    displacement: Array
+    base_stress: Array
+    strain: Array
+    contact_end: float | None
+    solver: str
+    switches: Array
+    steps: int
+
+
+class Motion(NamedTuple):
+    """The bare outcome of a run; see `Response`."""
+
+    displacement: Array
+    base_stress: Array
+    contact_end: float
+    switches: Array
+    steps: int
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A scene made ready to run many times with other springs: what does not change between runs.
+
+    Attributes
+    ----------
+    solver : str
+        The least solver.
+    area, height : float
+        A in m² and H in m.
+    ends, mass : arrays
+        The groups of springs and the areal masses between them; see `foamfit.taylor.integrate`.
+    drag : float
+        η_site/H, Pa·s/m.
+    top : int
+        What is known of the top; see `foamfit.taylor`.
+    values, time : (n,) arrays
+        The drive and its samples.
+    speed : float
+        Velocity of the striker, m/s; 0 = no impact.
+    """
+
+    solver: str
+    height: float
+    ends: NDArray[np.int64]
+    mass: Array
+    drag: float
+    top: int
+    values: Array
+    time: Array
+    speed: float
+
+    def run(self, rows: Array, heights: Array, rtol: float = 1e-6, *, inner: bool = True) -> Motion:
+        """Run the scene with the springs in `rows` (n_springs, columns) and their heights (m).
+
+        With `inner` false only the displacement of the top is computed, shape (1, n_t).
+
+        Raises
+        ------
+        SimulationError
+            If the scene has no finite answer; the message says why.
+        """
+        if self.solver == CLOSED_FORM:
+            motion = self._closed_form(rows, heights, inner)
+        else:
+            motion = self._integrate(rows, heights, rtol, inner)
+        if not (
+            math.isfinite(float(motion.base_stress.sum()))
+            and math.isfinite(float(motion.displacement.sum()))
+        ):
+            raise SimulationError(_OUTCOMES[taylor.NOT_FINITE])
+        return motion
+
+    def _closed_form(self, rows: Array, heights: Array, inner: bool) -> Motion:
+        """Undamped and massless: one stress in all springs; or one spring under known motion."""
+        count, n = len(heights), self.time.size
+        if self.top == taylor.MOTION:
+            stress, strain, branches = kernels.equilibrium_along(rows, heights, self.values)
+            eta = rows[0, kernels.ETA]
+            if count == 1 and eta > 0.0 and n > 1:
+                stress = stress + eta * np.gradient(strain[0], self.time)
+        else:
+            stress = self.values
+            strain, branches = np.empty((count, n)), np.empty((count, n), np.int64)
+            for i in range(count):
+                strain[i], branches[i] = kernels.strain_along(rows[i], stress)
+        nodes = np.cumsum(heights[:, None] * strain, axis=0)
+        return Motion(
+            nodes if inner else nodes[-1:],
+            np.array(stress),
+            math.nan,
+            _switches(self.time, strain, branches),
+            0,
+        )
+
+    def _integrate(self, rows: Array, heights: Array, rtol: float, inner: bool) -> Motion:
+        tolerance = max(0.01 * rtol, 1e-16)
+        order = min(max(round(4.0 - 0.5 * math.log(tolerance)), 6), 24)
+        displacement = np.empty((len(heights) if inner else 1, self.time.size))
+        stress = np.empty(self.time.size)
+        log = np.empty((1024, 5))
+        outcome, contact_end, steps, switches = taylor.integrate(
+            rows,
+            heights,
+            self.ends,
+            self.mass,
+            self.drag,
+            self.top,
+            self.values,
+            self.speed,
+            self.time,
+            tolerance,
+            order,
+            MAX_STEPS,
+            displacement,
+            stress,
+            log,
+        )
+        if outcome != taylor.DONE:
+            last = log[min(switches, len(log)) - 1, 0] if switches else self.time[0]
+            raise SimulationError(_OUTCOMES[outcome].format(steps=steps, time=last))
+        return Motion(displacement, stress, contact_end, log[:switches], steps)
+
+
+def _switches(time: Array, strain: Array, branches: NDArray[np.int64]) -> Array:
+    """List the changes of branch between samples, at the later sample."""
+    springs, samples = np.nonzero(np.diff(branches, axis=1))
+    order = np.argsort(samples, kind="stable")
+    i, j = springs[order], samples[order] + 1
+    return (
+        np.column_stack((time[j], i, branches[i, j - 1], branches[i, j], strain[i, j]))
+        if i.size
+        else np.empty((0, 5))
+    )
+
+
+def _time(t: ArrayLike) -> Array:
+    time = np.array(t, dtype=np.float64, order="C")  # a copy of one compiled type: writable
+    if time.ndim != 1 or time.size == 0:
+        raise ValueError("t must be a one-dimensional array with at least one sample")
+    if not np.all(np.isfinite(time)):
+        raise ValueError(f"t must be finite; sample {int(np.argmin(np.isfinite(time)))} is not")
+    if np.any(np.diff(time) <= 0.0):
+        at = int(np.argmax(np.diff(time) <= 0.0)) + 1
+        raise ValueError(f"t must increase; sample {at} is not later than the one before it")
+    return time
+
+
+def plan(chain: Chain, drive: Drive, t: ArrayLike) -> Plan:
+    """Find what a scene needs: the nodes that have a state, and the least solver.
+
+    Parameters
+    ----------
+    chain : Chain
+        Only its heights, area, masses, site damping and which springs have a dashpot count.
+    drive : Impact, StressDrive or DisplacementDrive
+        How it is loaded.
+    t : (n_t,) array
+        Samples, s, increasing.
+
+    Raises
+    ------
+    ValueError
+        If t does not increase or has not one value per sample of the drive.
+    """
+    time = _time(t)
+    masses = np.array(chain.masses)
+    speed, values = 0.0, np.zeros(1)
+    top = taylor.FREE
+    if isinstance(drive, Impact):
+        masses[-1] += drive.mass
+        speed = drive.velocity
+    else:
+        name = "stress" if isinstance(drive, StressDrive) else "displacement"
+        values = np.array(drive.stress if isinstance(drive, StressDrive) else drive.displacement)
+        if values.size != time.size:
+            raise ValueError(
+                f"{name} has {values.size} samples and t has {time.size}: give one value per sample"
+            )
+        if isinstance(drive, DisplacementDrive):
+            masses[-1] = 0.0
+            top = taylor.MOTION
+        elif masses[-1] == 0.0:
+            top = taylor.VISCOUS if chain.site_damping > 0.0 else taylor.STRESS
+    nodes = masses > 0.0
+    nodes[-1] = True
+    damped = any(spring.eta > 0.0 for spring in chain.springs) or top == taylor.VISCOUS
+    if np.any(masses > 0.0):
+        solver = SECOND_ORDER
+    elif damped and not (top == taylor.MOTION and len(masses) == 1):
+        solver = FIRST_ORDER
+    else:
+        solver = CLOSED_FORM
+    return Plan(
+        solver=solver,
+        height=chain.height,
+        ends=np.flatnonzero(nodes) + 1,
+        mass=masses[nodes] / chain.area,
+        drag=chain.site_damping / chain.height,
+        top=top,
+        values=values,
+        time=time,
+        speed=speed,
+    )
+
+
+def simulate(chain: Chain, drive: Drive, t: ArrayLike, rtol: float = 1e-6) -> Response:
+    """Simulate a chain under a drive.
+
+    Parameters
+    ----------
+    chain : Chain
+        Springs, heights, area, masses, onsite damper.
+    drive : Impact, StressDrive or DisplacementDrive
+        An impact starts at t = 0 (before, the striker is on its way); the sampled drives start
+        from rest at t[0] and are linear between samples, where a dashpot feels the mean rate.
+    t : (n_t,) array
+        Samples, s, increasing.
+    rtol : float
+        Wanted error of displacement and base stress relative to their range.
+
+    Returns
+    -------
+    Response
+        Past the end of contact the base stress is zero and the chain flies with the striker.
+
+    Raises
+    ------
+    ValueError
+        If something is not admissible; the message names it.
+    SimulationError
+        If the scene has no finite answer; the message says why.
+    """
+    if not 1e-14 <= rtol <= 1e-1:
+        raise ValueError(f"rtol = {rtol:g} is not admissible: it must be between 1e-14 and 0.1")
+    scene = plan(chain, drive, t)
+    rows = np.array([spring.row for spring in chain.springs])
+    motion = scene.run(rows, np.array(chain.heights), rtol)
+    return Response(
+        time=scene.time,
+        displacement=motion.displacement,
+        base_stress=motion.base_stress,
+        strain=motion.displacement[-1] / chain.height,
+        contact_end=None if math.isnan(motion.contact_end) else motion.contact_end,
+        solver=scene.solver,
+        switches=motion.switches,
+        steps=motion.steps,
+    )

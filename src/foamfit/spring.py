@@ -1,0 +1,372 @@
+"""One mesoscopic spring: the seven-parameter bistable law (eqs. 1-5) and the linear spring.
+
+The scalar functions at the top are plain Python that is also compiled, as it stands, by
+`foamfit.kernels`; each formula of the law is thus written once.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from foamfit.errors import SimulationError
+
+if TYPE_CHECKING:
+    from foamfit.kernels import Row
+
+Array = NDArray[np.float64]
+
+# The kinds of spring that the kernels tell apart.
+BISTABLE, LINEAR, UNILATERAL = 0, 1, 2
+
+
+def derived_points(
+    k0: float,
+    kc: float,
+    dsigma: float,
+    eps_a: float,
+    eps_c: float,
+    kh_plus: float,
+    kh_minus: float,
+) -> tuple[float, float, float, float, float]:
+    """Derive (σ_a, σ̄_c, ε_*, ε̂_a, ε̂_c) of a bistable spring in closed form.
+
+    Both quadratics are written about the known end of their branch (C2 for ε̂_c, A1 for ε̂_a),
+    where their coefficients hold no difference of nearly equal numbers.
+
+    Returns
+    -------
+    tuple of float
+        σ_a and σ̄_c in Pa; the strains ε_*, ε̂_a (eq. 4; -inf where branch e never meets
+        branch a) and ε̂_c (eq. 5).
+    """
+    sigma_a = k0 * eps_a / (1.0 - eps_a)
+    sigma_c = sigma_a + dsigma
+    eps_star = eps_c - sigma_c / (kc + sigma_c)
+
+    # Eq. 5, c = d. With y = ε - ε_c and u = 1 - (ε_c - ε_*) = kc/(kc + σ̄_c):
+    # u kh+ y² + (kc - u² kh+ + u gap) y - u² gap = 0, one root y >= 0.
+    gap = kh_plus * (eps_c - eps_a) - dsigma
+    u = kc / (kc + sigma_c)
+    b = kc - u * u * kh_plus + u * gap
+    root = math.sqrt(b * b + 4.0 * u * kh_plus * u * u * gap)
+    y = 2.0 * u * u * gap / (b + root) if b >= 0.0 else (root - b) / (2.0 * u * kh_plus)
+
+    # Eq. 4, a = e. With z = ε_a - ε and v = 1 - ε_a:
+    # v kh- z² + (v² kh- + v fall - k0) z + v² fall = 0, the smaller root z >= 0, if any.
+    fall = kh_minus * (eps_c - eps_a) - dsigma
+    v = 1.0 - eps_a
+    b = v * v * kh_minus + v * fall - k0
+    discriminant = b * b - 4.0 * v * kh_minus * v * v * fall
+    if fall == 0.0:
+        eps_hat_a = eps_a
+    elif b < 0.0 and discriminant >= 0.0:
+        eps_hat_a = eps_a - 2.0 * v * v * fall / (math.sqrt(discriminant) - b)
+    else:
+        eps_hat_a = -math.inf
+    return sigma_a, sigma_c, eps_star, eps_hat_a, eps_c + y
+
+
+def admissible(
+    k0: float,
+    kc: float,
+    dsigma: float,
+    eps_a: float,
+    eps_c: float,
+    kh_plus: float,
+    kh_minus: float,
+) -> bool:
+    """Tell whether the seven parameters are admissible (model: 0 < ε_a < ε_c, -1 < Δσ/σ_a <= 0, …).
+
+    The remaining conditions, ε_c < 1 + ε_*, ε̂_c >= ε_c and a loop of non-negative area, follow
+    from these: branch d lies above C2 and branch e below A1.
+    """
+    return (
+        0.0 < k0 < math.inf
+        and 0.0 < kc < math.inf
+        and 0.0 < eps_a < 1.0
+        and eps_a < eps_c < math.inf
+        and -k0 * eps_a / (1.0 - eps_a) < dsigma <= 0.0
+        and 0.0 <= kh_plus < math.inf
+        and 0.0 <= kh_minus < math.inf
+    )
+
+
+def _require(holds: bool, name: str, value: float, wanted: str) -> None:
+    if not holds:
+        raise ValueError(f"{name} = {value:g} is not admissible: it must be {wanted}")
+
+
+def _as_history(values: ArrayLike, name: str) -> Array:
+    history = np.ascontiguousarray(values, dtype=np.float64)
+    if history.ndim > 1:
+        raise ValueError(f"{name} must be one history (one dimension), not {history.ndim}")
+    if not np.all(np.isfinite(history)):
+        raise ValueError(f"{name} must be finite; sample {_first(~np.isfinite(history))} is not")
+    return np.atleast_1d(history)
+
+
+def _first(mask: NDArray[np.bool_]) -> int:
+    return int(np.argmax(np.atleast_1d(mask)))
+
+
+@dataclass(frozen=True)
+class BistableSpring:
+    """The hysteretic bistable spring of eqs. 2-5 with a dashpot in parallel.
+
+    Parameters
+    ----------
+    k0 : float
+        k_0, first slope of branch a, at zero stress, Pa.
+    kc : float
+        k_c, first slope of the densified branch c, at zero stress, Pa.
+    dsigma : float
+        Δσ = σ̄_c - σ_a, Pa; not positive.
+    eps_a : float
+        ε_a, strain at A1, where snapping starts.
+    eps_c : float
+        ε_c, strain at C2, where snap-back starts.
+    kh_plus : float
+        k_h+, slope of the snap-buckling branch d, A1→C1, Pa.
+    kh_minus : float
+        k_h-, slope of the snap-back branch e, C2→A2, Pa.
+    eta : float
+        η, dashpot in parallel, Pa·s.
+
+    Raises
+    ------
+    ValueError
+        If a parameter is not admissible; the message names it.
+    """
+
+    k0: float
+    kc: float
+    dsigma: float
+    eps_a: float
+    eps_c: float
+    kh_plus: float
+    kh_minus: float
+    eta: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse what is not admissible, by name."""
+        for item in fields(self):
+            value = float(getattr(self, item.name))
+            _require(math.isfinite(value), item.name, value, "finite")
+            object.__setattr__(self, item.name, value)
+        _require(self.k0 > 0, "k0", self.k0, "positive")
+        _require(self.kc > 0, "kc", self.kc, "positive")
+        _require(0 < self.eps_a < 1, "eps_a", self.eps_a, "between 0 and 1")
+        _require(
+            self.eps_c > self.eps_a, "eps_c", self.eps_c, f"greater than eps_a = {self.eps_a:g}"
+        )
+        sigma_a = self.k0 * self.eps_a / (1 - self.eps_a)
+        _require(
+            -sigma_a < self.dsigma <= 0,
+            "dsigma",
+            self.dsigma,
+            f"greater than -sigma_a = {-sigma_a:g} and at most 0",
+        )
+        _require(self.kh_plus >= 0, "kh_plus", self.kh_plus, "zero or positive")
+        _require(self.kh_minus >= 0, "kh_minus", self.kh_minus, "zero or positive")
+        _require(self.eta >= 0, "eta", self.eta, "zero or positive")
+
+    @property
+    def seven(self) -> tuple[float, float, float, float, float, float, float]:
+        """The seven parameters of the law in their order, SI."""
+        return (
+            self.k0,
+            self.kc,
+            self.dsigma,
+            self.eps_a,
+            self.eps_c,
+            self.kh_plus,
+            self.kh_minus,
+        )
+
+    @property
+    def sigma_a(self) -> float:
+        """σ_a, stress at A1, Pa."""
+        return derived_points(*self.seven)[0]
+
+    @property
+    def sigma_c(self) -> float:
+        """σ̄_c, stress at C2, Pa."""
+        return derived_points(*self.seven)[1]
+
+    @property
+    def eps_star(self) -> float:
+        """ε_*, strain at which branch c starts from zero stress (eq. 2)."""
+        return derived_points(*self.seven)[2]
+
+    @property
+    def eps_hat_a(self) -> float | None:
+        """ε̂_a, strain at A2 (eq. 4); None where branch e never meets branch a."""
+        eps_hat_a = derived_points(*self.seven)[3]
+        return eps_hat_a if math.isfinite(eps_hat_a) else None
+
+    @property
+    def eps_hat_c(self) -> float:
+        """ε̂_c, strain at C1 (eq. 5)."""
+        return derived_points(*self.seven)[4]
+
+    @property
+    def sigma_hat_a(self) -> float | None:
+        """Stress at A2, Pa; None where branch e never meets branch a."""
+        eps_hat_a = self.eps_hat_a
+        return None if eps_hat_a is None else self.k0 * eps_hat_a / (1 - eps_hat_a)
+
+    @property
+    def sigma_hat_c(self) -> float:
+        """Stress at C1, Pa."""
+        return self.sigma_a + self.kh_plus * (self.eps_hat_c - self.eps_a)
+
+    @property
+    def kind(self) -> int:
+        """The kind of spring that the kernels know."""
+        return BISTABLE
+
+    @cached_property
+    def row(self) -> Row:
+        """The spring as the kernels know it."""
+        from foamfit import kernels
+
+        return kernels.bistable_row(*self.seven, self.eta)
+
+    def stress(self, strain: ArrayLike) -> Array:
+        """Stress (Pa) of the spring without its dashpot along a strain history, shape (n,).
+
+        One flag is carried along the history (eqs. 2 and 3); the first sample starts with flag a.
+
+        Raises
+        ------
+        SimulationError
+            If a strain is at or past the end of its branch (1 on a, 1 + ε_* on c).
+        """
+        return _along_strain(self, strain)[0]
+
+    def strain(self, stress: ArrayLike) -> Array:
+        """Strain of the spring along a stress history (Pa), shape (n,); the inverse of `stress`.
+
+        Where a branch is flat (k_h± = 0) a stress beyond it jumps to the next branch.
+
+        Raises
+        ------
+        SimulationError
+            If a tension is beyond the pole of branch a (-k0).
+        """
+        return _along_stress(self, stress)
+
+    def tangent(self, strain: ArrayLike) -> Array:
+        """Slope dσ/dε (Pa) on the branch of each sample of a strain history, shape (n,)."""
+        from foamfit import kernels
+
+        history = _as_history(strain, "strain")
+        return kernels.tangent_along(self.row, history, _along_strain(self, history)[1])
+
+    def branches(self, strain: ArrayLike) -> NDArray[np.str_]:
+        """Name the branch, "a", "d", "c" or "e", of each sample of a strain history, shape (n,)."""
+        from foamfit import kernels
+
+        return np.array(kernels.BRANCH_NAMES)[_along_strain(self, strain)[1]]
+
+
+@dataclass(frozen=True)
+class LinearSpring:
+    """The linear spring S1 of the two-spring models, σ = k0 ε, with a dashpot in parallel.
+
+    Parameters
+    ----------
+    k0 : float
+        Slope, Pa.
+    eta : float
+        η, dashpot in parallel, Pa·s.
+    unilateral : bool
+        If true the spring carries no tension.
+
+    Raises
+    ------
+    ValueError
+        If a parameter is not admissible; the message names it.
+    """
+
+    k0: float
+    eta: float = 0.0
+    unilateral: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse what is not admissible, by name."""
+        for name in ("k0", "eta"):
+            value = float(getattr(self, name))
+            _require(math.isfinite(value), name, value, "finite")
+            object.__setattr__(self, name, value)
+        _require(self.k0 > 0, "k0", self.k0, "positive")
+        _require(self.eta >= 0, "eta", self.eta, "zero or positive")
+
+    @property
+    def kind(self) -> int:
+        """The kind of spring that the kernels know."""
+        return UNILATERAL if self.unilateral else LINEAR
+
+    @cached_property
+    def row(self) -> Row:
+        """The spring as the kernels know it."""
+        from foamfit import kernels
+
+        return kernels.linear_row(self.k0, self.eta, self.unilateral)
+
+    def stress(self, strain: ArrayLike) -> Array:
+        """Stress (Pa) of the spring without its dashpot along a strain history, shape (n,)."""
+        return _along_strain(self, strain)[0]
+
+    def strain(self, stress: ArrayLike) -> Array:
+        """Strain along a stress history (Pa), shape (n,).
+
+        Raises
+        ------
+        SimulationError
+            If a unilateral spring is asked for its strain under tension, which it cannot carry.
+        """
+        return _along_stress(self, stress)
+
+    def tangent(self, strain: ArrayLike) -> Array:
+        """Slope dσ/dε (Pa) at each sample of a strain history, shape (n,)."""
+        from foamfit import kernels
+
+        history = _as_history(strain, "strain")
+        return kernels.tangent_along(self.row, history, _along_strain(self, history)[1])
+
+
+Spring = BistableSpring | LinearSpring
+
+
+def _along_strain(spring: Spring, strain: ArrayLike) -> tuple[Array, NDArray[np.int64]]:
+    from foamfit import kernels
+
+    history = _as_history(strain, "strain")
+    stress, branches = kernels.stress_along(spring.row, history)
+    if not np.all(np.isfinite(stress)):
+        at = _first(~np.isfinite(stress))
+        raise SimulationError(
+            f"strain {history[at]:g} (sample {at}) is at or past the end of its branch, "
+            "where the stress is infinite: 1 on branch a, 1 + eps_star on branch c"
+        )
+    return stress, branches
+
+
+def _along_stress(spring: Spring, stress: ArrayLike) -> Array:
+    from foamfit import kernels
+
+    history = _as_history(stress, "stress")
+    strain = kernels.strain_along(spring.row, history)[0]
+    if not np.all(np.isfinite(strain)):
+        at = _first(~np.isfinite(strain))
+        raise SimulationError(
+            f"stress {history[at]:g} Pa (sample {at}) is a tension that the spring cannot carry"
+        )
+    return strain
