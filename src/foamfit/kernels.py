@@ -59,6 +59,26 @@ def fill_linear(row, k0, eta, unilateral):  # type: ignore[no-untyped-def]
     return True
 
 
+@njit(cache=True)
+def fill_rows(kinds, values, rows):  # type: ignore[no-untyped-def]
+    """Write the springs of a flat vector of parameters into `rows`; false if one is not admissible.
+
+    A bistable spring takes eight values (k0 … kh_minus, eta), a linear one two (k0, eta).
+    """
+    at = 0
+    for i in range(kinds.size):
+        if kinds[i] == BISTABLE:
+            p = values[at : at + 8]
+            fine = fill_bistable(rows[i], p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7])
+            at += 8
+        else:
+            fine = fill_linear(rows[i], values[at], values[at + 1], kinds[i] == UNILATERAL)
+            at += 2
+        if not fine:
+            return False
+    return True
+
+
 def bistable_row(*parameters: float) -> Row:
     """Make the row of an admissible bistable spring from k0 … kh_minus, eta (SI)."""
     row = np.zeros(N_COLUMNS)

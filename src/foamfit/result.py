@@ -2,18 +2,32 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import csv
+import json
+import math
+import shutil
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from uuid import uuid4
 
 import numpy as np
 from numpy.typing import NDArray
+
+from foamfit.errors import InputError
 
 if TYPE_CHECKING:
     import lmfit
 
     from foamfit.chain import Chain
     from foamfit.measurement import Measurement
+    from foamfit.spring import BistableSpring
+
+SCHEMA = 1
+DERIVED_POINTS = ("sigma_a", "sigma_c", "eps_star", "eps_hat_a", "eps_hat_c")
 
 Array = NDArray[np.float64]
 
@@ -23,7 +37,8 @@ class ParameterEstimate:
     """One identified parameter, in SI.
 
     `stderr` and `ci95` are None where the test does not determine it; `state` is "determined",
-    "weak", "not determined" or "fixed" (fixed by the user or the model), and `why` says so in a sentence.
+    "weak", "not determined" or "fixed" (fixed by the user or the model), and `why` says so in a
+    sentence.
     """
 
     value: float
@@ -40,7 +55,8 @@ class Curves:
     """Measured and fitted curves, one row per sample of the conditioned test; None = not there.
 
     `stress` and `displacement` are what the drive gives (base stress in Pa, top displacement in m);
-    `stress_along` is the stress (Pa) that the identified springs give along the measured displacement.
+    `stress_along` is the stress (Pa) that the identified springs give along the measured
+    displacement.
     """
 
     time: Array | None
@@ -85,6 +101,215 @@ class FitResult:
     curves: Curves
     switches: tuple[Switch, ...]
 
+    @property
+    def bistable_springs(self) -> dict[str, BistableSpring]:
+        """The bistable springs of the chain by their prefix, "s1" at the base."""
+        from foamfit.spring import BistableSpring
+
+        return {
+            f"s{i}": spring
+            for i, spring in enumerate(self.chain.springs, start=1)
+            if isinstance(spring, BistableSpring)
+        }
+
+    def to_json_dict(self) -> dict[str, Any]:
+        """Return the content of ``fit.json``: SI, plain types, null for what is not there.
+
+        Returns
+        -------
+        dict
+            Serialisable with ``allow_nan=False``; a number that is not finite becomes None.
+        """
+        derived = {
+            name: {point: getattr(spring, point) for point in DERIVED_POINTS}
+            for name, spring in self.bistable_springs.items()
+        }
+        content: dict[str, Any] = _plain(
+            {
+                "schema": SCHEMA,
+                "foamfit": version("foamfit"),
+                "test": self.measurement.name,
+                "data_sha256": self.measurement.data_sha256,
+                "model": self.model,
+                "drive": self.drive,
+                "seed": self.seed,
+                "status": self.status,
+                "warnings": self.warnings,
+                "parameters": {name: asdict(p) for name, p in self.parameters.items()},
+                "derived": derived,
+                "visited": self.visited,
+                "misfit": self.misfit,
+                "weights": self.weights,
+                "statistics": self.statistics,
+                "energy": self.energy,
+                "runtime_s": self.runtime_s,
+            }
+        )
+        return content
+
     def save(self, folder: str | Path) -> Path:
-        """Write the result folder whole, replacing an older one at the end."""
-        raise NotImplementedError
+        """Write the result folder whole, replacing an older one at the end.
+
+        Parameters
+        ----------
+        folder : str or Path
+            Where to; made with its parents. What stood there must be empty or a result folder.
+
+        Returns
+        -------
+        Path
+            The folder, with ``fit.json``, ``parameters.csv``, ``curves.csv``, ``fit.png``,
+            ``fit.pdf`` and ``report.html``.
+
+        Raises
+        ------
+        InputError
+            If something else stands there or it cannot be written; nothing is changed then.
+        """
+        folder = Path(folder)
+        check_target(folder)
+        try:
+            with _replacing(folder.resolve()) as fresh:
+                _write(self, fresh)
+        except OSError as error:
+            raise InputError(
+                f"the result cannot be written to {folder}: {error.strerror or error}"
+            ) from error
+        return folder
+
+
+def check_target(folder: str | Path) -> None:
+    """Raise InputError unless `folder` is free, empty or an older result that may be replaced."""
+    folder = Path(folder)
+    try:
+        if folder.is_dir():
+            if any(folder.iterdir()) and not (folder / "fit.json").is_file():
+                raise InputError(
+                    f"{folder} is not empty and holds no foamfit result (no fit.json), so it is "
+                    "not replaced; choose a new or an empty folder"
+                )
+        elif folder.exists():
+            raise InputError(f"{folder} is a file; choose a new or an empty folder")
+    except OSError as error:
+        raise InputError(f"{folder} cannot be read: {error.strerror or error}") from error
+
+
+def load_result(folder: str | Path) -> dict[str, Any]:
+    """Read the ``fit.json`` of a result folder.
+
+    Parameters
+    ----------
+    folder : str or Path
+        The result folder, or its ``fit.json``.
+
+    Returns
+    -------
+    dict
+        The content of ``fit.json``; values are SI.
+
+    Raises
+    ------
+    InputError
+        If there is no ``fit.json`` that this version of foamfit understands.
+    """
+    path = Path(folder)
+    if path.is_dir():
+        path = path / "fit.json"
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(
+            f"{folder} is not a result folder: {path.name} cannot be read "
+            f"({error.strerror or error})"
+        ) from error
+    except ValueError as error:  # neither UTF-8 nor JSON
+        raise InputError(f"{path} is not valid JSON: {error}") from error
+    if not isinstance(content, dict) or "schema" not in content:
+        raise InputError(f"{path} is not the result of a fit (it has no schema number)")
+    if content["schema"] != SCHEMA:
+        raise InputError(
+            f"{path} has schema {content['schema']}, this foamfit reads schema {SCHEMA}"
+        )
+    return content
+
+
+def _write(result: FitResult, folder: Path) -> None:
+    from foamfit.plots import image, plot_fit
+    from foamfit.report import render_report
+
+    text = json.dumps(result.to_json_dict(), indent=2, ensure_ascii=False, allow_nan=False)
+    (folder / "fit.json").write_text(text + "\n", encoding="utf-8")
+    _write_table(folder / "parameters.csv", _parameter_rows(result.parameters))
+    _write_table(folder / "curves.csv", _curve_rows(result.curves))
+    figure = plot_fit(result)
+    png = image(figure, "png")
+    (folder / "fit.png").write_bytes(png)
+    (folder / "fit.pdf").write_bytes(image(figure, "pdf"))
+    (folder / "report.html").write_text(render_report(result, fit_png=png), encoding="utf-8")
+
+
+def _write_table(path: Path, rows: Iterable[Iterable[object]]) -> None:
+    with path.open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows(rows)
+
+
+def _parameter_rows(parameters: Mapping[str, ParameterEstimate]) -> Iterator[list[object]]:
+    yield ["name", "value", "stderr", "ci95_low", "ci95_high", "unit", "state", "why"]
+    for name, p in parameters.items():
+        low, high = p.ci95 or (None, None)
+        numbers = (_plain(number) for number in (p.value, p.stderr, low, high))
+        yield [name, *numbers, p.unit, p.state, p.why]
+
+
+def _curve_rows(curves: Curves) -> Iterator[Iterable[object]]:
+    columns = {
+        "time (s)": curves.time,
+        "measured stress (Pa)": curves.measured_stress,
+        "fitted stress (Pa)": curves.stress,
+        "measured displacement (m)": curves.measured_displacement,
+        "fitted displacement (m)": curves.displacement,
+        "stress along measured displacement (Pa)": curves.stress_along,
+    }
+    there = {name: column for name, column in columns.items() if column is not None}
+    yield there.keys()
+    # Python floats are written with as many digits as they have, numpy's with their type's name.
+    yield from zip(*(column.tolist() for column in there.values()), strict=True)
+
+
+def _plain(value: Any) -> Any:
+    """Return `value` in the types of JSON, with None for every number that is not finite."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+@contextmanager
+def _replacing(folder: Path) -> Iterator[Path]:
+    """Give an empty sibling of `folder` to write into, and put it in its place if all went well."""
+    made = [parent for parent in folder.parents if not parent.exists()]
+    mark = uuid4().hex[:12]
+    fresh = folder.with_name(f".{folder.name}.{mark}.new")
+    old = folder.with_name(f".{folder.name}.{mark}.old")
+    try:
+        fresh.mkdir(parents=True)
+        yield fresh
+        if folder.exists():
+            folder.rename(old)
+        fresh.rename(folder)
+    except BaseException:  # KeyboardInterrupt too must leave everything as it was
+        if old.exists() and not folder.exists():
+            old.rename(folder)
+        shutil.rmtree(fresh, ignore_errors=True)
+        for parent in made:
+            with suppress(OSError):
+                parent.rmdir()
+        raise
+    finally:
+        if folder.exists():  # never the last copy
+            shutil.rmtree(old, ignore_errors=True)

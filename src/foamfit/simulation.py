@@ -106,10 +106,19 @@ class Plan:
     time: Array
     speed: float
 
-    def run(self, rows: Array, heights: Array, rtol: float = 1e-6, *, inner: bool = True) -> Motion:
+    def run(
+        self,
+        rows: Array,
+        heights: Array,
+        rtol: float = 1e-6,
+        *,
+        drag: float | None = None,
+        inner: bool = True,
+    ) -> Motion:
         """Run the scene with the springs in `rows` (n_springs, columns) and their heights (m).
 
-        With `inner` false only the displacement of the top is computed, shape (1, n_t).
+        `drag` replaces the scene's own. With `inner` false only the displacement of the top is
+        computed, shape (1, n_t).
 
         Raises
         ------
@@ -119,7 +128,9 @@ class Plan:
         if self.solver == CLOSED_FORM:
             motion = self._closed_form(rows, heights, inner)
         else:
-            motion = self._integrate(rows, heights, rtol, inner)
+            motion = self._integrate(
+                rows, heights, rtol, self.drag if drag is None else drag, inner
+            )
         if not (
             math.isfinite(float(motion.base_stress.sum()))
             and math.isfinite(float(motion.displacement.sum()))
@@ -149,7 +160,9 @@ class Plan:
             0,
         )
 
-    def _integrate(self, rows: Array, heights: Array, rtol: float, inner: bool) -> Motion:
+    def _integrate(
+        self, rows: Array, heights: Array, rtol: float, drag: float, inner: bool
+    ) -> Motion:
         tolerance = max(0.01 * rtol, 1e-16)
         order = min(max(round(4.0 - 0.5 * math.log(tolerance)), 6), 24)
         displacement = np.empty((len(heights) if inner else 1, self.time.size))
@@ -160,7 +173,7 @@ class Plan:
             heights,
             self.ends,
             self.mass,
-            self.drag,
+            drag,
             self.top,
             self.values,
             self.speed,

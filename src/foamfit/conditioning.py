@@ -1,0 +1,515 @@
+"""From the samples of a file to one loading and unloading, with time zero where contact starts.
+
+Each step is a function that returns a new `Record` and a sentence for each thing that it did.
+`condition` runs them in order. Nothing is dropped or changed without a sentence.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foamfit.errors import InputError
+from foamfit.measurement import Array, Specimen, Striker
+
+_MIN_ROWS = 10
+_MIN_REST = 20
+_MAX_ROWS = 1500
+_BLOCKS = 1000
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """The channels of a test in SI, each of shape (n,) or None where the file lacks it.
+
+    Time in s, stress in Pa, displacement of the top in m, velocity of the top in m/s and its
+    deceleration in m/s² (like the stress that causes it, it is positive in compression).
+    """
+
+    time: Array | None
+    stress: Array
+    displacement: Array | None
+    velocity: Array | None = None
+    acceleration: Array | None = None
+
+    def rows(self, which: slice | NDArray[np.bool_]) -> Record:
+        """Keep some rows of every channel."""
+        channels = (getattr(self, f.name) for f in fields(self))
+        return Record(*(None if values is None else values[which] for values in channels))
+
+    def __len__(self) -> int:
+        """Count the samples."""
+        return len(self.stress)
+
+    @property
+    def clock(self) -> Array:
+        """Time, or the sample's number where there is none, shape (n,)."""
+        return np.arange(len(self), dtype=np.float64) if self.time is None else self.time
+
+
+@dataclass(frozen=True)
+class Window:
+    """The part of a file to look at: times in s by the file's own clock, and which cycle."""
+
+    start: float | None = None
+    end: float | None = None
+    cycle: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Conditioned:
+    """A conditioned record, where its displacement came from, and what was done."""
+
+    record: Record
+    motion: str
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where contact starts: on the file's clock (None: at its first sample), and at which height.
+
+    `zero` is the displacement there, and `free` says that nothing pressed on the specimen before,
+    so that the samples before it show the offset of the sensor.
+    """
+
+    time: float | None
+    zero: float
+    free: bool
+    how: str
+
+
+def condition(
+    record: Record,
+    specimen: Specimen,
+    *,
+    striker: Striker | None = None,
+    window: Window | None = None,
+) -> Conditioned:
+    """Turn the samples of a file into one loading and unloading.
+
+    Parameters
+    ----------
+    record : Record
+        All samples of the file.
+    specimen : Specimen
+        Its height and area turn force into stress and limit the strain.
+    striker : Striker, optional
+        With it and a time the record is an impact, else a slow test whose displacement is driven.
+    window : Window, optional
+        What the user chose to look at.
+
+    Returns
+    -------
+    Conditioned
+        At most 1500 samples; time is zero and displacement is zero where contact starts.
+    """
+    notes: list[str] = []
+
+    def done(result: tuple[Record, list[str]]) -> Record:
+        notes.extend(result[1])
+        return result[0]
+
+    window = window or Window()
+    impact = striker is not None and record.time is not None
+    check_signs(record)
+    record = done(cut_to_window(record, window))
+    record = done(fill_staircase(record))
+    if impact and window.cycle != 1:
+        raise InputError("[window] cycle is for slow tests; for an impact give start and end.")
+    start = find_start(record if impact else select_cycle(record, 1)[0])
+    record = done(remove_offset(record, start, impact))
+    if not impact:
+        record = done(select_cycle(record, window.cycle))
+    if window.cycle > 1:  # a later cycle keeps the zero of the first, when the foam was fresh
+        start = Start(None, start.zero, False, f"with cycle {window.cycle}")
+    record = done(cut_to_contact(record, start, impact))
+    motion = "measured"
+    if record.displacement is None:
+        record, motion = integrate_motion(record, specimen, striker or Striker())
+        notes.append(f"The file has no displacement: the motion is {motion}.")
+    notes += checks(record, specimen, striker if impact else None, motion)
+    record = done(thin(record))
+    return Conditioned(record, motion, tuple(notes))
+
+
+def engineering(value: float, unit: str) -> str:
+    """Write a value for people: 3.839e6, "Pa" gives "3.839 MPa"."""
+    prefixes = {9: "G", 6: "M", 3: "k", 0: "", -3: "m", -6: "µ", -9: "n"}
+    power = 0 if value == 0 else int(np.clip(3 * np.floor(np.log10(abs(value)) / 3), -9, 9))
+    return f"{value / 10.0**power:.4g} {prefixes[power]}{unit}"
+
+
+# What the signals are like.
+
+
+def noise_level(values: Array) -> float:
+    """Estimate the standard deviation of the noise of a smooth, well sampled signal, shape (n,)."""
+    if len(values) < 4:
+        return 0.0
+    return float(1.4826 * np.median(np.abs(np.diff(values, 2))) / np.sqrt(6))
+
+
+def smooth(values: Array, width: int) -> Array:
+    """Take the moving mean over `width` samples, shape (n,)."""
+    from scipy.ndimage import uniform_filter1d
+
+    return values if width < 2 else np.asarray(uniform_filter1d(values, width, mode="nearest"))
+
+
+def line_at(time: Array, values: Array, at: float) -> tuple[float, float]:
+    """Value at the time `at`, and slope, of the straight line through the samples."""
+    slope, level = np.polyfit(time - at, values, 1)
+    return float(level), float(slope)
+
+
+def check_signs(record: Record) -> None:
+    """Refuse a channel that is plainly the other way round: compression is positive."""
+    hint = "is negative in compression; compression must be positive, so set scale = -1 for it"
+    stress, peak = record.stress, int(np.argmax(record.stress))
+    first = float(np.median(stress[:5]))
+    if first - stress.min() > 2 * max(stress[peak] - first, 0) and abs(stress.min()) > stress[peak]:
+        raise InputError(f"the stress or force {hint} in [columns].")
+    if record.displacement is not None:
+        moved = record.displacement[peak] - record.displacement[0]
+        if moved < -0.5 * np.ptp(record.displacement[: peak + 1]):
+            raise InputError(f"the displacement or strain {hint} in [columns].")
+    elif record.acceleration is not None:
+        if np.dot(stress - first, record.acceleration) < 0:
+            raise InputError(f"the acceleration {hint} in [columns] (braking is positive).")
+    elif record.velocity is not None and record.velocity[0] < record.velocity[-1]:
+        raise InputError(f"the velocity {hint} in [columns].")
+
+
+def checks(record: Record, specimen: Specimen, striker: Striker | None, motion: str) -> list[str]:
+    """Refuse strains beyond one; say what smells wrong."""
+    displacement, stress = record.displacement, record.stress
+    assert displacement is not None  # measured or integrated by now
+    if len(record) < _MIN_ROWS:
+        raise InputError(f"only {len(record)} samples are in contact; at least {_MIN_ROWS} needed.")
+    strain = float(displacement.max()) / specimen.height
+    if strain >= 1:
+        cause = "the unit of displacement or strain" if motion == "measured" else "the striker"
+        raise InputError(f"strain reaches {strain:.3g}, beyond one; check height and {cause}.")
+    notes = []
+    peak, last = float(stress.max()), int(np.argmax(stress))
+    if stress[:3].mean() > 0.05 * peak:
+        share = stress[:3].mean() / peak
+        notes.append(f"Check: the record starts under load, at {share:.0%} of the peak stress.")
+    width = max(1, len(record) // 100)
+    lowest = float(smooth(stress, width)[last:].min())
+    if lowest < -max(0.002 * peak, 4 * noise_level(stress) / np.sqrt(width)):
+        notes.append(
+            f"The stress goes down to {engineering(lowest, 'Pa')} after the peak (adhesion, drift "
+            "or ringing); it is kept."
+        )
+    if (
+        striker
+        and striker.velocity
+        and record.time is not None
+        and motion != "integrated from force"
+    ):
+        early = displacement <= 0.15 * displacement.max()
+        early[int(np.argmax(displacement)) :] = False
+        if early.sum() >= 3:
+            speed = line_at(record.time[early], displacement[early], 0.0)[1]
+            if abs(speed / striker.velocity - 1) > 0.1:
+                notes.append(
+                    f"Check: the displacement starts at {speed:.3g} m/s, but the striker's velocity"
+                    f" is given as {striker.velocity:.3g} m/s."
+                )
+    if specimen.mass:
+        density = specimen.mass / (specimen.area * specimen.height)
+        if not 1 < density < 3000:
+            notes.append(f"Check: mass and volume give a density of {density:.3g} kg/m³.")
+    return notes
+
+
+# The steps.
+
+
+def cut_to_window(record: Record, window: Window) -> tuple[Record, list[str]]:
+    """Keep what lies between the window's start and end, by the file's own clock."""
+    if window.start is None and window.end is None:
+        return record, []
+    if record.time is None:
+        raise InputError("[window] start and end need a time column; the file has none.")
+    start = -np.inf if window.start is None else window.start
+    end = np.inf if window.end is None else window.end
+    inside = (record.time >= start) & (record.time <= end)
+    if inside.sum() < _MIN_ROWS:
+        first, last = (engineering(float(t), "s") for t in record.time[[0, -1]])
+        raise InputError(
+            f"[window] start and end leave {inside.sum()} samples; at least {_MIN_ROWS} between "
+            f"{first} and {last} are needed."
+        )
+    cut = len(record) - int(inside.sum())
+    return record.rows(inside), [f"[window] cut {cut} of {len(record)} samples."]
+
+
+def fill_staircase(record: Record) -> tuple[Record, list[str]]:
+    """Interpolate a displacement that is held while the stress goes on.
+
+    The instants where its value is fresh are kept. A much longer hold is a real one: it lasts
+    until one usual step before the next fresh value.
+    """
+    displacement = record.displacement
+    if displacement is None:
+        return record, []
+    fresh = np.flatnonzero(np.diff(displacement) != 0) + 1
+    lengths = np.diff(fresh)
+    if len(lengths) < _MIN_ROWS or np.median(lengths) < 2:
+        return record, []
+    step = int(np.median(lengths))
+    held = fresh[np.append(lengths, len(record) - fresh[-1]) > 3 * step]
+    ends = np.append(fresh, len(record) - 1 + step)[np.searchsorted(fresh, held) + 1] - step
+    knots = np.unique(np.concatenate([[0], fresh[:1] - 1, fresh, ends]))
+    clock = record.clock
+    filled = np.interp(clock, clock[knots], displacement[knots])
+    note = (
+        f"The displacement is held for about {step} samples at a time; it is interpolated between "
+        f"the {len(fresh)} instants where it is fresh."
+    )
+    return replace(record, displacement=filled), [note]
+
+
+def select_cycle(record: Record, cycle: int) -> tuple[Record, list[str]]:
+    """Keep one loading and unloading of a slow test, cycle 1 being the first in the file."""
+    displacement = record.displacement
+    if displacement is None:
+        return record, []  # refused or integrated later
+    level = (displacement - displacement.min()) / np.ptp(displacement)
+    marks = np.where(level > 0.65, 1, np.where(level < 0.35, -1, 0))
+    at = np.flatnonzero(marks)
+    up, turn = marks[at] == 1, np.diff(marks[at])
+    rises = [*at[:1][up[:1]], *at[1:][turn > 0]]
+    falls = list(at[1:][turn < 0])
+    if rises and falls and falls[0] < rises[0]:
+        falls = falls[1:]
+    n = len(rises)
+    if cycle > n:
+        raise InputError(f"[window] cycle = {cycle}, but the file has {n}; give one from 1 to {n}.")
+    # A cycle runs from the last rest before its rise to its first return to rest after its fall.
+    start, end = 0, len(record)
+    if cycle > 1:
+        between = displacement[falls[cycle - 2] : rises[cycle - 1]]
+        start = rises[cycle - 1] - 1 - int(np.argmin(between[::-1]))
+    if cycle <= len(falls):
+        after = displacement[falls[cycle - 1] : rises[cycle] if cycle < n else len(record)]
+        rest = after.min() + 0.005 * np.ptp(displacement)
+        end = falls[cycle - 1] + int(np.argmax(after <= rest)) + 1
+    notes = []
+    if n > 1 or end - start < len(record):
+        notes.append(
+            f"Cycle {cycle} of {n} is used: {end - start} of {len(record)} samples, "
+            f"{start} before it and {len(record) - end} after it are cut."
+        )
+    if cycle > len(falls):
+        notes.append("The record has no unloading, so nothing in it determines unloading.")
+    return record.rows(slice(start, end)), notes
+
+
+def _rise(values: Array, share: float) -> int:
+    """First of three samples in a row above a share of the way from the lowest level to the top."""
+    before_peak = values[: int(np.argmax(values)) + 1]
+    base = float(np.percentile(before_peak, 5))
+    above = before_peak > base + share * (before_peak[-1] - base)
+    run = above[:-2] & above[1:-1] & above[2:]
+    return int(np.argmax(run)) if run.any() else int(np.argmax(above))
+
+
+def leave_rest(time: Array, values: Array) -> float | None:
+    """Time at which a signal leaves its rest, or None if it has none before it rises.
+
+    A rest followed by a straight rise is fitted by least squares to the samples up to 15 % of the
+    peak, so that the time is finer than the sampling.
+    """
+    high, low = _rise(values, 0.15), _rise(values, 0.05)
+    first = max(0, high - 4 * max(high - low, 3) - 8)
+    part = slice(first, high + 1, max(1, (high - first) // 1000))
+    t, y = time[part], values[part]
+    if len(t) < 5:
+        return None
+    starts = np.linspace(t[0], t[-2], 400)
+    ramps = np.maximum(0.0, t - starts[:, None])
+    ramps -= ramps.mean(axis=1, keepdims=True)
+    square, product = (ramps**2).sum(axis=1), ramps @ (y - y.mean())
+    misfit = ((y - y.mean()) ** 2).sum() - product**2 / square
+    best = int(np.argmin(misfit))
+    if first == 0:
+        # Would a rise from the very first sample do nearly as well (three standard errors)?
+        if misfit[0] <= misfit[best] * (1 + 9 / len(t)) + 1e-9 * np.var(y):
+            return None
+        # A curved start looks like a rest, but rises.
+        rest = t < starts[best]
+        if rest.sum() < 3:
+            return None
+        if (time[high] - starts[best]) * 2 > starts[best] - t[0]:
+            rise = line_at(t[rest], y[rest], 0.0)[1] * np.ptp(t[rest])
+            doubt = 4 * noise_level(values) * np.sqrt(12 / rest.sum())
+            if abs(rise) > max(doubt, 2e-3 * np.ptp(values)):
+                return None
+    return float(starts[best])
+
+
+def find_start(record: Record) -> Start:
+    """Find where contact starts: by the zero of the displacement, by its rest, or by the stress."""
+    time, w = record.clock, record.displacement
+    by_stress = leave_rest(time, record.stress)
+    if w is None:
+        return Start(by_stress, 0.0, True, "where the stress leaves its rest")
+    top = int(np.argmax(w))
+    onset = 0 if by_stress is None else int(np.searchsorted(time, by_stress))
+    travel = float(w[top] - w[onset])
+    crossing = int(np.argmax(w >= 0)) if w[top] > 0 else 0
+    near = slice(max(0, crossing - 5), crossing + 5)
+    below = crossing > 1 and w[0] < -max(4 * noise_level(w), 1e-4 * travel)
+    unloaded = record.stress[near].mean() < 0.2 * record.stress.max()
+    if below and unloaded and (by_stress is None or abs(w[onset]) < 0.3 * w[top]):
+        level, speed = line_at(time[near], w[near], time[crossing])
+        at = time[crossing] - level / speed if speed > 0 else time[crossing]
+        at = float(np.clip(at, time[crossing - 1], time[crossing + 1]))
+        if abs(at) < 0.05 * (time[crossing] - time[crossing - 1]):
+            at = 0.0  # the file's own time zero
+        return Start(at, 0.0, False, "where the displacement passes zero")
+    if by_stress is not None and w[onset] - w[0] > 0.1 * travel:
+        near = slice(max(0, onset - 5), onset + 5)
+        zero = line_at(time[near], w[near], by_stress)[0]
+        return Start(by_stress, zero, True, "where the stress leaves its rest")
+    by_motion = leave_rest(time[: top + 1], w[: top + 1]) if by_stress is not None else None
+    if by_motion is not None:
+        rest = w[time < by_motion]
+        zero = float(np.median(rest))
+        if len(rest) < _MIN_ROWS and abs(zero) < 0.02 * travel:
+            zero = 0.0  # too short a rest to doubt the file's own zero
+        return Start(by_motion, zero, True, "where the displacement leaves its rest")
+    few = slice(0, min(5, top + 1))
+    zero = line_at(time[few], w[few], time[0])[0] if top > 1 else float(w[0])
+    return Start(None, zero if abs(w[0]) > 0.02 * travel else 0.0, False, "at the first sample")
+
+
+def remove_offset(record: Record, start: Start, impact: bool) -> tuple[Record, list[str]]:
+    """Take from the stress (and the acceleration) its median before contact."""
+    if start.time is None or not (impact or start.free):
+        return record, []  # before a slow test nothing shows that the specimen is free
+    before = record.clock < start.time
+    before[max(0, int(before.sum()) - 2) :] = False
+    n = int(before.sum())
+    if n < _MIN_REST:
+        return record, []
+    rest = record.stress[before]
+    offset = float(np.median(rest))
+    rise = line_at(np.arange(n), rest, 0.0)[1] * n
+    if abs(rise) > max(0.01 * record.stress.max(), 4 * noise_level(rest) * np.sqrt(12 / n)):
+        told = f"by {engineering(rise, 'Pa')} in the {n} samples before contact"
+        return record, [f"The stress drifts {told}, so no offset is taken off."]
+    note = (
+        f"The stress before contact, {engineering(offset, 'Pa')} with a standard deviation of "
+        f"{engineering(float(rest.std()), 'Pa')} ({n} samples), is taken off as the sensor's offset."
+    )
+    a = record.acceleration
+    record = replace(
+        record,
+        stress=record.stress - offset,
+        acceleration=None if a is None else a - np.median(a[before]),
+    )
+    return record, [note]
+
+
+def contact_end(stress: Array) -> tuple[int, bool]:
+    """Index after the last sample of the contact with the highest stress, and if it was reached.
+
+    The end is the last return to zero: a mean over a few samples keeps noise from ending it early,
+    and a stress that soon rises again has not ended.
+    """
+    top = int(np.argmax(stress))
+    below = np.flatnonzero(stress[top:] < 0.5 * stress[top])
+    width = max(1, (int(below[0]) if below.size else 0) // 12)
+    mean = smooth(stress, width)
+    level = 0.0025 * stress[top] + 2 * noise_level(stress) / np.sqrt(width)
+    end = top
+    while True:
+        quiet = np.flatnonzero(mean[end:] <= level)
+        if not quiet.size:
+            return len(stress), False
+        end += int(quiet[0])
+        ahead = end + max(1, (end - top) // 5)
+        again = np.flatnonzero(mean[end:ahead] > 0.05 * stress[top])
+        if not again.size:
+            return end, True
+        end += int(again[-1])
+
+
+def cut_to_contact(record: Record, start: Start, impact: bool) -> tuple[Record, list[str]]:
+    """Cut what lies before and after contact; time and displacement are zero where it starts."""
+    time, w = record.clock, record.displacement
+    zero_time = float(time[0]) if start.time is None else start.time
+    first = 0 if start.time is None else int(np.searchsorted(time, start.time))
+    notes: list[str] = []
+    end = len(record)
+    if impact:
+        found, returned = contact_end(record.stress[first:])
+        end = min(end, first + found + max(3, found // 50)) if returned else end
+        if not returned:
+            notes.append("Check: the record ends before the stress has returned to zero.")
+    cut = f"; {first} samples before and {len(record) - end} after are cut, {end - first} kept"
+    at = "" if record.time is None else f" at {engineering(zero_time, 's')} in the file"
+    notes.insert(0, f"Contact starts {start.how}{at}{cut if end - first < len(record) else ''}.")
+    if start.zero != 0:
+        notes.append(f"The displacement there, {engineering(start.zero, 'm')}, is taken off.")
+    record = replace(
+        record,
+        time=None if record.time is None else time - zero_time,
+        displacement=None if w is None else w - start.zero,
+    )
+    return record.rows(slice(first, end)), notes
+
+
+def integrate_motion(record: Record, specimen: Specimen, striker: Striker) -> tuple[Record, str]:
+    """Integrate the displacement from acceleration, else velocity, else from the force.
+
+    From w(0) = 0 and w'(0) the striker's velocity; w'' = −a, or −σA/m. The integrals are exact
+    where the channel is straight between samples.
+    """
+    time = record.time
+    assert time is not None  # without a time the file has been refused
+    if record.acceleration is not None and striker.velocity:
+        rate, source = -record.acceleration, "acceleration"
+    elif record.velocity is not None:
+        rate, source = record.velocity, "velocity"
+    else:
+        assert striker.mass  # likewise
+        rate, source = -record.stress * specimen.area / striker.mass, "force"
+    # From time zero, which may lie before the first sample, to each sample.
+    first = rate[0] if source == "velocity" else 0.0
+    lead = time[0] > 0
+    t, r = (np.append(0.0, time), np.append(first, rate)) if lead else (time, rate)
+    dt = np.diff(t)
+    once = np.append(0.0, np.cumsum(0.5 * dt * (r[1:] + r[:-1])))
+    if source == "velocity":
+        w = once
+    else:
+        assert striker.velocity
+        v = striker.velocity + once
+        w = np.append(0.0, np.cumsum(v[:-1] * dt + dt**2 * (2 * r[:-1] + r[1:]) / 6))
+    return replace(record, displacement=w[1:] if lead else w), f"integrated from {source}"
+
+
+def thin(record: Record) -> tuple[Record, list[str]]:
+    """Average blocks of samples where there are many more than a fit needs; noise falls with it."""
+    n = len(record)
+    if n <= _MAX_ROWS:
+        return record, []
+    size = -(-n // _BLOCKS)
+    edges = np.arange(0, n, size)
+    counts = np.diff(np.append(edges, n))
+
+    def mean(values: Array | None) -> Array | None:
+        return None if values is None else np.add.reduceat(values, edges) / counts
+
+    stress = mean(record.stress)
+    assert stress is not None
+    thinned = Record(mean(record.time), stress, mean(record.displacement))
+    return thinned, [f"{n} samples are averaged in {len(edges)} blocks of {size}."]

@@ -1,0 +1,337 @@
+"""The objective: how far a model's curves are from the measured ones, sample by sample.
+
+Curves are compared in time (or sample by sample along a history), never by interpolating across
+the loop. Two channels were measured, stress and displacement; what is counted of them, and how
+much, is in `weights`, so that nothing is counted twice silently.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foamfit import kernels
+from foamfit.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
+from foamfit.errors import InputError, SimulationError
+from foamfit.measurement import Measurement
+from foamfit.model import Model
+from foamfit.simulation import Motion, Plan, plan
+from foamfit.spring import LinearSpring
+
+Array = NDArray[np.float64]
+
+CURVES = ("stress_time", "displacement_time", "stress_strain")
+DRIVES = ("impact", "stress", "displacement")
+# What a residual is, in units of the curve's scale, where a simulation failed.
+PENALTY = 10.0
+
+
+def choose_drive(measurement: Measurement) -> str:
+    """Choose the drive: impact if striker and time are known, else displacement.
+
+    Raises
+    ------
+    InputError
+        If the test has neither.
+    """
+    striker = measurement.striker
+    if (
+        striker is not None
+        and striker.mass is not None
+        and striker.velocity
+        and measurement.time is not None
+    ):
+        return "impact"
+    if measurement.displacement is not None:
+        return "displacement"
+    raise InputError(
+        f"{measurement.name}: no drive is possible; give a displacement or strain column, "
+        "or time and a [striker] with mass and velocity"
+    )
+
+
+def check_drive(measurement: Measurement, drive: str) -> None:
+    """Refuse a drive that the test cannot feed.
+
+    Raises
+    ------
+    InputError
+        Naming what is missing.
+    """
+    if drive not in DRIVES:
+        raise InputError(f"drive '{drive}' is unknown; it must be one of {', '.join(DRIVES)}")
+    striker = measurement.striker
+    missing = []
+    if measurement.stress is None:
+        missing.append("a force or stress column")
+    if drive == "impact":
+        if measurement.time is None:
+            missing.append("a time column")
+        if striker is None or striker.mass is None:
+            missing.append("[striker] mass")
+        if striker is None or not striker.velocity:
+            missing.append("[striker] velocity greater than zero")
+    elif measurement.displacement is None:
+        missing.append("a displacement or strain column")
+    if missing:
+        raise InputError(f"{measurement.name}: the {drive} drive needs {' and '.join(missing)}")
+
+
+def default_weights(measurement: Measurement, drive: str) -> dict[str, float]:
+    """Weights that count each measured channel once.
+
+    In the impact drive stress and displacement are compared in time; a displacement that was
+    integrated from the force is no second measurement. In the displacement drive the stress along
+    the measured displacement is the one curve, in the stress drive the displacement.
+    """
+    weights = dict.fromkeys(CURVES, 0.0)
+    if drive == "impact":
+        weights["stress_time"] = 1.0
+        if measurement.displacement is not None and measurement.motion != "integrated from force":
+            weights["displacement_time"] = 1.0
+    elif drive == "stress":
+        weights["displacement_time"] = 1.0
+    else:
+        weights["stress_strain"] = 1.0
+    return weights
+
+
+@dataclass(frozen=True, eq=False)
+class Simulated:
+    """The curves of one set of parameters; None where the drive prescribes or the test lacks them.
+
+    `stress_strain` is the stress (Pa) along the measured displacement. `motion` is the run itself.
+    """
+
+    stress_time: Array | None
+    displacement_time: Array | None
+    stress_strain: Array | None
+    motion: Motion
+
+
+@dataclass(eq=False)
+class Objective:
+    """Residuals of a model under a drive against a measurement.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        The conditioned test.
+    model : Model
+        The springs.
+    drive : str
+        "impact", "stress" or "displacement".
+    weights : dict
+        Weight of each curve; see `default_weights`. A weight w multiplies the curve's squares.
+    rtol : float
+        Tolerance of the simulation.
+
+    Attributes
+    ----------
+    evaluations, failures : int
+        How many sets of parameters were simulated, and how many of them could not be.
+    """
+
+    measurement: Measurement
+    model: Model
+    drive: str
+    weights: dict[str, float]
+    rtol: float = 1e-6
+    evaluations: int = field(default=0, init=False)
+    failures: int = field(default=0, init=False)
+
+    def __post_init__(self) -> None:
+        """Make the scenes ready and fix the scale of each curve."""
+        check_drive(self.measurement, self.drive)
+        self._check_weights()
+        self.time = self._time()
+        self._plan = self._scene(self._loading(), damped=False)
+        self._damped_plan = self._scene(self._loading(), damped=True)
+        along = None
+        if self.measurement.displacement is not None:
+            along = DisplacementDrive(self.measurement.displacement)
+        self._along = along and self._scene(along, damped=False)
+        self._damped_along = along and self._scene(along, damped=True)
+        self.measured = self._measured()
+        self.counted = tuple(
+            name for name in CURVES if self.weights[name] > 0 and self.measured[name] is not None
+        )
+        if not self.counted:
+            raise InputError(
+                f"{self.measurement.name}: no curve is left to fit; give one that the "
+                f"{self.drive} drive has a weight above zero"
+            )
+        self.scale = {name: self._scale(name) for name in CURVES}
+        self.sizes = tuple(self._curve(name).size for name in self.counted)
+        self.n_data = sum(self.sizes)
+
+    def _check_weights(self) -> None:
+        for name, weight in self.weights.items():
+            if name not in CURVES or not 0 <= weight < np.inf:
+                raise InputError(
+                    f"weights: '{name}' = {weight} is not admissible; give {', '.join(CURVES)} "
+                    "a weight of zero or more"
+                )
+        self.weights = dict.fromkeys(CURVES, 0.0) | self.weights
+
+    def _time(self) -> Array:
+        """Time of the samples, s; their number where the test has no time."""
+        time = self.measurement.time
+        stress = self._stress
+        return np.arange(stress.size, dtype=float) if time is None else time
+
+    @property
+    def _stress(self) -> Array:
+        assert self.measurement.stress is not None  # checked by check_drive
+        return self.measurement.stress
+
+    def _loading(self) -> Drive:
+        if self.drive == "impact":
+            striker = self.measurement.striker
+            assert striker is not None
+            assert striker.mass is not None
+            assert striker.velocity is not None
+            return Impact(striker.mass, striker.velocity)
+        if self.drive == "stress":
+            return StressDrive(self._stress)
+        assert self.measurement.displacement is not None
+        return DisplacementDrive(self.measurement.displacement)
+
+    def _scene(self, loading: Drive, *, damped: bool) -> Plan:
+        """Make a scene ready; only which springs have a dashpot matters here, not their values."""
+        specimen = self.measurement.specimen
+        count = len(self.model.kinds)
+        springs = [LinearSpring(1.0, eta=1.0 if damped else 0.0)] * count
+        heights = [specimen.height / count] * count
+        return plan(Chain(springs, heights, specimen.area), loading, self.time)
+
+    def _measured(self) -> dict[str, Array | None]:
+        """Measured curves that the drive leaves free."""
+        motion = self.measurement.displacement
+        return {
+            "stress_time": None if self.drive == "stress" else self._timed(self._stress),
+            "displacement_time": None if self.drive == "displacement" else motion,
+            "stress_strain": None if motion is None else self._stress,
+        }
+
+    def _timed(self, values: Array) -> Array | None:
+        return None if self.measurement.time is None else values
+
+    def _curve(self, name: str) -> Array:
+        curve = self.measured[name]
+        assert curve is not None
+        return curve
+
+    def _scale(self, name: str) -> float:
+        """One standard deviation of a curve if the test states it, else the curve's range."""
+        noise = self.measurement.noise
+        given = noise.displacement if name == "displacement_time" else noise.stress
+        curve = self.measured[name]
+        if given is not None or curve is None:
+            return given or 1.0
+        return float(np.ptp(curve))
+
+    # ------------------------------------------------------------------ simulation and residual
+
+    def simulate(self, values: Array, *, everything: bool = False) -> Simulated:
+        """Simulate a flat vector of parameters; what is not counted only if `everything`.
+
+        Raises
+        ------
+        SimulationError
+            If the parameters are not admissible or the scene has no finite answer.
+        """
+        rows = self.model.rows(values)
+        heights = np.ascontiguousarray(
+            self.model.heights(values, self.measurement.specimen.height)
+        )
+        if rows is None or not (np.all(heights > 0.0) and values[-1] >= 0.0):
+            raise SimulationError("the parameters are not admissible")
+        damped = bool(rows[:, kernels.ETA].any())
+        drag = float(values[-1]) / self.measurement.specimen.height
+        scene = self._damped_plan if damped else self._plan
+        run = scene.run(rows, heights, self.rtol, drag=drag, inner=False)
+        along: Array | None = None
+        if self.drive == "displacement":
+            along = run.base_stress
+        elif self._along and (everything or "stress_strain" in self.counted):
+            other = self._damped_along if damped else self._along
+            assert other is not None
+            along = other.run(rows, heights, self.rtol, inner=False).base_stress
+        return Simulated(
+            stress_time=None if self.drive == "stress" else self._timed(run.base_stress),
+            displacement_time=None if self.drive == "displacement" else run.displacement[-1],
+            stress_strain=along,
+            motion=run,
+        )
+
+    def residual(self, values: Array) -> Array:
+        """Weighted residuals of all counted curves, shape (n_data,), dimensionless.
+
+        Simulated minus measured over the curve's scale, times the root of its weight. Parameters
+        that cannot be simulated cost a finite penalty and are counted in `failures`.
+        """
+        self.evaluations += 1
+        try:
+            curves = self.simulate(values)
+        except SimulationError:
+            self.failures += 1
+            return np.full(self.n_data, self._penalty())
+        parts = []
+        for name in self.counted:
+            simulated = getattr(curves, name)
+            factor = self.weights[name] ** 0.5 / self.scale[name]
+            parts.append((simulated - self.measured[name]) * factor)
+        return np.concatenate(parts)
+
+    def _penalty(self) -> float:
+        """Residual per sample that is worse than any curve which stays within ten ranges."""
+        return PENALTY * max(
+            self.weights[name] ** 0.5 * float(np.ptp(self._curve(name))) / self.scale[name]
+            for name in self.counted
+        )
+
+    def jacobian(
+        self,
+        values: Array,
+        steps: Array,
+        vary: NDArray[np.int64],
+        tied: Callable[[Array], Array] = lambda values: values,
+    ) -> Array:
+        """Central differences of the residual, shape (n_data, n_vary).
+
+        `steps` (all parameters) holds the half width; where one side cannot be simulated the
+        other side alone is used. `tied` completes a vector in which some parameters hang on others.
+        """
+        columns = np.empty((self.n_data, vary.size))
+        here: Array | None = None
+        for column, i in enumerate(vary):
+            sides = []
+            for sign in (1.0, -1.0):
+                moved = values.copy()
+                moved[i] += sign * steps[i]
+                failures = self.failures
+                value = self.residual(tied(moved))
+                sides.append((moved[i], value if self.failures == failures else None))
+            (up, high), (down, low) = sides
+            if high is None or low is None:
+                here = self.residual(values) if here is None else here
+                up, high = (up, high) if high is not None else (values[i], here)
+                down, low = (down, low) if low is not None else (values[i], here)
+            columns[:, column] = (high - low) / (up - down) if up != down else 0.0
+        return columns
+
+    def misfit(self, curves: Simulated) -> dict[str, float | None]:
+        """RMS of simulated minus measured over the measured range, per curve; None if not there."""
+        out: dict[str, float | None] = {}
+        for name in CURVES:
+            measured, simulated = self.measured[name], getattr(curves, name)
+            if measured is None or simulated is None:
+                out[name] = None
+            else:
+                miss = np.sqrt(np.mean((simulated - measured) ** 2))
+                out[name] = float(miss / np.ptp(measured))
+        return out

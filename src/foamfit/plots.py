@@ -1,0 +1,382 @@
+"""What was fitted, to look at: the three panels of the paper's Figs. 3 and 4, and the residuals."""
+
+from __future__ import annotations
+
+import io
+import re
+import textwrap
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from foamfit.result import FitResult
+
+Array = NDArray[np.float64]
+
+GREY, BLUE, VERMILION = "#6b6b6b", "#0072B2", "#D55E00"  # of Okabe and Ito, told apart by all
+STYLE: Any = {  # matplotlib types its keys one by one
+    "font.family": "DejaVu Sans",
+    "font.size": 7.5,
+    "axes.labelsize": 8,
+    "axes.titlesize": 8,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.unicode_minus": True,
+    "xtick.labelsize": 7,
+    "ytick.labelsize": 7,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "legend.frameon": False,
+    "legend.fontsize": 7.5,
+    "pdf.fonttype": 42,
+}
+POINTS = {
+    ("a", "d"): "A1", ("d", "a"): "A1",
+    ("d", "c"): "C1",
+    ("c", "e"): "C2", ("e", "c"): "C2",
+    ("e", "a"): "A2",
+}  # fmt: skip
+UNITS = {
+    "Pa": ((1e6, "MPa"), (1e3, "kPa"), (1.0, "Pa")),
+    "s": ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs")),
+    "m": ((1.0, "m"), (1e-3, "mm"), (1e-6, "µm")),
+}
+BESIDE = {"a": (-6, 4), "d": (-6, 4), "c": (7, -3), "e": (4, -7)}  # points from the branch
+DPI = 250  # of a PNG
+MARKERS = 60  # of a measured curve: more of them blot
+
+
+def readable_unit(size: float, unit: str) -> tuple[float, str]:
+    """Return the unit in which a number of this size reads well.
+
+    Parameters
+    ----------
+    size : float
+        The largest number to show, in `unit`.
+    unit : str
+        "Pa", "s" or "m"; any other unit is kept.
+
+    Returns
+    -------
+    factor : float
+        What one of the readable units is in `unit`.
+    name : str
+        Its name, for example "MPa".
+    """
+    scales = UNITS.get(unit, ((1.0, unit),))
+    return next((scale for scale in scales if abs(size) >= scale[0]), scales[-1])
+
+
+def plot_fit(result: FitResult, path: str | Path | None = None) -> Figure:
+    """Draw stress-time, displacement-time and stress-strain, measured and fitted.
+
+    Parameters
+    ----------
+    result : FitResult
+        The fit; a panel of which it has no curve is left out.
+    path : str or Path, optional
+        Where to save the figure; the suffix gives the format.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        7 in wide where all three are there; it belongs to no pyplot state.
+    """
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    with matplotlib.rc_context(STYLE):
+        panels = list(_panels(result))
+        width = {0: 4.0, 1: 4.0, 2: 5.4, 3: 7.0}[len(panels)]
+        figure = Figure(figsize=(width, 2.75), layout="constrained")
+        for ax, panel in zip(_row(figure, len(panels)), panels, strict=True):
+            _draw(ax, panel)
+            _mark_switches(ax, panel, result)
+            if panel.key == "stress_strain":
+                _name_branches(ax, panel, result)
+        _head(figure, result)
+    if path is not None:
+        _save(figure, Path(path))
+    return figure
+
+
+def plot_residuals(result: FitResult, path: str | Path | None = None) -> Figure:
+    """Draw fitted minus measured along each curve, in units of the measured range.
+
+    Parameters
+    ----------
+    result : FitResult
+        The fit; a curve that has nothing to compare is left out.
+    path : str or Path, optional
+        Where to save the figure; the suffix gives the format.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        7 in wide, one strip above the other, over time, or over the sample where there is no time.
+    """
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    with matplotlib.rc_context(STYLE):
+        strips = list(_residuals(result))
+        figure = Figure(figsize=(7.0, 0.45 + 0.85 * max(len(strips), 1)), layout="constrained")
+        column = figure.subplots(max(len(strips), 1), 1, sharex=True, squeeze=False)[:, 0]
+        time = result.curves.time
+        for ax, (name, residual) in zip(column, strips, strict=False):
+            factor, unit = readable_unit(_size(time), "s") if time is not None else (1.0, "")
+            x = np.arange(residual.size) if time is None else time / factor
+            ax.axhline(0.0, color=GREY, lw=0.6)
+            ax.plot(x, 100.0 * residual, color=VERMILION, lw=0.9)
+            ax.set_ylabel("% of range")
+            ax.set_title(f"{name}: fitted − measured", loc="left", fontsize=7.5, pad=3)
+            column[-1].set_xlabel(f"time ({unit})" if unit else "sample")
+        if not strips:
+            _say_nothing_there(column[0])
+    if path is not None:
+        _save(figure, Path(path))
+    return figure
+
+
+def image(figure: Figure, form: Literal["png", "pdf", "svg"]) -> bytes:
+    """Return the figure as the bytes of a file (PDF with embedded TrueType fonts).
+
+    Parameters
+    ----------
+    figure : matplotlib.figure.Figure
+        What to render.
+    form : {"png", "pdf", "svg"}
+        The format.
+    """
+    import matplotlib
+
+    buffer = io.BytesIO()
+    # Without the date, the same fit gives the same file.
+    metadata = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(form)
+    with matplotlib.rc_context(STYLE), warnings.catch_warnings():
+        # A test may be named in letters that the font lacks: the figure is good without them.
+        warnings.filterwarnings("ignore", message="Glyph .* missing")
+        figure.savefig(buffer, format=form, dpi=DPI, metadata=metadata)
+    return buffer.getvalue()
+
+
+def origin_word(result: FitResult) -> str | None:
+    """Return "reconstruction" or "synthetic" where the test's name or notes say it is that."""
+    text = " ".join((result.measurement.name, *result.measurement.notes)).lower()
+    match = re.search(r"\b(reconstruct|synthetic)", text)
+    return match and {"reconstruct": "reconstruction"}.get(match[1], match[1])
+
+
+@dataclass(frozen=True)
+class _Line:
+    x: Array
+    y: Array
+    kind: Literal["measured", "fitted", "along"]
+
+
+@dataclass(frozen=True)
+class _Panel:
+    key: Literal["stress_time", "displacement_time", "stress_strain"]
+    x_name: str
+    x_unit: str
+    y_name: str
+    y_unit: str
+    lines: list[_Line]
+
+    def scale(self) -> tuple[float, str, float, str]:
+        """Return factor and axis label of x, then of y."""
+        x, x_unit = readable_unit(max(_size(line.x) for line in self.lines), self.x_unit)
+        y, y_unit = readable_unit(max(_size(line.y) for line in self.lines), self.y_unit)
+        return x, f"{self.x_name} ({x_unit})", y, f"{self.y_name} ({y_unit})"
+
+
+def _panels(result: FitResult) -> Iterator[_Panel]:
+    c, height = result.curves, result.measurement.specimen.height
+    # What a drive prescribes, the fitted loop has too, whether or not it is kept twice.
+    pushed = c.measured_stress if result.drive == "stress" and c.stress is None else c.stress
+    moved = c.displacement
+    if result.drive == "displacement" and moved is None:
+        moved = c.measured_displacement
+    measured_strain = None if c.measured_displacement is None else c.measured_displacement / height
+    strain = None if moved is None else moved / height
+    stress = [("measured", c.time, c.measured_stress), ("fitted", c.time, c.stress)]
+    motion = [("measured", c.time, c.measured_displacement), ("fitted", c.time, c.displacement)]
+    loop = [
+        ("measured", measured_strain, c.measured_stress),
+        ("fitted", strain, pushed),
+        ("along", measured_strain, c.stress_along),
+    ]
+    everything: list[tuple[Any, ...]] = [
+        ("stress_time", "time", "s", "stress", "Pa", stress),
+        ("displacement_time", "time", "s", "displacement", "m", motion),
+        ("stress_strain", "strain", "–", "stress", "Pa", loop),
+    ]
+    for key, x_name, x_unit, y_name, y_unit, curves in everything:
+        lines = [_Line(x, y, kind) for kind, x, y in curves if x is not None and y is not None]
+        if lines:
+            yield _Panel(key, x_name, x_unit, y_name, y_unit, lines)
+
+
+def _row(figure: Figure, n: int) -> list[Axes]:
+    axes: list[Axes] = list(figure.subplots(1, max(n, 1), squeeze=False)[0])
+    if n == 0:
+        _say_nothing_there(axes[0])
+    return axes[:n]
+
+
+def _say_nothing_there(ax: Axes) -> None:
+    ax.set_axis_off()
+    ax.text(0.5, 0.5, "no curve to compare", ha="center", va="center", transform=ax.transAxes)
+
+
+def _draw(ax: Axes, panel: _Panel) -> None:
+    fx, x_label, fy, y_label = panel.scale()
+    for line in panel.lines:
+        x, y = line.x / fx, line.y / fy
+        if line.kind == "measured":
+            some = _evenly(x, y, MARKERS)
+            ax.plot(x, y, color=GREY, lw=0.5, alpha=0.6, zorder=1)
+            ax.plot(
+                x[some], y[some], "o", ms=2.6, mfc="white", mec=GREY, mew=0.6, zorder=2,
+                label="measured",
+            )  # fmt: skip
+        elif line.kind == "fitted":
+            ax.plot(x, y, color=VERMILION, lw=1.3, zorder=3, label="fitted")
+        else:
+            ax.plot(
+                x, y, color=BLUE, lw=1.0, ls=(0, (4, 2)), zorder=4,
+                label="springs along measured strain",
+            )  # fmt: skip
+    ax.set_xlabel(x_label)
+    ax.set_ylabel(y_label)
+    ax.margins(0.05, 0.11)
+
+
+def _evenly(x: Array, y: Array, n: int) -> NDArray[np.intp]:
+    """Return up to `n` samples even along the curve; even in time they would crowd at its turns."""
+    there = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
+    if there.size <= n:
+        return there
+    dx, dy = (np.diff(v[there]) / (np.ptp(v[there]) or 1.0) for v in (x, y))
+    along = np.concatenate(([0.0], np.cumsum(np.hypot(dx, dy))))
+    return there[np.unique(np.searchsorted(along, np.linspace(0.0, along[-1], n)))]
+
+
+def _mark_switches(ax: Axes, panel: _Panel, result: FitResult) -> None:
+    fx, _, fy, _ = panel.scale()
+    at: dict[str, list[tuple[float, float]]] = {}
+    for switch in result.switches:
+        point = POINTS.get((switch.source, switch.target), f"{switch.source}→{switch.target}")
+        name = f"s{switch.spring} {point}" if len(result.chain.springs) > 1 else point
+        x = switch.time
+        if panel.key == "stress_strain":
+            x = switch.displacement / result.measurement.specimen.height
+        y = switch.displacement if panel.key == "displacement_time" else switch.stress
+        if x is not None:
+            at.setdefault(name, []).append((x / fx, y / fy))
+    for name, places in at.items():
+        ax.plot(*zip(*places, strict=True), "o", ms=3.2, color="black", zorder=5)
+        offset = _offset(name[-2:], panel.key)
+        ax.annotate(  # a spring that goes to and fro is named where it first does
+            name, places[0], offset, textcoords="offset points", zorder=6,
+            ha="left" if offset[0] > 0 else "right", va="center", fontsize=7,
+        )  # fmt: skip
+
+
+def _offset(point: str, key: str) -> tuple[float, float]:
+    """Return where the name of a point stands (in points): beside its curve, off the others."""
+    if key == "stress_strain":
+        return {"A1": (-4, 5), "C1": (-5, 3), "C2": (5, -3), "A2": (4, -7)}.get(point, (5, 5))
+    return {"A1": (5, -4), "C1": (-5, 3), "C2": (5, 3), "A2": (5, 4)}.get(point, (5, 5))
+
+
+def _name_branches(ax: Axes, panel: _Panel, result: FitResult) -> None:
+    """Write a, d, c, e beside the branches of the only spring."""
+    fitted = next((line for line in panel.lines if line.kind == "fitted"), None)
+    if len(result.chain.springs) > 1 or not result.bistable_springs or fitted is None:
+        return
+    fx, _, fy, _ = panel.scale()
+    starts = [0, *_switch_samples(result, fitted), fitted.x.size - 1]
+    branches = [*(switch.source for switch in result.switches[:1]), *_targets(result)]
+    named: set[str] = set()
+    for branch, start, end in zip(branches, starts, starts[1:], strict=False):
+        if branch not in named and end > start:
+            x, y = fitted.x[start : end + 1] / fx, fitted.y[start : end + 1] / fy
+            middle = _evenly(x, y, 3)[1:2]
+            ax.annotate(
+                branch, (float(x[middle][0]), float(y[middle][0])), BESIDE.get(branch, (6, 6)),
+                textcoords="offset points", ha="center", va="center", color=BLUE,
+                style="italic", weight="bold", zorder=6,
+            )  # fmt: skip
+        named.add(branch)
+
+
+def _targets(result: FitResult) -> list[str]:
+    return [switch.target for switch in result.switches] or ["a"]
+
+
+def _switch_samples(result: FitResult, loop: _Line) -> list[int]:
+    """Return the sample of the fitted loop (strain, stress) at which each switch happens."""
+    samples, time = [0], result.curves.time
+    for switch in result.switches:
+        if time is not None and switch.time is not None:
+            samples.append(min(int(np.searchsorted(time, switch.time)), loop.x.size - 1))
+        else:  # the nearest sample after the switch before
+            strain = switch.displacement / result.measurement.specimen.height
+            x, y = loop.x[samples[-1] :] - strain, loop.y[samples[-1] :] - switch.stress
+            away = np.hypot(x / (np.ptp(loop.x) or 1.0), y / (np.ptp(loop.y) or 1.0))
+            samples.append(samples[-1] + int(np.argmin(away)))
+    return samples[1:]
+
+
+def _head(figure: Figure, result: FitResult) -> None:
+    name = " ".join(result.measurement.name.split())
+    name = name if len(name) <= 60 else name[:59] + "…"
+    title = f"{name} · {result.model} · {result.drive} drive"
+    word = origin_word(result)
+    if word and word not in name.lower():
+        title += f" · {word}"
+    title = textwrap.fill(title, int(12 * figure.get_figwidth()))
+    # A name may hold a dollar sign: it is no formula.
+    figure.suptitle(title, x=0.012, ha="left", fontsize=8.5, weight="bold", parse_math=False)
+    entries: dict[str, Any] = {}
+    for ax in figure.axes:
+        handles, labels = ax.get_legend_handles_labels()
+        entries.update(zip(labels, handles, strict=True))
+    if entries:
+        figure.legend(
+            list(entries.values()), list(entries), loc="outside lower center", ncols=len(entries)
+        )
+
+
+def _residuals(result: FitResult) -> Iterator[tuple[str, Array]]:
+    c = result.curves
+    for key, name, fitted, measured in (
+        ("stress_time", "stress-time", c.stress, c.measured_stress),
+        ("displacement_time", "displacement-time", c.displacement, c.measured_displacement),
+        ("stress_strain", "stress-strain", c.stress_along, c.measured_stress),
+    ):
+        compared = result.misfit.get(key) is not None  # else the drive prescribes this curve
+        if compared and fitted is not None and measured is not None:
+            yield name, (fitted - measured) / (float(np.ptp(measured)) or 1.0)
+
+
+def _size(values: Array) -> float:
+    return float(np.nanmax(np.abs(values), initial=0.0))
+
+
+def _save(figure: Figure, path: Path) -> None:
+    form = path.suffix.lstrip(".").lower()
+    if form not in ("png", "pdf", "svg"):
+        raise ValueError(f"a figure is saved as .png, .pdf or .svg, not {path.name!r}")
+    path.write_bytes(image(figure, form))  # type: ignore[arg-type]

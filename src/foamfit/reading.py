@@ -1,0 +1,679 @@
+"""A test file and its TOML become a `Measurement`: units and column names end here, SI begins.
+
+A file holds one table, one row per sample. Its separator, its decimal sign and the row that names
+the columns are found from the first lines; the unit of a channel stands in its header, in a row of
+units beneath it, or in the ``[columns]`` table of the TOML. Every refusal is one sentence that
+names the file and the row, column or key, and says what would be right.
+"""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import difflib
+import functools
+import hashlib
+import io
+import math
+import re
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from foamfit.conditioning import Record, Window, condition
+from foamfit.errors import InputError
+from foamfit.measurement import Array, Measurement, Noise, Specimen, Striker
+
+# Channel: its SI unit, an example of a header, and the words that name it (the first one is best).
+_CHANNELS: dict[str, tuple[str, str, tuple[str, ...]]] = {
+    "time": ("s", "time (ms)", ("time", "t")),
+    "stress": ("Pa", "stress (MPa)", ("stress", "sigma")),
+    "force": ("N", "force (N)", ("force", "load", "f")),
+    "displacement": ("m", "displacement (mm)", ("displacement", "disp")),
+    "strain": ("", "strain (%)", ("strain", "eps", "epsilon")),
+    "acceleration": ("m/s**2", "acceleration (m/s^2)", ("acceleration", "accel", "deceleration")),
+    "velocity": ("m/s", "velocity (m/s)", ("velocity", "speed")),
+}
+_WORDS = {word for _, _, words in _CHANNELS.values() for word in words}
+# With one of these beside it a channel's name means something else.
+_OTHER = {"std", "sd", "dev", "error", "err", "noise", "uncertainty", "rate", "specific", "energy"}
+# Usual units, for headers in capitals: "MM" is millimetre as a displacement, "MPA" megapascal.
+_USUAL = ("s ms us m mm um cm N kN mN Pa kPa MPa GPa m/s mm/s m/s^2 V mV").split()
+_QUANTITY = r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*)"
+_MIN_ROWS = 10
+_HEAD_ROWS = 400
+
+
+# Units: everything that knows pint.
+
+
+@functools.cache
+def _registry() -> Any:
+    import pint
+
+    registry = pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
+    registry.define("microstrain = 1e-6 = ustrain")
+    return registry
+
+
+@functools.cache
+def _quantity(unit: str) -> Any | None:
+    """One `unit` as a pint quantity, or None where pint does not know it."""
+    text = unit.strip().replace("·", "*").replace("^", "**")
+    text = re.sub(r"(?<=[A-Za-z])(-?\d)", r"**\1", text)  # m/s2
+    if text in {"-", "–", "1"}:
+        text = ""
+    try:
+        return _registry().Quantity(1.0, _registry().parse_units(text))
+    except Exception:  # pint and the tokenizer beneath it have a dozen ways of saying no
+        return None
+
+
+def _spellings(unit: str) -> list[str]:
+    usual = [u for u in _USUAL if u.casefold() == unit.strip().casefold()]
+    return [unit, *usual, unit.lower()]
+
+
+def _is_unit(text: str) -> bool:
+    return any(_quantity(spelling) is not None for spelling in _spellings(text))
+
+
+def _parse_quantity(value: object, si: str, where: str, example: str) -> float:
+    """A quantity such as "1.19 mm" in the unit `si`; `where` names its file and key."""
+    match = re.fullmatch(_QUANTITY, str(value))
+    if not isinstance(value, str) or not match:
+        raise InputError(f'{where} = {value!r} is no quantity; give it like "{example}".')
+    number, unit = match.groups()
+    quantity = _quantity(unit)
+    if quantity is None:
+        raise InputError(f'{where} = "{value}" has an unknown unit; give it like "{example}".')
+    if not quantity.check(_quantity(si).dimensionality):  # type: ignore[union-attr]
+        raise InputError(f'{where} = "{value}" is of another kind; give it like "{example}".')
+    return float(number) * float(quantity.to(si).magnitude)
+
+
+# The TOML beside the table.
+
+_SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
+    "specimen": {
+        "height": ("m", "1.19 mm"),
+        "diameter": ("m", "5 mm"),
+        "area": ("m**2", "19.6 mm^2"),
+        "mass": ("kg", "5.56 mg"),
+        "heights": ("m", "0.7 mm"),
+    },
+    "striker": {"mass": ("kg", "7 g"), "velocity": ("m/s", "1.75 m/s")},
+    "noise": {"stress": ("Pa", "20 kPa"), "displacement": ("m", "2 um")},
+    "window": {"start": ("s", "0.5 ms"), "end": ("s", "2 ms"), "cycle": ("", "1")},
+}
+
+
+@dataclass(frozen=True)
+class _Column:
+    """What ``[columns]`` says of one channel."""
+
+    column: str
+    unit: str | None = None
+    scale: float = 1.0
+    scale_unit: str = ""
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """What the TOML says, in SI."""
+
+    name: str
+    specimen: Specimen
+    striker: Striker | None
+    noise: Noise
+    window: Window
+    columns: dict[str, _Column] = field(default_factory=dict)
+
+
+def _known(where: str, given: dict[str, Any], valid: list[str]) -> None:
+    for key in given:
+        if key not in valid:
+            near = difflib.get_close_matches(key, valid, n=2, cutoff=0.4) or valid
+            raise InputError(f"{where} has no key {key!r}; meant may be {', '.join(near)}.")
+
+
+def _read_settings(path: Path, test: Path) -> _Settings:
+    """Read and check the TOML at `path`, which describes the test file `test`."""
+    document = _load_toml(path, test)
+    _known(f"{path}:", document, ["name", "specimen", "striker", "columns", "noise", "window"])
+    name = document.get("name", test.stem)
+    if not isinstance(name, str) or not name.strip():
+        raise InputError(f"{path}: name = {name!r} is no text; give it in quotation marks.")
+    values: dict[str, dict[str, Any]] = {}
+    for section, keys in _SECTIONS.items():
+        table = document.get(section, {})
+        if not isinstance(table, dict):
+            raise InputError(f"{path}: {section} must be a table, [{section}].")
+        _known(f"{path}: [{section}]", table, list(keys))
+        values[section] = {k: _value(path, section, k, v) for k, v in table.items()}
+    striker = Striker(**values["striker"]) if values["striker"] else None
+    return _Settings(
+        name=name,
+        specimen=_specimen(path, values["specimen"]),
+        striker=striker,
+        noise=Noise(**values["noise"]),
+        window=Window(**values["window"]),
+        columns=_columns(path, document.get("columns", {})),
+    )
+
+
+def _load_toml(path: Path, test: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_bytes().decode("utf-8-sig"))
+    except FileNotFoundError:
+        raise InputError(
+            f"{path}: no such file; {test.name} needs a TOML with [specimen] height and diameter."
+        ) from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); give a TOML file.") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: is no UTF-8 text; a TOML file must be.") from None
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: is no valid TOML: {error}.") from None
+
+
+def _value(path: Path, section: str, key: str, value: Any) -> Any:
+    si, example = _SECTIONS[section][key]
+    where = f"{path}: [{section}] {key}"
+    if key == "cycle":
+        if type(value) is not int or value < 1:
+            raise InputError(f"{where} = {value!r} must be a whole number from 1 up.")
+        return value
+    if key == "heights":
+        if not isinstance(value, list) or not value:
+            raise InputError(f'{where} must be a list like ["0.700 mm", "0.490 mm"], base first.')
+        return tuple(_positive(_parse_quantity(v, si, where, example), where, v) for v in value)
+    number = _parse_quantity(value, si, where, example)
+    return number if section == "window" else _positive(number, where, value)
+
+
+def _positive(number: float, where: str, value: object) -> float:
+    if not (number > 0 and math.isfinite(number)):
+        raise InputError(f'{where} = "{value}" must be positive.')
+    return number
+
+
+def _specimen(path: Path, values: dict[str, Any]) -> Specimen:
+    if "height" not in values:
+        raise InputError(f'{path}: [specimen] height is missing; give it like height = "1.19 mm".')
+    diameter = values.pop("diameter", None)
+    if diameter is None and "area" not in values:
+        raise InputError(f'{path}: [specimen] needs a diameter = "5 mm" or an area = "19.6 mm^2".')
+    if diameter is not None:
+        area = math.pi * diameter**2 / 4
+        if not math.isclose(values.setdefault("area", area), area, rel_tol=0.02):
+            raise InputError(f"{path}: [specimen] area and diameter disagree; give one of them.")
+    heights = values.get("heights")
+    if heights and not math.isclose(sum(heights), values["height"], rel_tol=0.02):
+        raise InputError(f"{path}: [specimen] heights must add up to height.")
+    return Specimen(**values)
+
+
+def _columns(path: Path, table: Any) -> dict[str, _Column]:
+    if not isinstance(table, dict):
+        raise InputError(f"{path}: columns must be a table, [columns].")
+    _known(f"{path}: [columns]", table, list(_CHANNELS))
+    columns: dict[str, _Column] = {}
+    for channel, spec in table.items():
+        where = f"{path}: [columns] {channel}"
+        if not isinstance(spec, dict) or not isinstance(spec.get("column"), str):
+            raise InputError(f'{where} must be like {{ column = "Load", unit = "V" }}.')
+        _known(where, spec, ["column", "unit", "scale"])
+        unit = spec.get("unit")
+        if unit is not None and (not isinstance(unit, str) or _quantity(unit) is None):
+            raise InputError(f'{where}: unit = {unit!r} is unknown; give it like unit = "mm".')
+        columns[channel] = _Column(spec["column"], unit, *_scale(where, spec.get("scale", 1)))
+    return columns
+
+
+def _scale(where: str, scale: Any) -> tuple[float, str]:
+    match = re.fullmatch(_QUANTITY, str(scale))
+    number = float(match[1]) if match else 0.0
+    if not match or number in (0.0, math.inf, -math.inf) or _quantity(match[2]) is None:
+        raise InputError(f'{where}: scale = {scale!r} must be like -1 or "4444.4 N/V".')
+    return number, match[2]
+
+
+# The table: separator, headers, numbers.
+
+
+@dataclass(frozen=True)
+class _Header:
+    """One column's header: its text, the words of its name, its unit if it has one."""
+
+    text: str
+    words: tuple[str, ...]
+    unit: str | None
+
+
+@dataclass(frozen=True)
+class _Table:
+    """Where the numbers of a file are, before they are read."""
+
+    path: Path
+    raw: bytes
+    encoding: str
+    separator: str
+    decimal: str
+    first_row: int  # rows above the numbers
+    n_fields: int
+    headers: tuple[_Header, ...]
+
+    def rows(self) -> Any:
+        """Yield (row number in the file, cells) of the rows that are not blank."""
+        lines = io.TextIOWrapper(io.BytesIO(self.raw), self.encoding, errors="replace", newline="")
+        reader = csv.reader(lines, delimiter=self.separator)
+        for cells in reader:
+            if reader.line_num > self.first_row and any(cell.strip() for cell in cells):
+                yield reader.line_num, cells
+
+    def row_number(self, index: int) -> int:
+        """Number in the file of the sample at `index`."""
+        return next(number for i, (number, _) in enumerate(self.rows()) if i == index)
+
+
+def _parse_header(text: str) -> _Header:
+    text = text.strip()
+    bracket = re.fullmatch(r"(.*)[(\[{]([^()\[\]{}]*)[)\]}]", text)
+    bracket = bracket or re.fullmatch(r"(.+) / (\S+)", text)
+    if bracket:
+        words = re.split(r"[\s_]+", bracket[1].strip().lower())
+        return _Header(text, tuple(words), bracket[2].strip())
+    tokens = re.split(r"[\s_]+", text)
+    for i in range(1, len(tokens)):
+        rest = tokens[i:]
+        if rest[0].lower() in _WORDS or rest[0].isdigit():
+            continue
+        unit = "/".join(token for token in rest if token.lower() != "per")  # m_s2, N_per_kg
+        if _is_unit(unit):
+            return _Header(text, tuple(t.lower() for t in tokens[:i]), unit)
+    return _Header(text, tuple(t.lower() for t in tokens), None)
+
+
+def _rank(header: _Header, channel: str) -> int | None:
+    """How well a header names a channel: 0 is best, None not at all."""
+    words = _CHANNELS[channel][2]
+    if len(header.words) == 1 and header.words[0] in words:
+        return 0 if header.words[0] == words[0] else 1
+    named = [w for w in header.words if w in _WORDS and len(w) > 1]
+    if len(named) != 1 or named[0] not in words or _OTHER & set(header.words):
+        return None
+    if any(word.isdigit() for word in header.words):
+        return None  # displacement_1 and so on: inside the specimen
+    return 2
+
+
+def _decode(path: Path, raw: bytes) -> tuple[bytes, str]:
+    """The bytes without their mark, and their encoding."""
+    if not raw.strip():
+        raise InputError(f"{path}: the file is empty; it must hold a header and rows of numbers.")
+    for mark in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
+        if raw.startswith(mark):
+            raw = raw.decode("utf-16", errors="replace").encode()
+    raw = raw.removeprefix(codecs.BOM_UTF8)
+    if b"\n" not in raw:
+        raw = raw.replace(b"\r", b"\n")
+    if b"\0" in raw:
+        raise InputError(f"{path}: is a binary file; it must be a text table (CSV).")
+    try:
+        raw.decode()
+    except UnicodeDecodeError:
+        return raw, "latin-1"
+    return raw, "utf-8"
+
+
+def _number(cell: str) -> bool:
+    try:
+        float(cell.strip().replace(",", "."))
+    except ValueError:
+        return False
+    return True
+
+
+def _find_table(path: Path, raw: bytes, encoding: str, names: set[str]) -> _Table:
+    """Find separator, header row and decimal sign; `names` are column names given in the TOML."""
+    lines = io.TextIOWrapper(io.BytesIO(raw), encoding, newline=None)
+    head = [line for line, _ in zip(lines, range(_HEAD_ROWS), strict=False)]
+    best: tuple[int, int, str, list[list[str]]] = (0, 0, ",", [])
+    for separator in ("\t", ";", ","):
+        grid = list(csv.reader([line.rstrip("\r\n") for line in head], delimiter=separator))
+        for i, cells in enumerate(grid):
+            # On a tie the last row wins: titles and instrument settings stand above the header.
+            score = _score(cells, names)
+            if score and score >= best[0]:
+                best = (score, i, separator, grid)
+    score, i, separator, grid = best
+    if not score:
+        example = "time (ms), stress (MPa), displacement (mm)"
+        raise InputError(f"{path}: no row names the columns; the first must be like '{example}'.")
+    first, texts = _unit_row(grid, i)
+    headers = tuple(_parse_header(text) for text in texts)
+    body = [cells for cells in grid[first:] if any(c.strip() for c in cells)]
+    if not body:
+        raise InputError(f"{path}: has a header in row {i + 1} but no rows of numbers below it.")
+    cells = (cell for row in body for cell in row[: len(texts)])
+    comma = any(re.fullmatch(r"\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*", cell) for cell in cells)
+    decimal = "," if separator != "," and comma else "."
+    return _Table(path, raw, encoding, separator, decimal, first, len(texts), headers)
+
+
+def _score(cells: list[str], names: set[str]) -> int:
+    if len(cells) < 2 or any(_number(cell) for cell in cells):
+        return 0
+    headers = [_parse_header(cell) for cell in cells if cell.strip()]
+    channels = {c for c in _CHANNELS for h in headers if _rank(h, c) is not None}
+    given = {n for n in names for h in headers if _is_named(h, n)}
+    return len(channels) + len(given)
+
+
+def _is_named(header: _Header, name: str) -> bool:
+    name = " ".join(name.casefold().split())
+    bare = header.text.split("(")[0].split("[")[0]
+    return name in {" ".join(t.casefold().split()) for t in (header.text, bare)}
+
+
+def _unit_row(grid: list[list[str]], i: int) -> tuple[int, list[str]]:
+    """First row of numbers, and the headers with the units of the row beneath, if there is one."""
+    texts = list(grid[i])
+    below = [cell.strip().strip("()[]") for cell in grid[i + 1]] if i + 1 < len(grid) else []
+    units = [cell for cell in below if cell]
+    known = [unit for unit in units if _is_unit(unit) and not _number(unit)]
+    if not known or 2 * len(known) < len(units) or any(_number(unit) for unit in units):
+        return i + 1, texts
+    for k, unit in enumerate(below[: len(texts)]):
+        if unit and texts[k].strip() and _parse_header(texts[k]).unit is None:
+            texts[k] = f"{texts[k].strip()} ({unit})"
+    return i + 2, texts
+
+
+def _assign(table: _Table, settings: _Settings, toml: Path) -> dict[str, int]:
+    """Which column each channel is in: as ``[columns]`` says, else as the headers do."""
+    found: dict[str, int] = {}
+    for channel in _CHANNELS:
+        if channel in settings.columns:
+            name = settings.columns[channel].column
+            matches = [k for k, h in enumerate(table.headers) if _is_named(h, name)]
+            if len(matches) != 1:
+                listed = ", ".join(repr(h.text) for h in table.headers if h.text)
+                count = "twice" if matches else "nowhere"
+                raise InputError(
+                    f"{toml}: [columns] {channel}: column {name!r} is {count} in "
+                    f"{table.path.name}, which has {listed}."
+                )
+            found[channel] = matches[0]
+            continue
+        ranks = {k: r for k, h in enumerate(table.headers) if (r := _rank(h, channel)) is not None}
+        best = [k for k, r in ranks.items() if r == min(ranks.values())]
+        if len(best) > 1:
+            both = " and ".join(repr(table.headers[k].text) for k in best)
+            raise InputError(
+                f"{table.path}: columns {both} could both be the {channel}; keep one, or name it "
+                f"in [columns] of {toml.name}."
+            )
+        if best:
+            found[channel] = best[0]
+    # A channel that the TOML names replaces its twin that only a header names.
+    for one, other in (("stress", "force"), ("displacement", "strain")):
+        for given, twin in ((one, other), (other, one)):
+            if given in settings.columns and twin not in settings.columns:
+                found.pop(twin, None)
+    return found
+
+
+def _factor(table: _Table, channel: str, header: _Header, given: _Column | None) -> float:
+    """What the numbers of a column are multiplied by to be SI."""
+    si, example, _ = _CHANNELS[channel]
+    unit = given.unit if given and given.unit is not None else header.unit
+    scale, scale_unit = (given.scale, given.scale_unit) if given else (1.0, "")
+    where = f"{table.path}: column {header.text!r}"
+    if unit is None and not scale_unit and channel != "strain":
+        raise InputError(
+            f"{where} has no unit; write it in the header like '{example}' or in [columns]."
+        )
+    unit = unit or ""
+    if channel == "acceleration" and unit in {"g", "G"}:
+        unit = "standard_gravity"  # not gram
+    if not _is_unit(unit):
+        raise InputError(f"{where} has an unknown unit {unit!r}; write it like '{example}'.")
+    for spelling in _spellings(unit):
+        quantity = _quantity(spelling)
+        if quantity is None:
+            continue
+        product = quantity * scale * _quantity(scale_unit)
+        if product.check(_quantity(si).dimensionality):
+            return float(product.to(si or "dimensionless").magnitude)
+    raise InputError(
+        f"{where} cannot be read as {channel}: its unit {unit!r} is of another kind; "
+        f"write it like '{example}' or give a scale in [columns]."
+    )
+
+
+def _read_numbers(table: _Table, columns: dict[str, int]) -> dict[str, Array]:
+    """Read the columns as they stand in the file; whatever is no number is refused."""
+    import pandas as pd
+
+    # A header of our own, with one column more: that one shows if any row has too many cells.
+    header = table.separator.join(str(k) for k in range(table.n_fields + 1)).encode()
+    body = table.raw.split(b"\n", table.first_row)[-1]
+    kinds = {str(k): "float64" for k in columns.values()}
+    excess = str(table.n_fields)
+    try:
+        frame = pd.read_csv(
+            io.BytesIO(header + b"\n" + body),
+            sep=table.separator,
+            decimal=table.decimal,
+            encoding=table.encoding,
+            usecols=[*kinds, excess],
+            dtype=kinds | {excess: "str"},
+            na_filter=False,
+            index_col=False,
+        )
+    except (ValueError, pd.errors.ParserError) as error:
+        _refuse_cells(table, columns)
+        raise InputError(f"{table.path}: is no regular table ({error}).") from None
+    if frame[excess].astype(bool).any():
+        _refuse_cells(table, columns)
+    numbers = {c: frame[str(k)].to_numpy(np.float64) for c, k in columns.items()}
+    if not all(np.isfinite(values).all() for values in numbers.values()):
+        _refuse_cells(table, columns)
+    return numbers
+
+
+def _refuse_cells(table: _Table, columns: dict[str, int]) -> None:
+    """Find the first bad cell, row by row, and name it."""
+    for row, cells in table.rows():
+        if any(cell.strip() for cell in cells[table.n_fields :]):
+            raise InputError(
+                f"{table.path}: row {row} has {len(cells)} cells, but the header has "
+                f"{table.n_fields}; every row must have as many as the header."
+            )
+        for k in columns.values():
+            cell = cells[k].strip() if k < len(cells) else ""
+            where = f"{table.path}: row {row}, column {table.headers[k].text!r}"
+            if not cell:
+                raise InputError(f"{where} is empty; every sample must have a number there.")
+            text = cell.replace(",", ".") if table.decimal == "," else cell
+            try:
+                finite = math.isfinite(float(text))
+            except ValueError:
+                raise InputError(f"{where} is {cell!r}; it must be a number.") from None
+            if not finite:
+                raise InputError(f"{where} is {cell!r}; it must be a finite number.")
+
+
+# From columns to channels.
+
+
+def _record(
+    table: _Table, columns: dict[str, int], settings: _Settings
+) -> tuple[Record, tuple[str, ...]]:
+    """Read the channels that are needed, in SI, and say what was read from where."""
+    needed = _needed(table, columns, settings)
+    factors = {
+        c: _factor(table, c, table.headers[k], settings.columns.get(c)) for c, k in needed.items()
+    }
+    numbers = _read_numbers(table, needed)
+    if len(next(iter(numbers.values()))) < _MIN_ROWS:
+        raise InputError(f"{table.path}: has fewer than {_MIN_ROWS} rows; a test needs more.")
+    for channel, values in numbers.items():
+        if np.ptp(values) == 0:
+            name = table.headers[needed[channel]].text
+            raise InputError(f"{table.path}: column {name!r} is constant; a {channel} must vary.")
+        numbers[channel] = values * factors[channel]
+    notes = [_columns_note(table, needed), *_announced(table, len(values))]
+    time = numbers.pop("time", None)
+    if time is not None:
+        _check_time(table, time, table.headers[needed["time"]].text)
+    specimen = settings.specimen
+    stress = _one_of(numbers, "stress", "force", specimen.area, "the area", notes)
+    displacement = _one_of(numbers, "displacement", "strain", 1 / specimen.height, "height", notes)
+    assert stress is not None  # _needed has seen to it
+    velocity, acceleration = numbers.get("velocity"), numbers.get("acceleration")
+    return Record(time, stress, displacement, velocity, acceleration), tuple(notes)
+
+
+def _needed(table: _Table, columns: dict[str, int], settings: _Settings) -> dict[str, int]:
+    """The channels worth reading; refuse a file that lacks one that nothing can replace."""
+    has = set(columns)
+    listed = ", ".join(repr(h.text) for h in table.headers if h.text)
+    if not has & {"stress", "force"}:
+        raise InputError(
+            f"{table.path}: no column is a stress or a force (there are {listed}); name one like "
+            "'stress (MPa)' or in [columns]."
+        )
+    if has & {"displacement", "strain"}:
+        return {c: k for c, k in columns.items() if c not in {"velocity", "acceleration"}}
+    for channel in has & {"velocity", "acceleration"} - set(settings.columns):
+        try:  # these only help, so one whose unit does not say what it is can be left
+            _factor(table, channel, table.headers[columns[channel]], None)
+        except InputError:
+            has.remove(channel)
+    striker = settings.striker or Striker()
+    sources = "velocity" in has or (striker.velocity and (striker.mass or "acceleration" in has))
+    if "time" not in has or not sources:
+        raise InputError(
+            f"{table.path}: no column is a displacement or a strain (there are {listed}), and "
+            "without one a time column and the [striker] mass and velocity are needed to integrate "
+            "the motion."
+        )
+    return {c: k for c, k in columns.items() if c in has}
+
+
+def _columns_note(table: _Table, needed: dict[str, int]) -> str:
+    read = ", ".join(f"{c} from {table.headers[k].text!r}" for c, k in needed.items())
+    rest = [
+        repr(h.text) for k, h in enumerate(table.headers) if h.text and k not in needed.values()
+    ]
+    return f"Read {read}" + (f"; not used: {', '.join(rest)}." if rest else ".")
+
+
+def _announced(table: _Table, n: int) -> list[str]:
+    """Compare with the number of samples that an instrument's header announces."""
+    head = table.raw.split(b"\n", table.first_row)[: table.first_row]
+    for row, line in enumerate(head, 1):
+        match = re.match(rb"\W*(?:number of )?samples\W+(\d+)", line, re.IGNORECASE)
+        if match and int(match[1]) != n:
+            told = f"row {row} announces {int(match[1])} samples, but the table has {n}"
+            return [f"Check: {told}."]
+    return []
+
+
+def _check_time(table: _Table, time: Array, name: str) -> None:
+    back = np.flatnonzero(np.diff(time) <= 0)
+    if back.size:
+        index = int(back[0]) + 1
+        what = "repeats" if time[index] == time[index - 1] else "goes back"
+        raise InputError(
+            f"{table.path}: row {table.row_number(index)}, column {name!r}: time {what}; "
+            "it must increase from row to row."
+        )
+
+
+def _one_of(
+    numbers: dict[str, Array], first: str, second: str, ratio: float, by: str, notes: list[str]
+) -> Array | None:
+    """`first` if it is there, else `second` divided by `ratio`; both must agree to 3 %."""
+    one, two = numbers.get(first), numbers.get(second)
+    if two is None:
+        return one
+    if one is None:
+        notes.append(
+            f"The {first} is the {second} {'over' if first == 'stress' else 'times'} {by}."
+        )
+        return two / ratio
+    slope = float(np.dot(two, one) / np.dot(one, one)) / ratio
+    agree = f"the {second} is {slope:.3g} times what it gives with {by} of the specimen"
+    if abs(slope - 1) > 0.03:
+        notes.append(f"Check: the {first} is used, but {agree}; they are inconsistent.")
+    else:
+        notes.append(f"The {first} is used rather than the {second}, and they agree.")
+    return one
+
+
+# The public entry.
+
+
+def read_test(path: str | Path, specimen: str | Path | None = None) -> Measurement:
+    """Read a test file and its TOML, check both and condition the data.
+
+    Parameters
+    ----------
+    path : str or Path
+        The table: CSV, separated by commas, semicolons or tabs, one row per sample.
+    specimen : str or Path, optional
+        The TOML; without it, the file beside the table that ends in ``.toml``.
+
+    Returns
+    -------
+    Measurement
+        Channels in SI, compression positive, time zero where contact starts. Its notes say what
+        was done.
+
+    Raises
+    ------
+    InputError
+        Where the file, its TOML or what they hold cannot be used.
+    """
+    path = Path(path)
+    try:
+        raw = path.read_bytes()
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; give the CSV file of a test.") from None
+    except IsADirectoryError:
+        raise InputError(f"{path}: is a directory; give the CSV file of a test.") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
+    text, encoding = _decode(path, raw)
+    toml = Path(specimen) if specimen is not None else path.with_suffix(".toml")
+    settings = _read_settings(toml, path)
+    names = {column.column for column in settings.columns.values()}
+    table = _find_table(path, text, encoding, names)
+    columns = _assign(table, settings, toml)
+    record, notes = _record(table, columns, settings)
+    try:
+        conditioned = condition(
+            record, settings.specimen, striker=settings.striker, window=settings.window
+        )
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return Measurement(
+        name=settings.name,
+        path=path,
+        data_sha256=hashlib.sha256(raw).hexdigest(),
+        time=conditioned.record.time,
+        stress=conditioned.record.stress,
+        displacement=conditioned.record.displacement,
+        specimen=settings.specimen,
+        striker=settings.striker,
+        noise=settings.noise,
+        motion=conditioned.motion,
+        notes=(*notes, *conditioned.notes),
+    )

@@ -1,0 +1,251 @@
+"""What was fitted, to read: the HTML report of a result folder and the summary in the terminal."""
+
+from __future__ import annotations
+
+import base64
+import math
+import textwrap
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+from foamfit.plots import DPI, image, origin_word, plot_fit, plot_residuals, readable_unit
+
+if TYPE_CHECKING:
+    from foamfit.result import FitResult, ParameterEstimate
+
+CURVES = {
+    "stress_time": "stress-time",
+    "displacement_time": "displacement-time",
+    "stress_strain": "stress-strain",
+}
+DRIVES = {
+    "impact": "The motion follows from the mass and the velocity of the striker; nothing measured "
+    "enters the simulation.",
+    "stress": "The measured stress acts on the chain, which is in equilibrium at every sample.",
+    "displacement": "The measured displacement of the top is prescribed.",
+}
+BRANCHES = {"a": "elastic", "d": "snap-buckling", "c": "densified", "e": "snap-back"}
+POINTS = (  # attribute of the spring, symbol and its index, meaning, unit
+    ("sigma_a", ("σ", "a"), "stress at A1, where snapping starts", "Pa"),
+    ("sigma_c", ("σ̄", "c"), "stress at C2, where snap-back starts", "Pa"),
+    ("eps_star", ("ε", "*"), "strain at which branch c starts from zero stress", ""),
+    ("eps_hat_a", ("ε̂", "a"), "strain at A2, where branches e and a meet", ""),
+    ("eps_hat_c", ("ε̂", "c"), "strain at C1, where branches d and c meet", ""),
+    ("sigma_hat_c", ("σ̂", "c"), "stress at C1", "Pa"),
+)
+SYMBOLS = {
+    "k0": ("k", "0"), "kc": ("k", "c"), "dsigma": ("Δσ", ""), "eps_a": ("ε", "a"),
+    "eps_c": ("ε", "c"), "kh_plus": ("k", "h+"), "kh_minus": ("k", "h−"), "eta": ("η", ""),
+    "height": ("h", ""), "site_eta": ("η", "site"),
+}  # fmt: skip
+STATISTICS = {
+    "n_data": "data points", "n_vary": "parameters varied", "redchi": "reduced χ²", "aic": "AIC",
+    "aicc": "AICc", "bic": "BIC",
+}  # fmt: skip
+CITATION = (
+    "Thevamaran, R., Fraternali, F., Daraio, C. (2014). Multiscale Mass-Spring Model for "
+    "High-Rate Compression of Vertically Aligned Carbon Nanotube Foams. "
+    "Journal of Applied Mechanics 81, 121006."
+)
+
+
+@dataclass(frozen=True)
+class Readable:
+    """A parameter in the unit in which it reads well, its numbers rounded to its uncertainty."""
+
+    name: str
+    symbol: tuple[str, str]  # and its index
+    value: str
+    stderr: str
+    interval: str
+    unit: str
+    state: str
+    why: str
+
+    @property
+    def with_error(self) -> str:
+        """The value with its standard error, where there is one."""
+        return f"{self.value} ± {self.stderr}" if self.stderr else self.value
+
+
+def render_report(result: FitResult, *, fit_png: bytes | None = None) -> str:
+    """Return the report as one HTML page that needs nothing else.
+
+    Parameters
+    ----------
+    result : FitResult
+        What to report.
+    fit_png : bytes, optional
+        The figure of `plots.plot_fit` as PNG, if it is there already.
+
+    Returns
+    -------
+    str
+        HTML with its style and figures inside.
+    """
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("foamfit"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["number"] = number
+    plain = result.to_json_dict()
+    energy = plain["energy"]
+    return environment.get_template("report.html").render(
+        result=result,
+        version=version("foamfit"),
+        origin=origin_word(result),
+        misfits={name: result.misfit.get(key) for key, name in CURVES.items()},
+        statistics={
+            STATISTICS.get(name, name.replace("_", " ")): value
+            for name, value in plain["statistics"].items()
+            if name not in ("nfev", "n_starts")  # the page says these where it says how
+        },
+        visited=_visited(result),
+        parameters=[readable(name, p) for name, p in result.parameters.items()],
+        points={name: _points(spring) for name, spring in result.bistable_springs.items()},
+        energy_sentences=energy.pop("sentences", None) or [],
+        energy={name.replace("_", " "): value for name, value in energy.items()},
+        drive_meaning=DRIVES.get(result.drive, ""),
+        branches=BRANCHES,
+        fit_figure=_figure(fit_png or image(plot_fit(result), "png")),
+        residual_figure=_figure(image(plot_residuals(result), "png")),
+        citation=CITATION,
+    )
+
+
+def summary_text(result: FitResult) -> str:
+    """Return what the command prints after a fit: plain text, at most 100 columns wide.
+
+    Parameters
+    ----------
+    result : FitResult
+        What to sum up.
+
+    Returns
+    -------
+    str
+        Status, misfits, parameters and warnings; no newline at the end.
+    """
+    m = result.measurement
+    head = f"{m.name}: {result.model}, {result.drive} drive, seed {result.seed}: {result.status}"
+    misfits = [
+        f"{name} {100 * misfit:.2g} %"
+        for key, name in CURVES.items()
+        if (misfit := result.misfit.get(key)) is not None
+    ]
+    rows = [readable(name, p) for name, p in result.parameters.items()]
+    fixed = [f"{row.name} {row.value} {row.unit}" for row in rows if row.state == "fixed"]
+    lines = _wrap("", head)
+    lines += _wrap("", "misfit (RMS over range): " + (", ".join(misfits) or "no curve to compare"))
+    lines += ["", *_aligned([row for row in rows if row.state != "fixed"])]
+    lines += _wrap("", "fixed: " + ", ".join(fixed)) if fixed else []
+    lines += [""] if result.warnings else []
+    for warning in result.warnings:
+        lines += _wrap("warning: ", warning)
+    return "\n".join(lines)
+
+
+def readable(name: str, p: ParameterEstimate) -> Readable:
+    """Return a parameter as it is to be read.
+
+    Parameters
+    ----------
+    name : str
+        Its name, for example "s1_k0".
+    p : ParameterEstimate
+        Its value in SI; it is shown with the digits that its standard error leaves (two of the
+        error), or with four where there is none.
+    """
+    factor, unit = readable_unit(p.value or p.stderr or 0.0, p.unit)
+    value = p.value / factor
+    interval = stderr = ""
+    shown = number(value)
+    if math.isfinite(value) and p.stderr is not None and 0 < p.stderr < math.inf:
+        shown, stderr, places = _rounded(value, p.stderr / factor)
+        if p.ci95 is not None:
+            interval = " to ".join(_fixed(bound / factor, places) for bound in p.ci95)
+    unit = {"": "–", "1": "–", "-": "–", "Pa s": "Pa·s", "Pa*s": "Pa·s"}.get(unit, unit)
+    return Readable(name, _symbol(name), shown, stderr, interval, unit, p.state, p.why)
+
+
+def number(value: Any) -> str:
+    """Return anything as text; a number with four digits, an integer with all of its own."""
+    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, list | tuple):
+        return ", ".join(number(item) for item in value)
+    if not isinstance(value, float):
+        return str(value)
+    if value == 0 or 1e-3 <= abs(value) < 1e6:
+        decimals = 0 if value == 0 else max(0, 3 - math.floor(math.log10(abs(value))))
+        return _fixed(value, decimals)
+    return f"{value:.3e}".replace("-", "−")
+
+
+def _symbol(name: str) -> tuple[str, str]:
+    """Return the symbol of a parameter and its index: k and "c,2" of s2_kc."""
+    spring, _, base = name.partition("_")
+    if name in SYMBOLS or base not in SYMBOLS:
+        return SYMBOLS.get(name, (name, ""))
+    stem, index = SYMBOLS[base]
+    return stem, ",".join(part for part in (index, spring.removeprefix("s")) if part)
+
+
+def _rounded(value: float, stderr: float) -> tuple[str, str, int]:
+    """Return value and standard error to two digits of the error, and the decimal places."""
+    places = 1 - math.floor(math.log10(float(f"{stderr:.1e}")))
+    most = 6 - math.floor(math.log10(abs(value))) if value else 6
+    if places > most:  # an error far below the value, as of synthetic data: seven digits are enough
+        return _fixed(value, most), f"{stderr:.1e}", most
+    return _fixed(value, places), _fixed(stderr, places), places
+
+
+def _fixed(value: float, places: int) -> str:
+    text = f"{round(value, places):.{max(places, 0)}f}"
+    if float(text) == 0:
+        text = text.lstrip("-")
+    return text.replace("-", "−")
+
+
+def _points(spring: Any) -> list[tuple[tuple[str, str], str, str, str]]:
+    rows = []
+    for attribute, symbol, meaning, si in POINTS:
+        value = getattr(spring, attribute)
+        factor, unit = readable_unit(value or 0.0, si)
+        shown = "does not exist" if value is None else number(value / factor)
+        rows.append((symbol, meaning, shown, unit or "–"))
+    return rows
+
+
+def _visited(result: FitResult) -> dict[str, tuple[str, ...] | None]:
+    """Return the branches that each spring went through, None for a spring that has none."""
+    bistable = result.bistable_springs
+    names = [f"s{i}" for i in range(1, len(result.chain.springs) + 1)]
+    return {name: result.visited.get(name, ()) if name in bistable else None for name in names}
+
+
+def _aligned(rows: list[Readable]) -> list[str]:
+    header = ("parameter", "value ± stderr", "unit", "95 % interval", "state")
+    table = [header] + [(r.name, r.with_error, r.unit, r.interval, r.state) for r in rows]
+    widths = [max(len(row[i]) for row in table) for i in range(len(header))]
+    return [
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in table
+    ]
+
+
+def _wrap(start: str, text: str) -> list[str]:
+    return textwrap.wrap(start + text, 100, subsequent_indent="  ")
+
+
+def _figure(png: bytes) -> tuple[str, float]:
+    """Return a PNG in base64, and its width in inches (the width in pixels is in its header)."""
+    return base64.b64encode(png).decode("ascii"), int.from_bytes(png[16:20]) / DPI

@@ -1,0 +1,467 @@
+"""The lean search: start values read from the curve, and a descent from the best of many.
+
+The search moves in coordinates in which every admissible spring is a point of a box, so that no
+start needs luck and no step can leave what the law admits: logarithms of the stiffnesses and of
+ε_a, the drop Δσ/σ_a, the place of ε_c between ε_a and one, slopes and damping over the scales of
+the test. It first fits the loop (stress along the measured motion, closed form, cheap) and only
+then the curves of the drive itself.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.signal import savgol_filter
+from scipy.stats import qmc
+
+from foamfit.measurement import Measurement
+from foamfit.model import Model, split_name
+from foamfit.objective import Objective
+
+Array = NDArray[np.float64]
+Progress = Callable[[float, str], None]
+
+LOOP_SAMPLES = 240
+LAST_STRAIN = 0.999
+CURVE_STARTS = 300
+
+
+class SearchStoppedError(Exception):
+    """The time is up; the best point so far is the answer."""
+
+
+@dataclass(frozen=True)
+class Scales:
+    """The scales of a test that make its parameters dimensionless.
+
+    Attributes
+    ----------
+    stress, strain : float
+        Largest stress (Pa) and overall strain.
+    rate : float
+        Typical strain rate, 1/s; 0 where time is unknown.
+    height : float
+        m.
+    """
+
+    stress: float
+    strain: float
+    rate: float
+    height: float
+
+    @classmethod
+    def of(cls, measurement: Measurement) -> Scales:
+        """Scales of a test with stress and, if known, displacement."""
+        assert measurement.stress is not None
+        height = measurement.specimen.height
+        strain = 0.5
+        if measurement.displacement is not None:
+            strain = min(max(float(np.max(measurement.displacement)) / height, 1e-6), 0.999)
+        rate = 0.0
+        if measurement.time is not None:
+            loaded = measurement.time[measurement.stress > 0.02 * np.max(measurement.stress)]
+            rate = 2.0 * strain / max(float(np.ptp(loaded)), 1e-300) if loaded.size > 1 else 0.0
+        return cls(float(np.max(measurement.stress)), strain, rate, height)
+
+    @property
+    def slope(self) -> float:
+        """Stress over strain, Pa."""
+        return self.stress / self.strain
+
+    @property
+    def eta(self) -> float:
+        """Damping that would carry the whole stress, Pa·s."""
+        return self.stress / self.rate if self.rate > 0.0 else 1.0
+
+    def of_parameter(self, name: str, values: dict[str, float]) -> float:
+        """Natural size of a parameter, in its unit: what a change by 100 % means."""
+        spring, short = split_name(name)
+        if short == "eta":
+            return max(abs(values[name]), 0.1 * self.eta)
+        if short in ("kh_plus", "kh_minus"):
+            return max(abs(values[name]), 0.1 * self.slope)
+        if short == "dsigma":
+            eps_a = values[f"s{spring + 1}_eps_a"]
+            return values[f"s{spring + 1}_k0"] * eps_a / (1.0 - eps_a)
+        return abs(values[name]) or 1.0
+
+
+@dataclass(eq=False)
+class Tracker:
+    """Counts and times the evaluations of an objective and keeps the best point ever seen."""
+
+    objective: Objective
+    deadline: float | None = None
+    best_values: Array | None = None
+    best_cost: float = np.inf
+
+    def residual(self, values: Array) -> Array:
+        """Residual of the objective; raises SearchStoppedError once the time is up."""
+        failures = self.objective.failures
+        residual = self.objective.residual(values)
+        cost = float(residual @ residual)
+        if cost < self.best_cost and self.objective.failures == failures:
+            self.best_cost, self.best_values = cost, values.copy()
+        if self.deadline is not None and time.monotonic() > self.deadline:
+            raise SearchStoppedError
+        return residual
+
+
+# Coordinates of the box: lowest and highest. Stiffnesses are over the largest stress, slopes over
+# stress/strain, all of the test.
+BOX = {
+    "k0": (np.log(1e-3), np.log(1e4)),
+    "kc": (np.log(1e-2), np.log(1e5)),
+    "eps_a": (np.log(1e-3), np.log(0.95)),
+    "eps_c": (0.002, 1.0),
+    "dsigma": (0.0, 0.999),
+    "kh_plus": (0.0, 50.0),
+    "kh_minus": (0.0, 50.0),
+    "eta": (0.0, 10.0),
+    "height": (0.02, 0.98),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Space:
+    """The box in which the search moves, and the way between it and the vector of parameters.
+
+    Parameters
+    ----------
+    model : Model
+        The springs.
+    scales : Scales
+        Of the test.
+    values : (n,) array
+        Values of the parameters that do not vary (SI); the others are ignored.
+    free : tuple of str
+        Names of the parameters that vary.
+    low, high : (n,) arrays
+        Limits of every parameter, SI.
+    tied : callable
+        Completes a vector in which some parameters hang on others.
+    """
+
+    model: Model
+    scales: Scales
+    values: Array
+    free: tuple[str, ...]
+    low: Array
+    high: Array
+    tied: Callable[[Array], Array]
+
+    @cached_property
+    def coordinates(self) -> list[tuple[int, str, int]]:
+        """Place, short name and place of the spring's first parameter, what is needed first first."""
+        out = []
+        for name in sorted(self.free, key=lambda name: list(BOX).index(split_name(name)[1])):
+            spring, short = split_name(name)
+            first = self.model.index[f"s{spring + 1}_k0"] if spring >= 0 else -1
+            out.append((self.model.index[name], short, first))
+        return out
+
+    @cached_property
+    def box(self) -> tuple[Array, Array]:
+        """Lowest and highest coordinates, (n_free,) each."""
+        pairs = np.array([BOX[short] for _, short, _ in self.coordinates])
+        return pairs[:, 0], pairs[:, 1]
+
+    def _unit(self, short: str) -> float:
+        if short == "height":
+            return self.scales.height
+        return self.scales.eta if short == "eta" else self.scales.slope
+
+    def encode(self, values: Array) -> Array:
+        """Coordinates of a vector of parameters, moved into the box."""
+        out = np.empty(len(self.coordinates))
+        for j, (i, short, first) in enumerate(self.coordinates):
+            if short in ("k0", "kc"):
+                out[j] = np.log(max(values[i], 1e-300) / self.scales.stress)
+            elif short == "eps_a":
+                out[j] = np.log(max(values[i], 1e-300))
+            elif short == "eps_c":
+                out[j] = (values[i] - values[first + 3]) / (LAST_STRAIN - values[first + 3])
+            elif short == "dsigma":
+                out[j] = -values[i] / _stress_at_a1(values, first)
+            else:
+                out[j] = values[i] / self._unit(short)
+        low, high = self.box
+        margin = 1e-9 * (high - low)
+        return np.clip(out, low + margin, high - margin)
+
+    def decode(self, point: Array) -> Array:
+        """Vector of parameters (SI) at a point of the box."""
+        values = self.values.copy()
+        for u, (i, short, first) in zip(point, self.coordinates, strict=True):
+            if short in ("k0", "kc"):
+                value = np.exp(u) * self.scales.stress
+            elif short == "eps_a":
+                value = np.exp(u)
+            elif short == "eps_c":
+                value = values[first + 3] + u * (LAST_STRAIN - values[first + 3])
+            elif short == "dsigma":
+                value = -u * _stress_at_a1(values, first)
+            else:
+                value = u * self._unit(short)
+            values[i] = min(max(value, self.low[i]), self.high[i])
+        return self.tied(values)
+
+
+def _stress_at_a1(values: Array, first: int) -> float:
+    """σ_a = k0 ε_a/(1-ε_a) of the spring whose parameters start at `first`, Pa."""
+    return float(values[first] * values[first + 3] / (1.0 - values[first + 3]))
+
+
+# ---------------------------------------------------------------- starts
+
+
+def smooth_loop(measurement: Measurement) -> Measurement:
+    """Smooth and thin the measured loop, for the first descent only."""
+    motion, stress = measurement.displacement, measurement.stress
+    assert motion is not None
+    assert stress is not None
+    window = max(motion.size // 60, 1) * 2 + 1
+    if window > 3:
+        motion = savgol_filter(motion, window, 2)
+    keep = np.unique(np.linspace(0, motion.size - 1, min(motion.size, LOOP_SAMPLES)).astype(int))
+    time = measurement.time
+    return replace(
+        measurement,
+        displacement=motion[keep],
+        stress=stress[keep],
+        time=None if time is None else time[keep],
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """Loading and unloading stress (Pa) as functions of strain, read from a measured loop."""
+
+    strain: Array
+    stress: Array
+
+    @cached_property
+    def peak(self) -> int:
+        """Sample of the largest strain."""
+        return int(np.argmax(self.strain))
+
+    def loading(self, strain: float) -> float:
+        """Stress on the way up, Pa."""
+        up = np.maximum.accumulate(self.strain[: self.peak + 1])
+        return float(np.interp(strain, up, self.stress[: self.peak + 1]))
+
+    def unloading(self, strain: float) -> float:
+        """Stress on the way down, Pa."""
+        down = np.maximum.accumulate(self.strain[self.peak :][::-1])
+        return float(np.interp(strain, down, self.stress[self.peak :][::-1]))
+
+
+def read_spring(loop: Loop, marks: Array, scales: Scales) -> Array:
+    """Read a bistable spring off a loop, given where on it A1, C1 and C2 are taken to lie.
+
+    Parameters
+    ----------
+    loop : Loop
+        Of the spring.
+    marks : (5,) array
+        In [0, 1]: places of A1, C1 and C2 between their neighbours, shares of the stress at C2 and
+        of the damping.
+    scales : Scales
+        Of the test.
+
+    Returns
+    -------
+    (8,) array
+        k0 … kh_minus, eta (SI): initial slope from A1, k_h+ from A1 to C1, k_c through C1 and C2,
+        k_h- from C2 towards rest.
+    """
+    last = float(loop.strain[loop.peak])
+    eps_a = min((0.02 + 0.85 * marks[0]) * last, 0.9)
+    sigma_a = max(loop.loading(eps_a), 0.005 * scales.stress)
+    hat_c = eps_a + (0.15 + 0.87 * marks[1]) * max(last - eps_a, 1e-3)
+    sigma_hat_c = max(loop.loading(hat_c), sigma_a)
+    eps_c = eps_a + (0.2 + 0.8 * marks[2]) * (hat_c - eps_a)
+    sigma_c = loop.unloading(eps_c) * (0.5 + marks[3])
+    sigma_c = min(max(sigma_c, 0.02 * sigma_a), 0.98 * sigma_a)
+    return np.array(
+        [
+            sigma_a * (1.0 - eps_a) / eps_a,
+            _stiffness_between(hat_c - eps_c, sigma_c, sigma_hat_c),
+            sigma_c - sigma_a,
+            eps_a,
+            eps_c,
+            (sigma_hat_c - sigma_a) / (hat_c - eps_a),
+            sigma_c / eps_c,
+            0.1 * scales.eta * marks[4] ** 2,
+        ]
+    )
+
+
+def _stiffness_between(rise: float, low: float, high: float) -> float:
+    """k_c of a branch c that rises by a strain `rise` from stress `low` to `high` (Pa).
+
+    The larger root of rise (k+low)(k+high) = k (high-low); the nearest k_c if there is none.
+    """
+    gain = max(high - low, 1e-9 * high)
+    rise = max(rise, 1e-6)
+    b = gain - rise * (low + high)
+    discriminant = b * b - 4.0 * rise * rise * low * high
+    if b <= 0.0 or discriminant < 0.0:
+        return float(np.sqrt(low * high))
+    return float((b + np.sqrt(discriminant)) / (2.0 * rise))
+
+
+def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> list[Array]:
+    """Vectors of parameters read off the measured loop, from a Latin hypercube of marks."""
+    assert loop.displacement is not None
+    assert loop.stress is not None
+    kinds, index = space.model.kinds, space.model.index
+    count = len(kinds)
+    marks = qmc.LatinHypercube(5 + 2 * count, rng=rng).random(CURVE_STARTS)
+    starts = []
+    for mark in marks:
+        values = space.values.copy()
+        heights = np.full(count, space.scales.height / count)
+        if count > 1:
+            given = [index[f"s{i}_height"] for i in range(1, count + 1)]
+            for i, at in enumerate(given):
+                if space.model.names[at] in space.free:
+                    values[at] = heights[i] * (0.5 + mark[5 + i])
+            values = space.tied(values)
+            heights = np.maximum(values[given], 1e-3 * space.scales.height)
+        motion = loop.displacement.copy()
+        for i, kind in enumerate(kinds):
+            if kind != "bistable":
+                share = 10.0 ** (-3.0 + 2.7 * mark[5 + count + i])
+                k0 = heights[i] * space.scales.stress / (share * motion.max())
+                values[index[f"s{i + 1}_k0"]] = k0
+                motion = motion - heights[i] * loop.stress / k0
+        soft = sum(h for h, kind in zip(heights, kinds, strict=True) if kind == "bistable")
+        if soft:
+            spring = read_spring(Loop(motion / soft, loop.stress), mark, space.scales)
+        for i, kind in enumerate(kinds):
+            if kind == "bistable":
+                jitter = np.exp(0.4 * rng.standard_normal(8)) if kinds.count(kind) > 1 else 1.0
+                first = index[f"s{i + 1}_k0"]
+                values[first : first + 8] = spring * jitter
+        starts.append(space.encode(values))
+    return starts
+
+
+def box_starts(space: Space, rng: np.random.Generator, count: int) -> list[Array]:
+    """Latin hypercube over the inner part of the box, whatever the curve looks like."""
+    low, high = (edge.copy() for edge in space.box)
+    for j, (_, short, _) in enumerate(space.coordinates):
+        if short in ("kh_plus", "kh_minus"):
+            high[j] = 4.0
+        elif short == "eta":
+            high[j] = 0.3
+        elif short in ("k0", "kc"):
+            low[j], high[j] = np.log(0.3), np.log(300.0)
+    return list(low + (high - low) * qmc.LatinHypercube(low.size, rng=rng).random(count))
+
+
+# ---------------------------------------------------------------- descent
+
+
+def descend(tracker: Tracker, space: Space, start: Array, evaluations: int) -> tuple[float, Array]:
+    """Least-squares descent in the box from one start; returns (cost, coordinates) of its best."""
+    low, high = space.box
+    best = (np.inf, start)
+
+    def residual(point: Array) -> Array:
+        nonlocal best
+        value = tracker.residual(space.decode(point))
+        cost = float(value @ value)
+        if cost < best[0]:
+            best = (cost, point.copy())
+        return value
+
+    def jacobian(point: Array) -> Array:
+        here = residual(point)
+        columns = np.empty((here.size, point.size))
+        for j in range(point.size):
+            moved = point.copy()
+            step = 1e-5 if point[j] + 1e-5 < high[j] else -1e-5
+            moved[j] += step
+            columns[:, j] = (residual(moved) - here) / step
+        return columns
+
+    least_squares(
+        residual, start, jac=jacobian, bounds=(low, high), max_nfev=evaluations,
+        ftol=1e-5, xtol=1e-6, gtol=1e-10,
+    )  # fmt: skip
+    return best
+
+
+def rank(tracker: Tracker, space: Space, points: list[Array]) -> list[Array]:
+    """Sort points of the box by their cost, cheapest first."""
+    costs = []
+    for point in points:
+        residual = tracker.residual(space.decode(point))
+        costs.append(float(residual @ residual))
+    return [points[i] for i in np.argsort(costs, kind="stable")]
+
+
+def search(
+    tracker: Tracker,
+    space: Space,
+    *,
+    starts: int,
+    rng: np.random.Generator,
+    progress: Progress,
+) -> list[float]:
+    """Search for the best parameters; the tracker keeps them.
+
+    Parameters
+    ----------
+    tracker : Tracker
+        Of the objective of the drive.
+    space : Space
+        The box.
+    starts : int
+        Descents on the loop; the best third of them go on to the curves of the drive.
+    rng : Generator
+        Source of all chance.
+    progress : callable
+        Told the fraction done and what is going on.
+
+    Returns
+    -------
+    list of float
+        Final costs of the descents on the drive's curves, best first.
+
+    Raises
+    ------
+    SearchStoppedError
+        When the time is up.
+    """
+    points = [space.encode(space.values), *box_starts(space, rng, CURVE_STARTS // 3)]
+    objective = tracker.objective
+    if objective.measurement.displacement is not None:
+        loop = smooth_loop(objective.measurement)
+        points += curve_starts(space, loop, rng)
+        weights = {"stress_strain": 1.0}
+        inner = Tracker(Objective(loop, objective.model, "displacement", weights), tracker.deadline)
+        points = rank(inner, space, points)[:starts]
+        found = []
+        for i, point in enumerate(points):
+            progress(0.7 * i / starts, "loop")
+            found.append(descend(inner, space, point, 40))
+        objective.failures += inner.objective.failures
+        objective.evaluations += inner.objective.evaluations
+        found.sort(key=lambda item: item[0])
+        points = [point for _, point in found]
+    keep = max(3, starts // 3)
+    points = rank(tracker, space, points)[:keep]
+    costs = []
+    for i, point in enumerate(points):
+        progress(0.7 + 0.25 * i / keep, "curves")
+        costs.append(descend(tracker, space, point, 60)[0])
+    return sorted(costs)
