@@ -36,8 +36,8 @@ class Record:
 
     def rows(self, which: slice | NDArray[np.bool_]) -> Record:
         """Keep some rows of every channel."""
-        channels = (getattr(self, f.name) for f in fields(self))
-        return Record(*(None if values is None else values[which] for values in channels))
+        channels = {f.name: getattr(self, f.name) for f in fields(self)}
+        return replace(self, **{k: v[which] for k, v in channels.items() if v is not None})
 
     def __len__(self) -> int:
         """Count the samples."""
@@ -119,7 +119,7 @@ def condition(
     record = done(fill_staircase(record))
     if impact and window.cycle != 1:
         raise InputError("[window] cycle is for slow tests; for an impact give start and end.")
-    start = find_start(record if impact else select_cycle(record, 1)[0])
+    start = find_start(record if impact else select_cycle(record, 1)[0], impact)
     record = done(remove_offset(record, start, impact))
     if not impact:
         record = done(select_cycle(record, window.cycle))
@@ -258,14 +258,13 @@ def fill_staircase(record: Record) -> tuple[Record, list[str]]:
     displacement = record.displacement
     if displacement is None:
         return record, []
-    fresh = np.flatnonzero(np.diff(displacement) != 0) + 1
-    lengths = np.diff(fresh)
-    if len(lengths) < _MIN_ROWS or np.median(lengths) < 2:
-        return record, []
+    fresh = np.append(0, np.flatnonzero(np.diff(displacement) != 0) + 1)
+    lengths = np.diff(np.append(fresh, len(record)))
     step = int(np.median(lengths))
-    held = fresh[np.append(lengths, len(record) - fresh[-1]) > 3 * step]
-    ends = np.append(fresh, len(record) - 1 + step)[np.searchsorted(fresh, held) + 1] - step
-    knots = np.unique(np.concatenate([[0], fresh[:1] - 1, fresh, ends]))
+    if len(lengths) < _MIN_ROWS or step < 2:
+        return record, []
+    held = lengths > 3 * step
+    knots = np.union1d(fresh, (fresh + lengths - step)[held])
     clock = record.clock
     filled = np.interp(clock, clock[knots], displacement[knots])
     note = (
@@ -323,8 +322,8 @@ def _rise(values: Array, share: float) -> int:
 def leave_rest(time: Array, values: Array) -> float | None:
     """Time at which a signal leaves its rest, or None if it has none before it rises.
 
-    A rest followed by a straight rise is fitted by least squares to the samples up to 15 % of the
-    peak, so that the time is finer than the sampling.
+    A rest followed by a straight or else a quadratic rise is fitted by least squares to the samples
+    up to 15 % of the peak, so that the time is finer than the sampling.
     """
     high, low = _rise(values, 0.15), _rise(values, 0.05)
     first = max(0, high - 4 * max(high - low, 3) - 8)
@@ -333,10 +332,9 @@ def leave_rest(time: Array, values: Array) -> float | None:
     if len(t) < 5:
         return None
     starts = np.linspace(t[0], t[-2], 400)
-    ramps = np.maximum(0.0, t - starts[:, None])
-    ramps -= ramps.mean(axis=1, keepdims=True)
-    square, product = (ramps**2).sum(axis=1), ramps @ (y - y.mean())
-    misfit = ((y - y.mean()) ** 2).sum() - product**2 / square
+    straight, curved = _rise_misfit(t, y, starts, 1), _rise_misfit(t, y, starts, 2)
+    # The curve must fit clearly better: where noise hides the shape, the line is the safer guess.
+    misfit = curved if curved.min() < straight.min() * (1 - 9 / len(t)) else straight
     best = int(np.argmin(misfit))
     if first == 0:
         # Would a rise from the very first sample do nearly as well (three standard errors)?
@@ -354,14 +352,27 @@ def leave_rest(time: Array, values: Array) -> float | None:
     return float(starts[best])
 
 
-def find_start(record: Record) -> Start:
+def _rise_misfit(t: Array, y: Array, starts: Array, power: int) -> Array:
+    """Squared misfit of rest + factor · (t − start)^power, at its best, for each start."""
+    ramps = np.maximum(0.0, (t - starts[:, None]) / (t[-1] - t[0])) ** power
+    ramps -= ramps.mean(axis=1, keepdims=True)
+    centred = y - y.mean()
+    misfit: Array = (centred**2).sum() - (ramps @ centred) ** 2 / (ramps**2).sum(axis=1)
+    return misfit
+
+
+def find_start(record: Record, impact: bool) -> Start:
     """Find where contact starts: by the zero of the displacement, by its rest, or by the stress."""
     time, w = record.clock, record.displacement
     by_stress = leave_rest(time, record.stress)
+    onset = 0 if by_stress is None else int(np.searchsorted(time, by_stress))
+    # So few samples before the onset do not overrule a file that starts at its time zero.
+    few = time[0] == 0 and onset < _MIN_ROWS
+    if w is None and (by_stress is None or few):
+        return Start(None, 0.0, False, "at the first sample")
     if w is None:
         return Start(by_stress, 0.0, True, "where the stress leaves its rest")
     top = int(np.argmax(w))
-    onset = 0 if by_stress is None else int(np.searchsorted(time, by_stress))
     travel = float(w[top] - w[onset])
     crossing = int(np.argmax(w >= 0)) if w[top] > 0 else 0
     near = slice(max(0, crossing - 5), crossing + 5)
@@ -374,19 +385,21 @@ def find_start(record: Record) -> Start:
         if abs(at) < 0.05 * (time[crossing] - time[crossing - 1]):
             at = 0.0  # the file's own time zero
         return Start(at, 0.0, False, "where the displacement passes zero")
-    if by_stress is not None and w[onset] - w[0] > 0.1 * travel:
-        near = slice(max(0, onset - 5), onset + 5)
-        zero = line_at(time[near], w[near], by_stress)[0]
-        return Start(by_stress, zero, True, "where the stress leaves its rest")
     by_motion = leave_rest(time[: top + 1], w[: top + 1]) if by_stress is not None else None
-    if by_motion is not None:
+    approach = w[onset] - w[0]
+    # A striker's motion starts at contact, if tracked so; a machine's may start above the specimen.
+    if by_motion is not None and approach < (0.3 if impact else 0.1) * travel:
         rest = w[time < by_motion]
         zero = float(np.median(rest))
         if len(rest) < _MIN_ROWS and abs(zero) < 0.02 * travel:
             zero = 0.0  # too short a rest to doubt the file's own zero
         return Start(by_motion, zero, True, "where the displacement leaves its rest")
-    few = slice(0, min(5, top + 1))
-    zero = line_at(time[few], w[few], time[0])[0] if top > 1 else float(w[0])
+    if by_stress is not None and approach > 0.1 * travel and not few:
+        near = slice(max(0, onset - 5), onset + 5)
+        zero = line_at(time[near], w[near], by_stress)[0]
+        return Start(by_stress, zero, True, "where the stress leaves its rest")
+    early = slice(0, min(5, top + 1))
+    zero = line_at(time[early], w[early], time[0])[0] if top > 1 else float(w[0])
     return Start(None, zero if abs(w[0]) > 0.02 * travel else 0.0, False, "at the first sample")
 
 
@@ -401,13 +414,14 @@ def remove_offset(record: Record, start: Start, impact: bool) -> tuple[Record, l
         return record, []
     rest = record.stress[before]
     offset = float(np.median(rest))
-    rise = line_at(np.arange(n), rest, 0.0)[1] * n
+    rise = line_at(np.arange(n, dtype=np.float64), rest, 0.0)[1] * n
     if abs(rise) > max(0.01 * record.stress.max(), 4 * noise_level(rest) * np.sqrt(12 / n)):
         told = f"by {engineering(rise, 'Pa')} in the {n} samples before contact"
         return record, [f"The stress drifts {told}, so no offset is taken off."]
+    deviation = engineering(float(rest.std()), "Pa")
     note = (
         f"The stress before contact, {engineering(offset, 'Pa')} with a standard deviation of "
-        f"{engineering(float(rest.std()), 'Pa')} ({n} samples), is taken off as the sensor's offset."
+        f"{deviation} ({n} samples), is taken off as the sensor's offset."
     )
     a = record.acceleration
     record = replace(
@@ -432,8 +446,8 @@ def contact_end(stress: Array) -> tuple[int, bool]:
     end = top
     while True:
         quiet = np.flatnonzero(mean[end:] <= level)
-        if not quiet.size:
-            return len(stress), False
+        if not quiet.size:  # a record cut right at the end of contact has returned
+            return len(stress), bool(stress[-1] <= 0.02 * stress[top] + level)
         end += int(quiet[0])
         ahead = end + max(1, (end - top) // 5)
         again = np.flatnonzero(mean[end:ahead] > 0.05 * stress[top])
@@ -445,7 +459,10 @@ def contact_end(stress: Array) -> tuple[int, bool]:
 def cut_to_contact(record: Record, start: Start, impact: bool) -> tuple[Record, list[str]]:
     """Cut what lies before and after contact; time and displacement are zero where it starts."""
     time, w = record.clock, record.displacement
-    zero_time = float(time[0]) if start.time is None else start.time
+    if start.time is not None:
+        zero_time = start.time
+    else:  # a file whose first sample is a step or so after time zero has its zero right
+        zero_time = 0.0 if 0 <= time[0] <= 2 * (time[1] - time[0]) else float(time[0])
     first = 0 if start.time is None else int(np.searchsorted(time, start.time))
     notes: list[str] = []
     end = len(record)
@@ -455,7 +472,7 @@ def cut_to_contact(record: Record, start: Start, impact: bool) -> tuple[Record, 
         if not returned:
             notes.append("Check: the record ends before the stress has returned to zero.")
     cut = f"; {first} samples before and {len(record) - end} after are cut, {end - first} kept"
-    at = "" if record.time is None else f" at {engineering(zero_time, 's')} in the file"
+    at = "" if record.time is None else f", {engineering(zero_time, 's')} in the file"
     notes.insert(0, f"Contact starts {start.how}{at}{cut if end - first < len(record) else ''}.")
     if start.zero != 0:
         notes.append(f"The displacement there, {engineering(start.zero, 'm')}, is taken off.")

@@ -7,14 +7,13 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import lmfit
 import numpy as np
 from numpy.typing import NDArray
 
 from foamfit import kernels, uncertainty
-from foamfit.audit import audit
+from foamfit.audit import EnergyAudit, audit
 from foamfit.errors import InputError, SimulationError
 from foamfit.measurement import Measurement
 from foamfit.model import BRANCHES, Model, split_name, unit_of
@@ -228,7 +227,7 @@ def fit(
             "that were tried could be simulated; check the drive, the heights and the bounds"
         )
     problem.put(tracker.best_values)
-    return _conclude(problem, tracker.best_values, seed, costs, stopped, began)
+    return _conclude(problem, tracker.best_values, seed, starts, costs, stopped, began)
 
 
 def _problem(
@@ -362,6 +361,7 @@ def _conclude(
     problem: _Problem,
     values: Array,
     seed: int,
+    starts: int,
     costs: list[float],
     stopped: str | None,
     began: float,
@@ -372,7 +372,7 @@ def _conclude(
     residual = objective.residual(values)
     estimates, spread = _estimate(problem, values, residual)
     misfit = objective.misfit(simulated)
-    balance = audit(measurement).as_dict()
+    balance = audit(measurement)
     n_vary = sum(1 for item in estimates.values() if item.vary and item.stderr is not None)
     warnings = _warnings(problem, estimates, misfit, spread, stopped, costs, balance)
     worst = max(misfit[name] or 0.0 for name in objective.counted)
@@ -390,8 +390,8 @@ def _conclude(
         visited=_visited(problem, simulated),
         misfit=misfit,
         weights=objective.weights,
-        statistics=_statistics(residual, n_vary, spread, objective, costs),
-        energy=balance,
+        statistics=_statistics(residual, n_vary, starts, spread, objective, costs),
+        energy=balance.as_dict() | {"sentences": balance.sentences()},
         runtime_s=time.perf_counter() - began,
         curves=Curves(
             time=measurement.time,
@@ -466,6 +466,7 @@ def _varied(
 def _statistics(
     residual: Array,
     n_vary: int,
+    starts: int,
     spread: uncertainty.Covariance | None,
     objective: Objective,
     costs: list[float],
@@ -487,7 +488,8 @@ def _statistics(
         "bic": log_likelihood + n_vary * math.log(n),
         "nfev": objective.evaluations,
         "n_failed": objective.failures,
-        "n_starts": len(costs),
+        "n_starts": starts,
+        "n_descents": len(costs),
         "n_agreeing": sum(1 for cost in costs if cost <= 1.02 * costs[0]),
     }
 
@@ -519,7 +521,7 @@ def _warnings(
     spread: uncertainty.Covariance | None,
     stopped: str | None,
     costs: list[float],
-    balance: Mapping[str, Any],
+    balance: EnergyAudit,
 ) -> list[str]:
     """List what a reader must know before trusting the numbers, worst first."""
     objective = problem.objective
@@ -549,6 +551,5 @@ def _warnings(
             "The residuals are structured: they follow each other over "
             f"{max(spread.tau):.0f} samples, and the intervals count that."
         )
-    flags = balance.get("flags") or []
-    out.extend(str(flag) for flag in flags)
+    out.extend(balance.warnings())
     return out

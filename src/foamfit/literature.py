@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from foamfit.chain import Chain
-from foamfit.spring import BistableSpring, LinearSpring
+from foamfit.spring import BistableSpring, LinearSpring, Spring
 
 MPA, MM, MG = 1e6, 1e-3, 1e-6
 
@@ -121,3 +121,60 @@ published: dict[str, PublishedSet] = {
         _foam_2(),
     )
 }
+
+
+def table() -> str:
+    """Return the published sets and their derived points as text, in the paper's units."""
+    lines = ["Published parameter sets (Thevamaran, Fraternali & Daraio 2014, Tables 2 and 3)", ""]
+    head = ("set", "spring", "k0", "ds/s_a", "eta", "eps_a", "eps_c", "h", "kh+/k0", "kh-/k0")
+    widths = (16, 12, 8, 8, 9, 7, 7, 7, 7, 7, 6)
+    lines.append(_line((*head, "kc/k0"), widths))
+    lines.append(_line(("", "", "MPa", "", "Pa s", "", "", "mm", "", "", ""), widths))
+    for item in published.values():
+        for spring, height in zip(item.chain.springs, item.chain.heights, strict=True):
+            lines.append(_line(_published_row(item, spring, height), widths))
+    lines += ["", "Derived points of the bistable springs", ""]
+    points = ("sigma_a", "sigma_c", "eps_star", "eps_hat_a", "eps_hat_c", "sigma_hat_c")
+    widths = (16, 12, 12, 12, 12, 12, 12)
+    lines.append(_line(("set", *points), widths))
+    lines.append(_line(("", "MPa", "MPa", "", "", "", "MPa"), widths))
+    for item in published.values():
+        cells = [item.name]
+        for point in points:
+            value = getattr(item.bistable, point)
+            scale = MPA if point.startswith("sigma") else 1.0
+            cells.append("none" if value is None else f"{value / scale:.6f}")
+        lines.append(_line(tuple(cells), widths))
+    lines += ["", "Damping ratio eta/(2 H sqrt(rho kc)), rho = m_striker/(A H)", ""]
+    for item in published.values():
+        ratio = item.damping_ratio_by_formula()
+        if ratio is not None and item.damping_ratio is not None:
+            agrees = math.isclose(ratio, item.damping_ratio, rel_tol=2e-3)
+            verdict = "agrees" if agrees else "does not follow from the paper's own table"
+            lines.append(f"{item.name:<16}{ratio:.3g}   (paper {item.damping_ratio}: {verdict})")
+    return "\n".join(lines)
+
+
+def _line(cells: tuple[str, ...], widths: tuple[int, ...]) -> str:
+    first, *rest = (f"{cell:>{width}}" for cell, width in zip(cells, widths, strict=True))
+    return cells[0].ljust(widths[0]) + "".join(rest) if first else ""
+
+
+def _published_row(item: PublishedSet, spring: Spring, height: float) -> tuple[str, ...]:
+    h = f"{height / MM:.3f}"
+    if isinstance(spring, LinearSpring):
+        kind = "unilateral" if spring.unilateral else "linear"
+        return (item.name, kind, f"{spring.k0 / MPA:g}", "", "", "", "", h, "", "", "")
+    return (
+        item.name,
+        "bistable",
+        f"{spring.k0 / MPA:g}",
+        f"{spring.dsigma / spring.sigma_a:.2f}",
+        "-" if item.eta is None else f"{item.eta:g}",
+        f"{spring.eps_a:g}",
+        f"{spring.eps_c:g}",
+        h,
+        f"{spring.kh_plus / spring.k0:.3g}",
+        f"{spring.kh_minus / spring.k0:.3g}",
+        f"{spring.kc / spring.k0:.3g}",
+    )

@@ -17,6 +17,7 @@ import io
 import math
 import re
 import tomllib
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -41,7 +42,8 @@ _WORDS = {word for _, _, words in _CHANNELS.values() for word in words}
 # With one of these beside it a channel's name means something else.
 _OTHER = {"std", "sd", "dev", "error", "err", "noise", "uncertainty", "rate", "specific", "energy"}
 # Usual units, for headers in capitals: "MM" is millimetre as a displacement, "MPA" megapascal.
-_USUAL = ("s ms us m mm um cm N kN mN Pa kPa MPa GPa m/s mm/s m/s^2 V mV").split()
+_USUAL = ["s", "ms", "us", "m", "cm", "mm", "um", "N", "kN", "mN", "Pa", "kPa", "MPa", "GPa"]
+_USUAL += ["m/s", "mm/s", "m/s^2", "V", "mV"]
 _QUANTITY = r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*)"
 _MIN_ROWS = 10
 _HEAD_ROWS = 400
@@ -54,13 +56,13 @@ _HEAD_ROWS = 400
 def _registry() -> Any:
     import pint
 
-    registry = pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
+    registry: Any = pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
     registry.define("microstrain = 1e-6 = ustrain")
     return registry
 
 
 @functools.cache
-def _quantity(unit: str) -> Any | None:
+def _quantity(unit: str) -> Any:
     """One `unit` as a pint quantity, or None where pint does not know it."""
     text = unit.strip().replace("·", "*").replace("^", "**")
     text = re.sub(r"(?<=[A-Za-z])(-?\d)", r"**\1", text)  # m/s2
@@ -82,7 +84,7 @@ def _is_unit(text: str) -> bool:
 
 
 def _parse_quantity(value: object, si: str, where: str, example: str) -> float:
-    """A quantity such as "1.19 mm" in the unit `si`; `where` names its file and key."""
+    """Parse a quantity such as "1.19 mm" in the unit `si`; `where` names its file and key."""
     match = re.fullmatch(_QUANTITY, str(value))
     if not isinstance(value, str) or not match:
         raise InputError(f'{where} = {value!r} is no quantity; give it like "{example}".')
@@ -90,7 +92,7 @@ def _parse_quantity(value: object, si: str, where: str, example: str) -> float:
     quantity = _quantity(unit)
     if quantity is None:
         raise InputError(f'{where} = "{value}" has an unknown unit; give it like "{example}".')
-    if not quantity.check(_quantity(si).dimensionality):  # type: ignore[union-attr]
+    if not quantity.check(_quantity(si).dimensionality):
         raise InputError(f'{where} = "{value}" is of another kind; give it like "{example}".')
     return float(number) * float(quantity.to(si).magnitude)
 
@@ -267,7 +269,7 @@ class _Table:
     n_fields: int
     headers: tuple[_Header, ...]
 
-    def rows(self) -> Any:
+    def rows(self) -> Iterator[tuple[int, list[str]]]:
         """Yield (row number in the file, cells) of the rows that are not blank."""
         lines = io.TextIOWrapper(io.BytesIO(self.raw), self.encoding, errors="replace", newline="")
         reader = csv.reader(lines, delimiter=self.separator)
@@ -276,7 +278,7 @@ class _Table:
                 yield reader.line_num, cells
 
     def row_number(self, index: int) -> int:
-        """Number in the file of the sample at `index`."""
+        """Return the number in the file of the sample at `index`."""
         return next(number for i, (number, _) in enumerate(self.rows()) if i == index)
 
 
@@ -312,7 +314,7 @@ def _rank(header: _Header, channel: str) -> int | None:
 
 
 def _decode(path: Path, raw: bytes) -> tuple[bytes, str]:
-    """The bytes without their mark, and their encoding."""
+    """Return the bytes without their mark, and their encoding."""
     if not raw.strip():
         raise InputError(f"{path}: the file is empty; it must hold a header and rows of numbers.")
     for mark in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
@@ -359,8 +361,8 @@ def _find_table(path: Path, raw: bytes, encoding: str, names: set[str]) -> _Tabl
     body = [cells for cells in grid[first:] if any(c.strip() for c in cells)]
     if not body:
         raise InputError(f"{path}: has a header in row {i + 1} but no rows of numbers below it.")
-    cells = (cell for row in body for cell in row[: len(texts)])
-    comma = any(re.fullmatch(r"\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*", cell) for cell in cells)
+    values = (value for row in body for value in row[: len(texts)])
+    comma = any(re.fullmatch(r"\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*", v) for v in values)
     decimal = "," if separator != "," and comma else "."
     return _Table(path, raw, encoding, separator, decimal, first, len(texts), headers)
 
@@ -429,7 +431,7 @@ def _assign(table: _Table, settings: _Settings, toml: Path) -> dict[str, int]:
 
 
 def _factor(table: _Table, channel: str, header: _Header, given: _Column | None) -> float:
-    """What the numbers of a column are multiplied by to be SI."""
+    """Return what the numbers of a column are multiplied by to be SI."""
     si, example, _ = _CHANNELS[channel]
     unit = given.unit if given and given.unit is not None else header.unit
     scale, scale_unit = (given.scale, given.scale_unit) if given else (1.0, "")
@@ -528,7 +530,7 @@ def _record(
             name = table.headers[needed[channel]].text
             raise InputError(f"{table.path}: column {name!r} is constant; a {channel} must vary.")
         numbers[channel] = values * factors[channel]
-    notes = [_columns_note(table, needed), *_announced(table, len(values))]
+    notes = [_columns_note(table, needed, settings), *_announced(table, len(values))]
     time = numbers.pop("time", None)
     if time is not None:
         _check_time(table, time, table.headers[needed["time"]].text)
@@ -541,7 +543,7 @@ def _record(
 
 
 def _needed(table: _Table, columns: dict[str, int], settings: _Settings) -> dict[str, int]:
-    """The channels worth reading; refuse a file that lacks one that nothing can replace."""
+    """Choose the channels worth reading; refuse a file that lacks one that nothing can replace."""
     has = set(columns)
     listed = ", ".join(repr(h.text) for h in table.headers if h.text)
     if not has & {"stress", "force"}:
@@ -567,8 +569,15 @@ def _needed(table: _Table, columns: dict[str, int], settings: _Settings) -> dict
     return {c: k for c, k in columns.items() if c in has}
 
 
-def _columns_note(table: _Table, needed: dict[str, int]) -> str:
-    read = ", ".join(f"{c} from {table.headers[k].text!r}" for c, k in needed.items())
+def _columns_note(table: _Table, needed: dict[str, int], settings: _Settings) -> str:
+    parts = []
+    for channel, k in needed.items():
+        given = settings.columns.get(channel) or _Column("")
+        unit = f" in {given.unit}" if given.unit else ""
+        by = f"{given.scale:.6g} {given.scale_unit}".strip()
+        scale = f" times {by}" if by != "1" else ""
+        parts.append(f"{channel} from {table.headers[k].text!r}{unit}{scale}")
+    read = ", ".join(parts)
     rest = [
         repr(h.text) for k, h in enumerate(table.headers) if h.text and k not in needed.values()
     ]

@@ -409,6 +409,31 @@ def rank(tracker: Tracker, space: Space, points: list[Array]) -> list[Array]:
     return [points[i] for i in np.argsort(costs, kind="stable")]
 
 
+def spread_out(space: Space, points: list[Array], count: int) -> list[Array]:
+    """Choose `count` of the ranked points: the best, then the best of each range of ε_a.
+
+    Where branch d is about as stiff as branch a, the valleys of the cost differ by where A1 lies.
+    """
+    marks = [j for j, (_, short, _) in enumerate(space.coordinates) if short == "eps_a"]
+    if not marks:
+        return points[:count]
+    places = np.array([point[marks[0]] for point in points])
+    edges = np.quantile(places, np.linspace(0, 1, count + 1)[1:-1])
+    strata = np.searchsorted(edges, places)
+    first = [int(np.argmax(strata == stratum)) for stratum in np.unique(strata)]
+    chosen = list(dict.fromkeys([*sorted(first), *range(len(points))]))[:count]
+    return [points[i] for i in sorted(chosen)]
+
+
+def distinct(points: list[Array], count: int, apart: float = 0.02) -> list[Array]:
+    """First `count` points that lie apart from each other in some coordinate."""
+    chosen: list[Array] = []
+    for point in points:
+        if all(np.max(np.abs(point - other)) > apart for other in chosen):
+            chosen.append(point)
+    return chosen[:count]
+
+
 def search(
     tracker: Tracker,
     space: Space,
@@ -449,7 +474,7 @@ def search(
         points += curve_starts(space, loop, rng)
         weights = {"stress_strain": 1.0}
         inner = Tracker(Objective(loop, objective.model, "displacement", weights), tracker.deadline)
-        points = rank(inner, space, points)[:starts]
+        points = spread_out(space, rank(inner, space, points), starts)
         found = []
         for i, point in enumerate(points):
             progress(0.7 * i / starts, "loop")
@@ -459,9 +484,9 @@ def search(
         found.sort(key=lambda item: item[0])
         points = [point for _, point in found]
     keep = max(3, starts // 3)
-    points = rank(tracker, space, points)[:keep]
+    points = distinct(rank(tracker, space, points), keep)
     costs = []
     for i, point in enumerate(points):
-        progress(0.7 + 0.25 * i / keep, "curves")
+        progress(0.7 + 0.25 * i / len(points), "curves")
         costs.append(descend(tracker, space, point, 60)[0])
     return sorted(costs)

@@ -1,0 +1,255 @@
+"""The command `foamfit`. Heavy modules are imported by the commands that need them."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import click
+
+from foamfit.errors import InputError, SimulationError
+
+WRONG, NOT_ACCEPTABLE = 1, 2
+
+
+class _Group(click.Group):
+    """A command group whose every refusal is one sentence and exit code 1."""
+
+    def main(self, *args: Any, **kwargs: Any) -> Any:
+        kwargs["standalone_mode"] = False
+        try:
+            code = super().main(*args, **kwargs)
+        except (click.ClickException, InputError, SimulationError, ValueError) as error:
+            message = error.format_message() if isinstance(error, click.ClickException) else error
+            click.echo(f"foamfit: {message}", err=True)
+            sys.exit(WRONG)
+        except (click.Abort, KeyboardInterrupt):
+            click.echo("foamfit: interrupted before anything was found", err=True)
+            sys.exit(WRONG)
+        sys.exit(code if isinstance(code, int) else 0)
+
+
+@click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="foamfit", message="foamfit %(version)s")
+def main() -> None:
+    """Identify the parameters of a foam from an impact or compression test.
+
+    \b
+    Look at a test, then fit it:
+        foamfit check experiments/foam-1/foam-1-2.0ms-reconstruction.csv
+        foamfit fit experiments/foam-1/foam-1-2.0ms-reconstruction.csv
+    Two springs, fixed seed, result as JSON:
+        foamfit fit TEST.csv --model linear+bistable --seed 1 --json
+    A forward run:
+        foamfit simulate SCENE.toml --plot scene.png
+
+    The model is that of Thevamaran, Fraternali & Daraio (2014), J. Appl. Mech. 81, 121006.
+    """
+
+
+_TEST = click.argument("test", metavar="TEST.csv", type=click.Path(path_type=Path))
+_SPECIMEN = click.option(
+    "--specimen",
+    metavar="FILE.toml",
+    type=click.Path(path_type=Path),
+    help="Specimen, striker, columns, noise. Default: TEST.toml beside the CSV.",
+)
+
+
+@main.command()
+@_TEST
+@_SPECIMEN
+def check(test: Path, specimen: Path | None) -> None:
+    """Say what the loader understood of TEST.csv: columns, contact, specimen, energy.
+
+    \b
+    Example:
+        foamfit check TEST.csv --specimen foam.toml
+    """
+    from foamfit.audit import audit, describe
+    from foamfit.reading import read_test
+
+    measurement = read_test(test, specimen)
+    click.echo(describe(measurement, audit(measurement)))
+
+
+def _fixes(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> dict[str, float]:
+    fixed = {}
+    for text in values:
+        name, _, number = text.partition("=")
+        try:
+            fixed[name.strip()] = float(number)
+        except ValueError:
+            raise click.BadParameter(f"'{text}' is not NAME=VALUE in SI, as s1_eta=0") from None
+    return fixed
+
+
+@main.command()
+@_TEST
+@_SPECIMEN
+@click.option("--model", default="bistable", show_default=True, help="Springs from the base up.")
+@click.option(
+    "--drive",
+    type=click.Choice(["impact", "stress", "displacement"]),
+    help="Default: impact if striker and time are known, else displacement.",
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    help="Result folder. Default: fits/<test>/<model>.",
+)
+@click.option("--seed", default=0, show_default=True, help="Same test and seed, same numbers.")
+@click.option("--starts", default=12, show_default=True, help="Descents of the search.")
+@click.option("--max-time", type=float, metavar="SECONDS", help="Then the best so far is taken.")
+@click.option("--fix", multiple=True, metavar="NAME=VALUE", callback=_fixes, help="Hold one (SI).")
+@click.option("--vary", multiple=True, metavar="NAME", help="Vary one that is held by default.")
+@click.option("--json", "as_json", is_flag=True, help="Print fit.json on stdout, nothing else.")
+@click.option("--quiet", is_flag=True, help="Print nothing but warnings of failure.")
+def fit(
+    test: Path,
+    specimen: Path | None,
+    model: str,
+    drive: str | None,
+    out: Path | None,
+    seed: int,
+    starts: int,
+    max_time: float | None,
+    fix: dict[str, float],
+    vary: tuple[str, ...],
+    as_json: bool,
+    quiet: bool,
+) -> int:
+    """Identify the parameters of TEST.csv and write a result folder.
+
+    Exit code 0: a fit was made; 1: the input or the call is wrong; 2: no acceptable fit was found
+    (what was found is written).
+
+    \b
+    Examples:
+        foamfit fit TEST.csv
+        foamfit fit TEST.csv --drive displacement --out results/today
+        foamfit fit TEST.csv --model linear+bistable --fix s1_k0=60e6
+    """
+    from foamfit.reading import read_test
+    from foamfit.result import check_target
+
+    measurement = read_test(test, specimen)
+    folder = Path("fits", test.stem, model) if out is None else out
+    check_target(folder)
+    from foamfit import identification
+
+    params = identification.make_params(measurement, model, drive)
+    for name in (*fix, *vary):
+        if name not in params:
+            raise InputError(
+                f"parameter '{name}' is not one of the model {model}: {', '.join(params)}"
+            )
+    for name, value in fix.items():
+        params[name].set(value=value, vary=False, min=-float("inf"), max=float("inf"))
+    for name in vary:
+        params[name].set(vary=True)
+    with _progress(quiet or as_json) as progress:
+        result = identification.fit(
+            measurement,
+            model=model,
+            drive=drive,
+            seed=seed,
+            starts=starts,
+            max_time=max_time,
+            params=params,
+            progress=progress,
+        )
+    result.save(folder)
+    if as_json:
+        import json
+
+        click.echo(json.dumps(result.to_json_dict(), ensure_ascii=False, allow_nan=False))
+    elif not quiet:
+        from foamfit.report import summary_text
+
+        click.echo(summary_text(result))
+        click.echo(f"\nwritten to {folder}: open {folder / 'report.html'}")
+    if result.status == "failed":
+        click.echo(f"foamfit: no acceptable fit was found; see {folder}", err=True)
+        return NOT_ACCEPTABLE
+    return 0
+
+
+@contextmanager
+def _progress(quiet: bool) -> Iterator[Callable[[float, str], None]]:
+    """Give a progress bar on stderr; silent when stderr is no terminal."""
+    if quiet or not sys.stderr.isatty():
+        yield lambda fraction, what: None
+        return
+    from foamfit.warmth import compiled
+
+    if not compiled():
+        click.echo("compiling the solver: once after installation, some seconds", err=True)
+    with click.progressbar(length=1000, label="fit", file=sys.stderr, show_eta=False) as bar:
+        done = 0
+
+        def progress(fraction: float, what: str) -> None:
+            nonlocal done
+            now = round(1000 * fraction)
+            bar.label = f"fit: {what:<10}"
+            bar.update(now - done)
+            done = now
+
+        yield progress
+
+
+@main.command()
+@click.argument("scene", metavar="SCENE.toml", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), help="CSV. Default: SCENE.csv here.")
+@click.option("--plot", type=click.Path(path_type=Path), help="Also draw a PNG, PDF or SVG.")
+@click.option("--rtol", default=1e-6, show_default=True, help="Wanted error over the range.")
+def simulate(scene: Path, out: Path | None, plot: Path | None, rtol: float) -> None:
+    """Run any chain under any drive forward and write its response as CSV.
+
+    \b
+    SCENE.toml, for example:
+        [chain]
+        diameter = "5 mm"
+        [[chain.springs]]               # from the base up
+        kind = "bistable"               # or "linear", "unilateral"
+        height = "1.19 mm"
+        k0 = "5.5 MPa"
+        kc = "82.5 MPa"
+        dsigma = "-0.179 MPa"
+        eps_a = 0.14
+        eps_c = 0.31
+        kh_plus = "14.3 MPa"
+        kh_minus = "2.34 MPa"
+        [drive]
+        kind = "impact"                 # or "stress", "displacement" with file = "drive.csv"
+        mass = "7 g"
+        velocity = "2 m/s"
+        [time]
+        end = "1 ms"
+        samples = 501
+    Instead of the springs, published = "foam-1/model-3" under [chain] takes a published set.
+    """
+    from foamfit.scene import read_scene, write_response
+    from foamfit.simulation import simulate as run
+
+    chain, drive, time = read_scene(scene)
+    response = run(chain, drive, time, rtol)
+    target = Path(scene.with_suffix(".csv").name) if out is None else out
+    write_response(response, target)
+    click.echo(f"{response.solver}, {response.time.size} samples, written to {target}")
+    if plot is not None:
+        from foamfit.plots import plot_response
+
+        plot_response(response, plot)
+        click.echo(f"drawn in {plot}")
+
+
+@main.command()
+def published() -> None:
+    """Print the published parameter sets and their derived points."""
+    from foamfit.literature import table
+
+    click.echo(table())

@@ -1,0 +1,156 @@
+"""A fit that was never made: the spring law along a half-sine motion, with a little noise."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import lmfit
+import numpy as np
+
+from foamfit.chain import Chain
+from foamfit.measurement import Measurement, Specimen, Striker
+from foamfit.result import Curves, FitResult, ParameterEstimate, Switch
+from foamfit.spring import BistableSpring, LinearSpring
+
+HEIGHT, AREA = 1.19e-3, 1.9635e-5
+SPRING = BistableSpring(
+    k0=5.5e6, kc=82.5e6, dsigma=-0.17907e6, eps_a=0.14, eps_c=0.31, kh_plus=14.3e6, kh_minus=2.3e6
+)
+UNITS = {"eps_a": "", "eps_c": "", "height": "m", "eta": "Pa·s", "site_eta": "Pa·s"}
+
+
+def half_sine(
+    spring: BistableSpring = SPRING, top: float = 0.35, n: int = 601
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[Switch, ...]]:
+    """Time (s), strain, stress (Pa) and switches of the spring pressed to `top` and let go."""
+    time = np.linspace(0.0, 0.9e-3, n)
+    strain = top * np.sin(np.pi * time / time[-1])
+    stress, flag, branch, switches = np.empty(n), "a", "a", []
+    for i, eps in enumerate(strain):
+        before = branch
+        flag, branch = _branch(spring, flag, eps)
+        stress[i] = _stress(spring, branch, eps)
+        if branch != before:
+            switches.append(Switch(1, before, branch, time[i], eps * HEIGHT, stress[i]))
+    return time, strain, stress, tuple(switches)
+
+
+def _branch(s: BistableSpring, flag: str, eps: float) -> tuple[str, str]:
+    if flag == "a":
+        if eps > s.eps_hat_c:
+            return "c", "c"
+        return "a", "d" if eps > s.eps_a else "a"
+    if eps < (s.eps_hat_a or 0.0):
+        return "a", "a"
+    return "c", "c" if eps > s.eps_c else "e"
+
+
+def _stress(s: BistableSpring, branch: str, eps: float) -> float:
+    return {
+        "a": s.k0 * eps / (1 - eps),
+        "d": s.sigma_a + s.kh_plus * (eps - s.eps_a),
+        "c": s.kc * (eps - s.eps_star) / (1 - eps + s.eps_star),
+        "e": s.sigma_c + s.kh_minus * (eps - s.eps_c),
+    }[branch]
+
+
+def estimate(name: str, value: float, **changed: Any) -> ParameterEstimate:
+    stderr = 0.012 * abs(value)
+    given: dict[str, Any] = {
+        "value": value,
+        "stderr": stderr,
+        "ci95": (value - 1.96 * stderr, value + 1.96 * stderr),
+        "unit": UNITS.get(name.split("_", 1)[-1], UNITS.get(name, "Pa")),
+        "vary": True,
+        "state": "determined",
+        "why": "the test reaches its branch",
+    }
+    return ParameterEstimate(**(given | changed))
+
+
+def parameters() -> dict[str, ParameterEstimate]:
+    values = {
+        f"s1_{name}": getattr(SPRING, name)
+        for name in ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus", "eta")
+    }
+    made = {name: estimate(name, value) for name, value in values.items()}
+    made["s1_kc"] = estimate(
+        "s1_kc", SPRING.kc, state="weak", why="its interval is wider than half of its value"
+    )
+    made["s1_kh_minus"] = estimate(
+        "s1_kh_minus", SPRING.kh_minus, stderr=None, ci95=None, state="not determined",
+        why="branch e was never reached",
+    )  # fmt: skip
+    made["s1_eta"] = estimate(
+        "s1_eta", 0.0, stderr=None, ci95=None, vary=False, state="fixed", why="fixed by the model"
+    )
+    return made
+
+
+def result(**changed: Any) -> FitResult:
+    """Return a whole result of a one-spring impact fit; anything can be replaced."""
+    time, strain, stress, switches = half_sine()
+    random = np.random.default_rng(0)
+    measured_stress = stress + 0.03e6 * random.standard_normal(time.size)
+    measured_displacement = 1.01 * strain * HEIGHT
+    given: dict[str, Any] = {
+        "measurement": Measurement(
+            name="VACNT foam-1, reconstruction",
+            path=None,
+            data_sha256="5d41402abc4b2a76b9719d911017c592ae1f0f0e4d1e7e5f8a3b2c1d0e9f8a7b",
+            time=time,
+            stress=measured_stress,
+            displacement=measured_displacement,
+            specimen=Specimen(height=HEIGHT, area=AREA, mass=5.56e-6),
+            striker=Striker(mass=7e-3, velocity=1.75),
+            motion="measured",
+            notes=("The force was divided by the area 19.6 mm².", "Time zero was set at contact."),
+        ),
+        "model": "bistable",
+        "drive": "impact",
+        "seed": 3,
+        "status": "warnings",
+        "warnings": ("s1_kh_minus is not determined: branch e was never reached.",),
+        "chain": Chain(springs=[SPRING], heights=[HEIGHT], area=AREA),
+        "params": lmfit.Parameters(),
+        "parameters": parameters(),
+        "visited": {"s1": ("a", "d", "c", "e")},
+        "misfit": {"stress_time": 0.012, "displacement_time": 0.004, "stress_strain": None},
+        "weights": {"stress": 0.5, "displacement": 0.5},
+        "statistics": {
+            "n_data": 1202, "n_vary": 7, "redchi": 1.02, "aic": -301.2, "aicc": -301.0,
+            "bic": -265.3, "nfev": 4210, "n_starts": 16,
+        },
+        "energy": {
+            "striker_kinetic_J": 0.01072, "absorbed_J": np.float64(0.0095), "closes": False,
+            "peak_MPa": None, "sentences": ["The striker brings 0.0107 J.", "The loop takes less."],
+        },
+        "runtime_s": 21.4,
+        "curves": Curves(
+            time=time,
+            measured_stress=measured_stress,
+            measured_displacement=measured_displacement,
+            stress=stress,
+            displacement=strain * HEIGHT,
+            stress_along=stress * 1.01,
+        ),
+        "switches": switches,
+    }  # fmt: skip
+    return FitResult(**(given | changed))
+
+
+def chain_result() -> FitResult:
+    """Return a result of linear+bistable, with names that must stay apart."""
+    one = result()
+    springs = [LinearSpring(k0=60e6), SPRING]
+    switches = tuple(
+        Switch(2, s.source, s.target, s.time, s.displacement, s.stress) for s in one.switches
+    )
+    renamed = {name.replace("s1_", "s2_"): p for name, p in one.parameters.items()}
+    return result(
+        model="linear+bistable",
+        chain=Chain(springs=springs, heights=[0.7e-3, 0.49e-3], area=AREA),
+        parameters={"s1_k0": estimate("s1_k0", 60e6), **renamed},
+        visited={"s1": (), "s2": ("a", "d", "c", "e")},
+        switches=switches,
+    )

@@ -1,0 +1,51 @@
+"""Random springs and histories for property tests."""
+
+import numpy as np
+from hypothesis import assume
+from hypothesis import strategies as st
+
+import foamfit as ff
+from reference import law
+
+
+@st.composite
+def admissible_parameters(draw: st.DrawFn) -> dict[str, float]:
+    """The seven parameters of a random admissible spring, SI."""
+    k0 = 10.0 ** draw(st.floats(5.0, 9.0))
+    eps_a = draw(st.floats(0.02, 0.5))
+    eps_c = draw(st.floats(eps_a + 0.02, 0.9))
+    sigma_a = k0 * eps_a / (1 - eps_a)
+    dsigma = sigma_a * draw(st.floats(-0.95, 0.0, exclude_min=True))
+    sigma_c = sigma_a + dsigma
+    return {
+        "k0": k0,
+        "kc": k0 * draw(st.floats(1.0, 100.0)),
+        "dsigma": dsigma,
+        "eps_a": eps_a,
+        "eps_c": eps_c,
+        "kh_plus": k0 * draw(st.floats(0.0, 10.0)),
+        "kh_minus": sigma_c / eps_c * draw(st.floats(0.0, 3.0)),
+    }
+
+
+@st.composite
+def admissible_springs(draw: st.DrawFn, sloped: bool = False) -> ff.BistableSpring:
+    """A random admissible spring; `sloped` ones have no flat branch, so stress gives strain."""
+    spring = ff.BistableSpring(**draw(admissible_parameters()))
+    if sloped:
+        assume(spring.kh_plus > 1e-3 * spring.k0 and spring.kh_minus > 1e-3 * spring.k0)
+    return spring
+
+
+def strain_history(
+    spring: ff.BistableSpring, seed: int, turns: int = 12, fine: int = 7
+) -> np.ndarray:
+    """A random reversing strain history that reaches past C1, sampled `fine` times per stroke."""
+    rng = np.random.default_rng(seed)
+    points = law(spring)
+    top = points.eps_hat_c + 0.5 * (points.limit - points.eps_hat_c)
+    ends = rng.uniform(0.0, top, turns)
+    ends[rng.integers(turns)] = top  # both flags are seen at least once
+    corners = np.concatenate([[0.0], ends])
+    at = np.linspace(0.0, turns, fine * turns + 1)
+    return np.interp(at, np.arange(turns + 1), corners)

@@ -1,0 +1,128 @@
+"""The balance of energy and momentum, and what is printed of a test."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from foamfit.audit import audit, describe
+from foamfit.measurement import Measurement, Noise, Specimen, Striker
+from foamfit.reading import read_test
+
+DATA = Path(os.environ.get("FOAMFIT_DATA", Path(__file__).parents[2] / "shared" / "data"))
+SPECIMEN = Specimen(height=1e-3, area=2e-5)
+MASS, VELOCITY, REBOUND, STIFFNESS = 7e-3, 1.75, 1.05, 5e4
+
+
+def bounce():
+    """Return a test on a spring that is stiff in loading and gives back v = REBOUND."""
+    omega = np.sqrt(STIFFNESS / MASS)
+    loading = np.linspace(0, np.pi / 2 / omega, 400)
+    top = VELOCITY / omega
+    # In unloading a spring that is soft by (REBOUND / VELOCITY)² keeps the same top.
+    slow = omega * REBOUND / VELOCITY
+    unloading = np.linspace(0, np.pi / 2 / slow, 400)[1:]
+    time = np.concatenate([loading, loading[-1] + unloading])
+    w = np.concatenate([top * np.sin(omega * loading), top * np.cos(slow * unloading)])
+    stiffness = np.where(time <= loading[-1], STIFFNESS, STIFFNESS * (REBOUND / VELOCITY) ** 2)
+    return Measurement(
+        name="bounce",
+        path=None,
+        data_sha256="",
+        time=time,
+        stress=stiffness * w / SPECIMEN.area,
+        displacement=w,
+        specimen=SPECIMEN,
+        striker=Striker(MASS, VELOCITY),
+        noise=Noise(stress=2e4),
+        motion="measured",
+        notes=("Read it.", "Contact starts at the first sample."),
+    )
+
+
+def test_a_test_that_closes():
+    found = audit(bounce())
+    energy = MASS * VELOCITY**2 / (2 * SPECIMEN.area * SPECIMEN.height)
+    assert found.striker_energy == pytest.approx(energy)
+    assert found.absorbed_energy == pytest.approx(energy, rel=1e-3)
+    assert found.dissipated_fraction == pytest.approx(1 - (REBOUND / VELOCITY) ** 2, rel=1e-3)
+    assert found.rebound_velocity == pytest.approx(REBOUND, rel=0.01)
+    assert found.momentum_change == pytest.approx(MASS * (VELOCITY + REBOUND), rel=0.01)
+    assert found.impulse_ratio == pytest.approx(1, rel=0.01)
+    assert found.warnings() == []
+    assert found.missing == ()
+
+
+@pytest.mark.parametrize(
+    ("scale", "words"),
+    [
+        (1.2, ["absorbs 1.20 times", "impossible"]),
+        (0.78, ["only 0.78", "impulse of the force is 0.78"]),
+    ],
+)
+def test_a_wrong_scale_of_force_is_found(scale, words):
+    test = bounce()
+    sentences = " ".join(audit(replace(test, stress=scale * test.stress)).sentences())
+    assert all(word in sentences for word in words)
+
+
+@pytest.mark.parametrize("scale", [0.96, 1.04])
+def test_a_few_percent_are_let_pass(scale):
+    test = bounce()
+    assert audit(replace(test, stress=scale * test.stress)).warnings() == []
+
+
+def test_a_loop_run_the_wrong_way_is_found():
+    test = bounce()
+    stress = np.where(test.time > test.time[399], 3 * test.stress, test.stress)
+    assert any("gives out more" in w for w in audit(replace(test, stress=stress)).warnings())
+
+
+@pytest.mark.parametrize(
+    ("change", "gone", "words"),
+    [
+        ({"striker": None}, "striker_energy", "mass and velocity"),
+        ({"striker": Striker(velocity=1.75)}, "momentum_change", "mass"),
+        ({"displacement": None}, "absorbed_energy", "displacement"),
+        ({"time": None}, "impulse", "momentum"),
+        ({"motion": "integrated from force"}, "momentum_change", "motion comes from the force"),
+    ],
+)
+def test_what_is_missing_is_named(change, gone, words):
+    found = audit(replace(bounce(), **change))
+    assert getattr(found, gone) is None
+    assert any(words in sentence for sentence in found.missing)
+    assert set(map(type, found.as_dict().values())) <= {float, str, type(None)}
+
+
+def test_a_record_without_unloading_dissipates_nothing_known():
+    test = bounce()
+    half = {c: getattr(test, c)[:390] for c in ("time", "stress", "displacement")}
+    found = audit(replace(test, **half))
+    assert found.dissipated_energy is None
+    assert found.rebound_velocity is None
+
+
+def test_the_description_holds_what_a_person_asks():
+    test = bounce()
+    text = describe(test, audit(test))
+    for words in ("bounce", "height 1 mm", "7 g, 1.75 m/s", "799 of time", "Contact starts", "kPa"):
+        assert words in text
+    assert f"peak {test.stress.max() / 1e6:.4g} MPa" in text
+    assert len(text.splitlines()) <= 40
+    assert max(map(len, text.splitlines())) <= 100
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="the measured data are not here")
+@pytest.mark.parametrize(("number", "velocity"), [(1, 0.785), (3, 0.905)])
+def test_cartilage_does_not_close(tmp_path, number, velocity):
+    toml = tmp_path / "cartilage.toml"
+    toml.write_text(
+        '[specimen]\nheight = "0.563 mm"\ndiameter = "8.5 mm"\n'
+        f'[striker]\nmass = "358.39 g"\nvelocity = "{velocity} m/s"\n'
+    )
+    found = audit(read_test(DATA / "cartilage-impact" / f"test_{number}_impact.csv", toml))
+    assert 0.765 < found.impulse_ratio < 0.795
+    assert any("impulse of the force" in warning for warning in found.warnings())

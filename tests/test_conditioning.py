@@ -1,0 +1,296 @@
+"""Each step from samples to one loading and unloading, on pulses whose truth is known."""
+
+import numpy as np
+import pytest
+
+from foamfit.conditioning import (
+    Record,
+    Window,
+    condition,
+    engineering,
+    fill_staircase,
+    noise_level,
+    select_cycle,
+    thin,
+)
+from foamfit.errors import InputError
+from foamfit.measurement import Specimen, Striker
+
+SPECIMEN = Specimen(height=1.19e-3, area=1.9635e-5, mass=5.56e-6)
+STRIKER = Striker(mass=7e-3, velocity=1.75)
+DURATION = 7e-4
+PEAK = 1.9 * 7e-3 * 1.75 * np.pi / 2 / DURATION / 1.9635e-5  # takes 0.95 of the momentum twice
+
+
+def pulse(t):
+    """Stress, displacement and velocity of a half-sine pulse on the striker, contact from t = 0."""
+    omega = np.pi / DURATION
+    inside = np.clip(t, 0, DURATION)
+    stress = np.where((t > 0) & (t < DURATION), PEAK * np.sin(omega * inside), 0.0)
+    a = PEAK * SPECIMEN.area / STRIKER.mass
+    v = STRIKER.velocity - a / omega * (1 - np.cos(omega * inside))
+    w = STRIKER.velocity * inside - a / omega * (inside - np.sin(omega * inside) / omega)
+    w = w + np.where(t < 0, STRIKER.velocity * t, 0) + v * np.maximum(t - DURATION, 0)
+    return stress, w, v
+
+
+def impact(n=600, before=0.0, after=0.0, noise=0.0, offset=0.0, origin=0.0, w="measured"):
+    """Return a record of a pulse; `before` and `after` are shares of contact."""
+    step = DURATION / n
+    t = np.arange(-round(before * n), round((1 + after) * n) + 1) * step
+    if before:
+        t = t + 0.37 * step  # contact starts between two samples
+    stress, displacement, _ = pulse(t)
+    random = np.random.default_rng(0)
+    stress = stress + PEAK * (offset + noise * random.normal(size=t.size))
+    displacement = displacement + 4e-4 * noise * random.normal(size=t.size)
+    if w == "at rest before contact":
+        displacement = np.where(t < 0, 0.0, displacement)
+    elif w == "from another zero":
+        displacement = displacement + 2e-3
+    return Record(t + origin, stress, None if w == "missing" else displacement)
+
+
+def run(record, **window):
+    return condition(record, SPECIMEN, striker=STRIKER, window=Window(**window))
+
+
+def error_of_motion(conditioned):
+    """RMS error of displacement along the contact, as a share of its peak."""
+    record = conditioned.record
+    truth = pulse(record.time)[1]
+    inside = record.time <= DURATION
+    return np.sqrt(np.mean((record.displacement - truth)[inside] ** 2)) / truth.max()
+
+
+# Where contact starts.
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.003, 0.01])
+@pytest.mark.parametrize("n", [100, 600, 5000])
+@pytest.mark.parametrize("w", ["measured", "missing"])
+def test_a_file_that_starts_in_contact_keeps_its_time_zero(n, noise, w):
+    record = impact(n, noise=noise, w=w)
+    conditioned = run(record)
+    width = -(-len(record) // 1000) if n > 1500 else 1
+    assert conditioned.record.time[0] == pytest.approx(np.mean(record.time[:width]), abs=1e-15)
+    assert conditioned.record.stress[0] == pytest.approx(np.mean(record.stress[:width]))
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.003, 0.01])
+@pytest.mark.parametrize(
+    "w", ["measured", "at rest before contact", "from another zero", "missing"]
+)
+def test_contact_is_found_after_a_pretrigger(noise, w):
+    conditioned = run(impact(before=0.4, after=0.4, noise=noise, offset=0.03, origin=5e-3, w=w))
+    record = conditioned.record
+    assert 0 <= record.time[0] < 0.012 * DURATION
+    assert record.time[-1] == pytest.approx(DURATION, rel=0.05)
+    assert error_of_motion(conditioned) < 0.015
+    # the sensor's offset is gone
+    assert record.stress[-3:].mean() == pytest.approx(0, abs=0.02 * PEAK)
+    assert any("offset" in note for note in conditioned.notes)
+    assert any("are cut" in note for note in conditioned.notes)
+
+
+def test_contact_starts_between_samples():
+    record = run(impact(before=0.4, after=0.2, origin=5e-3)).record
+    assert record.time[0] == pytest.approx(0.37 * DURATION / 600, rel=0.02)
+
+
+def test_a_drifting_sensor_is_left_alone_and_noted():
+    record = impact(before=0.4, after=0.2)
+    drift = np.where(record.time < 0, 0.2 * PEAK * (record.time - record.time[0]) / DURATION, 0)
+    conditioned = run(Record(record.time, record.stress + drift, record.displacement))
+    assert any("drifts" in note for note in conditioned.notes)
+    assert conditioned.record.stress.max() == pytest.approx(PEAK, rel=1e-3)
+
+
+# Where contact ends.
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_contact_ends_before_a_second_bounce(noise):
+    t = np.arange(0, 4000) * DURATION / 1000
+    stress, w, _ = pulse(t)
+    second = 0.4 * pulse(t - 2 * DURATION)[0]
+    random = np.random.default_rng(0)
+    record = Record(t, stress + second + noise * PEAK * random.normal(size=t.size), w)
+    end = run(record).record.time[-1]
+    assert end == pytest.approx(DURATION, rel=0.04)
+
+
+def test_a_record_that_ends_too_early_is_noted():
+    record = impact().rows(slice(0, 450))
+    assert any("ends before the stress has returned" in note for note in run(record).notes)
+
+
+# Displacement.
+
+
+@pytest.mark.parametrize("source", ["force", "velocity", "acceleration"])
+@pytest.mark.parametrize("before", [0.0, 0.4])
+def test_motion_is_integrated_where_it_is_missing(source, before):
+    record = impact(before=before, after=0.2 if before else 0.0, w="missing")
+    stress, _, velocity = pulse(record.time)
+    deceleration = stress * SPECIMEN.area / STRIKER.mass
+    record = Record(
+        record.time,
+        record.stress,
+        None,
+        velocity if source == "velocity" else None,
+        deceleration if source == "acceleration" else None,
+    )
+    conditioned = run(record)
+    assert conditioned.motion == f"integrated from {source}"
+    assert any(conditioned.motion in note for note in conditioned.notes)
+    assert error_of_motion(conditioned) < (5e-3 if before else 1e-5)
+
+
+def test_a_staircase_becomes_its_ramp():
+    t = np.arange(1000) * 1e-3
+    w = 1e-4 * np.sin(np.pi * t)
+    held = w[np.arange(1000) // 5 * 5]
+    filled, notes = fill_staircase(Record(t, w, held))
+    assert np.abs(filled.displacement - w)[:-5].max() < 0.02 * np.abs(held - w).max()
+    assert "5 samples" in notes[0]
+
+
+def test_a_true_hold_stays_a_hold():
+    t = np.arange(1000) * 1e-3
+    w = np.interp(t, [0, 0.4, 0.6, 1.0], [0, 1e-4, 1e-4, 0])
+    held = w[np.arange(1000) // 5 * 5]
+    filled, _ = fill_staircase(Record(t, w, held))
+    assert np.abs(filled.displacement - w)[:-5].max() < 1e-3 * w.max()
+
+
+def test_a_smooth_displacement_is_no_staircase():
+    record = impact()
+    assert fill_staircase(record) == (record, [])
+
+
+# Slow tests.
+
+
+def cycles(n=3, hold=50):
+    """Triangles of 1 mm with holds below and above, after a rest; stress follows displacement."""
+    corners = np.cumsum([60, *(n * [200, hold, 200, hold])])
+    heights = [0, *(n * [1e-3, 1e-3, 2e-5, 2e-5])]
+    w = np.interp(np.arange(corners[-1]), corners, heights)
+    t = np.arange(w.size) * 0.01
+    return Record(t, 1e9 * w, w - 5e-3)
+
+
+@pytest.mark.parametrize("cycle", [1, 2, 3])
+def test_one_cycle_of_a_slow_test_is_kept(cycle):
+    conditioned = condition(cycles(), SPECIMEN, window=Window(cycle=cycle))
+    record = conditioned.record
+    assert 440 <= len(record) <= 510
+    assert record.time[0] == pytest.approx(0, abs=0.011)
+    # the zero is that of the first contact, in every cycle
+    assert record.displacement.max() == pytest.approx(1e-3, rel=1e-3)
+    assert record.displacement[-1] == pytest.approx(2e-5, abs=6e-6)
+    assert any(f"Cycle {cycle} of 3" in note for note in conditioned.notes)
+
+
+def test_a_cycle_that_is_not_there_is_refused():
+    with pytest.raises(InputError, match="the file has 3"):
+        condition(cycles(), SPECIMEN, window=Window(cycle=4))
+    with pytest.raises(InputError, match="slow tests"):
+        run(impact(), cycle=2)
+
+
+def test_a_slow_test_without_unloading_says_so():
+    record = cycles(1).rows(slice(0, 300))
+    _, notes = select_cycle(record, 1)
+    assert any("no unloading" in note for note in notes)
+
+
+def test_the_approach_of_a_slow_test_is_cut():
+    w = np.concatenate([np.linspace(-1e-3, 1e-3, 400), np.linspace(1e-3, 0, 200)]) + 7e-3
+    stress = 1e9 * np.maximum(w - 7e-3, 0)
+    conditioned = condition(Record(np.arange(600) * 0.01, stress, w), SPECIMEN)
+    assert conditioned.record.displacement.max() == pytest.approx(1e-3, rel=0.01)
+    assert conditioned.record.displacement[0] == pytest.approx(0, abs=1e-5)
+
+
+def test_adhesion_is_kept_and_noted():
+    record = cycles(1)
+    stress = record.stress - 0.1 * record.stress.max() * (np.arange(len(record)) > 450)
+    conditioned = condition(Record(record.time, stress, record.displacement), SPECIMEN)
+    assert conditioned.record.stress.min() < 0
+    assert any("kept" in note and "-" in note for note in conditioned.notes)
+
+
+# Window, thinning, checks.
+
+
+def test_the_window_is_by_the_clock_of_the_file():
+    record = impact(before=1.0, after=1.0, origin=5e-3)
+    conditioned = run(record, start=4.8e-3, end=5.9e-3)
+    assert any("[window] cut" in note for note in conditioned.notes)
+    assert error_of_motion(conditioned) < 0.01
+    with pytest.raises(InputError, match="need a time"):
+        condition(Record(None, record.stress, record.displacement), SPECIMEN, window=Window(0.0))
+
+
+@pytest.mark.parametrize("n", [1501, 2000, 54321])
+def test_thinning_keeps_the_peak_and_lowers_the_noise(n):
+    t = np.linspace(0, DURATION, n)
+    stress, w, _ = pulse(t)
+    thinned, notes = thin(Record(t, stress, w))
+    assert len(thinned) <= 1000
+    assert thinned.stress.max() == pytest.approx(PEAK, rel=1e-3)
+    assert thinned.displacement.max() == pytest.approx(w.max(), rel=1e-3)
+    assert np.interp(3e-4, thinned.time, thinned.stress) == pytest.approx(
+        float(pulse(np.array(3e-4))[0]), rel=1e-3
+    )
+    assert str(n) in notes[0]
+
+
+def test_short_records_are_not_thinned():
+    record = impact(1400)
+    assert thin(record) == (record, [])
+
+
+@pytest.mark.parametrize(
+    ("specimen", "striker", "words"),
+    [
+        (SPECIMEN, Striker(7e-3, 2.2), "velocity is given as 2.2"),
+        (Specimen(1.19e-3, 1.9635e-5, mass=5.56e-3), STRIKER, "density"),
+    ],
+)
+def test_what_smells_wrong_is_noted(specimen, striker, words):
+    notes = condition(impact(), specimen, striker=striker).notes
+    assert any(note.startswith("Check:") and words in note for note in notes)
+    assert not any(note.startswith("Check:") for note in run(impact()).notes)
+
+
+def test_a_start_under_load_is_noted():
+    notes = run(impact().rows(slice(60, None))).notes
+    assert any(note.startswith("Check: the record starts under load") for note in notes)
+
+
+def test_strain_beyond_one_is_refused():
+    with pytest.raises(InputError, match="beyond one"):
+        condition(impact(), Specimen(3e-4, 1.9635e-5), striker=STRIKER)
+
+
+def test_an_acceleration_that_is_not_braking_is_refused():
+    record = impact(w="missing")
+    with pytest.raises(InputError, match="scale = -1"):
+        run(Record(record.time, record.stress, None, None, -record.stress))
+
+
+def test_noise_is_estimated_from_the_signal():
+    random = np.random.default_rng(0)
+    stress = pulse(np.linspace(0, DURATION, 4000))[0] + 1e4 * random.normal(size=4000)
+    assert noise_level(stress) == pytest.approx(1e4, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [(3.839e6, "Pa", "3.839 MPa"), (0, "Pa", "0 Pa"), (1.19e-3, "m", "1.19 mm"), (-5, "s", "-5 s")],
+)
+def test_values_for_people(value, unit, text):
+    assert engineering(value, unit) == text

@@ -1,0 +1,169 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import pytest
+
+import fabricated
+from foamfit.plots import STYLE, image, origin_word, plot_fit, plot_residuals, readable_unit
+from foamfit.result import FitResult
+
+
+def with_curves(result: FitResult, **changed: Any) -> FitResult:
+    return replace(result, curves=replace(result.curves, **changed))
+
+
+def texts(ax: Any) -> list[str]:
+    return [text.get_text() for text in ax.texts]
+
+
+def line(ax: Any, label: str) -> Any:
+    return next(line for line in ax.lines if line.get_label() == label)
+
+
+def test_three_panels_with_units() -> None:
+    figure = plot_fit(fabricated.result())
+    assert [(ax.get_xlabel(), ax.get_ylabel()) for ax in figure.axes] == [
+        ("time (µs)", "stress (MPa)"),
+        ("time (µs)", "displacement (µm)"),
+        ("strain (–)", "stress (MPa)"),
+    ]
+    assert figure.get_figwidth() == 7.0
+
+
+def test_the_curves_are_drawn_in_these_units() -> None:
+    result = fabricated.result()
+    stress_time, displacement_time, loop = plot_fit(result).axes
+    np.testing.assert_allclose(line(stress_time, "fitted").get_ydata(), result.curves.stress / 1e6)
+    np.testing.assert_allclose(
+        line(displacement_time, "fitted").get_xdata() / 1e6, result.curves.time
+    )
+    strain = result.curves.measured_displacement / fabricated.HEIGHT
+    np.testing.assert_allclose(line(loop, "springs along measured strain").get_xdata(), strain)
+
+
+def test_switches_and_branches_are_named() -> None:
+    *in_time, loop = plot_fit(fabricated.result()).axes
+    for ax in in_time:
+        assert texts(ax) == ["A1", "C1", "C2", "A2"]
+    assert set(texts(loop)) == {"A1", "C1", "C2", "A2", "a", "d", "c", "e"}
+
+
+def test_branch_letters_stand_on_their_branches() -> None:
+    loop = plot_fit(fabricated.result()).axes[-1]
+    at = {text.get_text(): text.xy[0] for text in loop.texts}
+    spring = fabricated.SPRING
+    assert 0 < at["a"] < spring.eps_a < at["d"] < spring.eps_hat_c
+    assert 0 < at["e"] < spring.eps_c < at["c"]
+
+
+def test_only_branches_of_the_response_are_lettered() -> None:
+    result = fabricated.result(switches=fabricated.result().switches[:1])
+    assert {"c", "e"}.isdisjoint(texts(plot_fit(result).axes[-1]))
+
+
+def test_switches_of_a_chain_carry_their_spring() -> None:
+    for ax in plot_fit(fabricated.chain_result()).axes:
+        assert texts(ax) == ["s2 A1", "s2 C1", "s2 C2", "s2 A2"]
+
+
+def test_a_point_that_is_passed_twice_is_named_once() -> None:
+    once = fabricated.result().switches
+    ax = plot_fit(fabricated.result(switches=once + once)).axes[0]
+    assert texts(ax) == ["A1", "C1", "C2", "A2"]
+
+
+@pytest.mark.parametrize(
+    ("missing", "panels"),
+    [
+        (["time"], ["strain (–)"]),
+        (["measured_displacement", "displacement", "stress_along"], ["time (µs)"]),
+        (["measured_stress", "stress", "stress_along"], ["time (µs)"]),
+        (["measured_stress", "stress", "stress_along", "time"], []),
+    ],
+)
+def test_a_panel_without_curves_is_left_out(missing: list[str], panels: list[str]) -> None:
+    result = with_curves(fabricated.result(), **dict.fromkeys(missing))
+    figure = plot_fit(result)
+    assert [ax.get_xlabel() for ax in figure.axes if ax.axison] == panels
+    assert image(figure, "png")
+
+
+def test_the_loop_of_a_displacement_drive_without_time() -> None:
+    result = with_curves(fabricated.result(drive="displacement"), time=None, displacement=None)
+    switches = tuple(replace(s, time=None) for s in result.switches)
+    (loop,) = plot_fit(replace(result, switches=switches)).axes
+    assert line(loop, "fitted") is not None
+    assert {"a", "d", "c", "e", "A1"} <= set(texts(loop))
+
+
+def test_the_origin_is_visible_even_if_only_a_note_tells_it() -> None:
+    measurement = fabricated.result().measurement
+    noted = replace(measurement, name="foam " * 40, notes=("This is a reconstruction.",))
+    result = fabricated.result(measurement=noted)
+    assert "reconstruction" in plot_fit(result).get_suptitle()
+    plain = replace(measurement, name="foam-1", notes=())
+    assert origin_word(fabricated.result(measurement=plain)) is None
+    assert (
+        origin_word(fabricated.result(measurement=replace(plain, name="Synthetic 3")))
+        == "synthetic"
+    )
+
+
+def test_a_name_is_no_formula_and_may_be_in_any_script() -> None:
+    measurement = replace(fabricated.result().measurement, name=r"$\frac{1$ 測試")
+    assert image(plot_fit(fabricated.result(measurement=measurement)), "png")
+
+
+def test_residuals_are_in_percent_of_the_measured_range() -> None:
+    result = fabricated.result()
+    first, second = plot_residuals(result).axes  # the stress-strain misfit is None
+    c = result.curves
+    drawn = first.lines[1].get_ydata()
+    expected = 100 * (c.stress - c.measured_stress) / np.ptp(c.measured_stress)
+    np.testing.assert_allclose(drawn, expected)
+    assert second.get_xlabel() == "time (µs)"
+
+
+def test_residuals_without_time_are_over_the_sample() -> None:
+    misfit = {"stress_time": None, "displacement_time": None, "stress_strain": 0.02}
+    (strip,) = plot_residuals(with_curves(fabricated.result(misfit=misfit), time=None)).axes
+    assert strip.get_xlabel() == "sample"
+
+
+def test_nothing_to_compare_is_said() -> None:
+    (ax,) = plot_residuals(fabricated.result(misfit={})).axes
+    assert texts(ax) == ["no curve to compare"]
+
+
+def test_the_pdf_embeds_truetype_and_no_setting_leaks(tmp_path: Path) -> None:
+    before = {key: matplotlib.rcParams[key] for key in STYLE}
+    plot_fit(fabricated.result(), tmp_path / "fit.pdf")
+    content = (tmp_path / "fit.pdf").read_bytes()
+    assert b"/FontFile2" in content
+    assert b"/Type3" not in content
+    assert {key: matplotlib.rcParams[key] for key in STYLE} == before
+
+
+def test_a_format_that_is_not_made_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"not 'fit\.docx'"):
+        plot_fit(fabricated.result(), tmp_path / "fit.docx")
+
+
+@pytest.mark.parametrize(
+    ("size", "unit", "expected"),
+    [
+        (5.5e6, "Pa", (1e6, "MPa")),
+        (-0.179e6, "Pa", (1e3, "kPa")),
+        (1.19e-3, "m", (1e-3, "mm")),
+        (0.0, "s", (1e-6, "µs")),
+        (0.3, "", (1.0, "")),
+        (1e4, "Pa·s", (1.0, "Pa·s")),
+    ],
+)
+def test_readable_unit(size: float, unit: str, expected: tuple[float, str]) -> None:
+    assert readable_unit(size, unit) == expected

@@ -1,0 +1,412 @@
+"""What a test file may look like, and how one that cannot be used is refused."""
+
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from foamfit.errors import InputError
+from foamfit.reading import read_test
+
+DATA = Path(os.environ.get("FOAMFIT_DATA", Path(__file__).parents[2] / "shared" / "data"))
+needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the measured data are not here")
+
+SPECIMEN = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\n'
+STRIKER = '[striker]\nmass = "1 kg"\nvelocity = "1 m/s"\n'
+LOOP = np.sin(np.linspace(0, np.pi, 41))  # loading and unloading, from 0 over 1 to 0
+
+
+def numbers(separator=",", decimal="."):
+    """Rows of time (ms), stress (2 MPa at most) and displacement (4 mm at most)."""
+    time_ms = np.arange(41.0)
+    table = zip(time_ms, 2 * LOOP, 4 * LOOP, strict=True)
+    rows = [separator.join(f"{v:.9g}" for v in row) for row in table]
+    return [row.replace(".", decimal) for row in rows]
+
+
+def write(folder, header="time (ms),stress (MPa),displacement (mm)", rows=None, toml=SPECIMEN):
+    rows = numbers() if rows is None else rows
+    path = folder / "test.csv"
+    path.write_text("\n".join([*([header] if header else []), *rows]) + "\n", encoding="utf-8")
+    if toml is not None:
+        path.with_suffix(".toml").write_text(toml, encoding="utf-8")
+    return path
+
+
+def expect(test):
+    """Check that it is the loop of `numbers`."""
+    assert test.time[-1] == pytest.approx(0.04)
+    assert test.stress.max() == pytest.approx(2e6)
+    assert test.displacement.max() == pytest.approx(4e-3)
+    assert test.motion == "measured"
+
+
+# What is read.
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "time (ms),stress (MPa),displacement (mm)",
+        "Time [ms],Stress[MPa],DISPLACEMENT (mm)",
+        "time_ms,stress_MPa,displacement_mm",
+        "t (ms) , sigma (MPa) , disp (mm)",
+        "TIME (MS),STRESS (MPA),DISPLACEMENT (MM)",
+        "Time / ms,Nominal stress / N/mm^2,Top displacement / mm",
+        "time ms,stress N/mm²,displacement mm",
+    ],
+)
+def test_units_stand_in_the_headers(tmp_path, header):
+    expect(read_test(write(tmp_path, header)))
+
+
+@pytest.mark.parametrize(
+    ("header", "separator", "decimal"),
+    [
+        ("time (ms);stress (MPa);displacement (mm)", ";", ","),
+        ("time (ms);stress (MPa);displacement (mm)", ";", "."),
+        ("time (ms)\tstress (MPa)\tdisplacement (mm)\t", "\t", "."),
+        ("time (ms)\tstress (MPa)\tdisplacement (mm)", "\t", ","),
+    ],
+)
+def test_separators_and_decimal_signs(tmp_path, header, separator, decimal):
+    end = separator if header.endswith(separator) else ""
+    rows = [row + end for row in numbers(separator=separator, decimal=decimal)]
+    expect(read_test(write(tmp_path, header, rows)))
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "latin-1"])
+@pytest.mark.parametrize("newline", ["\n", "\r\n", "\r"])
+def test_encodings_and_line_ends(tmp_path, encoding, newline):
+    path = write(tmp_path)
+    lines = ["Versuch für die Größe µ", "time (ms),stress (MPa),displacement (mm)", *numbers()]
+    path.write_bytes((newline.join(lines) + newline).encode(encoding))
+    expect(read_test(path))
+
+
+def test_title_lines_unit_row_blank_line_and_comment_column(tmp_path):
+    rows = [
+        "Samples,41,41",
+        "",
+        "Time,Stress,Displacement,Comment",
+        "(ms),(MPa),(mm),",
+        *(row + (",what a foam" if i == 3 else "") for i, row in enumerate(numbers())),
+    ]
+    test = read_test(write(tmp_path, "Test of a foam, force and time", rows))
+    expect(test)
+    assert "'Comment'" in test.notes[0]
+
+
+def test_columns_of_the_toml_come_first(tmp_path):
+    toml = SPECIMEN + (
+        "[columns]\n"
+        'time = { column = "A", unit = "ms" }\n'
+        'force = { column = "B", unit = "V", scale = "100 N/V" }\n'
+        'strain = { column = "C", unit = "%", scale = 10 }\n'
+    )
+    expect(read_test(write(tmp_path, "A,B,C", toml=toml)))
+
+
+def test_force_and_strain_use_the_specimen(tmp_path):
+    rows = [f"{i},{200 * y},{40 * y}" for i, y in enumerate(LOOP)]
+    expect(read_test(write(tmp_path, "time (ms),Normal force (N),strain (%)", rows)))
+
+
+def test_stress_goes_before_force_and_disagreement_is_noted(tmp_path):
+    rows = [f"{i},{2 * y},{250 * y},{4 * y}" for i, y in enumerate(LOOP)]
+    test = read_test(write(tmp_path, "time_ms,stress_MPa,force_N,displacement_mm", rows))
+    expect(test)
+    assert any(n.startswith("Check:") and "1.25" in n for n in test.notes)
+
+
+def test_time_may_be_missing_in_a_slow_test(tmp_path):
+    rows = [row.split(",", 1)[1] for row in numbers()]
+    test = read_test(write(tmp_path, "stress (MPa),displacement (mm)", rows))
+    assert test.time is None
+    assert test.displacement.max() == pytest.approx(4e-3)
+
+
+def test_the_toml_is_read_in_si(tmp_path):
+    toml = (
+        'name = "foam"\n[specimen]\nheight = "1.190 mm"\ndiameter = "5 mm"\nmass = "5.56 mg"\n'
+        'heights = ["0.700 mm", "0.490 mm"]\n[striker]\nmass = "7 g"\nvelocity = "1.75 m/s"\n'
+        '[noise]\nstress = "20 kPa"\ndisplacement = "2 um"\n'
+    )
+    rows = [f"{i},{2 * y},{0.4 * y}" for i, y in enumerate(LOOP)]
+    test = read_test(write(tmp_path, rows=rows, toml=toml))
+    assert test.name == "foam"
+    assert test.specimen.area == pytest.approx(np.pi * 2.5e-3**2)
+    assert test.specimen.heights == pytest.approx((7e-4, 4.9e-4))
+    assert (test.specimen.mass, test.striker.mass) == pytest.approx((5.56e-6, 7e-3))
+    assert (test.noise.stress, test.noise.displacement) == pytest.approx((2e4, 2e-6))
+    assert len(test.data_sha256) == 64
+
+
+def test_a_million_rows_take_seconds(tmp_path):
+    n = 1_000_000
+    t = np.linspace(0, 1, n)
+    y = np.sin(np.pi * t)
+    path = write(tmp_path, toml=SPECIMEN + STRIKER)
+    block = "\n".join(f"{a:.7f},{2 * b:.7f},{4 * b:.7f}" for a, b in zip(t, y, strict=True))
+    path.write_text("time (ms),stress (MPa),displacement (mm)\n" + block)
+    begin = time.perf_counter()
+    test = read_test(path)
+    assert time.perf_counter() - begin < 10  # about 1 s; the rest is for slow machines
+    assert len(test.stress) <= 1000
+    assert test.stress.max() == pytest.approx(2e6, rel=1e-3)
+
+
+# What is refused: one sentence that names what is wrong.
+
+
+def refused(path, *words, specimen=None):
+    with pytest.raises(InputError) as caught:
+        read_test(path, specimen)
+    message = str(caught.value)
+    assert "\n" not in message
+    for word in words:
+        assert word in message
+
+
+HEADER = "time (ms),stress (MPa),displacement (mm)"
+
+
+def test_refuses_missing_files_and_directories(tmp_path):
+    refused(tmp_path / "none.csv", "none.csv", "no such file")
+    refused(tmp_path, "directory")
+    path = write(tmp_path, toml=None)
+    refused(path, "test.toml", "height")
+    refused(path, "other.toml", specimen=tmp_path / "other.toml")
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", ["empty"]),
+        (b" \n\n", ["empty"]),
+        (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR", ["binary"]),
+        (HEADER.encode() + b"\n", ["row 1", "no rows of numbers"]),
+        (b"1,2,3\n" * 20, ["names the columns"]),
+        (b"hello\nworld\n", ["names the columns"]),
+    ],
+)
+def test_refuses_what_is_no_table(tmp_path, content, words):
+    path = write(tmp_path)
+    path.write_bytes(content)
+    refused(path, "test.csv", *words)
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        ("time (ms),stress (furlong),displacement (mm)", ["stress (furlong)", "another kind"]),
+        ("time (ms),stress (xyz),displacement (mm)", ["unknown unit 'xyz'", "stress (MPa)"]),
+        ("time (ms),force (mm),displacement (mm)", ["force (mm)", "another kind"]),
+        ("time,stress (MPa),displacement (mm)", ["'time' has no unit", "time (ms)", "[columns]"]),
+        ("time (ms),stress,displacement (mm)", ["'stress' has no unit"]),
+        ("time (ms),torque (mm),displacement (mm)", ["no column is a stress or a force"]),
+        ("time (ms),stress (MPa),torque (N m)", ["no column is a displacement", "[striker]"]),
+        ("time (ms),stress (MPa),stress (MPa)", ["'stress (MPa)' and 'stress (MPa)'"]),
+        ("time (ms),left force (N),right force (N)", ["left force (N)", "right force (N)"]),
+    ],
+)
+def test_refuses_headers(tmp_path, header, words):
+    refused(write(tmp_path, header), "test.csv", *words)
+
+
+def test_refuses_a_motion_that_nothing_gives(tmp_path):
+    rows = [row.rsplit(",", 1)[0] for row in numbers()]
+    refused(write(tmp_path, "time (ms),stress (MPa)", rows), "[striker] mass and velocity")
+
+
+@pytest.mark.parametrize(
+    ("row", "words"),
+    [
+        ("7,abc,1", ["row 9", "'stress (MPa)'", "'abc'", "number"]),
+        ("7,,1", ["row 9", "'stress (MPa)'", "empty"]),
+        ("7,1", ["row 9", "'displacement (mm)'", "empty"]),
+        ("7,1,NaN", ["row 9", "'displacement (mm)'", "finite"]),
+        ("7,inf,1", ["row 9", "'stress (MPa)'", "finite"]),
+        ("7,1,1,1", ["row 9", "4 cells", "3"]),
+        ("5,1,1", ["row 9", "'time (ms)'", "goes back"]),
+        ("6,1,1", ["row 9", "'time (ms)'", "repeats"]),
+    ],
+)
+def test_refuses_rows_by_their_number(tmp_path, row, words):
+    rows = numbers()
+    rows[7] = row
+    refused(write(tmp_path, rows=rows), "test.csv", *words)
+
+
+def test_row_numbers_count_titles_and_blank_lines(tmp_path):
+    rows = ["", HEADER, *numbers()]
+    rows.insert(5, "")
+    rows[9] = "6,x,1"
+    refused(write(tmp_path, "A title", rows), "row 11", "'x'")
+
+
+@pytest.mark.parametrize(
+    ("factors", "words"),
+    [
+        ((-2, 4), ["stress", "scale = -1"]),
+        ((2, -4), ["displacement", "scale = -1"]),
+        ((2, 40), ["strain reaches 4", "height"]),
+        ((0, 4), ["'stress (MPa)' is constant"]),
+        ((2, 0), ["'displacement (mm)' is constant"]),
+    ],
+)
+def test_refuses_values_that_cannot_be(tmp_path, factors, words):
+    rows = [f"{i},{factors[0] * y},{factors[1] * y}" for i, y in enumerate(LOOP)]
+    refused(write(tmp_path, rows=rows), "test.csv", *words)
+
+
+def test_refuses_too_few_rows(tmp_path):
+    refused(write(tmp_path, rows=numbers()[:5]), "fewer than 10 rows")
+
+
+@pytest.mark.parametrize(
+    ("toml", "words"),
+    [
+        ('[specimen]\narea = "1 mm^2"\n', ["[specimen] height is missing"]),
+        ('[specimen]\nheight = "1 mm"\n', ["diameter", "area"]),
+        ('[specimen]\nheight = "-1 mm"\narea = "1 mm^2"\n', ["height", "positive"]),
+        ('[specimen]\nheight = "0 mm"\narea = "1 mm^2"\n', ["height", "positive"]),
+        ('[specimen]\nheight = 1.19\narea = "1 mm^2"\n', ["height = 1.19", '"1.19 mm"']),
+        ('[specimen]\nheight = "1.19"\narea = "1 mm^2"\n', ["height", "another kind"]),
+        ('[specimen]\nheight = "tall"\narea = "1 mm^2"\n', ["height", "no quantity"]),
+        ('[specimen]\nheight = "1 kg"\narea = "1 mm^2"\n', ["height", "another kind"]),
+        ('[specimen]\nheight = "1 mmm"\narea = "1 mm^2"\n', ["height", "unknown unit"]),
+        ('[specimen]\nheight = "1 mm"\narea = "1 mm^2"\ndiameter = "5 mm"\n', ["disagree"]),
+        ("[specimen]\nheight = \n", ["line 2"]),
+        (SPECIMEN + 'hight = "1 mm"\n', ["no key 'hight'", "height"]),
+        ("[specimn]\n", ["no key 'specimn'", "specimen"]),
+        ("specimen = 3\n", ["[specimen]"]),
+        ("name = 3\n" + SPECIMEN, ["name = 3"]),
+        (SPECIMEN + 'heights = ["1 mm", "2 mm"]\n', ["heights must add up"]),
+        (SPECIMEN + '[striker]\nmass = "7 mm"\n', ["[striker] mass", "7 g"]),
+        (SPECIMEN + '[noise]\nstress = "-1 Pa"\n', ["[noise] stress", "positive"]),
+        (SPECIMEN + "[window]\ncycle = 0\n", ["[window] cycle", "from 1"]),
+        (SPECIMEN + "[window]\ncycle = 2\n", ["the file has 1"]),
+        (SPECIMEN + '[window]\nstart = "1 s"\n', ["[window]", "0 samples"]),
+        (SPECIMEN + '[columns]\nforce = "Load"\n', ["[columns] force"]),
+        (SPECIMEN + '[columns]\nforc = { column = "F" }\n', ["no key 'forc'", "force"]),
+        (SPECIMEN + '[columns]\nforce = { column = "F" }\n', ["'F' is nowhere", "'time (ms)'"]),
+        (
+            SPECIMEN + '[columns]\nforce = { column = "F", units = "N" }\n',
+            ["no key 'units'", "unit"],
+        ),
+        (SPECIMEN + '[columns]\nforce = { column = "F", unit = "Q!" }\n', ["'Q!' is unknown"]),
+        (SPECIMEN + '[columns]\nforce = { column = "F", scale = "0" }\n', ["scale = '0'"]),
+        (
+            SPECIMEN + '[columns]\nforce = { column = "stress (MPa)", scale = "2 N/V" }\n',
+            ["cannot be read as force"],
+        ),
+    ],
+)
+def test_refuses_tomls(tmp_path, toml, words):
+    refused(write(tmp_path, toml=toml), *words)
+
+
+# Measured data.
+
+SHOES = {
+    "turbo-comp-1": (7.63, 10.53),
+    "turbo-comp-2": (7.68, 9.66),
+    "leap-comp-2": (7.62, 10.65),
+    "leap-comp-3": (7.80, 10.68),
+    "new-heel-comp-1": (7.67, 9.90),
+}
+
+
+def shoe_toml(folder, shoe, more=""):
+    diameter, height = SHOES[shoe]
+    path = folder / "shoe.toml"
+    path.write_text(f'[specimen]\nheight = "{height} mm"\ndiameter = "{diameter} mm"\n{more}')
+    return path
+
+
+@needs_data
+@pytest.mark.parametrize("shoe", SHOES)
+def test_shoe_foam(tmp_path, shoe):
+    path = DATA / "shoe-foam" / f"{shoe}_cycle1.csv"
+    test = read_test(path, shoe_toml(tmp_path, shoe))
+    assert test.time[0] == 0.0  # the file starts in contact
+    assert len(test.time) > 1260
+    assert test.displacement.max() / test.specimen.height == pytest.approx(0.615, abs=0.015)
+    assert any("held for about 5 samples" in note for note in test.notes)
+    assert not any(note.startswith("Check:") for note in test.notes)
+    assert (np.diff(test.displacement) == 0).mean() < 0.2  # most are held in the file
+
+
+@needs_data
+def test_shoe_foam_as_the_instrument_wrote_it(tmp_path):
+    more = '[columns]\ndisplacement = { column = "Gap (um)", unit = "um", scale = "-1" }\n'
+    raw = DATA / "shoe-foam" / "turbo-comp-1_raw.txt"
+    test = read_test(raw, shoe_toml(tmp_path, "turbo-comp-1", more))
+    derived = read_test(
+        raw.with_name("turbo-comp-1_cycle1.csv"), shoe_toml(tmp_path, "turbo-comp-1")
+    )
+    assert test.stress.max() == pytest.approx(derived.stress.max(), rel=2e-3)
+    assert test.displacement.max() == pytest.approx(derived.displacement.max(), rel=2e-3)
+    assert test.time[-1] == pytest.approx(derived.time[-1], abs=0.02)
+    assert any("Cycle 1 of 7" in note for note in test.notes)
+    gap = '[columns]\ndisplacement = { column = "Gap (um)" }\n'
+    refused(raw, "scale = -1", specimen=shoe_toml(tmp_path, "turbo-comp-1", gap))
+
+
+def cartilage_toml(folder, more):
+    path = folder / "cartilage.toml"
+    path.write_text(
+        '[specimen]\nheight = "0.563 mm"\ndiameter = "8.5 mm"\n'
+        '[striker]\nmass = "358.39 g"\nvelocity = "0.785 m/s"\n' + more
+    )
+    return path
+
+
+VOLTS = (
+    '[columns]\ntime = { column = "X_Value", unit = "s" }\n'
+    'force = { column = "Load", unit = "V", scale = "4444.4 N/V" }\n'
+)
+
+
+@needs_data
+@pytest.mark.parametrize(
+    ("more", "motion", "strain"),
+    [
+        ("", "integrated from force", 0.90),
+        (
+            'acceleration = { column = "Acceleration", unit = "V", scale = "9586.5 m/s^2/V" }\n',
+            "integrated from acceleration",
+            0.79,
+        ),
+    ],
+)
+def test_cartilage_as_labview_wrote_it(tmp_path, more, motion, strain):
+    raw = DATA / "cartilage-impact" / "test_1_raw.txt"
+    test = read_test(raw, cartilage_toml(tmp_path, VOLTS + more))
+    assert test.motion == motion
+    assert test.displacement.max() / test.specimen.height == pytest.approx(strain, abs=0.04)
+    assert test.time[-1] == pytest.approx(1.45e-3, abs=0.15e-3)  # not the second bounce
+    assert any("announces 100000 samples" in note for note in test.notes)
+
+
+@needs_data
+def test_lattice_needs_a_height(tmp_path):
+    path = DATA / "lattice-impact" / "Hex_Diamond_contact.csv"
+    refused(path, "height")
+    toml = tmp_path / "lattice.toml"
+    toml.write_text('[specimen]\nheight = "50 mm"\ndiameter = "50 mm"\n')
+    refused(path, "no column is a stress or a force", specimen=toml)
+
+
+@needs_data
+def test_syntactic_foam_has_no_time_and_no_unloading(tmp_path):
+    toml = tmp_path / "syntactic.toml"
+    toml.write_text('[specimen]\nheight = "20 mm"\ndiameter = "10 mm"\n')
+    test = read_test(DATA / "syntactic-foam" / "specimen_3-1.csv", toml)
+    assert test.time is None
+    assert len(test.stress) == 1186
+    assert test.stress.max() == pytest.approx(144.348e6)
+    assert any("no unloading" in note for note in test.notes)

@@ -1,0 +1,185 @@
+from __future__ import annotations
+
+import html
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from typing import Any
+
+import pytest
+
+import fabricated
+from foamfit.report import number, readable, render_report, summary_text
+
+
+class Page(HTMLParser):
+    """The references, tags and text of a page."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.references: list[str] = []
+        self.open: list[str] = []
+        self.tags: set[str] = set()
+        self.text = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+        if tag not in ("meta", "img"):
+            self.open.append(tag)
+        names = ("src", "href", "srcset", "action", "data", "poster")
+        self.references += [value or "" for name, value in attrs if name in names]
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if "style" not in self.open:
+            self.text += " " + data
+
+    @property
+    def words(self) -> str:
+        return " ".join(self.text.split())
+
+
+def page(**changed: Any) -> Page:
+    return Page(render_report(fabricated.result(**changed), fit_png=b"\x89PNG" + bytes(20)))
+
+
+def test_the_page_needs_nothing_else() -> None:
+    text = render_report(fabricated.result())
+    whole = Page(text)
+    assert whole.open == []  # every tag is closed, in order
+    assert len(whole.references) == 2
+    assert all(ref.startswith("data:image/png;base64,iVBOR") for ref in whole.references)
+    assert not re.search(r"@import|url\(|<link|<script", text)
+    assert "http" not in re.sub(r"base64,[^\"]*", "", text)
+
+
+def test_text_from_files_is_escaped() -> None:
+    evil = "<script>alert('x')</script> & \"co\""
+    result = fabricated.result()
+    changed = {
+        "measurement": replace(result.measurement, name=evil, notes=(evil,), motion=evil),
+        "warnings": (evil,),
+        "parameters": {evil: fabricated.estimate("s1_k0", 1.0, why=evil, state=evil, unit=evil)},
+        "energy": {evil: evil, "sentences": [evil]},
+        "visited": {"s1": (evil,)},
+    }
+    whole = page(**changed)
+    assert "script" not in whole.tags
+    assert whole.text.count(evil) >= 9
+    assert evil not in render_report(fabricated.result(**changed))
+
+
+def test_warnings_come_first() -> None:
+    words = page().words
+    warning = words.index("s1_kh_minus is not determined: branch e was never reached.")
+    assert warning < words.index("What was fitted") < words.index("Parameters")
+    assert "Warnings" not in page(warnings=(), status="ok").words
+    assert "No acceptable fit was found" in page(status="failed").words
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        "bistable model, impact drive · reconstruction, not a measurement",
+        "SHA-256 5d41402abc4b2a76",
+        "stress-time 1.2 displacement-time 0.4 stress-strain none",
+        "reduced χ² 1.020",
+        "s1_kc k c,1 82.50 ± 0.99 MPa 80.56 to 84.44 weak its interval is wider than half",
+        "s1_kh_minus k h−,1 2.300 MPa – not determined branch e was never reached",
+        "σ a stress at A1, where snapping starts 895.3 kPa",
+        "The striker brings 0.0107 J. The loop takes less. striker kinetic J 0.01072",
+        "closes no peak MPa –",
+        "The force was divided by the area 19.6 mm².",
+        "starts 16 simulations 4210 run time 21.4 s",
+        "Journal of Applied Mechanics 81, 121006",
+    ],
+)
+def test_the_page_says(said: str) -> None:
+    assert said in page().words
+
+
+def test_branches_are_told_per_spring() -> None:
+    words = page(visited={"s1": ("a", "d")}).words
+    assert "d · snap-buckling c · densified, not reached e · snap-back, not reached" in words
+    whole = Page(render_report(fabricated.chain_result())).words
+    assert "s1 linear, has no branches s2 a · elastic" in whole
+
+
+def test_a_point_that_does_not_exist_is_said() -> None:
+    result = fabricated.result()
+    steep = replace(fabricated.SPRING, kh_minus=1e8)
+    chain = type(result.chain)(springs=[steep], heights=[fabricated.HEIGHT], area=fabricated.AREA)
+    assert "where branches e and a meet does not exist" in page(chain=chain).words
+    assert fabricated.result(chain=chain).to_json_dict()["derived"]["s1"]["eps_hat_a"] is None
+
+
+def test_the_page_is_made_of_little() -> None:
+    result = fabricated.result(energy={}, statistics={}, weights={}, warnings=(), status="ok")
+    bare = replace(result.measurement, notes=(), motion=None, data_sha256="")
+    whole = Page(render_report(replace(result, measurement=bare)))
+    assert "not read from a file" in whole.words
+    assert "Energy audit" not in whole.words
+
+
+@pytest.mark.parametrize(
+    ("value", "stderr", "unit", "expected"),
+    [
+        (5.5e6, 12.3e3, "Pa", ("5.500 ± 0.012", "MPa")),
+        (5.5e6, 0.0996e6, "Pa", ("5.50 ± 0.10", "MPa")),
+        (-179070.0, 2148.0, "Pa", ("−179.1 ± 2.1", "kPa")),
+        (0.49e-3, 3e-6, "m", ("490.0 ± 3.0", "µm")),
+        (12345.6, 148.0, "Pa s", ("12350 ± 150", "Pa·s")),
+        (0.0, 300.0, "Pa·s", ("0 ± 300", "Pa·s")),
+        (0.14, 3.0, "", ("0.1 ± 3.0", "–")),
+        (5.5e6, 1e-6, "Pa", ("5.500000 ± 1.0e-12", "MPa")),
+        (5.5e6, None, "Pa", ("5.500", "MPa")),
+        (5.5e6, float("nan"), "Pa", ("5.500", "MPa")),
+        (float("nan"), 1.0, "Pa", ("–", "Pa")),
+    ],
+)
+def test_value_and_uncertainty_are_rounded_together(
+    value: float, stderr: float | None, unit: str, expected: tuple[str, str]
+) -> None:
+    ci95 = None if stderr is None else (value - stderr, value + stderr)
+    shown = readable(
+        "s1_k0", fabricated.estimate("s1_k0", value, stderr=stderr, ci95=ci95, unit=unit)
+    )
+    assert (shown.with_error, shown.unit) == expected
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (None, "–"), (True, "yes"), (1202, "1202"), (float("inf"), "–"), (0.0, "0"),
+        (-0.25, "−0.2500"), (1234.56, "1235"), (1e-7, "1.000e−07"), (["a", 1.0], "a, 1.000"),
+    ],
+)  # fmt: skip
+def test_number(value: object, text: str) -> None:
+    assert number(value) == text
+
+
+def test_summary_is_short_and_aligned() -> None:
+    lines = summary_text(fabricated.chain_result()).splitlines()
+    assert len(lines) <= 30
+    assert max(map(len, lines)) <= 100
+    table = [line for line in lines if line.startswith(("s1_", "s2_"))]
+    column = next(line for line in lines if line.startswith("parameter")).index("unit")
+    assert {line[column:].split()[0] for line in table} == {"MPa", "kPa", "–"}
+    assert all(line[column - 1] == " " for line in table)
+
+
+def test_summary_says_what_matters() -> None:
+    text = summary_text(fabricated.result())
+    assert text.startswith("VACNT foam-1, reconstruction: bistable, impact drive, seed 3: warnings")
+    assert "stress-time 1.2 %, displacement-time 0.4 %\n" in text
+    assert "fixed: s1_eta 0 Pa·s" in text
+    assert text.endswith("warning: s1_kh_minus is not determined: branch e was never reached.")
+    assert html.unescape(text) == text
+
+
+def test_long_warnings_are_wrapped() -> None:
+    text = summary_text(fabricated.result(warnings=("word " * 60,)))
+    assert max(map(len, text.splitlines())) <= 100

@@ -1,0 +1,231 @@
+from __future__ import annotations
+
+import csv
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fabricated
+import foamfit.plots
+import foamfit.report
+from foamfit.errors import InputError
+from foamfit.result import check_target, load_result
+
+FILES = {"fit.json", "parameters.csv", "curves.csv", "report.html", "fit.png", "fit.pdf"}
+KEYS = {
+    "schema", "foamfit", "test", "data_sha256", "model", "drive", "seed", "status", "warnings",
+    "parameters", "derived", "visited", "misfit", "weights", "statistics", "energy", "runtime_s",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return fabricated.result().save(tmp_path_factory.mktemp("fits") / "foam" / "bistable")
+
+
+@pytest.fixture
+def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Save without the time that figures take, where the test is about the folder."""
+    for module in (foamfit.plots, foamfit.report):
+        monkeypatch.setattr(module, "image", lambda *_: b"\x89PNG" + bytes(20))
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def strict(text: str) -> dict:
+    def refuse(name: str) -> None:
+        raise AssertionError(f"{name} is no JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def test_folder_is_complete_and_nothing_is_beside_it(saved: Path) -> None:
+    assert {path.name for path in saved.iterdir()} == FILES
+    assert [path.name for path in saved.parent.iterdir()] == ["bistable"]
+    assert (saved / "fit.png").read_bytes().startswith(b"\x89PNG")
+    assert (saved / "fit.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_folder_is_as_readable_as_any_new_folder(saved: Path) -> None:
+    (saved.parent / "other").mkdir()
+    assert saved.stat().st_mode == (saved.parent / "other").stat().st_mode
+    (saved.parent / "other").rmdir()
+
+
+def test_json_keeps_the_contract(saved: Path) -> None:
+    content = strict((saved / "fit.json").read_text(encoding="utf-8"))
+    assert set(content) == KEYS
+    assert content["schema"] == 1
+    assert content["parameters"]["s1_k0"] == {
+        "value": 5.5e6, "stderr": 66000.0, "ci95": [5370640.0, 5629360.0], "unit": "Pa",
+        "vary": True, "state": "determined", "why": "the test reaches its branch",
+    }  # fmt: skip
+    assert content["visited"] == {"s1": ["a", "d", "c", "e"]}
+    assert content["misfit"]["stress_strain"] is None
+    assert content["weights"] == {"stress": 0.5, "displacement": 0.5}
+    assert content["energy"]["absorbed_J"] == 0.0095
+    assert content["derived"]["s1"]["sigma_a"] == pytest.approx(0.895349e6, rel=1e-6)
+    assert content["derived"]["s1"]["eps_hat_c"] == pytest.approx(0.345858, abs=1e-6)
+
+
+def test_what_is_not_determined_is_null(saved: Path) -> None:
+    p = load_result(saved)["parameters"]["s1_kh_minus"]
+    assert p["stderr"] is None
+    assert p["ci95"] is None
+    assert "branch e" in p["why"]
+
+
+def test_no_number_in_the_json_is_other_than_finite() -> None:
+    odd = fabricated.estimate("s1_kc", 1.0, stderr=np.nan, ci95=(-np.inf, np.inf))
+    result = fabricated.result(
+        parameters={"s1_kc": odd},
+        statistics={"redchi": np.float64("inf"), "n_data": np.int64(3)},
+        energy={"lost_J": np.array([1.0, np.nan])},
+    )
+    content = strict(json.dumps(result.to_json_dict(), allow_nan=False))
+    assert content["parameters"]["s1_kc"]["stderr"] is None
+    assert content["parameters"]["s1_kc"]["ci95"] == [None, None]
+    assert content["statistics"] == {"redchi": None, "n_data": 3}
+    assert content["energy"] == {"lost_J": [1.0, None]}
+
+
+def test_only_bistable_springs_have_derived_points() -> None:
+    assert set(fabricated.chain_result().to_json_dict()["derived"]) == {"s2"}
+
+
+def test_parameters_csv(saved: Path) -> None:
+    table = {row["name"]: row for row in rows(saved / "parameters.csv")}
+    assert float(table["s1_k0"]["ci95_low"]) == 5370640.0
+    assert table["s1_kh_minus"]["stderr"] == table["s1_kh_minus"]["ci95_high"] == ""
+    assert table["s1_kh_minus"]["state"] == "not determined"
+
+
+def test_curves_csv_gives_the_curves_back(saved: Path) -> None:
+    table = rows(saved / "curves.csv")
+    curves = fabricated.result().curves
+    assert list(table[0]) == [
+        "time (s)", "measured stress (Pa)", "fitted stress (Pa)", "measured displacement (m)",
+        "fitted displacement (m)", "stress along measured displacement (Pa)",
+    ]  # fmt: skip
+    assert [float(row["measured stress (Pa)"]) for row in table] == list(curves.measured_stress)
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_a_curve_that_is_not_there_has_no_column(tmp_path: Path) -> None:
+    result = fabricated.result()
+    result = replace(result, curves=replace(result.curves, time=None, displacement=None))
+    table = rows(result.save(tmp_path / "r") / "curves.csv")
+    assert list(table[0]) == [
+        "measured stress (Pa)", "fitted stress (Pa)", "measured displacement (m)",
+        "stress along measured displacement (Pa)",
+    ]  # fmt: skip
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_an_older_result_is_replaced_whole(tmp_path: Path) -> None:
+    folder = fabricated.result().save(tmp_path / "r")
+    (folder / "of an older version.txt").write_text("x")
+    fabricated.result(seed=8).save(folder)
+    assert {path.name for path in folder.iterdir()} == FILES
+    assert load_result(folder)["seed"] == 8
+    assert [path.name for path in tmp_path.iterdir()] == ["r"]
+
+
+@pytest.mark.usefixtures("no_figures")
+@pytest.mark.parametrize("failure", [RuntimeError, KeyboardInterrupt])
+def test_failing_midway_leaves_the_older_result(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: type[BaseException]
+) -> None:
+    folder = fabricated.result(seed=1).save(tmp_path / "r")
+
+    def fail(*_: object, **__: object) -> None:
+        raise failure
+
+    monkeypatch.setattr(foamfit.report, "render_report", fail)
+    with pytest.raises(failure):
+        fabricated.result(seed=2).save(folder)
+    with pytest.raises(failure):
+        fabricated.result(seed=2).save(tmp_path / "new" / "deep")
+    assert load_result(folder)["seed"] == 1
+    assert {path.name for path in folder.iterdir()} == FILES
+    assert [path.name for path in tmp_path.iterdir()] == ["r"]
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_failing_at_the_swap_puts_the_older_result_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = fabricated.result(seed=1).save(tmp_path / "r")
+    rename = Path.rename
+
+    def fail_for_the_new(self: Path, target: Path) -> Path:
+        if self.name.endswith(".new"):
+            raise OSError(28, "No space left on device")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", fail_for_the_new)
+    with pytest.raises(InputError, match="No space left on device"):
+        fabricated.result(seed=2).save(folder)
+    assert load_result(folder)["seed"] == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["r"]
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_a_folder_of_something_else_is_refused_and_kept(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("all of it")
+    with pytest.raises(InputError, match="not empty"):
+        fabricated.result().save(tmp_path)
+    with pytest.raises(InputError, match="is a file"):
+        check_target(tmp_path / "thesis.tex")
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_an_empty_folder_is_taken(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    assert load_result(fabricated.result().save(str(tmp_path / "empty")))["schema"] == 1
+
+
+def test_an_output_that_cannot_be_written_is_an_input_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(InputError, match="cannot be written"):
+        fabricated.result().save(tmp_path / "file" / "r")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_without_permission_is_an_input_error(tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    try:
+        with pytest.raises(InputError, match="Permission denied"):
+            fabricated.result().save(tmp_path / "r")
+    finally:
+        tmp_path.chmod(0o700)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        (None, "is not a result folder"),
+        ("{", "not valid JSON"),
+        ("[1]", "not the result of a fit"),
+        ('{"schema": 99}', "schema 99"),
+    ],
+)
+def test_loading_what_is_no_result(tmp_path: Path, text: str | None, complaint: str) -> None:
+    if text is not None:
+        (tmp_path / "fit.json").write_text(text)
+    with pytest.raises(InputError, match=complaint):
+        load_result(tmp_path)
+
+
+def test_the_same_result_gives_the_same_files(saved: Path, tmp_path: Path) -> None:
+    again = fabricated.result().save(tmp_path / "again")
+    assert all((again / name).read_bytes() == (saved / name).read_bytes() for name in FILES)

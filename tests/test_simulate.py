@@ -1,0 +1,489 @@
+"""`simulate` against the independent reference, published facts, energy and its own contract."""
+
+import dataclasses
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+
+import foamfit as ff
+from reference import (
+    Bistable,
+    Chain,
+    Impact,
+    Linear,
+    Motion,
+    energy_balance,
+    law,
+    reference_displacement,
+    reference_impact,
+    reference_stress,
+)
+
+AREA = np.pi * 2.5e-3**2
+
+
+def bistable(
+    k0: float, ratio: float, eps_a: float, eps_c: float, plus: float, minus: float, kc: float
+) -> Bistable:
+    dsigma = ratio * k0 * eps_a / (1 - eps_a)
+    return Bistable(k0, kc * k0, dsigma, eps_a, eps_c, plus * k0, minus * k0)
+
+
+def damped(spring: Bistable | Linear, eta: float) -> Bistable | Linear:
+    return dataclasses.replace(spring, eta=eta)
+
+
+MODEL_1 = bistable(5.5e6, -0.20, 0.14, 0.31, 2.6, 0.450, 15)
+MODEL_2 = bistable(5.5e6, -0.20, 0.14, 0.31, 2.6, 0.425, 15)
+BASE_3, TOP_3 = Linear(60e6), bistable(2e6, -0.32, 0.35, 0.71, 3.4, 0.525, 30)
+BASE_2, TOP_2 = Linear(250e6, unilateral=True), bistable(5.75e6, -0.80, 0.40, 0.70, 6.0, 0.2, 40)
+ONE, THREE, TWO = (1.190e-3,), (0.700e-3, 0.490e-3), (0.350e-3, 0.756e-3)
+SMALL_1, SMALL_2 = (5.56e-6, 0.0), (5.05e-6, 0.0)
+FOAM_1, FOAM_2 = Impact(7e-3, 1.75), Impact(7e-3, 4.44)
+
+CHAINS = {
+    "model-1": Chain((MODEL_1,), ONE, AREA),
+    "model-1, own mass on top": Chain((MODEL_1,), ONE, AREA, (5.56e-6,)),
+    "model-2, dashpot": Chain((damped(MODEL_2, 1e4),), ONE, AREA),
+    "model-2, light dashpot": Chain((damped(MODEL_2, 1e2),), ONE, AREA),
+    "model-2, onsite": Chain((MODEL_2,), ONE, AREA, site_damping=1e4),
+    "model-2, light onsite and dashpot": Chain((damped(MODEL_2, 50),), ONE, AREA, site_damping=1e2),
+    "model-3": Chain((BASE_3, TOP_3), THREE, AREA),
+    "model-3, dashpot": Chain((damped(BASE_3, 3e2), TOP_3), THREE, AREA),
+    "model-3, dashpots": Chain((damped(BASE_3, 3e2), damped(TOP_3, 1e2)), THREE, AREA),
+    "model-3, onsite": Chain((BASE_3, TOP_3), THREE, AREA, site_damping=3e2),
+    "model-3, mass": Chain((BASE_3, TOP_3), THREE, AREA, SMALL_1),
+    "model-3, mass, dashpot": Chain((damped(BASE_3, 3e2), TOP_3), THREE, AREA, SMALL_1),
+    "model-3, mass, onsite": Chain((BASE_3, TOP_3), THREE, AREA, SMALL_1, 3e2),
+    "foam-2": Chain((BASE_2, TOP_2), TWO, AREA),
+    "foam-2, dashpot": Chain((damped(BASE_2, 1e4), TOP_2), TWO, AREA),
+    "foam-2, onsite": Chain((BASE_2, TOP_2), TWO, AREA, site_damping=1e4),
+    "foam-2, light onsite": Chain((BASE_2, TOP_2), TWO, AREA, site_damping=2e2),
+    "foam-2, mass": Chain((BASE_2, TOP_2), TWO, AREA, SMALL_2),
+    "foam-2, mass, onsite": Chain((BASE_2, TOP_2), TWO, AREA, SMALL_2, 1e4),
+    "foam-2, mass, light dashpot": Chain((damped(BASE_2, 3e2), TOP_2), TWO, AREA, SMALL_2),
+    "two loops": Chain((MODEL_1, TOP_3), (0.6e-3, 0.5e-3), AREA),
+    "two loops, dashpots": Chain((damped(MODEL_1, 80), damped(TOP_3, 60)), (0.6e-3, 0.5e-3), AREA),
+}
+FAST = {  # fast enough to close the loop of foam-1
+    "model-1": 2.1,
+    "model-2, light dashpot": 2.4,
+    "model-2, light onsite and dashpot": 2.5,
+    "model-3": 2.1,
+    "model-3, mass": 2.1,
+    "model-3, dashpots": 2.2,
+    "two loops": 2.6,
+    "two loops, dashpots": 2.7,
+}
+
+
+def built(chain: Chain) -> ff.Chain:
+    """The package's chain of a reference chain."""
+    springs = [
+        (ff.BistableSpring if isinstance(s, Bistable) else ff.LinearSpring)(**dataclasses.asdict(s))
+        for s in chain.springs
+    ]
+    masses = {} if chain.masses is None else {"masses": chain.masses}
+    return ff.Chain(
+        springs=springs,
+        heights=chain.heights,
+        area=chain.area,
+        site_damping=chain.site_damping,
+        **masses,
+    )
+
+
+def published_impact(name: str) -> Impact:
+    return FOAM_2 if name.startswith("foam-2") else FOAM_1
+
+
+def loop_stress(name: str) -> float:
+    return max(law(s).sigma_hat_c for s in CHAINS[name].springs if isinstance(s, Bistable))
+
+
+TIME = np.linspace(0.0, 1.0e-3, 307)
+
+
+def history() -> np.ndarray:
+    """Rises past 1, is taken back in part, rises again, and goes to zero; starts at rest."""
+    s = TIME / TIME[-1]
+    return np.interp(s, [0, 0.25, 0.36, 0.55, 0.8, 0.9, 1.0], [0, 0.62, 0.45, 1.13, 0.1, 0.22, 0])
+
+
+@cache
+def case(name: str, drive: str) -> tuple[Motion, ff.Impact | ff.StressDrive | ff.DisplacementDrive]:
+    """The reference motion of a chain and the package's drive for it."""
+    chain = CHAINS[name]
+    if drive in ("impact", "fast impact"):
+        impact = published_impact(name) if drive == "impact" else Impact(7e-3, FAST[name])
+        return reference_impact(chain, impact, TIME), ff.Impact(impact.mass, impact.velocity)
+    stress = history() * loop_stress(name)
+    if drive == "stress":
+        return reference_stress(chain, stress, TIME), ff.StressDrive(stress)
+    # a displacement that takes the chain, undamped, through the same states more smoothly
+    still = dataclasses.replace(
+        chain, springs=tuple(damped(s, 0.0) for s in chain.springs), masses=None, site_damping=0.0
+    )
+    most = reference_stress(still, np.array([0.0, stress.max()]), TIME[:2]).displacement[-1, -1]
+    s = TIME / TIME[-1]
+    top = most * (np.sin(np.pi * s) ** 2 + 0.12 * np.sin(3 * np.pi * s) ** 2)
+    return reference_displacement(chain, top, TIME), ff.DisplacementDrive(top)
+
+
+CASES = [(name, drive) for name in CHAINS for drive in ("impact", "stress", "displacement")]
+CASES += [(name, "fast impact") for name in FAST]
+
+
+def errors(got: ff.Response, want: Motion) -> tuple[float, float]:
+    """Largest error over range of the displacements (worst node) and of the base stress."""
+    miss = np.abs(got.displacement - want.displacement).max(axis=1)
+    return (
+        float((miss / np.ptp(want.displacement, axis=1)).max()),
+        float(np.abs(got.base_stress - want.base_stress).max() / np.ptp(want.base_stress)),
+    )
+
+
+@pytest.mark.parametrize(("rtol", "bar"), [(1e-6, 1e-6), (1e-9, 1e-8)])
+@pytest.mark.parametrize(("name", "drive"), CASES)
+def test_against_reference(name: str, drive: str, rtol: float, bar: float) -> None:
+    want, load = case(name, drive)
+    got = ff.simulate(built(CHAINS[name]), load, TIME, rtol=rtol)
+    if ", mass" in name and rtol == 1e-6 and len(CHAINS[name].springs) == 2:
+        bar = 1e-5
+    displacement, stress = errors(got, want)
+    assert displacement <= bar
+    assert stress <= bar
+    np.testing.assert_allclose(got.strain, want.strain, rtol=0, atol=bar * np.ptp(want.strain))
+    if want.contact_end is None:
+        assert got.contact_end is None
+    else:
+        assert got.contact_end == pytest.approx(want.contact_end, rel=bar)
+
+
+@pytest.mark.parametrize("name", CHAINS)
+def test_cases_visit_every_branch(name: str) -> None:
+    """The drives above are worth something: each loop is run through in the sampled drives."""
+    quiet = "onsite" in name or "dashpot" in name
+    for drive in ("stress", "displacement"):
+        want, _ = case(name, drive)
+        strain = (
+            np.diff(want.displacement, axis=0, prepend=0.0)
+            / np.array(CHAINS[name].heights)[:, None]
+        )
+        seen = set()
+        for spring, eps in zip(CHAINS[name].springs, strain, strict=True):
+            if isinstance(spring, Bistable):
+                seen |= set(law(spring).branches(eps))
+        assert seen >= ({"a"} if quiet else {"a", "d", "c", "e"})
+
+
+LEAST = {
+    ("model-1", "impact"): "second order",
+    ("model-1", "stress"): "closed form",
+    ("model-1", "displacement"): "closed form",
+    ("model-1, own mass on top", "stress"): "second order",
+    ("model-1, own mass on top", "displacement"): "closed form",
+    ("model-2, dashpot", "stress"): "first order",
+    ("model-2, dashpot", "displacement"): "closed form",
+    ("model-2, onsite", "stress"): "first order",
+    ("model-2, onsite", "displacement"): "closed form",
+    ("model-3", "stress"): "closed form",
+    ("model-3", "displacement"): "closed form",
+    ("model-3", "impact"): "second order",
+    ("model-3, dashpot", "stress"): "first order",
+    ("model-3, dashpot", "displacement"): "first order",
+    ("model-3, onsite", "displacement"): "closed form",
+    ("model-3, mass", "stress"): "second order",
+    ("model-3, mass", "displacement"): "second order",
+    ("foam-2, dashpot", "impact"): "second order",
+}
+
+
+@pytest.mark.parametrize(("name", "drive"), LEAST)
+def test_least_solver(name: str, drive: str) -> None:
+    load = {
+        "impact": ff.Impact(7e-3, 1.0),
+        "stress": ff.StressDrive([0.0, 1e5, 0.0]),
+        "displacement": ff.DisplacementDrive([0.0, 1e-5, 0.0]),
+    }[drive]
+    got = ff.simulate(built(CHAINS[name]), load, [0.0, 1e-4, 2e-4])
+    assert got.solver == LEAST[name, drive]
+
+
+# ------------------------------------------------------------------------------- published facts
+
+
+def impact(name: str, n: int = 4001, rtol: float = 1e-9) -> tuple[ff.Response, np.ndarray, float]:
+    """Response, strain of each spring and rebound velocity in the published impact."""
+    drive = published_impact(name)
+    t = np.linspace(0.0, 1.0e-3, n)
+    got = ff.simulate(built(CHAINS[name]), ff.Impact(drive.mass, drive.velocity), t, rtol=rtol)
+    heights = np.array(CHAINS[name].heights)[:, None]
+    strain = np.diff(got.displacement, axis=0, prepend=0.0) / heights
+    rebound = -(got.displacement[-1, -1] - got.displacement[-1, -2]) / (t[-1] - t[-2])
+    assert got.contact_end is not None
+    assert got.contact_end < t[-2]
+    return got, strain, rebound
+
+
+def test_foam_1_rebounds_without_loss() -> None:
+    got, strain, rebound = impact("model-1")
+    assert f"{strain.max():.3f}" == "0.322"
+    assert strain.max() < law(MODEL_1).eps_hat_c
+    assert rebound == pytest.approx(1.75, rel=1e-8)
+    assert got.base_stress.min() >= 0.0
+
+
+def test_foam_1_with_two_springs_rebounds_without_loss() -> None:
+    _, strain, rebound = impact("model-3")
+    assert strain[1].max() == pytest.approx(0.705, abs=1e-3)
+    assert rebound == pytest.approx(1.75, rel=1e-8)
+    # with the interior mass a little energy stays behind in its vibration
+    _, strain, rebound = impact("model-3, mass")
+    assert f"{strain[1].max():.3f}" == "0.705"
+    assert rebound == pytest.approx(1.75, rel=1e-4)
+
+
+def test_foam_2_closes_its_loop() -> None:
+    """The published numbers hold for the interior mass without dampers."""
+    got, strain, rebound = impact("foam-2, mass")
+    assert f"{strain[1].max():.3f}" == "0.767"
+    assert strain[1].max() > law(TOP_2).eps_hat_c
+    assert f"{got.base_stress.max() / 1e6:.1f}" == "17.4"
+    assert f"{rebound:.2f}" == "2.17"
+    # without it, nothing vibrates, and a little more comes back
+    got, strain, rebound = impact("foam-2")
+    assert f"{strain[1].max():.3f}" == "0.767"
+    assert f"{got.base_stress.max() / 1e6:.1f}" == "17.4"
+    assert f"{rebound:.2f}" == "2.19"
+
+
+def test_speed_at_which_foam_1_closes_its_loop() -> None:
+    points = law(MODEL_1)
+    needed = math.sqrt(2 * points.work([points.eps_hat_c])[0] * AREA * ONE[0] / 7e-3)
+    t = np.linspace(0, 1e-3, 101)
+    chain = built(CHAINS["model-1"])
+    for factor, closes in [(1 - 1e-6, False), (1 + 1e-6, True)]:
+        speed = factor * needed
+        got = ff.simulate(chain, ff.Impact(7e-3, speed), t, rtol=1e-9)
+        rebound = -(got.displacement[-1, -1] - got.displacement[-1, -2]) / (t[-1] - t[-2])
+        assert bool(rebound < 0.99 * speed) is closes
+
+
+# ----------------------------------------------------------------------------------------- energy
+
+
+@pytest.mark.parametrize(
+    ("name", "speed"),
+    [("model-1", 1.75), ("model-1", 2.1), ("model-3", 2.1), ("foam-2", 4.44), ("two loops", 2.6)],
+)
+def test_energy_of_an_undamped_impact(name: str, speed: float) -> None:
+    chain, drive = CHAINS[name], Impact(7e-3, speed)
+    near = 5e-7 * np.arange(-2, 3)
+    centre = np.linspace(2e-6, 9e-4, 400)
+    t = (centre[:, None] + near).ravel()
+    t = np.concatenate([[0.0], t])
+    got = ff.simulate(built(chain), ff.Impact(7e-3, speed), t, rtol=1e-12)
+    w = got.displacement[-1, 1:].reshape(-1, 5)
+    velocity = np.zeros_like(got.displacement)
+    velocity[-1, 3::5] = w @ [1, -8, 0, 8, -1] / (12 * 5e-7)
+    on = centre + near[-1] < got.contact_end
+    energy = energy_balance(chain, drive, got.displacement, velocity)
+    brought = energy["brought"][0]
+    total = (energy["kinetic"] + energy["work"])[3::5]
+    # five samples on one branch of every spring: there the difference formula holds
+    strain = np.diff(got.displacement, axis=0, prepend=0.0) / np.array(chain.heights)[:, None]
+    for spring, eps in zip(chain.springs, strain, strict=True):
+        if isinstance(spring, Bistable):
+            names = np.array(law(spring).branches(eps))[1:].reshape(-1, 5)
+            on &= (names == names[:, :1]).all(axis=1)
+    assert on.sum() > 150
+    np.testing.assert_allclose(total[on], brought, rtol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("name", "speed"), [("model-1", 1.75), ("model-1", 2.1), ("model-3", 2.1), ("two loops", 2.6)]
+)
+def test_rebound_is_what_the_loop_leaves(name: str, speed: float) -> None:
+    chain = CHAINS[name]
+    t = np.linspace(0.0, 1.2e-3, 301)
+    got = ff.simulate(built(chain), ff.Impact(7e-3, speed), t, rtol=1e-9)
+    free = t > got.contact_end
+    rebound = np.polyfit(t[free], got.displacement[-1, free], 1)[0]
+    assert rebound < 0
+    taken = 0.0
+    strain = np.diff(got.displacement, axis=0, prepend=0.0) / np.array(chain.heights)[:, None]
+    for spring, h, eps in zip(chain.springs, chain.heights, strain, strict=True):
+        # up to the end of contact, where no stress is left
+        during = eps[~free]
+        flag = "a"
+        if isinstance(spring, Bistable) and law(spring).branches(during)[-1] in "ce":
+            flag = "c"
+        end = law(spring).strain_at(flag, 0.0)
+        taken += AREA * h * law(spring).work([*during, end])[-1]
+    assert 0.5 * 7e-3 * rebound**2 == pytest.approx(0.5 * 7e-3 * speed**2 - taken, rel=1e-8)
+
+
+# --------------------------------------------------------------------------------------- contract
+
+
+@pytest.mark.parametrize(
+    "name", ["model-1", "model-2, dashpot", "model-3, dashpot", "foam-2", "foam-2, mass"]
+)
+def test_after_contact_the_chain_flies(name: str) -> None:
+    drive = published_impact(name)
+    got = ff.simulate(built(CHAINS[name]), ff.Impact(drive.mass, drive.velocity), TIME)
+    assert isinstance(got.contact_end, float)
+    free = got.contact_end < TIME
+    assert free.sum() > 20
+    assert (got.base_stress[free] == 0.0).all()
+    assert (got.base_stress[~free] >= 0.0).all()
+    rates = np.diff(got.displacement[:, free], axis=1) / np.diff(TIME[free])
+    np.testing.assert_allclose(rates, np.broadcast_to(rates[-1, -1], rates.shape), rtol=1e-9)
+    assert rates[-1, -1] < 0
+
+
+@pytest.mark.parametrize("name", ["model-1", "foam-2, mass"])
+@pytest.mark.parametrize("drive", ["impact", "stress", "displacement"])
+def test_shapes_and_meaning(name: str, drive: str) -> None:
+    _, load = case(name, drive)
+    chain = built(CHAINS[name])
+    got = ff.simulate(chain, load, list(TIME))
+    n = len(chain.springs)
+    assert got.displacement.shape == (n, len(TIME))
+    for field in (got.time, got.base_stress, got.strain):
+        assert field.shape == (len(TIME),)
+        assert field.dtype == np.float64
+    np.testing.assert_array_equal(got.time, TIME)
+    np.testing.assert_allclose(got.strain, got.displacement[-1] / sum(CHAINS[name].heights))
+    assert got.solver in ("closed form", "first order", "second order")
+    if drive != "impact":
+        assert got.contact_end is None
+    if drive == "displacement":
+        np.testing.assert_allclose(got.displacement[-1], load.displacement, rtol=1e-14, atol=1e-18)
+
+
+@pytest.mark.parametrize("name", ["model-1", "model-3, mass", "foam-2, dashpot"])
+def test_samples_do_not_change_an_impact(name: str) -> None:
+    drive = published_impact(name)
+    load = ff.Impact(drive.mass, drive.velocity)
+    rng = np.random.default_rng(1)
+    some = np.sort(rng.choice(np.arange(1, len(TIME)), 23, replace=False))
+    every = ff.simulate(built(CHAINS[name]), load, TIME)
+    few = ff.simulate(built(CHAINS[name]), load, TIME[[0, *some]])
+    np.testing.assert_allclose(
+        few.displacement,
+        every.displacement[:, [0, *some]],
+        rtol=0,
+        atol=2e-5 * every.strain.max() * sum(CHAINS[name].heights),
+    )
+    alone = ff.simulate(built(CHAINS[name]), load, TIME[some])
+    np.testing.assert_allclose(
+        alone.base_stress, few.base_stress[1:], rtol=0, atol=2e-5 * every.base_stress.max()
+    )
+
+
+def test_masses_that_do_not_matter_are_not_computed() -> None:
+    chain = CHAINS["model-1"]
+    w = case("model-1", "displacement")[1]
+    light = ff.simulate(built(chain), w, TIME)
+    heavy = ff.simulate(built(dataclasses.replace(chain, masses=(1.0,))), w, TIME)
+    np.testing.assert_array_equal(heavy.base_stress, light.base_stress)
+
+
+SCENE = built(CHAINS["model-3"])
+GOOD = np.array([0.0, 1e-4, 2e-4])
+
+
+@pytest.mark.parametrize(
+    "t", [[0.0, 2e-4, 1e-4], [0.0, 0.0, 1e-4], [0.0, math.nan, 1e-4], [0, 1, math.inf]]
+)
+@pytest.mark.parametrize(
+    "load",
+    [ff.Impact(7e-3, 1.0), ff.StressDrive([0.0, 1e5, 0.0]), ff.DisplacementDrive([0.0, 1e-5, 0.0])],
+    ids=["impact", "stress", "displacement"],
+)
+def test_time_that_does_not_increase_is_refused(t: list[float], load: ff.Impact) -> None:
+    with pytest.raises(ValueError, match=r"\bt\b"):
+        ff.simulate(SCENE, load, t)
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (lambda: ff.StressDrive([0.0, 1e5]), "stress"),
+        (lambda: ff.StressDrive([0.0, math.nan, 0.0]), "stress"),
+        (lambda: ff.StressDrive([0.0, math.inf, 0.0]), "stress"),
+        (lambda: ff.DisplacementDrive([0.0, 1e-5, 0.0, 0.0]), "displacement"),
+        (lambda: ff.DisplacementDrive([0.0, math.nan, 0.0]), "displacement"),
+        (lambda: ff.Impact(7e-3, 0.0), "velocity"),
+        (lambda: ff.Impact(7e-3, -1.0), "velocity"),
+        (lambda: ff.Impact(7e-3, math.nan), "velocity"),
+        (lambda: ff.Impact(7e-3, math.inf), "velocity"),
+        (lambda: ff.Impact(0.0, 1.0), "mass"),
+        (lambda: ff.Impact(-7e-3, 1.0), "mass"),
+        (lambda: ff.Impact(math.nan, 1.0), "mass"),
+    ],
+)
+def test_inadmissible_drives_are_refused_by_name(make: object, name: str) -> None:
+    with pytest.raises(ValueError, match=rf"\b{name}\b"):
+        ff.simulate(SCENE, make(), GOOD)  # type: ignore[operator]
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        ({"springs": []}, "springs"),
+        ({"heights": [1e-3]}, "heights"),
+        ({"heights": [1e-3, 0.0]}, "heights"),
+        ({"heights": [1e-3, -1e-3]}, "heights"),
+        ({"heights": [1e-3, math.nan]}, "heights"),
+        ({"area": 0.0}, "area"),
+        ({"area": -1.0}, "area"),
+        ({"area": math.nan}, "area"),
+        ({"masses": [0.0]}, "masses"),
+        ({"masses": [-1e-6, 0.0]}, "masses"),
+        ({"masses": [math.nan, 0.0]}, "masses"),
+        ({"site_damping": -1.0}, "site_damping"),
+        ({"site_damping": math.nan}, "site_damping"),
+    ],
+)
+def test_inadmissible_chains_are_refused_by_name(change: dict[str, object], name: str) -> None:
+    good = {"springs": list(SCENE.springs), "heights": [1e-3, 1e-3], "area": AREA}
+    with pytest.raises(ValueError, match=rf"\b{name}\b"):
+        ff.Chain(**{**good, **change})
+
+
+@pytest.mark.parametrize("rtol", [0.0, -1e-6, math.nan, math.inf])
+def test_inadmissible_tolerance_is_refused(rtol: float) -> None:
+    with pytest.raises(ValueError, match=r"\brtol\b"):
+        ff.simulate(SCENE, ff.Impact(7e-3, 1.0), GOOD, rtol=rtol)
+
+
+@pytest.mark.parametrize(
+    "name", ["model-1", "model-2, dashpot", "model-3, dashpot", "model-3, mass"]
+)
+@pytest.mark.parametrize(
+    "load",
+    [
+        ff.Impact(7e-3, 60.0),
+        ff.Impact(1.0, 5.0),
+        ff.Impact(1e-9, 1e-3),
+        ff.StressDrive([0.0, -1e9, 0.0]),
+        ff.StressDrive([0.0, 1e12, 0.0]),
+        ff.DisplacementDrive([0.0, 1.7e-3, 0.0]),
+        ff.DisplacementDrive([0.0, -1e-3, 0.0]),
+    ],
+    ids=repr,
+)
+def test_an_extreme_scene_is_finite_or_refused(name: str, load: ff.Impact) -> None:
+    try:
+        got = ff.simulate(built(CHAINS[name]), load, GOOD)
+    except (ff.SimulationError, ValueError) as error:
+        assert str(error)  # noqa: PT017
+        return
+    assert np.isfinite(got.displacement).all()
+    assert np.isfinite(got.base_stress).all()
+    assert np.isfinite(got.strain).all()
