@@ -103,7 +103,7 @@ def loop_stress(name: str) -> float:
     return max(law(s).sigma_hat_c for s in CHAINS[name].springs if isinstance(s, Bistable))
 
 
-TIME = np.linspace(0.0, 1.0e-3, 307)
+TIME = np.linspace(0.0, 1.0e-3, 223)
 
 
 def history() -> np.ndarray:
@@ -132,7 +132,10 @@ def case(name: str, drive: str) -> tuple[Motion, ff.Impact | ff.StressDrive | ff
     return reference_displacement(chain, top, TIME), ff.DisplacementDrive(top)
 
 
-CASES = [(name, drive) for name in CHAINS for drive in ("impact", "stress", "displacement")]
+# under a prescribed displacement the onsite damper of the top acts on nothing: one case will do
+CASES = [(name, drive) for name in CHAINS for drive in ("impact", "stress")]
+CASES += [(name, "displacement") for name in CHAINS if "onsite" not in name]
+CASES += [("model-3, onsite", "displacement")]
 CASES += [(name, "fast impact") for name in FAST]
 
 
@@ -167,6 +170,8 @@ def test_cases_visit_every_branch(name: str) -> None:
     """The drives above are worth something: each loop is run through in the sampled drives."""
     quiet = "onsite" in name or "dashpot" in name
     for drive in ("stress", "displacement"):
+        if (name, drive) not in CASES:
+            continue
         want, _ = case(name, drive)
         strain = (
             np.diff(want.displacement, axis=0, prepend=0.0)
@@ -337,7 +342,7 @@ def test_after_contact_the_chain_flies(name: str) -> None:
     got = ff.simulate(built(CHAINS[name]), ff.Impact(drive.mass, drive.velocity), TIME)
     assert isinstance(got.contact_end, float)
     free = got.contact_end < TIME
-    assert free.sum() > 20
+    assert free.sum() > 15
     assert (got.base_stress[free] == 0.0).all()
     assert (got.base_stress[~free] >= 0.0).all()
     rates = np.diff(got.displacement[:, free], axis=1) / np.diff(TIME[free])

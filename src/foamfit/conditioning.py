@@ -442,7 +442,7 @@ def contact_end(stress: Array) -> tuple[int, bool]:
     below = np.flatnonzero(stress[top:] < 0.5 * stress[top])
     width = max(1, (int(below[0]) if below.size else 0) // 12)
     mean = smooth(stress, width)
-    level = 0.0025 * stress[top] + 2 * noise_level(stress) / np.sqrt(width)
+    level = min(0.0025 + 2 * noise_level(stress) / np.sqrt(width) / stress[top], 0.04) * stress[top]
     end = top
     while True:
         quiet = np.flatnonzero(mean[end:] <= level)
@@ -453,7 +453,7 @@ def contact_end(stress: Array) -> tuple[int, bool]:
         again = np.flatnonzero(mean[end:ahead] > 0.05 * stress[top])
         if not again.size:
             return end, True
-        end += int(again[-1])
+        end += max(1, int(again[-1]))
 
 
 def cut_to_contact(record: Record, start: Start, impact: bool) -> tuple[Record, list[str]]:

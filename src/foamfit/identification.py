@@ -24,9 +24,12 @@ from foamfit.search import Scales, SearchStoppedError, Space, Tracker, search
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
-# A curve that is off by more than this share of its range was not fitted.
-UNACCEPTABLE = 0.2
+# A curve was not fitted if it is off by more than this share of its own standard deviation; it is
+# fitted poorly if it is off by more than this share of its range.
+UNACCEPTABLE = 0.5
 POOR = 0.05
+
+Costs = list[tuple[float, int]]
 
 
 def make_params(
@@ -261,9 +264,9 @@ def _identify(
     starts: int,
     seed: int,
     progress: Callable[[float, str], None],
-) -> tuple[list[float], str | None]:
+) -> tuple[Costs, str | None]:
     """Search, then refine by lmfit; returns the costs of the descents and what stopped it."""
-    costs: list[float] = []
+    costs: Costs = []
     try:
         costs = search(
             tracker,
@@ -362,7 +365,7 @@ def _conclude(
     values: Array,
     seed: int,
     starts: int,
-    costs: list[float],
+    costs: Costs,
     stopped: str | None,
     began: float,
 ) -> FitResult:
@@ -375,8 +378,8 @@ def _conclude(
     balance = audit(measurement)
     n_vary = sum(1 for item in estimates.values() if item.vary and item.stderr is not None)
     warnings = _warnings(problem, estimates, misfit, spread, stopped, costs, balance)
-    worst = max(misfit[name] or 0.0 for name in objective.counted)
-    status = "failed" if worst > UNACCEPTABLE else ("warnings" if warnings else "ok")
+    missed = any(_missed(objective, misfit, name) for name in objective.counted)
+    status = "failed" if missed else ("warnings" if warnings else "ok")
     return FitResult(
         measurement=measurement,
         model=problem.model.name,
@@ -469,7 +472,7 @@ def _statistics(
     starts: int,
     spread: uncertainty.Covariance | None,
     objective: Objective,
-    costs: list[float],
+    costs: Costs,
 ) -> dict[str, float | int | None]:
     """Statistics as lmfit defines them (chi-square, AIC, BIC), and what the search cost."""
     n = residual.size
@@ -490,8 +493,20 @@ def _statistics(
         "n_failed": objective.failures,
         "n_starts": starts,
         "n_descents": len(costs),
-        "n_agreeing": sum(1 for cost in costs if cost <= 1.02 * costs[0]),
+        "n_agreeing": _agreeing(costs),
     }
+
+
+def _agreeing(costs: Costs) -> int:
+    """How many descents led to the best cost, within 2 %."""
+    return sum(count for cost, count in costs if cost <= 1.02 * costs[0][0])
+
+
+def _missed(objective: Objective, misfit: Mapping[str, float | None], name: str) -> bool:
+    """Whether a counted curve was not fitted at all."""
+    measured = objective.measured[name]
+    assert measured is not None
+    return (misfit[name] or 0.0) * float(np.ptp(measured)) > UNACCEPTABLE * float(np.std(measured))
 
 
 def _switches(problem: _Problem, simulated: Simulated) -> tuple[Switch, ...]:
@@ -520,7 +535,7 @@ def _warnings(
     misfit: Mapping[str, float | None],
     spread: uncertainty.Covariance | None,
     stopped: str | None,
-    costs: list[float],
+    costs: Costs,
     balance: EnergyAudit,
 ) -> list[str]:
     """List what a reader must know before trusting the numbers, worst first."""
@@ -531,7 +546,7 @@ def _warnings(
     for name in objective.counted:
         off = misfit[name] or 0.0
         if off > POOR:
-            word = "is not acceptable" if off > UNACCEPTABLE else "is large"
+            word = "is not acceptable" if _missed(objective, misfit, name) else "is large"
             out.append(f"The misfit of {name} is {off:.1%} of its range, which {word}.")
     for verdict in ("not determined", "weak"):
         names = [name for name, item in estimates.items() if item.state == verdict]
@@ -544,7 +559,7 @@ def _warnings(
             f"{objective.failures} of {objective.evaluations} trials could not be simulated; "
             "the bounds may be wrong."
         )
-    if len(costs) > 1 and sum(cost <= 1.02 * costs[0] for cost in costs) < 2 and stopped is None:
+    if _agreeing(costs) == 1 and stopped is None:
         out.append("Only one of the descents reached the best point; try more starts.")
     if spread is not None and max(spread.tau) > 5.0:
         out.append(

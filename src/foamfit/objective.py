@@ -245,9 +245,7 @@ class Objective:
             If the parameters are not admissible or the scene has no finite answer.
         """
         rows = self.model.rows(values)
-        heights = np.ascontiguousarray(
-            self.model.heights(values, self.measurement.specimen.height)
-        )
+        heights = np.ascontiguousarray(self.model.heights(values, self.measurement.specimen.height))
         if rows is None or not (np.all(heights > 0.0) and values[-1] >= 0.0):
             raise SimulationError("the parameters are not admissible")
         damped = bool(rows[:, kernels.ETA].any())

@@ -76,7 +76,7 @@ def _only(where: str, table: dict[str, Any], known: set[str]) -> None:
 
 def _number(where: str, table: dict[str, Any], key: str, unit: str, example: str) -> float:
     if key not in table:
-        raise InputError(f"{where} {key} is missing; give it like {key} = \"{example}\"")
+        raise InputError(f'{where} {key} is missing; give it like {key} = "{example}"')
     value = table[key]
     if unit == "" and isinstance(value, int | float) and not isinstance(value, bool):
         return float(value)

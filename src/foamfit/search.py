@@ -103,13 +103,18 @@ class Tracker:
 
     def residual(self, values: Array) -> Array:
         """Residual of the objective; raises SearchStoppedError once the time is up."""
+        residual = self.consider(values)
+        if self.deadline is not None and time.monotonic() > self.deadline:
+            raise SearchStoppedError
+        return residual
+
+    def consider(self, values: Array) -> Array:
+        """Residual of the objective, whatever the time."""
         failures = self.objective.failures
         residual = self.objective.residual(values)
         cost = float(residual @ residual)
         if cost < self.best_cost and self.objective.failures == failures:
             self.best_cost, self.best_values = cost, values.copy()
-        if self.deadline is not None and time.monotonic() > self.deadline:
-            raise SearchStoppedError
         return residual
 
 
@@ -284,8 +289,10 @@ def read_spring(loop: Loop, marks: Array, scales: Scales) -> Array:
     last = float(loop.strain[loop.peak])
     eps_a = min((0.02 + 0.85 * marks[0]) * last, 0.9)
     sigma_a = max(loop.loading(eps_a), 0.005 * scales.stress)
-    hat_c = eps_a + (0.15 + 0.87 * marks[1]) * max(last - eps_a, 1e-3)
-    sigma_hat_c = max(loop.loading(hat_c), sigma_a)
+    hat_c = eps_a + (0.15 + 1.1 * marks[1]) * max(last - eps_a, 1e-3)  # perhaps never reached
+    seen = min(hat_c, max(last, eps_a + 1e-3))
+    kh_plus = max((loop.loading(seen) - sigma_a) / (seen - eps_a), 0.0)
+    sigma_hat_c = sigma_a + kh_plus * (hat_c - eps_a)
     eps_c = eps_a + (0.2 + 0.8 * marks[2]) * (hat_c - eps_a)
     sigma_c = loop.unloading(eps_c) * (0.5 + marks[3])
     sigma_c = min(max(sigma_c, 0.02 * sigma_a), 0.98 * sigma_a)
@@ -296,7 +303,7 @@ def read_spring(loop: Loop, marks: Array, scales: Scales) -> Array:
             sigma_c - sigma_a,
             eps_a,
             eps_c,
-            (sigma_hat_c - sigma_a) / (hat_c - eps_a),
+            kh_plus,
             sigma_c / eps_c,
             0.1 * scales.eta * marks[4] ** 2,
         ]
@@ -400,13 +407,13 @@ def descend(tracker: Tracker, space: Space, start: Array, evaluations: int) -> t
     return best
 
 
-def rank(tracker: Tracker, space: Space, points: list[Array]) -> list[Array]:
-    """Sort points of the box by their cost, cheapest first."""
-    costs = []
+def rank(tracker: Tracker, space: Space, points: list[Array]) -> list[tuple[float, Array]]:
+    """Points of the box with their costs, cheapest first."""
+    ranked = []
     for point in points:
         residual = tracker.residual(space.decode(point))
-        costs.append(float(residual @ residual))
-    return [points[i] for i in np.argsort(costs, kind="stable")]
+        ranked.append((float(residual @ residual), point))
+    return sorted(ranked, key=lambda item: item[0])
 
 
 def spread_out(space: Space, points: list[Array], count: int) -> list[Array]:
@@ -425,13 +432,17 @@ def spread_out(space: Space, points: list[Array], count: int) -> list[Array]:
     return [points[i] for i in sorted(chosen)]
 
 
-def distinct(points: list[Array], count: int, apart: float = 0.02) -> list[Array]:
-    """First `count` points that lie apart from each other in some coordinate."""
-    chosen: list[Array] = []
-    for point in points:
-        if all(np.max(np.abs(point - other)) > apart for other in chosen):
-            chosen.append(point)
-    return chosen[:count]
+def valleys(ends: list[tuple[float, Array]], apart: float = 1e-3) -> list[tuple[int, Array]]:
+    """Ends of descents, best first, one of each cost with their number: one cost, one valley."""
+    chosen: list[tuple[int, Array]] = []
+    last = 0.0
+    for cost, point in sorted(ends, key=lambda item: item[0]):
+        if chosen and cost <= (1.0 + apart) * last:
+            chosen[-1] = (chosen[-1][0] + 1, chosen[-1][1])
+        else:
+            chosen.append((1, point))
+            last = cost
+    return chosen
 
 
 def search(
@@ -441,7 +452,7 @@ def search(
     starts: int,
     rng: np.random.Generator,
     progress: Progress,
-) -> list[float]:
+) -> list[tuple[float, int]]:
     """Search for the best parameters; the tracker keeps them.
 
     Parameters
@@ -451,7 +462,7 @@ def search(
     space : Space
         The box.
     starts : int
-        Descents on the loop; the best third of them go on to the curves of the drive.
+        Descents on the loop; the best half of the valleys go on to the curves of the drive.
     rng : Generator
         Source of all chance.
     progress : callable
@@ -459,8 +470,9 @@ def search(
 
     Returns
     -------
-    list of float
-        Final costs of the descents on the drive's curves, best first.
+    list of (float, int)
+        Final costs of the descents on the drive's curves, best first, and how many descents on the
+        loop led to each.
 
     Raises
     ------
@@ -468,25 +480,47 @@ def search(
         When the time is up.
     """
     points = [space.encode(space.values), *box_starts(space, rng, CURVE_STARTS // 3)]
-    objective = tracker.objective
-    if objective.measurement.displacement is not None:
-        loop = smooth_loop(objective.measurement)
-        points += curve_starts(space, loop, rng)
-        weights = {"stress_strain": 1.0}
-        inner = Tracker(Objective(loop, objective.model, "displacement", weights), tracker.deadline)
-        points = spread_out(space, rank(inner, space, points), starts)
-        found = []
-        for i, point in enumerate(points):
-            progress(0.7 * i / starts, "loop")
-            found.append(descend(inner, space, point, 40))
-        objective.failures += inner.objective.failures
-        objective.evaluations += inner.objective.evaluations
-        found.sort(key=lambda item: item[0])
-        points = [point for _, point in found]
-    keep = max(3, starts // 3)
-    points = distinct(rank(tracker, space, points), keep)
-    costs = []
+    if tracker.objective.measurement.displacement is not None:
+        ends = _search_loop(tracker, space, points, starts, rng, progress)
+        counts = {id(point): count for count, point in valleys(ends)}
+        points = [point for _, point in valleys(ends)]
+    else:
+        counts = {}
+    points = [point for _, point in valleys(rank(tracker, space, points))][: max(3, starts // 2)]
+    out = []
     for i, point in enumerate(points):
         progress(0.7 + 0.25 * i / len(points), "curves")
-        costs.append(descend(tracker, space, point, 60)[0])
-    return sorted(costs)
+        out.append((descend(tracker, space, point, 60)[0], counts.get(id(point), 1)))
+    return sorted(out)
+
+
+def _search_loop(
+    tracker: Tracker,
+    space: Space,
+    points: list[Array],
+    starts: int,
+    rng: np.random.Generator,
+    progress: Progress,
+) -> list[tuple[float, Array]]:
+    """Descend on the smoothed loop, from the curve's own starts too; returns costs and ends.
+
+    However this ends, the best point of the loop is handed to the tracker.
+    """
+    objective = tracker.objective
+    loop = smooth_loop(objective.measurement)
+    inner = Tracker(
+        Objective(loop, objective.model, "displacement", {"stress_strain": 1.0}), tracker.deadline
+    )
+    try:
+        ranked = rank(inner, space, points + curve_starts(space, loop, rng))
+        points = [point for _, point in ranked]
+        ends = []
+        for i, point in enumerate(spread_out(space, points, starts)):
+            progress(0.7 * i / starts, "loop")
+            ends.append(descend(inner, space, point, 40))
+    finally:
+        objective.evaluations += inner.objective.evaluations
+        objective.failures += inner.objective.failures
+        if inner.best_values is not None:
+            tracker.consider(inner.best_values)
+    return ends

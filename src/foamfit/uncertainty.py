@@ -81,7 +81,9 @@ class Covariance:
         return self.matrix / np.outer(scale, scale)
 
 
-def covariance(jacobian: Array, residual: Array, sizes: tuple[int, ...], sizes_of: Array) -> Covariance:
+def covariance(
+    jacobian: Array, residual: Array, sizes: tuple[int, ...], sizes_of: Array
+) -> Covariance:
     """Covariance (JᵀJ)⁻¹ Jᵀ S J (JᵀJ)⁻¹ with S the noise of each curve, counted effectively.
 
     Parameters

@@ -1,0 +1,71 @@
+"""Shared synthetic tests: simulated impacts and loops with stated noise."""
+
+from __future__ import annotations
+
+import functools
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import foamfit as ff
+from foamfit.measurement import Measurement, Noise, Specimen, Striker
+
+ROOT = Path(__file__).parent.parent
+EXPERIMENTS = ROOT / "experiments"
+DATA = Path(os.environ.get("FOAMFIT_DATA", ROOT.parent / "shared" / "data"))
+
+HEIGHT, AREA = 1.19e-3, 1.9635e-5
+
+needs_data = pytest.mark.skipif(
+    not DATA.is_dir(), reason="the measurements of others are not beside this checkout"
+)
+
+
+@functools.cache
+def synthetic_impact(
+    velocity: float = 2.0, noise: float = 0.01, seed: int = 0, eta: float = 0.0, samples: int = 401
+) -> tuple[ff.BistableSpring, Measurement]:
+    """A simulated impact on a spring with the published parameters of foam-1, time zero known."""
+    spring = ff.published["foam-1/model-1"].bistable
+    spring = ff.BistableSpring(*spring.seven, eta=eta)
+    chain = ff.Chain([spring], [HEIGHT], AREA)
+    time = np.linspace(0.0, 0.75e-3, samples)
+    response = ff.simulate(chain, ff.Impact(7e-3, velocity), time)
+    rng = np.random.default_rng(seed)
+    stress, motion = response.base_stress, response.displacement[-1]
+    spread = [noise * np.ptp(stress), noise * np.ptp(motion)]
+    measurement = Measurement(
+        name="synthetic impact",
+        path=None,
+        data_sha256="0" * 64,
+        time=time,
+        stress=stress + spread[0] * rng.standard_normal(samples),
+        displacement=motion + spread[1] * rng.standard_normal(samples),
+        specimen=Specimen(HEIGHT, AREA),
+        striker=Striker(7e-3, velocity),
+        noise=Noise(*spread) if noise else Noise(),
+        motion="measured",
+    )
+    return spring, measurement
+
+
+@functools.cache
+def synthetic_loop(noise: float = 0.005) -> tuple[ff.BistableSpring, Measurement]:
+    """A quasi-static loop without time and without striker."""
+    spring = ff.published["foam-1/model-1"].bistable
+    strain = np.concatenate([np.linspace(0, 0.38, 200), np.linspace(0.38, 0.02, 200)[1:]])
+    stress = spring.stress(strain)
+    rng = np.random.default_rng(1)
+    measurement = Measurement(
+        name="synthetic loop",
+        path=None,
+        data_sha256="",
+        time=None,
+        stress=stress + noise * np.ptp(stress) * rng.standard_normal(stress.size),
+        displacement=strain * HEIGHT,
+        specimen=Specimen(HEIGHT, AREA),
+        motion="measured",
+    )
+    return spring, measurement

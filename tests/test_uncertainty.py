@@ -1,0 +1,81 @@
+"""Autocorrelation, covariance and states against cases that are known in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from foamfit.uncertainty import autocorrelation_time, covariance, interval, state
+
+
+def ar1(n: int, rho: float, seed: int) -> np.ndarray:
+    """First-order autoregressive noise of unit variance."""
+    white = np.random.default_rng(seed).standard_normal(n + 500)
+    return lfilter([np.sqrt(1 - rho**2)], [1.0, -rho], white)[500:]
+
+
+@pytest.mark.parametrize("rho", [0.5, 0.8, 0.9])
+def test_autocorrelation_time_of_an_autoregressive_noise(rho):
+    """τ = (1+ρ)/(1-ρ) in closed form."""
+    found = np.mean([autocorrelation_time(ar1(4000, rho, seed)) for seed in range(20)])
+    assert found == pytest.approx((1 + rho) / (1 - rho), rel=0.15)
+
+
+def test_white_noise_counts_every_sample():
+    rng = np.random.default_rng(0)
+    times = [autocorrelation_time(rng.standard_normal(500)) for _ in range(50)]
+    assert np.mean(times) < 1.1
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.8])
+def test_the_error_of_a_line_covers_its_scatter(rho):
+    """Slope and offset of a line in white and in correlated noise, 300 repetitions."""
+    x = np.linspace(-1, 1, 800)
+    jacobian = np.column_stack([np.ones_like(x), x])
+    slopes, errors = [], []
+    for seed in range(300):
+        y = ar1(x.size, rho, seed)
+        best = np.linalg.lstsq(jacobian, y, rcond=None)[0]
+        spread = covariance(jacobian, y - jacobian @ best, (x.size,), np.ones(2))
+        slopes.append(best[1])
+        errors.append(spread.stderr[1])
+    assert np.mean(errors) == pytest.approx(np.std(slopes), rel=0.15)
+
+
+def test_each_curve_has_its_own_noise():
+    rng = np.random.default_rng(3)
+    jacobian = np.zeros((2000, 2))
+    jacobian[:1000, 0] = jacobian[1000:, 1] = 1.0
+    residual = rng.standard_normal(2000)
+    residual[1000:] *= 10.0
+    spread = covariance(jacobian, residual, (1000, 1000), np.ones(2))
+    assert spread.stderr[1] / spread.stderr[0] == pytest.approx(10.0, rel=0.1)
+
+
+def test_a_direction_without_trace_is_not_a_number():
+    x = np.linspace(0, 1, 100)
+    jacobian = np.column_stack([x, x, np.ones_like(x)])
+    spread = covariance(jacobian, np.sin(40 * x), (100,), np.ones(3))
+    assert np.isnan(spread.stderr[:2]).all()
+    assert np.isfinite(spread.stderr[2])
+
+
+def test_the_interval_stays_within_the_limits():
+    low, high = interval(1.0, 1.0, 1e6, 0.0, 10.0)
+    assert low == 0.0
+    assert high == pytest.approx(1 + 1.95996, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("ci95", "value", "expected"),
+    [
+        ((0.9, 1.1), 1.0, "determined"),
+        ((0.2, 1.8), 1.0, "weak"),
+        ((-4.0, 6.0), 1.0, "not determined"),
+        (None, 1.0, "not determined"),
+        ((0.0, 0.1), 0.0, "weak"),
+    ],
+)
+def test_states(ci95, value, expected):
+    assert state(value, ci95, 1.0, 0.0, 10.0)[0] == expected
