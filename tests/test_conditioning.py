@@ -239,6 +239,8 @@ def test_the_window_is_by_the_clock_of_the_file():
     conditioned = run(record, start=4.8e-3, end=5.9e-3)
     assert any("[window] cut" in note for note in conditioned.notes)
     assert error_of_motion(conditioned) < 0.01
+    with pytest.raises(InputError, match="constant within"):
+        condition(cycles(), SPECIMEN, window=Window(end=0.4))
     with pytest.raises(InputError, match="need a time"):
         condition(Record(None, record.stress, record.displacement), SPECIMEN, window=Window(0.0))
 

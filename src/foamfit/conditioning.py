@@ -114,8 +114,8 @@ def condition(
 
     window = window or Window()
     impact = striker is not None and record.time is not None
-    check_signs(record)
     record = done(cut_to_window(record, window))
+    check_signs(record)
     record = done(fill_staircase(record))
     if impact and window.cycle != 1:
         raise InputError("[window] cycle is for slow tests; for an impact give start and end.")
@@ -239,14 +239,20 @@ def cut_to_window(record: Record, window: Window) -> tuple[Record, list[str]]:
     start = -np.inf if window.start is None else window.start
     end = np.inf if window.end is None else window.end
     inside = (record.time >= start) & (record.time <= end)
-    if inside.sum() < _MIN_ROWS:
+    cut = len(record) - int(inside.sum())
+    if len(record) - cut < _MIN_ROWS:
         first, last = (engineering(float(t), "s") for t in record.time[[0, -1]])
         raise InputError(
             f"[window] start and end leave {inside.sum()} samples; at least {_MIN_ROWS} between "
             f"{first} and {last} are needed."
         )
-    cut = len(record) - int(inside.sum())
-    return record.rows(inside), [f"[window] cut {cut} of {len(record)} samples."]
+    note = f"[window] cut {cut} of {len(record)} samples."
+    record = record.rows(inside)
+    for name in ("stress", "displacement"):
+        values = getattr(record, name)
+        if values is not None and np.ptp(values) == 0:
+            raise InputError(f"the {name} is constant within [window]; it must vary.")
+    return record, [note]
 
 
 def fill_staircase(record: Record) -> tuple[Record, list[str]]:

@@ -294,17 +294,24 @@ def _bracket(rows, branches, heights, elongation, sigma, eps):  # type: ignore[n
 
 @njit(cache=True)
 def _split_jump(rows, branches, heights, elongation, low, high, eps):  # type: ignore[no-untyped-def]
-    """Share out an elongation that lies inside a jump (k_h± = 0) at one stress, base first."""
+    """Share out an elongation that lies inside a jump at one stress; returns that stress.
+
+    Flat branches (k_h± = 0) share it from the base up. Where a unilateral spring opens, the stress
+    is zero and the gap takes what the other springs leave.
+    """
     upper = np.empty(eps.size)
     _series_strain(rows, branches, heights, high, upper)
     rest = elongation - _series_strain(rows, branches, heights, low, eps)[0]
     for i in range(eps.size):
-        if eps[i] == -math.inf:  # a gap that opens takes all of the tension-free elongation
-            eps[i] = 0.0
-            continue
+        if eps[i] == -math.inf:
+            rest = elongation - _series_strain(rows, branches, heights, 0.0, eps)[0]
+            eps[i] += rest / heights[i]
+            return 0.0
+    for i in range(eps.size):
         gain = min(max(rest / heights[i], 0.0), upper[i] - eps[i])
         eps[i] += gain
         rest -= heights[i] * gain
+    return 0.5 * (low + high)
 
 
 @njit(cache=True)
@@ -337,8 +344,9 @@ def equilibrate(rows, branches, heights, elongation, sigma, eps):  # type: ignor
     scale = abs(elongation)
     for i in range(eps.size):
         scale += heights[i] * abs(eps[i])
-    if not abs(total - elongation) <= 1e-12 * scale + 4e-16 * compliance * abs(sigma):
-        _split_jump(rows, branches, heights, elongation, low, high, eps)
+    slack = 1e-12 * scale + 4e-16 * compliance * abs(sigma)
+    if not (math.isfinite(total) and abs(total - elongation) <= slack):
+        sigma = _split_jump(rows, branches, heights, elongation, low, high, eps)
     for i in range(eps.size):
         branches[i] = branch_at_strain(rows[i], branches[i], eps[i])
     return sigma

@@ -500,9 +500,11 @@ def integrate(  # type: ignore[no-untyped-def]
                 span, spring, side = when, i, where
         leaves = False
         if struck:
-            pressed = pressed or group[0, 0] > 0.0
             when, where = _crossing(group[0], order, 0.0, math.inf, span)
-            if where != 0 and (spring < 0 or when < span) and (pressed or when > 0.0):
+            if pressed and group[0, 0] <= 0.0 and group[0, 1] <= 0.0:
+                when, where = 0.0, -1  # a unilateral spring has just opened
+            pressed = pressed or group[0, 0] > 0.0
+            if where != 0 and when <= span and (pressed or when > 0.0):
                 span, leaves, spring = when, True, -1
         end = now + span
         if end <= now and span > 0.0:
