@@ -35,7 +35,7 @@ VELOCITIES = {
 TABLE = """\
 # RECONSTRUCTION, not a measurement: simulated from the published parameters of {set}
 # (Thevamaran, Fraternali & Daraio 2014), impact drive, {velocity} m/s, no damping,
-# white noise of {noise:.0%} of each channel's range, seed {seed}. Remake: experiments/reconstruct.py
+# white noise of {noise:.0%} of each channel's range, seed {seed}; by experiments/reconstruct.py
 time (ms),force (N),displacement (mm)
 """
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import lmfit
 import numpy as np
 import pytest
-from conftest import DATA, needs_data, synthetic_impact, synthetic_loop
 
 import foamfit as ff
+from conftest import DATA, needs_data, synthetic_impact, synthetic_loop
 from foamfit import search
 from foamfit.identification import make_params
 from foamfit.measurement import Noise

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import synthetic_impact, synthetic_loop
 
 import foamfit as ff
+from conftest import synthetic_impact, synthetic_loop
 from foamfit.measurement import Noise
 from foamfit.model import Model
 from foamfit.objective import (

@@ -32,7 +32,7 @@ HEIGHT, AREA, MASS = 1.2e-3, 1.9635e-5, 7e-3
 
 
 def random_case(rng: np.random.Generator) -> tuple[ff.BistableSpring, Measurement]:
-    """A random spring and its synthetic impact, struck so that branch c carries part of the path."""
+    """A random spring and its synthetic impact, struck hard enough to use branch c."""
     k0 = 10 ** rng.uniform(6, 7.5)
     eps_a = rng.uniform(0.05, 0.35)
     sigma_a = k0 * eps_a / (1 - eps_a)

@@ -114,7 +114,7 @@ class Impact:
 
 @dataclass(frozen=True, eq=False)
 class StressDrive:
-    """A stress history (Pa), sampled at t and linear between samples, acts on the top, from rest."""
+    """A stress history (Pa), sampled at t and linear in between, acts on the top, from rest."""
 
     stress: Array
 

@@ -351,9 +351,9 @@ def _unreached(problem: _Problem, values: Array) -> dict[str, str]:
     for name in problem.model.names:
         spring, short = split_name(name)
         branch = BRANCHES.get(short)
-        if branch and problem.model.kinds[spring] == "bistable":
-            if branch not in visited[f"s{spring + 1}"]:
-                out[name] = branch
+        bistable = branch and problem.model.kinds[spring] == "bistable"
+        if branch and bistable and branch not in visited[f"s{spring + 1}"]:
+            out[name] = branch
     return out
 
 

@@ -32,7 +32,17 @@ _admissible = njit(cache=True)(admissible)
 
 
 @njit(cache=True)
-def fill_bistable(row, k0, kc, dsigma, eps_a, eps_c, kh_plus, kh_minus, eta):  # type: ignore[no-untyped-def]
+def fill_bistable(
+    row: Row,
+    k0: float,
+    kc: float,
+    dsigma: float,
+    eps_a: float,
+    eps_c: float,
+    kh_plus: float,
+    kh_minus: float,
+    eta: float,
+) -> bool:
     """Write a bistable spring into `row`; false, and nothing written, if it is not admissible."""
     if not (_admissible(k0, kc, dsigma, eps_a, eps_c, kh_plus, kh_minus) and eta >= 0.0):
         return False
@@ -50,7 +60,7 @@ def fill_bistable(row, k0, kc, dsigma, eps_a, eps_c, kh_plus, kh_minus, eta):  #
 
 
 @njit(cache=True)
-def fill_linear(row, k0, eta, unilateral):  # type: ignore[no-untyped-def]
+def fill_linear(row: Row, k0: float, eta: float, unilateral: bool) -> bool:
     """Write a linear spring into `row`; false, and nothing written, if it is not admissible."""
     if not (0.0 < k0 < math.inf and eta >= 0.0):
         return False
@@ -60,7 +70,7 @@ def fill_linear(row, k0, eta, unilateral):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def fill_rows(kinds, values, rows):  # type: ignore[no-untyped-def]
+def fill_rows(kinds: Branches, values: Array, rows: Array) -> bool:
     """Write the springs of a flat vector of parameters into `rows`; false if one is not admissible.
 
     A bistable spring takes eight values (k0 … kh_minus, eta), a linear one two (k0, eta).
@@ -97,7 +107,7 @@ def linear_row(k0: float, eta: float, unilateral: bool) -> Row:
 
 
 @njit(cache=True)
-def branch_shape(row, branch):  # type: ignore[no-untyped-def]
+def branch_shape(row: Row, branch: int) -> tuple[bool, float, float, float]:
     """Return (curved, slope k, strain origin x0, stress origin s0) of a branch of eq. 2.
 
     Curved (a and c): σ = k x/(1-x) with x = ε - x0. Straight (d, e, linear): σ = s0 + k (ε - x0).
@@ -116,7 +126,7 @@ def branch_shape(row, branch):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def stress_on(row, branch, eps):  # type: ignore[no-untyped-def]
+def stress_on(row: Row, branch: int, eps: float) -> float:
     """Stress on a branch (eq. 2); infinite at or past the pole of a curved one."""
     curved, k, x0, s0 = branch_shape(row, branch)
     x = eps - x0
@@ -126,7 +136,7 @@ def stress_on(row, branch, eps):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def strain_on(row, branch, sigma):  # type: ignore[no-untyped-def]
+def strain_on(row: Row, branch: int, sigma: float) -> float:
     """Strain on a branch, the inverse of eq. 2; on a flat branch its end where it is entered."""
     curved, k, x0, s0 = branch_shape(row, branch)
     if curved:
@@ -135,14 +145,14 @@ def strain_on(row, branch, sigma):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def slope_on(row, branch, eps):  # type: ignore[no-untyped-def]
+def slope_on(row: Row, branch: int, eps: float) -> float:
     """Slope dσ/dε of eq. 2 on a branch."""
     curved, k, x0, _ = branch_shape(row, branch)
     return k / (1.0 - (eps - x0)) ** 2 if curved else k
 
 
 @njit(cache=True)
-def interval(row, branch):  # type: ignore[no-untyped-def]
+def interval(row: Row, branch: int) -> tuple[float, float]:
     """Strains (low, high) at which a spring leaves a branch."""
     if branch == A:
         return -math.inf, row[EPS_A]
@@ -158,35 +168,35 @@ def interval(row, branch):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def above(branch):  # type: ignore[no-untyped-def]
+def above(branch: int) -> int:
     """Name the branch that a spring enters when it leaves `branch` upwards in strain."""
     if branch == A:
         return D
-    return C if branch == D or branch == E else LINE
+    return C if branch in (D, E) else LINE
 
 
 @njit(cache=True)
-def below(branch):  # type: ignore[no-untyped-def]
+def below(branch: int) -> int:
     """Name the branch that a spring enters when it leaves `branch` downwards in strain."""
     if branch == C:
         return E
-    return A if branch == D or branch == E else OPEN
+    return A if branch in (D, E) else OPEN
 
 
 @njit(cache=True)
-def first_branch(row):  # type: ignore[no-untyped-def]
+def first_branch(row: Row) -> int:
     """Branch of a spring at rest."""
     return A if row[KIND] == BISTABLE else LINE
 
 
 @njit(cache=True)
-def branch_at_strain(row, branch, eps):  # type: ignore[no-untyped-def]
+def branch_at_strain(row: Row, branch: int, eps: float) -> int:
     """Branch at strain `eps` of a spring that was last seen on `branch` (eqs. 2 and 3)."""
     if row[KIND] == LINEAR:
         return LINE
     if row[KIND] == UNILATERAL:
         return LINE if eps >= 0.0 else OPEN
-    if branch == A or branch == D:
+    if branch in (A, D):
         if eps < row[EPS_A]:
             return A
         return D if eps <= row[EPS_HAT_C] else C
@@ -196,13 +206,13 @@ def branch_at_strain(row, branch, eps):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def branch_at_stress(row, branch, sigma):  # type: ignore[no-untyped-def]
+def branch_at_stress(row: Row, branch: int, sigma: float) -> int:
     """Branch at stress `sigma` of a spring that was last seen on `branch` (eqs. 2 and 3)."""
     if row[KIND] == LINEAR:
         return LINE
     if row[KIND] == UNILATERAL:
         return LINE if sigma >= 0.0 else OPEN
-    if branch == A or branch == D:
+    if branch in (A, D):
         if sigma < row[SIGMA_A]:
             return A
         if row[KH_PLUS] == 0.0:
@@ -216,7 +226,7 @@ def branch_at_stress(row, branch, sigma):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def stress_along(row, eps):  # type: ignore[no-untyped-def]
+def stress_along(row: Row, eps: Array) -> tuple[Array, Branches]:
     """Stress and branch of one spring along a strain history, from rest."""
     sigma = np.empty(eps.size)
     branches = np.empty(eps.size, np.int64)
@@ -229,7 +239,7 @@ def stress_along(row, eps):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def strain_along(row, sigma):  # type: ignore[no-untyped-def]
+def strain_along(row: Row, sigma: Array) -> tuple[Array, Branches]:
     """Strain and branch of one spring along a stress history, from rest; -inf if it cannot."""
     eps = np.empty(sigma.size)
     branches = np.empty(sigma.size, np.int64)
@@ -242,7 +252,7 @@ def strain_along(row, sigma):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def tangent_along(row, eps, branches):  # type: ignore[no-untyped-def]
+def tangent_along(row: Row, eps: Array, branches: Branches) -> Array:
     """Slope dσ/dε at each sample of a strain history whose branches are known."""
     slope = np.empty(eps.size)
     for j in range(eps.size):
@@ -254,7 +264,9 @@ def tangent_along(row, eps, branches):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _series_strain(rows, branches, heights, sigma, eps):  # type: ignore[no-untyped-def]
+def _series_strain(
+    rows: Array, branches: Branches, heights: Array, sigma: float, eps: Array
+) -> tuple[float, float]:
     """Strains of springs in series under one stress; returns (elongation, compliance)."""
     total = 0.0
     compliance = 0.0
@@ -271,7 +283,9 @@ def _series_strain(rows, branches, heights, sigma, eps):  # type: ignore[no-unty
 
 
 @njit(cache=True)
-def _bracket(rows, branches, heights, elongation, sigma, eps):  # type: ignore[no-untyped-def]
+def _bracket(
+    rows: Array, branches: Branches, heights: Array, elongation: float, sigma: float, eps: Array
+) -> tuple[float, float]:
     """Stresses (low, high) between which springs in series reach `elongation`."""
     step = 1e-3 * abs(sigma)
     for i in range(rows.shape[0]):
@@ -293,7 +307,15 @@ def _bracket(rows, branches, heights, elongation, sigma, eps):  # type: ignore[n
 
 
 @njit(cache=True)
-def _split_jump(rows, branches, heights, elongation, low, high, eps):  # type: ignore[no-untyped-def]
+def _split_jump(
+    rows: Array,
+    branches: Branches,
+    heights: Array,
+    elongation: float,
+    low: float,
+    high: float,
+    eps: Array,
+) -> float:
     """Share out an elongation that lies inside a jump at one stress; returns that stress.
 
     Flat branches (k_h± = 0) share it from the base up. Where a unilateral spring opens, the stress
@@ -315,7 +337,9 @@ def _split_jump(rows, branches, heights, elongation, low, high, eps):  # type: i
 
 
 @njit(cache=True)
-def equilibrate(rows, branches, heights, elongation, sigma, eps):  # type: ignore[no-untyped-def]
+def equilibrate(
+    rows: Array, branches: Branches, heights: Array, elongation: float, sigma: float, eps: Array
+) -> float:
     """Common stress of undamped springs in series at a given elongation; fills their strains.
 
     Along a monotone stretch each spring follows one monotone function of the common stress, so the
@@ -353,7 +377,7 @@ def equilibrate(rows, branches, heights, elongation, sigma, eps):  # type: ignor
 
 
 @njit(cache=True)
-def equilibrium_along(rows, heights, top):  # type: ignore[no-untyped-def]
+def equilibrium_along(rows: Array, heights: Array, top: Array) -> tuple[Array, Array, Branches]:
     """Springs in series, undamped and massless, along a history of the top's displacement (m).
 
     Returns

@@ -69,7 +69,7 @@ def _bistable(
     kh_minus: float,
     kc: float,
 ) -> BistableSpring:
-    """Make a spring from the columns of Tables 2 and 3: k0 in MPa, Δσ/σ_a, strains, slopes over k0."""
+    """Make a spring of Tables 2 and 3: k0 in MPa, Δσ/σ_a, ε_a, ε_c, slopes over k0."""
     slope = k0 * MPA
     return BistableSpring(
         k0=slope,
@@ -94,7 +94,10 @@ def _one_spring(name: str, kh_minus: float, eta: float | None, ratio: float | No
 
 
 def _model_3() -> PublishedSet:
-    springs = [LinearSpring(60 * MPA), _bistable(2.0, -0.32, 0.35, 0.71, 3.40, 0.525, 30.0)]
+    springs: list[Spring] = [
+        LinearSpring(60 * MPA),
+        _bistable(2.0, -0.32, 0.35, 0.71, 3.40, 0.525, 30.0),
+    ]
     chain = Chain(springs, [0.700 * MM, 0.490 * MM], _AREA, [5.56 * MG, 0.0], site_damping=3e2)
     return PublishedSet(
         "foam-1/model-3", "linear+bistable", chain, 3e2, 0.0297, striker_mass=7e-3, **_FOAM_1
@@ -102,7 +105,7 @@ def _model_3() -> PublishedSet:
 
 
 def _foam_2() -> PublishedSet:
-    springs = [
+    springs: list[Spring] = [
         LinearSpring(250 * MPA, unilateral=True),
         _bistable(5.75, -0.80, 0.40, 0.70, 6.00, 0.200, 40.0),
     ]
@@ -135,16 +138,16 @@ def table() -> str:
             lines.append(_line(_published_row(item, spring, height), widths))
     lines += ["", "Derived points of the bistable springs", ""]
     points = ("sigma_a", "sigma_c", "eps_star", "eps_hat_a", "eps_hat_c", "sigma_hat_c")
-    widths = (16, 12, 12, 12, 12, 12, 12)
-    lines.append(_line(("set", *points), widths))
-    lines.append(_line(("", "MPa", "MPa", "", "", "", "MPa"), widths))
+    columns = (16, 12, 12, 12, 12, 12, 12)
+    lines.append(_line(("set", *points), columns))
+    lines.append(_line(("", "MPa", "MPa", "", "", "", "MPa"), columns))
     for item in published.values():
         cells = [item.name]
         for point in points:
             value = getattr(item.bistable, point)
             scale = MPA if point.startswith("sigma") else 1.0
             cells.append("none" if value is None else f"{value / scale:.6f}")
-        lines.append(_line(tuple(cells), widths))
+        lines.append(_line(tuple(cells), columns))
     lines += ["", "Damping ratio eta/(2 H sqrt(rho kc)), rho = m_striker/(A H)", ""]
     for item in published.values():
         ratio = item.damping_ratio_by_formula()
@@ -156,8 +159,9 @@ def table() -> str:
 
 
 def _line(cells: tuple[str, ...], widths: tuple[int, ...]) -> str:
-    first, *rest = (f"{cell:>{width}}" for cell, width in zip(cells, widths, strict=True))
-    return cells[0].ljust(widths[0]) + "".join(rest) if first else ""
+    """Set the cells of a row right-aligned, the first one left-aligned."""
+    rest = (f"{cell:>{width}}" for cell, width in zip(cells[1:], widths[1:], strict=True))
+    return f"{cells[0]:<{widths[0]}}{''.join(rest)}".rstrip()
 
 
 def _published_row(item: PublishedSet, spring: Spring, height: float) -> tuple[str, ...]:

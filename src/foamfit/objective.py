@@ -148,13 +148,12 @@ class Objective:
         check_drive(self.measurement, self.drive)
         self._check_weights()
         self.time = self._time()
-        self._plan = self._scene(self._loading(), damped=False)
-        self._damped_plan = self._scene(self._loading(), damped=True)
-        along = None
+        loading = self._loading()
+        self._plans = {damped: self._scene(loading, damped=damped) for damped in (False, True)}
+        self._along: dict[bool, Plan] = {}
         if self.measurement.displacement is not None:
             along = DisplacementDrive(self.measurement.displacement)
-        self._along = along and self._scene(along, damped=False)
-        self._damped_along = along and self._scene(along, damped=True)
+            self._along = {damped: self._scene(along, damped=damped) for damped in (False, True)}
         self.measured = self._measured()
         self.counted = tuple(
             name for name in CURVES if self.weights[name] > 0 and self.measured[name] is not None
@@ -250,15 +249,12 @@ class Objective:
             raise SimulationError("the parameters are not admissible")
         damped = bool(rows[:, kernels.ETA].any())
         drag = float(values[-1]) / self.measurement.specimen.height
-        scene = self._damped_plan if damped else self._plan
-        run = scene.run(rows, heights, self.rtol, drag=drag, inner=False)
+        run = self._plans[damped].run(rows, heights, self.rtol, drag=drag, inner=False)
         along: Array | None = None
         if self.drive == "displacement":
             along = run.base_stress
         elif self._along and (everything or "stress_strain" in self.counted):
-            other = self._damped_along if damped else self._along
-            assert other is not None
-            along = other.run(rows, heights, self.rtol, inner=False).base_stress
+            along = self._along[damped].run(rows, heights, self.rtol, inner=False).base_stress
         return Simulated(
             stress_time=None if self.drive == "stress" else self._timed(run.base_stress),
             displacement_time=None if self.drive == "displacement" else run.displacement[-1],
@@ -287,8 +283,10 @@ class Objective:
 
     def _penalty(self) -> float:
         """Residual per sample that is worse than any curve which stays within ten ranges."""
-        return PENALTY * max(
-            self.weights[name] ** 0.5 * float(np.ptp(self._curve(name))) / self.scale[name]
+        return max(
+            PENALTY
+            * float(self.weights[name] ** 0.5 * np.ptp(self._curve(name)))
+            / self.scale[name]
             for name in self.counted
         )
 

@@ -29,7 +29,7 @@ from foamfit.errors import InputError
 from foamfit.measurement import Array, Measurement, Noise, Specimen, Striker
 
 # Channel: its SI unit, an example of a header, and the words that name it (the first one is best).
-_CHANNELS: dict[str, tuple[str, str, tuple[str, ...]]] = {
+_KNOWN: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "time": ("s", "time (ms)", ("time", "t")),
     "stress": ("Pa", "stress (MPa)", ("stress", "sigma")),
     "force": ("N", "force (N)", ("force", "load", "f")),
@@ -38,210 +38,11 @@ _CHANNELS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "acceleration": ("m/s**2", "acceleration (m/s^2)", ("acceleration", "accel", "deceleration")),
     "velocity": ("m/s", "velocity (m/s)", ("velocity", "speed")),
 }
-_WORDS = {word for _, _, words in _CHANNELS.values() for word in words}
+_WORDS = {word for _, _, words in _KNOWN.values() for word in words}
 # With one of these beside it a channel's name means something else.
 _OTHER = {"std", "sd", "dev", "error", "err", "noise", "uncertainty", "rate", "specific", "energy"}
-# Usual units, for headers in capitals: "MM" is millimetre as a displacement, "MPA" megapascal.
-_USUAL = ["s", "ms", "us", "m", "cm", "mm", "um", "N", "kN", "mN", "Pa", "kPa", "MPa", "GPa"]
-_USUAL += ["m/s", "mm/s", "m/s^2", "V", "mV"]
-_QUANTITY = r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*)"
 _MIN_ROWS = 10
 _HEAD_ROWS = 400
-
-
-# Units: everything that knows pint.
-
-
-@functools.cache
-def _registry() -> Any:
-    import pint
-
-    registry: Any = pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
-    registry.define("microstrain = 1e-6 = ustrain")
-    return registry
-
-
-@functools.cache
-def _quantity(unit: str) -> Any:
-    """One `unit` as a pint quantity, or None where pint does not know it."""
-    text = unit.strip().replace("·", "*").replace("^", "**")
-    text = re.sub(r"(?<=[A-Za-z])(-?\d)", r"**\1", text)  # m/s2
-    if text in {"-", "–", "1"}:
-        text = ""
-    try:
-        return _registry().Quantity(1.0, _registry().parse_units(text))
-    except Exception:  # pint and the tokenizer beneath it have a dozen ways of saying no
-        return None
-
-
-def _spellings(unit: str) -> list[str]:
-    usual = [u for u in _USUAL if u.casefold() == unit.strip().casefold()]
-    return [unit, *usual, unit.lower()]
-
-
-def _is_unit(text: str) -> bool:
-    return any(_quantity(spelling) is not None for spelling in _spellings(text))
-
-
-def _parse_quantity(value: object, si: str, where: str, example: str) -> float:
-    """Parse a quantity such as "1.19 mm" in the unit `si`; `where` names its file and key."""
-    match = re.fullmatch(_QUANTITY, str(value))
-    if not isinstance(value, str) or not match:
-        raise InputError(f'{where} = {value!r} is no quantity; give it like "{example}".')
-    number, unit = match.groups()
-    quantity = _quantity(unit)
-    if quantity is None:
-        raise InputError(f'{where} = "{value}" has an unknown unit; give it like "{example}".')
-    if not quantity.check(_quantity(si).dimensionality):
-        raise InputError(f'{where} = "{value}" is of another kind; give it like "{example}".')
-    return float(number) * float(quantity.to(si).magnitude)
-
-
-# The TOML beside the table.
-
-_SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
-    "specimen": {
-        "height": ("m", "1.19 mm"),
-        "diameter": ("m", "5 mm"),
-        "area": ("m**2", "19.6 mm^2"),
-        "mass": ("kg", "5.56 mg"),
-        "heights": ("m", "0.7 mm"),
-    },
-    "striker": {"mass": ("kg", "7 g"), "velocity": ("m/s", "1.75 m/s")},
-    "noise": {"stress": ("Pa", "20 kPa"), "displacement": ("m", "2 um")},
-    "window": {"start": ("s", "0.5 ms"), "end": ("s", "2 ms"), "cycle": ("", "1")},
-}
-
-
-@dataclass(frozen=True)
-class _Column:
-    """What ``[columns]`` says of one channel."""
-
-    column: str
-    unit: str | None = None
-    scale: float = 1.0
-    scale_unit: str = ""
-
-
-@dataclass(frozen=True)
-class _Settings:
-    """What the TOML says, in SI."""
-
-    name: str
-    specimen: Specimen
-    striker: Striker | None
-    noise: Noise
-    window: Window
-    columns: dict[str, _Column] = field(default_factory=dict)
-
-
-def _known(where: str, given: dict[str, Any], valid: list[str]) -> None:
-    for key in given:
-        if key not in valid:
-            near = difflib.get_close_matches(key, valid, n=2, cutoff=0.4) or valid
-            raise InputError(f"{where} has no key {key!r}; meant may be {', '.join(near)}.")
-
-
-def _read_settings(path: Path, test: Path) -> _Settings:
-    """Read and check the TOML at `path`, which describes the test file `test`."""
-    document = _load_toml(path, test)
-    _known(f"{path}:", document, ["name", "specimen", "striker", "columns", "noise", "window"])
-    name = document.get("name", test.stem)
-    if not isinstance(name, str) or not name.strip():
-        raise InputError(f"{path}: name = {name!r} is no text; give it in quotation marks.")
-    values: dict[str, dict[str, Any]] = {}
-    for section, keys in _SECTIONS.items():
-        table = document.get(section, {})
-        if not isinstance(table, dict):
-            raise InputError(f"{path}: {section} must be a table, [{section}].")
-        _known(f"{path}: [{section}]", table, list(keys))
-        values[section] = {k: _value(path, section, k, v) for k, v in table.items()}
-    striker = Striker(**values["striker"]) if values["striker"] else None
-    return _Settings(
-        name=name,
-        specimen=_specimen(path, values["specimen"]),
-        striker=striker,
-        noise=Noise(**values["noise"]),
-        window=Window(**values["window"]),
-        columns=_columns(path, document.get("columns", {})),
-    )
-
-
-def _load_toml(path: Path, test: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_bytes().decode("utf-8-sig"))
-    except FileNotFoundError:
-        raise InputError(
-            f"{path}: no such file; {test.name} needs a TOML with [specimen] height and diameter."
-        ) from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give a TOML file.") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: is no UTF-8 text; a TOML file must be.") from None
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: is no valid TOML: {error}.") from None
-
-
-def _value(path: Path, section: str, key: str, value: Any) -> Any:
-    si, example = _SECTIONS[section][key]
-    where = f"{path}: [{section}] {key}"
-    if key == "cycle":
-        if type(value) is not int or value < 1:
-            raise InputError(f"{where} = {value!r} must be a whole number from 1 up.")
-        return value
-    if key == "heights":
-        if not isinstance(value, list) or not value:
-            raise InputError(f'{where} must be a list like ["0.700 mm", "0.490 mm"], base first.')
-        return tuple(_positive(_parse_quantity(v, si, where, example), where, v) for v in value)
-    number = _parse_quantity(value, si, where, example)
-    return number if section == "window" else _positive(number, where, value)
-
-
-def _positive(number: float, where: str, value: object) -> float:
-    if not (number > 0 and math.isfinite(number)):
-        raise InputError(f'{where} = "{value}" must be positive.')
-    return number
-
-
-def _specimen(path: Path, values: dict[str, Any]) -> Specimen:
-    if "height" not in values:
-        raise InputError(f'{path}: [specimen] height is missing; give it like height = "1.19 mm".')
-    diameter = values.pop("diameter", None)
-    if diameter is None and "area" not in values:
-        raise InputError(f'{path}: [specimen] needs a diameter = "5 mm" or an area = "19.6 mm^2".')
-    if diameter is not None:
-        area = math.pi * diameter**2 / 4
-        if not math.isclose(values.setdefault("area", area), area, rel_tol=0.02):
-            raise InputError(f"{path}: [specimen] area and diameter disagree; give one of them.")
-    heights = values.get("heights")
-    if heights and not math.isclose(sum(heights), values["height"], rel_tol=0.02):
-        raise InputError(f"{path}: [specimen] heights must add up to height.")
-    return Specimen(**values)
-
-
-def _columns(path: Path, table: Any) -> dict[str, _Column]:
-    if not isinstance(table, dict):
-        raise InputError(f"{path}: columns must be a table, [columns].")
-    _known(f"{path}: [columns]", table, list(_CHANNELS))
-    columns: dict[str, _Column] = {}
-    for channel, spec in table.items():
-        where = f"{path}: [columns] {channel}"
-        if not isinstance(spec, dict) or not isinstance(spec.get("column"), str):
-            raise InputError(f'{where} must be like {{ column = "Load", unit = "V" }}.')
-        _known(where, spec, ["column", "unit", "scale"])
-        unit = spec.get("unit")
-        if unit is not None and (not isinstance(unit, str) or _quantity(unit) is None):
-            raise InputError(f'{where}: unit = {unit!r} is unknown; give it like unit = "mm".')
-        columns[channel] = _Column(spec["column"], unit, *_scale(where, spec.get("scale", 1)))
-    return columns
-
-
-def _scale(where: str, scale: Any) -> tuple[float, str]:
-    match = re.fullmatch(_QUANTITY, str(scale))
-    number = float(match[1]) if match else 0.0
-    if not match or number in (0.0, math.inf, -math.inf) or _quantity(match[2]) is None:
-        raise InputError(f'{where}: scale = {scale!r} must be like -1 or "4444.4 N/V".')
-    return number, match[2]
 
 
 # The table: separator, headers, numbers.
@@ -302,7 +103,7 @@ def _parse_header(text: str) -> _Header:
 
 def _rank(header: _Header, channel: str) -> int | None:
     """How well a header names a channel: 0 is best, None not at all."""
-    words = _CHANNELS[channel][2]
+    words = _KNOWN[channel][2]
     if len(header.words) == 1 and header.words[0] in words:
         return 0 if header.words[0] == words[0] else 1
     named = [w for w in header.words if w in _WORDS and len(w) > 1]
@@ -371,7 +172,7 @@ def _score(cells: list[str], names: set[str]) -> int:
     if len(cells) < 2 or any(_number(cell) for cell in cells):
         return 0
     headers = [_parse_header(cell) for cell in cells if cell.strip()]
-    channels = {c for c in _CHANNELS for h in headers if _rank(h, c) is not None}
+    channels = {c for c in _KNOWN for h in headers if _rank(h, c) is not None}
     given = {n for n in names for h in headers if _is_named(h, n)}
     return len(channels) + len(given)
 
@@ -396,10 +197,10 @@ def _unit_row(grid: list[list[str]], i: int) -> tuple[int, list[str]]:
     return i + 2, texts
 
 
-def _assign(table: _Table, settings: _Settings, toml: Path) -> dict[str, int]:
+def _assign(table: _Table, settings: Settings, toml: Path) -> dict[str, int]:
     """Which column each channel is in: as ``[columns]`` says, else as the headers do."""
     found: dict[str, int] = {}
-    for channel in _CHANNELS:
+    for channel in _KNOWN:
         if channel in settings.columns:
             name = settings.columns[channel].column
             matches = [k for k, h in enumerate(table.headers) if _is_named(h, name)]
@@ -430,9 +231,9 @@ def _assign(table: _Table, settings: _Settings, toml: Path) -> dict[str, int]:
     return found
 
 
-def _factor(table: _Table, channel: str, header: _Header, given: _Column | None) -> float:
+def _factor(table: _Table, channel: str, header: _Header, given: Column | None) -> float:
     """Return what the numbers of a column are multiplied by to be SI."""
-    si, example, _ = _CHANNELS[channel]
+    si, example, _ = _KNOWN[channel]
     unit = given.unit if given and given.unit is not None else header.unit
     scale, scale_unit = (given.scale, given.scale_unit) if given else (1.0, "")
     where = f"{table.path}: column {header.text!r}"
@@ -515,7 +316,7 @@ def _refuse_cells(table: _Table, columns: dict[str, int]) -> None:
 
 
 def _record(
-    table: _Table, columns: dict[str, int], settings: _Settings
+    table: _Table, columns: dict[str, int], settings: Settings
 ) -> tuple[Record, tuple[str, ...]]:
     """Read the channels that are needed, in SI, and say what was read from where."""
     needed = _needed(table, columns, settings)
@@ -542,7 +343,7 @@ def _record(
     return Record(time, stress, displacement, velocity, acceleration), tuple(notes)
 
 
-def _needed(table: _Table, columns: dict[str, int], settings: _Settings) -> dict[str, int]:
+def _needed(table: _Table, columns: dict[str, int], settings: Settings) -> dict[str, int]:
     """Choose the channels worth reading; refuse a file that lacks one that nothing can replace."""
     has = set(columns)
     listed = ", ".join(repr(h.text) for h in table.headers if h.text)
@@ -569,10 +370,10 @@ def _needed(table: _Table, columns: dict[str, int], settings: _Settings) -> dict
     return {c: k for c, k in columns.items() if c in has}
 
 
-def _columns_note(table: _Table, needed: dict[str, int], settings: _Settings) -> str:
+def _columns_note(table: _Table, needed: dict[str, int], settings: Settings) -> str:
     parts = []
     for channel, k in needed.items():
-        given = settings.columns.get(channel) or _Column("")
+        given = settings.columns.get(channel) or Column("")
         unit = f" in {given.unit}" if given.unit else ""
         by = f"{given.scale:.6g} {given.scale_unit}".strip()
         scale = f" times {by}" if by != "1" else ""
@@ -662,7 +463,7 @@ def read_test(path: str | Path, specimen: str | Path | None = None) -> Measureme
         raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
     text, encoding = _decode(path, raw)
     toml = Path(specimen) if specimen is not None else path.with_suffix(".toml")
-    settings = _read_settings(toml, path)
+    settings = read_settings(toml, path)
     names = {column.column for column in settings.columns.values()}
     table = _find_table(path, text, encoding, names)
     columns = _assign(table, settings, toml)

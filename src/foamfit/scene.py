@@ -14,9 +14,9 @@ from foamfit.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.errors import InputError
 from foamfit.literature import published
 from foamfit.model import BISTABLE_NAMES, KINDS
+from foamfit.reading import _parse_quantity as parse_quantity
 from foamfit.simulation import Response
 from foamfit.spring import BistableSpring, LinearSpring, Spring
-from foamfit.reading import _parse_quantity as parse_quantity
 
 Array = NDArray[np.float64]
 

@@ -163,7 +163,7 @@ class Space:
 
     @cached_property
     def coordinates(self) -> list[tuple[int, str, int]]:
-        """Place, short name and place of the spring's first parameter, what is needed first first."""
+        """Place, short name, place of the spring's first parameter; what others need comes first."""
         out = []
         for name in sorted(self.free, key=lambda name: list(BOX).index(split_name(name)[1])):
             spring, short = split_name(name)

@@ -20,11 +20,13 @@ from numba import njit
 
 from foamfit.kernels import (
     ETA,
+    Array,
+    Branches,
     above,
     below,
-    branch_shape,
     branch_at_strain,
     branch_at_stress,
+    branch_shape,
     equilibrate,
     first_branch,
     interval,
@@ -40,7 +42,7 @@ DONE, TOO_MANY_STEPS, STEP_UNDERFLOW, FLAT_UNDER_STRESS, NOT_FINITE = range(5)
 
 
 @njit(cache=True)
-def _product(x, y, n, first, last):  # type: ignore[no-untyped-def]
+def _product(x: Array, y: Array, n: int, first: int, last: int) -> float:
     """Σ x_j y_{n-j} for j from first to last."""
     total = 0.0
     for j in range(first, last + 1):
@@ -49,7 +51,7 @@ def _product(x, y, n, first, last):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _stress_term(rows, i, branch, eps, sig, n):  # type: ignore[no-untyped-def]
+def _stress_term(rows: Array, i: int, branch: int, eps: Array, sig: Array, n: int) -> float:
     """Order n of a spring's stress from its strain up to order n."""
     if n == 0:
         return stress_on(rows[i], branch, eps[i, 0])
@@ -62,7 +64,9 @@ def _stress_term(rows, i, branch, eps, sig, n):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _strain_term(rows, i, branch, eps, sig, n):  # type: ignore[no-untyped-def]
+def _strain_term(
+    rows: Array, i: int, branch: int, eps: Array, sig: Array, n: int
+) -> tuple[float, float]:
     """Order n >= 1 of a spring's strain as (known part, compliance): ε_n = known + compliance σ_n.
 
     The compliance of a flat branch is infinite.
@@ -76,7 +80,17 @@ def _strain_term(rows, i, branch, eps, sig, n):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _share_elongation(rows, branches, heights, i0, i1, eps, sig, u_n, n):  # type: ignore[no-untyped-def]
+def _share_elongation(
+    rows: Array,
+    branches: Branches,
+    heights: Array,
+    i0: int,
+    i1: int,
+    eps: Array,
+    sig: Array,
+    u_n: float,
+    n: int,
+) -> float:
     """Order n >= 1 of the common stress of a group that has springs without dashpot.
 
     Fills the strains of those springs; a flat branch takes up all that the others leave.
@@ -107,7 +121,20 @@ def _share_elongation(rows, branches, heights, i0, i1, eps, sig, u_n, n):  # typ
 
 
 @njit(cache=True)
-def _group_term(rows, branches, heights, i0, i1, eps, sig, u_n, rate_n, push_n, drag, n):  # type: ignore[no-untyped-def]
+def _group_term(
+    rows: Array,
+    branches: Branches,
+    heights: Array,
+    i0: int,
+    i1: int,
+    eps: Array,
+    sig: Array,
+    u_n: float,
+    rate_n: float,
+    push_n: float,
+    drag: float,
+    n: int,
+) -> float:
     """Order n of the common stress of a group whose elongation is known.
 
     u_n and rate_n are order n of the elongation and of its rate. Where the node above is viscous
@@ -144,7 +171,9 @@ def _group_term(rows, branches, heights, i0, i1, eps, sig, u_n, rate_n, push_n, 
 
 
 @njit(cache=True)
-def _stressed_term(rows, branches, i0, i1, eps, sig, s_n, n):  # type: ignore[no-untyped-def]
+def _stressed_term(
+    rows: Array, branches: Branches, i0: int, i1: int, eps: Array, sig: Array, s_n: float, n: int
+) -> bool:
     """Order n of the strains of a group whose stress is prescribed; false if it cannot be."""
     for i in range(i0, i1):
         if rows[i, ETA] > 0.0 or n == 0:
@@ -160,8 +189,22 @@ def _stressed_term(rows, branches, i0, i1, eps, sig, s_n, n):  # type: ignore[no
 
 @njit(cache=True)
 def _expand(
-    rows, branches, heights, ends, mass, top, drag, push, motion, w, v, eps, sig, group, order
-):  # type: ignore[no-untyped-def]
+    rows: Array,
+    branches: Branches,
+    heights: Array,
+    ends: Branches,
+    mass: Array,
+    top: int,
+    drag: float,
+    push: Array,
+    motion: Array,
+    w: Array,
+    v: Array,
+    eps: Array,
+    sig: Array,
+    group: Array,
+    order: int,
+) -> bool:
     """Fill the Taylor coefficients of all that moves, up to `order`; false if it cannot be.
 
     w, v (groups, order + 2) hold the nodes above the groups, eps and sig (springs, order + 1) the
@@ -206,7 +249,7 @@ def _expand(
 
 
 @njit(cache=True)
-def _value(c, order, tau):  # type: ignore[no-untyped-def]
+def _value(c: Array, order: int, tau: float) -> float:
     """Value of a polynomial."""
     total = c[order]
     for n in range(order - 1, -1, -1):
@@ -215,8 +258,8 @@ def _value(c, order, tau):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _slope(c, order, tau):  # type: ignore[no-untyped-def]
-    """Derivative of a polynomial."""
+def _slope(c: Array, order: int, tau: float) -> float:
+    """Return the derivative of a polynomial."""
     total = order * c[order]
     for n in range(order - 1, 0, -1):
         total = total * tau + n * c[n]
@@ -224,7 +267,7 @@ def _slope(c, order, tau):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _root(c, order, level, lo, hi):  # type: ignore[no-untyped-def]
+def _root(c: Array, order: int, level: float, lo: float, hi: float) -> float:
     """Root of polynomial - level in [lo, hi], whose ends lie on either side: guarded Newton."""
     rising = _value(c, order, hi) > level
     tau = 0.5 * (lo + hi)
@@ -240,7 +283,7 @@ def _root(c, order, level, lo, hi):  # type: ignore[no-untyped-def]
         trial = tau - f / d if d != 0.0 else lo
         if not lo < trial < hi:
             trial = 0.5 * (lo + hi)
-        if abs(trial - tau) <= 4e-16 * abs(tau) or trial == lo or trial == hi:
+        if abs(trial - tau) <= 4e-16 * abs(tau) or trial in (lo, hi):
             tau = trial
             break
         tau = trial
@@ -248,7 +291,7 @@ def _root(c, order, level, lo, hi):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _turn(c, order, lo, hi):  # type: ignore[no-untyped-def]
+def _turn(c: Array, order: int, lo: float, hi: float) -> float:
     """Bisect for the turning point of a polynomial whose slope changes sign in [lo, hi]."""
     rising = _slope(c, order, lo) > 0.0
     for _ in range(50):
@@ -261,7 +304,7 @@ def _turn(c, order, lo, hi):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _crossing(c, order, low, high, span):  # type: ignore[no-untyped-def]
+def _crossing(c: Array, order: int, low: float, high: float, span: float) -> tuple[float, int]:
     """First time in [0, span] at which a polynomial leaves [low, high], and the side (-1, 0, 1).
 
     A start outside by rounding, or on an end, counts as inside until it moves outwards.
@@ -295,7 +338,7 @@ def _crossing(c, order, low, high, span):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _longest(c, order, scale, tol, span):  # type: ignore[no-untyped-def]
+def _longest(c: Array, order: int, scale: float, tol: float, span: float) -> float:
     """Step at which the last two terms of a series fall below tol × scale."""
     for n in (order - 1, order):
         size = abs(c[n])
@@ -305,8 +348,20 @@ def _longest(c, order, scale, tol, span):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _step_length(heights, w, eps, sig, push, order, tol, span, w_scale, s_scale, top):  # type: ignore[no-untyped-def]
-    """Longest step within `span` whose truncation is below `tol` of the motion and stress so far."""
+def _step_length(
+    heights: Array,
+    w: Array,
+    eps: Array,
+    sig: Array,
+    push: Array,
+    order: int,
+    tol: float,
+    span: float,
+    w_scale: float,
+    s_scale: float,
+    top: int,
+) -> float:
+    """Longest step within `span` that truncates below `tol` of the motion and stress so far."""
     reach = w_scale
     load = max(s_scale, abs(push[0]))
     for _ in range(60):  # at rest the only scale is what the step itself reaches
@@ -330,7 +385,19 @@ def _step_length(heights, w, eps, sig, push, order, tol, span, w_scale, s_scale,
 
 
 @njit(cache=True)
-def _sample(heights, ends, order, tau, w, eps, group, top, out_w, out_s, j):  # type: ignore[no-untyped-def]
+def _sample(
+    heights: Array,
+    ends: Branches,
+    order: int,
+    tau: float,
+    w: Array,
+    eps: Array,
+    group: Array,
+    top: int,
+    out_w: Array,
+    out_s: Array,
+    j: int,
+) -> None:
     """Write displacements and base stress at time tau of the step into column j."""
     out_s[j] = _value(group[0], order, tau)
     if out_w.shape[0] == 1 and top != STRESS:
@@ -349,7 +416,9 @@ def _sample(heights, ends, order, tau, w, eps, group, top, out_w, out_s, j):  # 
 
 
 @njit(cache=True)
-def _fly(out_w, out_s, t, first, t_end, w_end, speed):  # type: ignore[no-untyped-def]
+def _fly(
+    out_w: Array, out_s: Array, t: Array, first: int, t_end: float, w_end: Array, speed: float
+) -> None:
     """After contact the chain keeps its shape and moves with the striker; nothing presses."""
     for j in range(first, t.size):
         out_s[j] = 0.0
@@ -358,7 +427,16 @@ def _fly(out_w, out_s, t, first, t_end, w_end, speed):  # type: ignore[no-untype
 
 
 @njit(cache=True)
-def _settle(rows, branches, heights, ends, w, eps, top, push0):  # type: ignore[no-untyped-def]
+def _settle(
+    rows: Array,
+    branches: Branches,
+    heights: Array,
+    ends: Branches,
+    w: Array,
+    eps: Array,
+    top: int,
+    push0: float,
+) -> None:
     """Share the elongation of undamped groups anew, so that rounding does not pile up."""
     i0 = 0
     for g in range(ends.size):
@@ -385,7 +463,16 @@ def _settle(rows, branches, heights, ends, w, eps, top, push0):  # type: ignore[
 
 
 @njit(cache=True)
-def _start(rows, branches, heights, ends, top, value, w, eps):  # type: ignore[no-untyped-def]
+def _start(
+    rows: Array,
+    branches: Branches,
+    heights: Array,
+    ends: Branches,
+    top: int,
+    value: float,
+    w: Array,
+    eps: Array,
+) -> None:
     """At the first sample the springs under a prescribed motion or stress are in equilibrium."""
     last = ends.size - 1
     i0, i1 = (ends[last - 1] if last > 0 else 0), ends[last]
@@ -406,9 +493,23 @@ def _start(rows, branches, heights, ends, top, value, w, eps):  # type: ignore[n
 
 
 @njit(cache=True)
-def integrate(  # type: ignore[no-untyped-def]
-    rows, heights, ends, mass, drag, top, values, speed, t, tol, order, max_steps, out_w, out_s, log
-):
+def integrate(
+    rows: Array,
+    heights: Array,
+    ends: Branches,
+    mass: Array,
+    drag: float,
+    top: int,
+    values: Array,
+    speed: float,
+    t: Array,
+    tol: float,
+    order: int,
+    max_steps: int,
+    out_w: Array,
+    out_s: Array,
+    log: Array,
+) -> tuple[int, float, int, int]:
     """Integrate a chain from rest (or struck) over the samples t.
 
     Parameters
@@ -482,7 +583,8 @@ def integrate(  # type: ignore[no-untyped-def]
             driven = motion if top == MOTION else push
             driven[0], driven[1] = values[knot] + rate * (now - t[knot]), rate
         if not _expand(
-            rows, branches, heights, ends, mass, top, drag, push, motion, w, v, eps, sig, group, order
+            rows, branches, heights, ends, mass, top, drag, push, motion,
+            w, v, eps, sig, group, order,
         ):  # fmt: skip
             return FLAT_UNDER_STRESS, contact_end, step, switches
         if top == MOTION and knot > 0 and fresh:  # a dashpot feels the kink in the motion

@@ -9,4 +9,4 @@ def compiled() -> bool:
     """Tell whether an earlier run left the compiled integrator in the cache."""
     from foamfit.taylor import integrate
 
-    return any(Path(integrate.stats.cache_path).glob("taylor.integrate-*.nbc"))
+    return any(Path(integrate.stats.cache_path or ".").glob("taylor.integrate-*.nbc"))
