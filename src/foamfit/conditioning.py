@@ -380,14 +380,13 @@ def find_start(record: Record, impact: bool) -> Start:
         return Start(by_stress, 0.0, True, "where the stress leaves its rest")
     top = int(np.argmax(w))
     travel = float(w[top] - w[onset])
-    crossing = int(np.argmax(w >= 0)) if w[top] > 0 else 0
-    near = slice(max(0, crossing - 5), crossing + 5)
+    crossing, near = _passage(time, w, top)
     below = crossing > 1 and w[0] < -max(4 * noise_level(w), 1e-4 * travel)
     unloaded = record.stress[near].mean() < 0.2 * record.stress.max()
     if below and unloaded and (by_stress is None or abs(w[onset]) < 0.3 * w[top]):
         level, speed = line_at(time[near], w[near], time[crossing])
         at = time[crossing] - level / speed if speed > 0 else time[crossing]
-        at = float(np.clip(at, time[crossing - 1], time[crossing + 1]))
+        at = float(np.clip(at, time[near][0], time[near][-1]))
         if abs(at) < 0.05 * (time[crossing] - time[crossing - 1]):
             at = 0.0  # the file's own time zero
         return Start(at, 0.0, False, "where the displacement passes zero")
@@ -407,6 +406,24 @@ def find_start(record: Record, impact: bool) -> Start:
     early = slice(0, min(5, top + 1))
     zero = line_at(time[early], w[early], time[0])[0] if top > 1 else float(w[0])
     return Start(None, zero if abs(w[0]) > 0.02 * travel else 0.0, False, "at the first sample")
+
+
+def _passage(time: Array, w: Array, top: int) -> tuple[int, slice]:
+    """Sample at which a motion passes zero on its way up, and the samples around it.
+
+    A mean over a fiftieth of the rise keeps noise from passing first. The samples around are as
+    many as bring the scatter of their line to a thousandth of the rise, but within a twelfth of the
+    rise on either side, where the motion is still straight.
+    """
+    if w[top] <= 0:
+        return 0, slice(0, 5)
+    rough = int(np.argmax(w >= 0))
+    crossing = int(np.argmax(smooth(w, max(1, (top - rough) // 50)) >= 0))
+    needed = (noise_level(w) / (1e-3 * w[top])) ** 2
+    reach = (time[top] - time[crossing]) * min(1 / 12, 0.5 * needed / max(top - crossing, 1))
+    first = int(np.searchsorted(time, time[crossing] - reach))
+    last = int(np.searchsorted(time, time[crossing] + reach))
+    return crossing, slice(max(0, min(first, crossing - 5)), max(last, crossing + 5))
 
 
 def remove_offset(record: Record, start: Start, impact: bool) -> tuple[Record, list[str]]:

@@ -14,11 +14,14 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from foamfit.errors import InputError
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from foamfit.result import FitResult
+    from foamfit.simulation import Response
 
 Array = NDArray[np.float64]
 
@@ -143,6 +146,63 @@ def plot_residuals(result: FitResult, path: str | Path | None = None) -> Figure:
             column[-1].set_xlabel(f"time ({unit})" if unit else "sample")
         if not strips:
             _say_nothing_there(column[0])
+    if path is not None:
+        _save(figure, Path(path))
+    return figure
+
+
+def plot_response(response: Response, path: str | Path | None = None) -> Figure:
+    """Draw what a forward run gave: base stress and displacements over time, stress over strain.
+
+    Parameters
+    ----------
+    response : Response
+        From `foamfit.simulate`.
+    path : str or Path, optional
+        Where to save the figure; the suffix gives the format.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        7 in wide, three panels; it belongs to no pyplot state.
+    """
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    time, stress, nodes = response.time, response.base_stress, response.displacement
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(7.0, 2.75), layout="constrained")
+        axes = figure.subplots(1, 3)
+        (ft, t_unit), (fs, s_unit) = (
+            readable_unit(_size(time), "s"),
+            readable_unit(_size(stress), "Pa"),
+        )
+        fw, w_unit = readable_unit(_size(nodes), "m")
+        axes[0].plot(time / ft, stress / fs, color=VERMILION, lw=1.3)
+        # From the base up: light to dark, the top in the colour of what is simulated.
+        shades = np.linspace(0.7, 0.35, max(len(nodes) - 1, 1))
+        for i, node in enumerate(nodes[:-1]):
+            axes[1].plot(time / ft, node / fw, color=str(shades[i]), lw=1.0, label=f"node {i + 1}")
+        axes[1].plot(time / ft, nodes[-1] / fw, color=VERMILION, lw=1.3, label="top")
+        axes[2].plot(response.strain, stress / fs, color=VERMILION, lw=1.3)
+        for ax, x_label, y_label in (
+            (axes[0], f"time ({t_unit})", f"base stress ({s_unit})"),
+            (axes[1], f"time ({t_unit})", f"displacement ({w_unit})"),
+            (axes[2], "overall strain (–)", f"base stress ({s_unit})"),
+        ):
+            ax.set_xlabel(x_label)
+            ax.set_ylabel(y_label)
+            ax.margins(0.05, 0.11)
+        if response.contact_end is not None:
+            for ax in axes[:2]:
+                ax.axvline(response.contact_end / ft, color=GREY, lw=0.6, ls=(0, (2, 2)))
+            axes[0].annotate(
+                "end of contact", (response.contact_end / ft, 1.0), (-3, -3),
+                xycoords=("data", "axes fraction"), textcoords="offset points",
+                ha="right", va="top", rotation=90, color=GREY, fontsize=6.5,
+            )  # fmt: skip
+        if len(nodes) > 1:
+            axes[1].legend(loc="best", handlelength=1.4)
     if path is not None:
         _save(figure, Path(path))
     return figure
@@ -375,8 +435,18 @@ def _size(values: Array) -> float:
     return float(np.nanmax(np.abs(values), initial=0.0))
 
 
+def figure_format(path: str | Path) -> Literal["png", "pdf", "svg"]:
+    """Return the format that the suffix of a path names; any other is refused."""
+    forms: dict[str, Literal["png", "pdf", "svg"]] = {".png": "png", ".pdf": "pdf", ".svg": "svg"}
+    form = forms.get(Path(path).suffix.lower())
+    if form is None:
+        raise InputError(f"a figure is saved as .png, .pdf or .svg, not {Path(path).name!r}")
+    return form
+
+
 def _save(figure: Figure, path: Path) -> None:
-    form = path.suffix.lstrip(".").lower()
-    if form not in ("png", "pdf", "svg"):
-        raise ValueError(f"a figure is saved as .png, .pdf or .svg, not {path.name!r}")
-    path.write_bytes(image(figure, form))  # type: ignore[arg-type]
+    content = image(figure, figure_format(path))
+    try:
+        path.write_bytes(content)
+    except OSError as error:
+        raise InputError(f"{path} cannot be written: {error.strerror or error}") from None

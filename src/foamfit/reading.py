@@ -1,4 +1,4 @@
-"""A test file and its TOML become a `Measurement`: units and column names end here, SI begins.
+"""A test file and its TOML become a `Measurement`: column names end here, SI begins.
 
 A file holds one table, one row per sample. Its separator, its decimal sign and the row that names
 the columns are found from the first lines; the unit of a channel stands in its header, in a row of
@@ -10,26 +10,24 @@ from __future__ import annotations
 
 import codecs
 import csv
-import difflib
-import functools
 import hashlib
 import io
 import math
 import re
-import tomllib
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from foamfit.conditioning import Record, Window, condition
+from foamfit.conditioning import Record, condition
 from foamfit.errors import InputError
-from foamfit.measurement import Array, Measurement, Noise, Specimen, Striker
+from foamfit.measurement import Array, Measurement, Striker
+from foamfit.settings import Column, Settings, read_settings
+from foamfit.units import factor, is_unit
 
 # Channel: its SI unit, an example of a header, and the words that name it (the first one is best).
-_KNOWN: dict[str, tuple[str, str, tuple[str, ...]]] = {
+_CHANNELS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "time": ("s", "time (ms)", ("time", "t")),
     "stress": ("Pa", "stress (MPa)", ("stress", "sigma")),
     "force": ("N", "force (N)", ("force", "load", "f")),
@@ -38,7 +36,7 @@ _KNOWN: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "acceleration": ("m/s**2", "acceleration (m/s^2)", ("acceleration", "accel", "deceleration")),
     "velocity": ("m/s", "velocity (m/s)", ("velocity", "speed")),
 }
-_WORDS = {word for _, _, words in _KNOWN.values() for word in words}
+_WORDS = {word for _, _, words in _CHANNELS.values() for word in words}
 # With one of these beside it a channel's name means something else.
 _OTHER = {"std", "sd", "dev", "error", "err", "noise", "uncertainty", "rate", "specific", "energy"}
 _MIN_ROWS = 10
@@ -96,14 +94,14 @@ def _parse_header(text: str) -> _Header:
         if rest[0].lower() in _WORDS or rest[0].isdigit():
             continue
         unit = "/".join(token for token in rest if token.lower() != "per")  # m_s2, N_per_kg
-        if _is_unit(unit):
+        if is_unit(unit, any_case=True):
             return _Header(text, tuple(t.lower() for t in tokens[:i]), unit)
     return _Header(text, tuple(t.lower() for t in tokens), None)
 
 
 def _rank(header: _Header, channel: str) -> int | None:
     """How well a header names a channel: 0 is best, None not at all."""
-    words = _KNOWN[channel][2]
+    words = _CHANNELS[channel][2]
     if len(header.words) == 1 and header.words[0] in words:
         return 0 if header.words[0] == words[0] else 1
     named = [w for w in header.words if w in _WORDS and len(w) > 1]
@@ -172,7 +170,7 @@ def _score(cells: list[str], names: set[str]) -> int:
     if len(cells) < 2 or any(_number(cell) for cell in cells):
         return 0
     headers = [_parse_header(cell) for cell in cells if cell.strip()]
-    channels = {c for c in _KNOWN for h in headers if _rank(h, c) is not None}
+    channels = {c for c in _CHANNELS for h in headers if _rank(h, c) is not None}
     given = {n for n in names for h in headers if _is_named(h, n)}
     return len(channels) + len(given)
 
@@ -188,7 +186,7 @@ def _unit_row(grid: list[list[str]], i: int) -> tuple[int, list[str]]:
     texts = list(grid[i])
     below = [cell.strip().strip("()[]") for cell in grid[i + 1]] if i + 1 < len(grid) else []
     units = [cell for cell in below if cell]
-    known = [unit for unit in units if _is_unit(unit) and not _number(unit)]
+    known = [unit for unit in units if is_unit(unit, any_case=True) and not _number(unit)]
     if not known or 2 * len(known) < len(units) or any(_number(unit) for unit in units):
         return i + 1, texts
     for k, unit in enumerate(below[: len(texts)]):
@@ -197,12 +195,12 @@ def _unit_row(grid: list[list[str]], i: int) -> tuple[int, list[str]]:
     return i + 2, texts
 
 
-def _assign(table: _Table, settings: Settings, toml: Path) -> dict[str, int]:
-    """Which column each channel is in: as ``[columns]`` says, else as the headers do."""
+def _assign(table: _Table, given: dict[str, Column], toml: Path | None) -> dict[str, int]:
+    """Which column each channel is in: as ``[columns]`` of the TOML says, else as the headers do."""
     found: dict[str, int] = {}
-    for channel in _KNOWN:
-        if channel in settings.columns:
-            name = settings.columns[channel].column
+    for channel in _CHANNELS:
+        if channel in given:
+            name = given[channel].column
             matches = [k for k, h in enumerate(table.headers) if _is_named(h, name)]
             if len(matches) != 1:
                 listed = ", ".join(repr(h.text) for h in table.headers if h.text)
@@ -218,22 +216,22 @@ def _assign(table: _Table, settings: Settings, toml: Path) -> dict[str, int]:
         if len(best) > 1:
             both = " and ".join(repr(table.headers[k].text) for k in best)
             raise InputError(
-                f"{table.path}: columns {both} could both be the {channel}; keep one, or name it "
-                f"in [columns] of {toml.name}."
+                f"{table.path}: columns {both} could both be the {channel}; keep one"
+                + (f", or name it in [columns] of {toml.name}." if toml else ".")
             )
         if best:
             found[channel] = best[0]
     # A channel that the TOML names replaces its twin that only a header names.
     for one, other in (("stress", "force"), ("displacement", "strain")):
-        for given, twin in ((one, other), (other, one)):
-            if given in settings.columns and twin not in settings.columns:
+        for named, twin in ((one, other), (other, one)):
+            if named in given and twin not in given:
                 found.pop(twin, None)
     return found
 
 
 def _factor(table: _Table, channel: str, header: _Header, given: Column | None) -> float:
     """Return what the numbers of a column are multiplied by to be SI."""
-    si, example, _ = _KNOWN[channel]
+    si, example, _ = _CHANNELS[channel]
     unit = given.unit if given and given.unit is not None else header.unit
     scale, scale_unit = (given.scale, given.scale_unit) if given else (1.0, "")
     where = f"{table.path}: column {header.text!r}"
@@ -244,15 +242,11 @@ def _factor(table: _Table, channel: str, header: _Header, given: Column | None) 
     unit = unit or ""
     if channel == "acceleration" and unit in {"g", "G"}:
         unit = "standard_gravity"  # not gram
-    if not _is_unit(unit):
+    if not is_unit(unit, any_case=True):
         raise InputError(f"{where} has an unknown unit {unit!r}; write it like '{example}'.")
-    for spelling in _spellings(unit):
-        quantity = _quantity(spelling)
-        if quantity is None:
-            continue
-        product = quantity * scale * _quantity(scale_unit)
-        if product.check(_quantity(si).dimensionality):
-            return float(product.to(si or "dimensionless").magnitude)
+    si_per_unit = factor(unit, si, times=scale_unit)
+    if si_per_unit is not None:
+        return scale * si_per_unit
     raise InputError(
         f"{where} cannot be read as {channel}: its unit {unit!r} is of another kind; "
         f"write it like '{example}' or give a scale in [columns]."
@@ -428,7 +422,55 @@ def _one_of(
     return one
 
 
-# The public entry.
+# The public entries.
+
+
+def _bytes(path: Path, wanted: str) -> bytes:
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; give {wanted}.") from None
+    except IsADirectoryError:
+        raise InputError(f"{path}: is a directory; give {wanted}.") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
+
+
+def read_history(path: Path, channel: str) -> tuple[Array, Array]:
+    """Read time and one other channel of a table, as they stand there.
+
+    Parameters
+    ----------
+    path : Path
+        The table, as in `read_test`; a column without a unit is in SI.
+    channel : str
+        For example "stress".
+
+    Returns
+    -------
+    time, values : (n,) array
+        In SI.
+
+    Raises
+    ------
+    InputError
+        Where the file cannot be used.
+    """
+    wanted = f"a CSV with the columns 'time (ms)' and '{_CHANNELS[channel][1]}'"
+    text, encoding = _decode(path, _bytes(path, wanted))
+    table = _find_table(path, text, encoding, set())
+    found = _assign(table, {}, None)
+    for name in ("time", channel):
+        if name not in found:
+            raise InputError(f"{path}: has no column for the {name}; it must be {wanted}.")
+    columns = {name: found[name] for name in ("time", channel)}
+    numbers = _read_numbers(table, columns)
+    _check_time(table, numbers["time"], table.headers[columns["time"]].text)
+    for name, k in columns.items():
+        header = table.headers[k]
+        in_si = Column(header.text, _CHANNELS[name][0]) if header.unit is None else None
+        numbers[name] = numbers[name] * _factor(table, name, header, in_si)
+    return numbers["time"], numbers[channel]
 
 
 def read_test(path: str | Path, specimen: str | Path | None = None) -> Measurement:
@@ -453,20 +495,13 @@ def read_test(path: str | Path, specimen: str | Path | None = None) -> Measureme
         Where the file, its TOML or what they hold cannot be used.
     """
     path = Path(path)
-    try:
-        raw = path.read_bytes()
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; give the CSV file of a test.") from None
-    except IsADirectoryError:
-        raise InputError(f"{path}: is a directory; give the CSV file of a test.") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
+    raw = _bytes(path, "the CSV file of a test")
     text, encoding = _decode(path, raw)
     toml = Path(specimen) if specimen is not None else path.with_suffix(".toml")
-    settings = read_settings(toml, path)
+    settings = read_settings(toml, path, channels=_CHANNELS)
     names = {column.column for column in settings.columns.values()}
     table = _find_table(path, text, encoding, names)
-    columns = _assign(table, settings, toml)
+    columns = _assign(table, settings.columns, toml)
     record, notes = _record(table, columns, settings)
     try:
         conditioned = condition(

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import csv
-import tomllib
+import math
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,15 +14,29 @@ from numpy.typing import NDArray
 from foamfit.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.errors import InputError
 from foamfit.literature import published
-from foamfit.model import BISTABLE_NAMES, KINDS
-from foamfit.reading import _parse_quantity as parse_quantity
+from foamfit.model import BISTABLE_NAMES, KINDS, LINEAR_NAMES
+from foamfit.reading import read_history
+from foamfit.settings import check_keys, load_toml
 from foamfit.simulation import Response
 from foamfit.spring import BistableSpring, LinearSpring, Spring
+from foamfit.units import parse_quantity
 
 Array = NDArray[np.float64]
 
-_UNITS = {"eps_a": "", "eps_c": "", "eta": "Pa*s", "height": "m", "mass": "kg"}
-_EXAMPLES = {"eps_a": "0.14", "eps_c": "0.31", "eta": "100 Pa*s", "height": "1 mm", "mass": "5 mg"}
+_EXAMPLES = {  # key: SI unit and an example
+    "eps_a": ("", "0.14"),
+    "eps_c": ("", "0.31"),
+    "eta": ("Pa*s", "100 Pa*s"),
+    "dsigma": ("Pa", "-0.18 MPa"),
+    "height": ("m", "1 mm"),
+    "mass": ("kg", "7 g"),
+    "velocity": ("m/s", "1.75 m/s"),
+    "diameter": ("m", "5 mm"),
+    "area": ("m**2", "19.6 mm^2"),
+    "site_damping": ("Pa*s", "0 Pa*s"),
+    "end": ("s", "1 ms"),
+}
+_MOST_SAMPLES = 1_000_000
 
 
 def read_scene(path: Path) -> tuple[Chain, Drive, Array]:
@@ -42,41 +57,25 @@ def read_scene(path: Path) -> tuple[Chain, Drive, Array]:
     InputError
         Naming the file and the key that is wrong.
     """
-    try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; give the TOML file of a scene") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); give a TOML file") from None
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: is no valid TOML: {error}") from None
-    _only(f"{path}", document, {"chain", "drive", "time"})
-    try:
-        chain = _chain(f"{path}: [chain]", _table(path, document, "chain"))
-        drive, time = _drive(path, document)
-    except InputError:
-        raise
-    except ValueError as error:
-        raise InputError(f"{path}: {error}") from None
+    document = load_toml(path, "give the TOML file of a scene")
+    check_keys(f"{path}:", document, ["chain", "drive", "time"])
+    chain = _chain(f"{path}: [chain]", _table(path, document, "chain"))
+    drive, time = _drive(path, document)
     return chain, drive, time
 
 
 def _table(path: Path, document: dict[str, Any], name: str) -> dict[str, Any]:
     table = document.get(name)
     if not isinstance(table, dict):
-        raise InputError(f"{path}: the table [{name}] is missing; see foamfit simulate --help")
+        raise InputError(f"{path}: the table [{name}] is missing; see foamfit simulate --help.")
     return table
 
 
-def _only(where: str, table: dict[str, Any], known: set[str]) -> None:
-    for key in table:
-        if key not in known:
-            raise InputError(f"{where} has no key '{key}'; it may have {', '.join(sorted(known))}")
-
-
-def _number(where: str, table: dict[str, Any], key: str, unit: str, example: str) -> float:
+def _number(where: str, table: dict[str, Any], key: str) -> float:
+    unit, example = _EXAMPLES.get(key, ("Pa", "1 MPa"))
     if key not in table:
-        raise InputError(f'{where} {key} is missing; give it like {key} = "{example}"')
+        right = example if unit == "" else f'"{example}"'
+        raise InputError(f"{where} {key} is missing; give it like {key} = {right}.")
     value = table[key]
     if unit == "" and isinstance(value, int | float) and not isinstance(value, bool):
         return float(value)
@@ -85,39 +84,48 @@ def _number(where: str, table: dict[str, Any], key: str, unit: str, example: str
 
 def _chain(where: str, table: dict[str, Any]) -> Chain:
     if "published" in table:
-        _only(where, table, {"published"})
-        if table["published"] not in published:
-            raise InputError(f"{where} published must be one of {', '.join(published)}")
-        return published[table["published"]].chain
-    _only(where, table, {"area", "diameter", "springs", "site_damping"})
+        check_keys(where, table, ["published"])
+        name = table["published"]
+        if not isinstance(name, str) or name not in published:
+            raise InputError(f"{where} published = {name!r}; it may be {', '.join(published)}.")
+        return published[name].chain
+    check_keys(where, table, ["area", "diameter", "springs", "site_damping"])
     if "diameter" in table:
-        area = np.pi / 4.0 * _number(where, table, "diameter", "m", "5 mm") ** 2
+        if "area" in table:
+            raise InputError(f"{where} has both a diameter and an area; give one of them.")
+        area = math.pi / 4.0 * _number(where, table, "diameter") ** 2
     else:
-        area = _number(where, table, "area", "m**2", "19.6 mm^2")
+        area = _number(where, table, "area")
+    given = table.get("springs")
+    if not isinstance(given, list) or not given or not all(isinstance(g, dict) for g in given):
+        raise InputError(f"{where} needs springs, each under [[chain.springs]], base first.")
     springs, heights, masses = [], [], []
-    for i, given in enumerate(table.get("springs", []), start=1):
+    for i, item in enumerate(given, start=1):
         here = f"{where} spring {i}:"
-        springs.append(_spring(here, given))
-        heights.append(_number(here, given, "height", "m", "1 mm"))
-        masses.append(_number(here, given, "mass", "kg", "5 mg") if "mass" in given else 0.0)
-    site = _number(where, table, "site_damping", "Pa*s", "0 Pa*s") if "site_damping" in table else 0
-    return Chain(springs, heights, area, masses, site_damping=site)
+        springs.append(_spring(here, item))
+        heights.append(_number(here, item, "height"))
+        masses.append(_number(here, item, "mass") if "mass" in item else 0.0)
+    site = _number(where, table, "site_damping") if "site_damping" in table else 0.0
+    try:
+        return Chain(springs, heights, area, masses, site_damping=site)
+    except ValueError as error:
+        raise InputError(f"{where} {error}.") from None
 
 
 def _spring(where: str, given: dict[str, Any]) -> Spring:
     kind = given.get("kind")
     if kind not in KINDS:
-        raise InputError(f"{where} kind = {kind!r}; it must be one of {', '.join(KINDS)}")
-    names = BISTABLE_NAMES if kind == "bistable" else ("k0", "eta")
-    _only(where, given, {"kind", "height", "mass", *names})
-    values = {
-        name: _number(where, given, name, _UNITS.get(name, "Pa"), _EXAMPLES.get(name, "1 MPa"))
-        for name in names
-        if name != "eta" or name in given
-    }
-    if kind == "bistable":
-        return BistableSpring(**values)
-    return LinearSpring(**values, unilateral=kind == "unilateral")
+        raise InputError(f"{where} kind = {kind!r}; it must be one of {', '.join(KINDS)}.")
+    names = BISTABLE_NAMES if kind == "bistable" else LINEAR_NAMES
+    check_keys(where, given, ["kind", "height", "mass", *names])
+    needed = [name for name in names if name != "eta" or name in given]
+    values = {name: _number(where, given, name) for name in needed}
+    try:
+        if kind == "bistable":
+            return BistableSpring(**values)
+        return LinearSpring(**values, unilateral=kind == "unilateral")
+    except ValueError as error:
+        raise InputError(f"{where} {error}.") from None
 
 
 def _drive(path: Path, document: dict[str, Any]) -> tuple[Drive, Array]:
@@ -125,43 +133,42 @@ def _drive(path: Path, document: dict[str, Any]) -> tuple[Drive, Array]:
     where = f"{path}: [drive]"
     kind = table.get("kind")
     if kind == "impact":
-        _only(where, table, {"kind", "mass", "velocity"})
-        mass = _number(where, table, "mass", "kg", "7 g")
-        velocity = _number(where, table, "velocity", "m/s", "1.75 m/s")
-        return Impact(mass, velocity), _samples(path, document)
+        check_keys(where, table, ["kind", "mass", "velocity"])
+        mass, velocity = (_number(where, table, key) for key in ("mass", "velocity"))
+        try:
+            return Impact(mass, velocity), _samples(path, document)
+        except InputError:
+            raise
+        except ValueError as error:
+            raise InputError(f"{where} {error}.") from None
     if kind not in ("stress", "displacement"):
-        raise InputError(f"{where} kind = {kind!r}; it must be impact, stress or displacement")
-    _only(where, table, {"kind", "file"})
-    if "file" not in table:
-        raise InputError(f"{where} file is missing; give a CSV with columns t (s) and {kind} (SI)")
-    time, values = _history(path.parent / str(table["file"]))
+        raise InputError(f"{where} kind = {kind!r}; it must be impact, stress or displacement.")
+    check_keys(where, table, ["kind", "file"])
+    if not isinstance(table.get("file"), str):
+        raise InputError(f'{where} file is missing; give a CSV like file = "drive.csv".')
+    if "time" in document:
+        raise InputError(f"{path}: [time] must be left out, the samples are those of the drive.")
+    time, values = read_history(path.parent / table["file"], kind)
     return (StressDrive(values) if kind == "stress" else DisplacementDrive(values)), time
 
 
 def _samples(path: Path, document: dict[str, Any]) -> Array:
     table = _table(path, document, "time")
     where = f"{path}: [time]"
-    _only(where, table, {"end", "samples"})
-    end = _number(where, table, "end", "s", "1 ms")
+    check_keys(where, table, ["end", "samples"])
+    end = _number(where, table, "end")
+    if not 0.0 < end < math.inf:
+        raise InputError(f"{where} end = {table['end']!r} must be positive.")
     samples = table.get("samples", 501)
-    if not isinstance(samples, int) or samples < 2 or not end > 0:
-        raise InputError(f"{where} needs a positive end and at least 2 samples")
+    if type(samples) is not int or not 2 <= samples <= _MOST_SAMPLES:
+        raise InputError(
+            f"{where} samples = {samples!r} must be a whole number from 2 to {_MOST_SAMPLES}."
+        )
     return np.linspace(0.0, end, samples)
 
 
-def _history(path: Path) -> tuple[Array, Array]:
-    """Read the two columns of a drive, time (s) and stress (Pa) or displacement (m)."""
-    try:
-        table = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read as a drive ({error})") from None
-    if table.shape[1] != 2:
-        raise InputError(f"{path}: has {table.shape[1]} columns; give time (s) and the drive (SI)")
-    return table[:, 0], table[:, 1]
-
-
 def write_response(response: Response, path: Path) -> None:
-    """Write a response as CSV, SI, one row per sample.
+    """Write a response as CSV, SI, one row per sample; what stood there stays if that fails.
 
     Raises
     ------
@@ -171,10 +178,13 @@ def write_response(response: Response, path: Path) -> None:
     nodes = range(1, len(response.displacement) + 1)
     header = ["time (s)", "base stress (Pa)", "strain", *(f"displacement_{i} (m)" for i in nodes)]
     columns = [response.time, response.base_stress, response.strain, *response.displacement]
+    fresh = path.with_name(f".{path.name}.{uuid4().hex[:12]}.new")
     try:
-        with path.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
+        with fresh.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file, lineterminator="\n")
             writer.writerow(header)
             writer.writerows(zip(*(column.tolist() for column in columns), strict=True))
+        fresh.replace(path)
     except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror or error}") from None
+        fresh.unlink(missing_ok=True)
+        raise InputError(f"{path} cannot be written: {error.strerror or error}.") from None

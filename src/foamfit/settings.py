@@ -15,8 +15,6 @@ from foamfit.errors import InputError
 from foamfit.measurement import Noise, Specimen, Striker
 from foamfit.units import is_unit, parse_quantity, split_quantity
 
-CHANNELS = ("time", "stress", "force", "displacement", "strain", "acceleration", "velocity")
-
 # Section, key: SI unit and an example.
 _SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
     "specimen": {
@@ -90,8 +88,17 @@ def check_keys(where: str, given: Iterable[str], valid: Iterable[str]) -> None:
             raise InputError(f"{where} has no key {key!r}; meant may be {', '.join(near)}.")
 
 
-def read_settings(path: Path, test: Path) -> Settings:
-    """Read and check the TOML at `path`, which describes the test file `test`.
+def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Settings:
+    """Read and check the TOML at `path`.
+
+    Parameters
+    ----------
+    path : Path
+        The TOML.
+    test : Path
+        The test file that it describes.
+    channels : iterable of str
+        What [columns] may name.
 
     Raises
     ------
@@ -116,7 +123,7 @@ def read_settings(path: Path, test: Path) -> Settings:
         striker=Striker(**values["striker"]) if values["striker"] else None,
         noise=Noise(**values["noise"]),
         window=Window(**values["window"]),
-        columns=_columns(path, document.get("columns", {})),
+        columns=_columns(path, document.get("columns", {}), channels),
     )
 
 
@@ -157,10 +164,10 @@ def _specimen(path: Path, values: dict[str, Any]) -> Specimen:
     return Specimen(**values)
 
 
-def _columns(path: Path, table: Any) -> dict[str, Column]:
+def _columns(path: Path, table: Any, channels: Iterable[str]) -> dict[str, Column]:
     if not isinstance(table, dict):
         raise InputError(f"{path}: columns must be a table, [columns].")
-    check_keys(f"{path}: [columns]", table, CHANNELS)
+    check_keys(f"{path}: [columns]", table, channels)
     columns: dict[str, Column] = {}
     for channel, spec in table.items():
         where = f"{path}: [columns] {channel}"
