@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from foamfit.audit import audit, describe
+from conftest import EXPERIMENTS, synthetic_impact
+from foamfit.audit import audit, describe, largest_motion
 from foamfit.measurement import Measurement, Noise, Specimen, Striker
 from foamfit.reading import read_test
 
@@ -53,6 +54,39 @@ def test_a_test_that_closes():
     assert found.impulse_ratio == pytest.approx(1, rel=0.01)
     assert found.warnings() == []
     assert found.missing == ()
+
+
+@pytest.mark.parametrize("velocity", [1.75, 2.0, 2.3])
+@pytest.mark.parametrize(("noise", "scatter"), [(0.0, 2e-4), (0.01, 0.015), (0.02, 0.03)])
+def test_noise_does_not_bias_the_absorbed_energy(velocity, noise, scatter):
+    tests = [synthetic_impact(velocity, noise, seed)[1] for seed in range(20 if noise else 1)]
+    found = [audit(test) for test in tests]
+    ratios = np.array([item.absorbed_over_striker for item in found])
+    assert abs(ratios.mean() - 1) < (0.01 if noise else 2e-4)
+    assert ratios.std() <= scatter
+    peaks = [largest_motion(test.displacement, test.time)[1] for test in tests]
+    true = synthetic_impact(velocity, 0.0)[1].displacement.max()
+    assert np.mean(peaks) == pytest.approx(true, rel=5e-3)
+    assert np.std(peaks) <= 0.4 * noise * true
+    lost = synthetic_impact(velocity, 0.0)[1]
+    fractions = [item.dissipated_fraction for item in found]
+    assert np.mean(fractions) == pytest.approx(audit(lost).dissipated_fraction, abs=0.015)
+
+
+def test_a_reconstruction_is_not_called_impossible():
+    test = read_test(EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv")
+    found = audit(test)
+    assert found.absorbed_over_striker == pytest.approx(1, abs=0.02)
+    assert found.warnings() == []
+
+
+def test_the_turn_of_a_clean_motion_is_its_largest_sample():
+    motion = np.array([0.0, 1.0, 2.0, 1.5, 0.0])
+    assert largest_motion(motion) == (2, 2.0)
+    tent = 1.0 - np.abs(np.linspace(-1, 1, 301))
+    assert largest_motion(tent) == (150, 1.0)
+    noisy = tent + 0.01 * np.random.default_rng(0).standard_normal(301)
+    assert largest_motion(noisy)[1] == pytest.approx(1, abs=0.015)
 
 
 @pytest.mark.parametrize(

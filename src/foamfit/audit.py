@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from foamfit.conditioning import engineering, line_at
+from foamfit.conditioning import engineering, line_at, noise_level
 from foamfit.measurement import Array, Measurement, Striker
 
 
@@ -125,12 +125,14 @@ def audit(measurement: Measurement) -> EnergyAudit:
         missing.append("The striker's energy needs its mass and velocity.")
     if test.stress is not None and test.displacement is not None:
         strain = test.displacement / specimen.height
-        top = int(np.argmax(strain))
-        absorbed = float(np.trapezoid(test.stress[: top + 1], strain[: top + 1]))
+        top, largest = largest_motion(test.displacement, test.time)
         # What precedes the first sample is the triangle from zero at time zero.
-        absorbed += 0.5 * float(max(test.stress[0], 0.0) * max(strain[0], 0.0))
+        before = 0.5 * float(max(test.stress[0], 0.0) * max(strain[0], 0.0))
+        absorbed = before + float(np.trapezoid(test.stress[: top + 1], strain[: top + 1]))
+        # The sum ends at a noisy strain, where the stress is highest; the true end is the turn.
+        absorbed += float(test.stress[top]) * (largest / specimen.height - float(strain[top]))
         if _unloaded(test.stress):
-            dissipated = absorbed + float(np.trapezoid(test.stress[top:], strain[top:]))
+            dissipated = before + float(np.trapezoid(test.stress, strain))
         else:
             missing.append("The dissipated energy needs the unloading.")
         ratio = absorbed / striker_energy if striker_energy else None
@@ -155,6 +157,39 @@ def audit(measurement: Measurement) -> EnergyAudit:
         motion=test.motion,
         missing=tuple(missing),
     )
+
+
+def largest_motion(displacement: Array, time: Array | None = None) -> tuple[int, float]:
+    """Find the turn of a motion: the largest of its samples would be the largest of its noise.
+
+    A quartic is fitted to the samples about the turn that the noise could confuse with it; where
+    the motion is so clean that they are few, the largest sample is the turn.
+
+    Parameters
+    ----------
+    displacement : (n,) array
+        m.
+    time : (n,) array, optional
+        s; without it the samples count as evenly spaced.
+
+    Returns
+    -------
+    index : int
+        The sample at the turn.
+    value : float
+        The displacement there, free of the noise of that sample, m.
+    """
+    floor = displacement.max() - 8.0 * noise_level(displacement)
+    near = np.flatnonzero(displacement >= floor)
+    about = np.arange(near[0], near[-1] + 1)
+    if len(about) < 12:
+        top = int(np.argmax(displacement))
+        return top, float(displacement[top])
+    x = about.astype(np.float64) if time is None else time[about]
+    x = 2.0 * (x - x[0]) / (x[-1] - x[0]) - 1.0
+    turn = np.polyval(np.polyfit(x, displacement[about], 4), x)
+    top = int(np.argmax(turn))
+    return int(about[top]), float(turn[top])
 
 
 def _unloaded(stress: Array) -> bool:
@@ -261,15 +296,15 @@ def _sampling(time: Array | None, stress: Array | None, displacement: Array | No
 def _peaks(test: Measurement) -> list[tuple[str, str]]:
     lines = []
     if test.stress is not None:
-        at = "" if test.time is None else f" at {_moment(test.time, test.stress)}"
+        at = _moment(test.time, int(np.argmax(test.stress)))
         lines.append(("stress", f"peak {engineering(float(test.stress.max()), 'Pa')}{at}"))
     if test.displacement is not None:
-        w = float(test.displacement.max())
-        at = "" if test.time is None else f" at {_moment(test.time, test.displacement)}"
+        top, w = largest_motion(test.displacement, test.time)
+        at = _moment(test.time, top)
         text = f"peak {w / test.specimen.height:.4g} ({engineering(w, 'm')}){at}, {test.motion}"
         lines.append(("strain", text))
     return lines
 
 
-def _moment(time: Array, values: Array) -> str:
-    return engineering(float(time[int(np.argmax(values))]), "s")
+def _moment(time: Array | None, sample: int) -> str:
+    return "" if time is None else f" at {engineering(float(time[sample]), 's')}"

@@ -1,16 +1,23 @@
 """The command `foamfit`. Heavy modules are imported by the commands that need them."""
 
+# ruff: noqa: D301  (a \b keeps click from joining the lines of an example)
+
 from __future__ import annotations
 
+import math
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
 from foamfit.errors import InputError, SimulationError
+
+if TYPE_CHECKING:
+    import lmfit
 
 WRONG, NOT_ACCEPTABLE = 1, 2
 
@@ -22,25 +29,55 @@ class _Group(click.Group):
         kwargs["standalone_mode"] = False
         try:
             code = super().main(*args, **kwargs)
-        except (click.ClickException, InputError, SimulationError, ValueError) as error:
-            message = error.format_message() if isinstance(error, click.ClickException) else error
-            click.echo(f"foamfit: {message}", err=True)
-            sys.exit(WRONG)
+            sys.stdout.flush()
+        except click.ClickException as error:
+            _refuse(_one_sentence(error))
+        except (InputError, SimulationError, ValueError) as error:
+            _refuse(str(error))
         except (click.Abort, KeyboardInterrupt):
-            click.echo("foamfit: interrupted before anything was found", err=True)
+            _refuse("interrupted before anything was found")
+        except BrokenPipeError:  # whoever read the output has enough, as `head`
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             sys.exit(WRONG)
+        except Exception as error:
+            if os.environ.get("FOAMFIT_TRACEBACK"):
+                raise
+            told = f"{type(error).__name__}: {error}"
+            _refuse(f"this is a defect of foamfit ({told}); FOAMFIT_TRACEBACK=1 shows where it is")
         sys.exit(code if isinstance(code, int) else 0)
 
 
-@click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
+def _refuse(message: str) -> NoReturn:
+    """Print one line on stderr and leave."""
+    click.echo(f"foamfit: {' '.join(message.split())}", err=True)
+    sys.exit(WRONG)
+
+
+def _one_sentence(error: click.ClickException) -> str:
+    """Return what click refuses, and where the right call is told, where click does not tell it."""
+    message = error.format_message()
+    if isinstance(error, click.UsageError) and not isinstance(error, click.BadParameter):
+        path = error.ctx.command_path if error.ctx else "foamfit"
+        message = message.replace(". Did you", ", did you").replace(". (Did you", " (did you")
+        message = f"{message.rstrip('.?')}; see {path} --help"
+    return message
+
+
+@click.group(
+    "foamfit",
+    cls=_Group,
+    invoke_without_command=True,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
 @click.version_option(package_name="foamfit", message="foamfit %(version)s")
-def main() -> None:
+@click.pass_context
+def main(context: click.Context) -> None:
     """Identify the parameters of a foam from an impact or compression test.
 
     \b
     Look at a test, then fit it:
-        foamfit check experiments/foam-1/foam-1-2.0ms-reconstruction.csv
-        foamfit fit experiments/foam-1/foam-1-2.0ms-reconstruction.csv
+        foamfit check experiments/foam-1/model-1-2.0mps-reconstruction.csv
+        foamfit fit experiments/foam-1/model-1-2.0mps-reconstruction.csv
     Two springs, fixed seed, result as JSON:
         foamfit fit TEST.csv --model linear+bistable --seed 1 --json
     A forward run:
@@ -48,6 +85,8 @@ def main() -> None:
 
     The model is that of Thevamaran, Fraternali & Daraio (2014), J. Appl. Mech. 81, 121006.
     """
+    if context.invoked_subcommand is None:
+        click.echo(context.get_help())
 
 
 _TEST = click.argument("test", metavar="TEST.csv", type=click.Path(path_type=Path))
@@ -76,15 +115,44 @@ def check(test: Path, specimen: Path | None) -> None:
     click.echo(describe(measurement, audit(measurement)))
 
 
-def _fixes(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> dict[str, float]:
+def _fixes(
+    context: click.Context, option: click.Parameter, values: tuple[str, ...]
+) -> dict[str, float]:
     fixed = {}
     for text in values:
         name, _, number = text.partition("=")
         try:
             fixed[name.strip()] = float(number)
         except ValueError:
-            raise click.BadParameter(f"'{text}' is not NAME=VALUE in SI, as s1_eta=0") from None
+            fixed[name.strip()] = math.nan
+        if not math.isfinite(fixed[name.strip()]):
+            raise click.BadParameter(f"'{text}' is not NAME=VALUE in SI, as s1_eta=0.")
     return fixed
+
+
+def _hold_and_vary(
+    params: lmfit.Parameters, model: str, fix: dict[str, float], vary: tuple[str, ...]
+) -> None:
+    """Do what --fix and --vary say to the parameters of a model."""
+    for name in (*fix, *vary):
+        if name not in params:
+            raise InputError(
+                f"parameter '{name}' is not one of the model {model}; "
+                f"its parameters are {', '.join(params)}"
+            )
+        if name in fix and name in vary:
+            raise InputError(f"parameter '{name}' cannot be both fixed and varied; choose one")
+        if params[name].expr is not None:
+            others = ", ".join(other for other in params if other in params[name].expr)
+            raise InputError(f"parameter '{name}' follows from {others}; fix or vary that instead")
+        if name in vary and name.endswith("_height") and not params[name].vary:
+            raise InputError(
+                f"'{name}' is given by the specimen; leave [specimen] heights out to have it fitted"
+            )
+    for name, value in fix.items():
+        params[name].set(value=value, vary=False, min=-math.inf, max=math.inf)
+    for name in vary:
+        params[name].set(vary=True)
 
 
 @main.command()
@@ -101,8 +169,20 @@ def _fixes(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> di
     type=click.Path(path_type=Path),
     help="Result folder. Default: fits/<test>/<model>.",
 )
-@click.option("--seed", default=0, show_default=True, help="Same test and seed, same numbers.")
-@click.option("--starts", default=12, show_default=True, help="Descents of the search.")
+@click.option(
+    "--seed",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help="Same test and seed, same numbers.",
+)
+@click.option(
+    "--starts",
+    type=click.IntRange(min=1),
+    default=12,
+    show_default=True,
+    help="Descents of the search.",
+)
 @click.option("--max-time", type=float, metavar="SECONDS", help="Then the best so far is taken.")
 @click.option("--fix", multiple=True, metavar="NAME=VALUE", callback=_fixes, help="Hold one (SI).")
 @click.option("--vary", multiple=True, metavar="NAME", help="Vary one that is held by default.")
@@ -115,7 +195,7 @@ def fit(
     drive: str | None,
     out: Path | None,
     seed: int,
-    starts: int,
+    starts: int | None,
     max_time: float | None,
     fix: dict[str, float],
     vary: tuple[str, ...],
@@ -133,24 +213,18 @@ def fit(
         foamfit fit TEST.csv --drive displacement --out results/today
         foamfit fit TEST.csv --model linear+bistable --fix s1_k0=60e6
     """
+    from foamfit.model import Model
     from foamfit.reading import read_test
     from foamfit.result import check_target
 
+    model = Model.parse(model).name
     measurement = read_test(test, specimen)
     folder = Path("fits", test.stem, model) if out is None else out
     check_target(folder)
     from foamfit import identification
 
     params = identification.make_params(measurement, model, drive)
-    for name in (*fix, *vary):
-        if name not in params:
-            raise InputError(
-                f"parameter '{name}' is not one of the model {model}: {', '.join(params)}"
-            )
-    for name, value in fix.items():
-        params[name].set(value=value, vary=False, min=-float("inf"), max=float("inf"))
-    for name in vary:
-        params[name].set(vary=True)
+    _hold_and_vary(params, model, fix, vary)
     with _progress(quiet or as_json) as progress:
         result = identification.fit(
             measurement,
@@ -235,9 +309,16 @@ def simulate(scene: Path, out: Path | None, plot: Path | None, rtol: float) -> N
     from foamfit.scene import read_scene, write_response
     from foamfit.simulation import simulate as run
 
+    target = Path(scene.with_suffix(".csv").name) if out is None else out
+    for path in (target, plot):
+        if path is not None:
+            _check_file(path)
+    if plot is not None:
+        from foamfit.plots import figure_format
+
+        figure_format(plot)
     chain, drive, time = read_scene(scene)
     response = run(chain, drive, time, rtol)
-    target = Path(scene.with_suffix(".csv").name) if out is None else out
     write_response(response, target)
     click.echo(f"{response.solver}, {response.time.size} samples, written to {target}")
     if plot is not None:
@@ -245,6 +326,16 @@ def simulate(scene: Path, out: Path | None, plot: Path | None, rtol: float) -> N
 
         plot_response(response, plot)
         click.echo(f"drawn in {plot}")
+
+
+def _check_file(path: Path) -> None:
+    """Refuse a file that could not be written, before anything is computed."""
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; name a file")
+    if not path.parent.is_dir():
+        raise InputError(f"{path} cannot be written: there is no folder {path.parent}")
+    if not os.access(path.parent, os.W_OK) or (path.exists() and not os.access(path, os.W_OK)):
+        raise InputError(f"{path} cannot be written: permission denied")
 
 
 @main.command()

@@ -29,6 +29,9 @@ log = logging.getLogger(__name__)
 UNACCEPTABLE = 0.5
 POOR = 0.05
 
+# Descents of the search for each spring.
+STARTS = 16
+
 Costs = list[tuple[float, int]]
 
 
@@ -77,7 +80,7 @@ def make_params(
         value, low, high = guess[short]
         vary = short != "eta" or (drive == "impact" and spring >= 0)
         params.add(name, value=value, min=low, max=high, vary=vary)
-    _add_heights(params, measurement, len(model.kinds))
+    _add_heights(params, measurement, model)
     for name in model.names:
         if name.endswith("_dsigma"):
             own = name.removesuffix("dsigma")
@@ -86,8 +89,9 @@ def make_params(
     return params
 
 
-def _add_heights(params: lmfit.Parameters, measurement: Measurement, count: int) -> None:
+def _add_heights(params: lmfit.Parameters, measurement: Measurement, model: Model) -> None:
     """Heights of a chain: the specimen's, or varied with their sum fixed."""
+    count = len(model.kinds)
     if count == 1:
         return
     specimen = measurement.specimen
@@ -104,8 +108,13 @@ def _add_heights(params: lmfit.Parameters, measurement: Measurement, count: int)
     for i in range(1, count):
         value = specimen.height / count
         params.add(f"s{i}_height", value=value, min=low, max=specimen.height - low)
-    rest = " - ".join(f"s{i}_height" for i in range(1, count))
-    params.add(f"s{count}_height", expr=f"{specimen.height!r} - {rest}")
+    params.add(f"s{count}_height", expr=_rest_of_height(measurement, model))
+
+
+def _rest_of_height(measurement: Measurement, model: Model) -> str:
+    """Expression of the last spring's height: what the others leave of the specimen."""
+    others = [f"s{i}_height" for i in range(1, len(model.kinds))]
+    return " - ".join([repr(measurement.specimen.height), *others])
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +147,9 @@ class _Problem:
         if not tied:
             return lambda values: values
         places = [self.model.index[name] for name in tied]
+        rest = _rest_of_height(self.measurement, self.model)
+        if [self.params[name].expr for name in tied] == [rest]:
+            return self._last_height
         scratch = self.params.copy()
 
         def complete(values: Array) -> Array:
@@ -149,6 +161,12 @@ class _Problem:
             return values
 
         return complete
+
+    def _last_height(self, values: Array) -> Array:
+        """Complete the heights to that of the specimen; the expression itself, but fast."""
+        count = len(self.model.kinds)
+        values[-2] = self.measurement.specimen.height - values[-1 - count : -2].sum()
+        return values
 
     def space(self) -> Space:
         return Space(
@@ -173,7 +191,7 @@ def fit(
     model: str = "bistable",
     drive: str | None = None,
     seed: int = 0,
-    starts: int = 12,
+    starts: int | None = None,
     max_time: float | None = None,
     params: lmfit.Parameters | None = None,
     weights: Mapping[str, float] | None = None,
@@ -192,8 +210,8 @@ def fit(
         impact, displacement.
     seed : int
         Same test and seed give the same numbers.
-    starts : int
-        Descents of the search.
+    starts : int, optional
+        Descents of the search; by default 16 for each spring.
     max_time : float, optional
         Seconds after which the best point so far is the result.
     params : lmfit.Parameters, optional
@@ -216,11 +234,12 @@ def fit(
         If nothing that was tried could be simulated.
     """
     began = time.perf_counter()
-    if starts < 1:
+    if starts is not None and starts < 1:
         raise InputError(f"starts = {starts} is not admissible; it must be at least 1")
     if max_time is not None and not max_time > 0:
         raise InputError(f"max_time = {max_time:g} s is not admissible; it must be positive")
     problem = _problem(measurement, model, drive, params, weights)
+    starts = STARTS * len(problem.model.kinds) if starts is None else starts
     deadline = None if max_time is None else time.monotonic() + max_time
     tracker = Tracker(problem.objective, deadline)
     costs, stopped = _identify(problem, tracker, starts, seed, progress or (lambda *_: None))
@@ -346,7 +365,7 @@ def _visited(problem: _Problem, simulated: Simulated) -> dict[str, tuple[str, ..
 
 def _unreached(problem: _Problem, values: Array) -> dict[str, str]:
     """Parameters whose branch was never reached, and that branch."""
-    visited = _visited(problem, problem.objective.simulate(values))
+    visited = _visited(problem, problem.objective.simulate(values, everything=True))
     out = {}
     for name in problem.model.names:
         spring, short = split_name(name)

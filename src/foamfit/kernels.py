@@ -19,6 +19,9 @@ Array = NDArray[np.float64]
 Row = Array
 Branches = NDArray[np.int64]
 
+# Division by zero gives infinity, as in NumPy; every loop that can meet it says what it does then.
+compiled = njit(cache=True, error_model="numpy")
+
 # Columns of a row.
 KIND, K0, KC, EPS_A, EPS_C, KH_PLUS, KH_MINUS, ETA = range(8)
 SIGMA_A, SIGMA_C, EPS_STAR, EPS_HAT_A, EPS_HAT_C, SIGMA_HAT_A, SIGMA_HAT_C, N_COLUMNS = range(8, 16)
@@ -27,11 +30,11 @@ SIGMA_A, SIGMA_C, EPS_STAR, EPS_HAT_A, EPS_HAT_C, SIGMA_HAT_A, SIGMA_HAT_C, N_CO
 A, D, C, E, LINE, OPEN = range(6)
 BRANCH_NAMES = ("a", "d", "c", "e", "line", "open")
 
-_derived_points = njit(cache=True)(derived_points)
-_admissible = njit(cache=True)(admissible)
+_derived_points = compiled(derived_points)
+_admissible = compiled(admissible)
 
 
-@njit(cache=True)
+@compiled
 def fill_bistable(
     row: Row,
     k0: float,
@@ -59,7 +62,7 @@ def fill_bistable(
     return True
 
 
-@njit(cache=True)
+@compiled
 def fill_linear(row: Row, k0: float, eta: float, unilateral: bool) -> bool:
     """Write a linear spring into `row`; false, and nothing written, if it is not admissible."""
     if not (0.0 < k0 < math.inf and eta >= 0.0):
@@ -69,7 +72,7 @@ def fill_linear(row: Row, k0: float, eta: float, unilateral: bool) -> bool:
     return True
 
 
-@njit(cache=True)
+@compiled
 def fill_rows(kinds: Branches, values: Array, rows: Array) -> bool:
     """Write the springs of a flat vector of parameters into `rows`; false if one is not admissible.
 
@@ -106,7 +109,7 @@ def linear_row(k0: float, eta: float, unilateral: bool) -> Row:
 # ---------------------------------------------------------------- the law of one spring
 
 
-@njit(cache=True)
+@compiled
 def branch_shape(row: Row, branch: int) -> tuple[bool, float, float, float]:
     """Return (curved, slope k, strain origin x0, stress origin s0) of a branch of eq. 2.
 
@@ -125,7 +128,7 @@ def branch_shape(row: Row, branch: int) -> tuple[bool, float, float, float]:
     return False, 0.0, 0.0, 0.0
 
 
-@njit(cache=True)
+@compiled
 def stress_on(row: Row, branch: int, eps: float) -> float:
     """Stress on a branch (eq. 2); infinite at or past the pole of a curved one."""
     curved, k, x0, s0 = branch_shape(row, branch)
@@ -135,7 +138,7 @@ def stress_on(row: Row, branch: int, eps: float) -> float:
     return k * x / (1.0 - x) if x < 1.0 else math.inf
 
 
-@njit(cache=True)
+@compiled
 def strain_on(row: Row, branch: int, sigma: float) -> float:
     """Strain on a branch, the inverse of eq. 2; on a flat branch its end where it is entered."""
     curved, k, x0, s0 = branch_shape(row, branch)
@@ -144,14 +147,14 @@ def strain_on(row: Row, branch: int, sigma: float) -> float:
     return x0 + (sigma - s0) / k if k > 0.0 else x0
 
 
-@njit(cache=True)
+@compiled
 def slope_on(row: Row, branch: int, eps: float) -> float:
     """Slope dσ/dε of eq. 2 on a branch."""
     curved, k, x0, _ = branch_shape(row, branch)
     return k / (1.0 - (eps - x0)) ** 2 if curved else k
 
 
-@njit(cache=True)
+@compiled
 def interval(row: Row, branch: int) -> tuple[float, float]:
     """Strains (low, high) at which a spring leaves a branch."""
     if branch == A:
@@ -167,7 +170,7 @@ def interval(row: Row, branch: int) -> tuple[float, float]:
     return -math.inf, 0.0
 
 
-@njit(cache=True)
+@compiled
 def above(branch: int) -> int:
     """Name the branch that a spring enters when it leaves `branch` upwards in strain."""
     if branch == A:
@@ -175,7 +178,7 @@ def above(branch: int) -> int:
     return C if branch in (D, E) else LINE
 
 
-@njit(cache=True)
+@compiled
 def below(branch: int) -> int:
     """Name the branch that a spring enters when it leaves `branch` downwards in strain."""
     if branch == C:
@@ -183,13 +186,13 @@ def below(branch: int) -> int:
     return A if branch in (D, E) else OPEN
 
 
-@njit(cache=True)
+@compiled
 def first_branch(row: Row) -> int:
     """Branch of a spring at rest."""
     return A if row[KIND] == BISTABLE else LINE
 
 
-@njit(cache=True)
+@compiled
 def branch_at_strain(row: Row, branch: int, eps: float) -> int:
     """Branch at strain `eps` of a spring that was last seen on `branch` (eqs. 2 and 3)."""
     if row[KIND] == LINEAR:
@@ -205,7 +208,7 @@ def branch_at_strain(row: Row, branch: int, eps: float) -> int:
     return E if eps >= row[EPS_HAT_A] else A
 
 
-@njit(cache=True)
+@compiled
 def branch_at_stress(row: Row, branch: int, sigma: float) -> int:
     """Branch at stress `sigma` of a spring that was last seen on `branch` (eqs. 2 and 3)."""
     if row[KIND] == LINEAR:
@@ -225,7 +228,7 @@ def branch_at_stress(row: Row, branch: int, sigma: float) -> int:
     return E if sigma >= row[SIGMA_HAT_A] else A
 
 
-@njit(cache=True)
+@compiled
 def stress_along(row: Row, eps: Array) -> tuple[Array, Branches]:
     """Stress and branch of one spring along a strain history, from rest."""
     sigma = np.empty(eps.size)
@@ -238,7 +241,7 @@ def stress_along(row: Row, eps: Array) -> tuple[Array, Branches]:
     return sigma, branches
 
 
-@njit(cache=True)
+@compiled
 def strain_along(row: Row, sigma: Array) -> tuple[Array, Branches]:
     """Strain and branch of one spring along a stress history, from rest; -inf if it cannot."""
     eps = np.empty(sigma.size)
@@ -251,7 +254,7 @@ def strain_along(row: Row, sigma: Array) -> tuple[Array, Branches]:
     return eps, branches
 
 
-@njit(cache=True)
+@compiled
 def tangent_along(row: Row, eps: Array, branches: Branches) -> Array:
     """Slope dσ/dε at each sample of a strain history whose branches are known."""
     slope = np.empty(eps.size)
@@ -263,26 +266,30 @@ def tangent_along(row: Row, eps: Array, branches: Branches) -> Array:
 # ---------------------------------------------------------------- springs in series, in equilibrium
 
 
-@njit(cache=True)
+@compiled
 def _series_strain(
     rows: Array, branches: Branches, heights: Array, sigma: float, eps: Array
-) -> tuple[float, float]:
-    """Strains of springs in series under one stress; returns (elongation, compliance)."""
+) -> tuple[float, float, float]:
+    """Fill the strains of springs in series under one stress.
+
+    Returns elongation, compliance, and the size of the terms that the elongation is made of.
+    """
     total = 0.0
     compliance = 0.0
+    size = 0.0
     for i in range(rows.shape[0]):
         branch = branch_at_stress(rows[i], branches[i], sigma)
         if branch == OPEN:
             eps[i] = -math.inf
         else:
             eps[i] = strain_on(rows[i], branch, sigma)
-            slope = slope_on(rows[i], branch, eps[i])
-            compliance += heights[i] / slope if slope > 0.0 else math.inf
+            compliance += heights[i] / slope_on(rows[i], branch, eps[i])
         total += heights[i] * eps[i]
-    return total, compliance
+        size += heights[i] * abs(eps[i])
+    return total, compliance, size
 
 
-@njit(cache=True)
+@compiled
 def _bracket(
     rows: Array, branches: Branches, heights: Array, elongation: float, sigma: float, eps: Array
 ) -> tuple[float, float]:
@@ -306,7 +313,7 @@ def _bracket(
     return low, high
 
 
-@njit(cache=True)
+@compiled
 def _split_jump(
     rows: Array,
     branches: Branches,
@@ -336,47 +343,48 @@ def _split_jump(
     return 0.5 * (low + high)
 
 
-@njit(cache=True)
+@compiled
 def equilibrate(
     rows: Array, branches: Branches, heights: Array, elongation: float, sigma: float, eps: Array
 ) -> float:
     """Common stress of undamped springs in series at a given elongation; fills their strains.
 
     Along a monotone stretch each spring follows one monotone function of the common stress, so the
-    sum of their elongations has one root, whatever switches lie on the way. Newton's method inside
-    a shrinking bracket finds it. Where the root lies in a jump of that function (k_h± = 0), the
+    sum of their elongations has one root, whatever switches lie on the way. Newton's method finds
+    it, from the eighth trial on inside a shrinking bracket. Where the root lies in a jump of that function (k_h± = 0), the
     springs share it from the base up. `branches` is brought up to date.
     """
-    low, high = _bracket(rows, branches, heights, elongation, sigma, eps)
-    sigma = min(max(sigma, low), high)
-    for _ in range(200):
-        total, compliance = _series_strain(rows, branches, heights, sigma, eps)
+    found = False
+    low, high = -math.inf, math.inf
+    for trial_number in range(200):
+        total, compliance, size = _series_strain(rows, branches, heights, sigma, eps)
         miss = total - elongation
-        if miss == 0.0:
+        if abs(miss) <= 2e-15 * (size + abs(elongation)) and math.isfinite(total):
+            found = True
             break
         if miss > 0.0:
-            high = sigma
+            high = min(high, sigma)
         else:
-            low = sigma
+            low = max(low, sigma)
         trial = sigma - miss / compliance
-        if not low < trial < high:
+        if trial_number == 8:  # a kink or a jump: bracket it
+            low, high = _bracket(rows, branches, heights, elongation, sigma, eps)
+        if trial_number >= 8 and not low < trial < high:
             trial = 0.5 * (low + high)
-        if trial == sigma or abs(trial - sigma) <= 2e-16 * abs(sigma):
-            break
+            if trial in (low, high):  # neighbouring numbers: nothing lies between them
+                found = abs(miss) <= 1e-12 * (size + abs(elongation))
+                break
+        elif not low < trial < high:
+            trial = 0.5 * (low + high) if math.isfinite(low) and math.isfinite(high) else sigma
         sigma = trial
-    total, compliance = _series_strain(rows, branches, heights, sigma, eps)
-    scale = abs(elongation)
-    for i in range(eps.size):
-        scale += heights[i] * abs(eps[i])
-    slack = 1e-12 * scale + 4e-16 * compliance * abs(sigma)
-    if not (math.isfinite(total) and abs(total - elongation) <= slack):
+    if not found:
         sigma = _split_jump(rows, branches, heights, elongation, low, high, eps)
     for i in range(eps.size):
         branches[i] = branch_at_strain(rows[i], branches[i], eps[i])
     return sigma
 
 
-@njit(cache=True)
+@compiled
 def equilibrium_along(rows: Array, heights: Array, top: Array) -> tuple[Array, Array, Branches]:
     """Springs in series, undamped and massless, along a history of the top's displacement (m).
 

@@ -18,7 +18,8 @@ from foamfit.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.errors import InputError, SimulationError
 from foamfit.measurement import Measurement
 from foamfit.model import Model
-from foamfit.simulation import Motion, Plan, plan
+from foamfit.simulation import Motion, Plan
+from foamfit.simulation import plan as make_plan
 from foamfit.spring import LinearSpring
 
 Array = NDArray[np.float64]
@@ -166,6 +167,14 @@ class Objective:
         self.scale = {name: self._scale(name) for name in CURVES}
         self.sizes = tuple(self._curve(name).size for name in self.counted)
         self.n_data = sum(self.sizes)
+        # Worse per sample than any curve that stays within ten ranges.
+        self.penalty = max(
+            PENALTY
+            * self.weights[name] ** 0.5
+            * float(np.ptp(self._curve(name)))
+            / self.scale[name]
+            for name in self.counted
+        )
 
     def _check_weights(self) -> None:
         for name, weight in self.weights.items():
@@ -205,7 +214,7 @@ class Objective:
         count = len(self.model.kinds)
         springs = [LinearSpring(1.0, eta=1.0 if damped else 0.0)] * count
         heights = [specimen.height / count] * count
-        return plan(Chain(springs, heights, specimen.area), loading, self.time)
+        return make_plan(Chain(springs, heights, specimen.area), loading, self.time)
 
     def _measured(self) -> dict[str, Array | None]:
         """Measured curves that the drive leaves free."""
@@ -249,12 +258,14 @@ class Objective:
             raise SimulationError("the parameters are not admissible")
         damped = bool(rows[:, kernels.ETA].any())
         drag = float(values[-1]) / self.measurement.specimen.height
-        run = self._plans[damped].run(rows, heights, self.rtol, drag=drag, inner=False)
+        plan = self._plans[damped]
+        run = plan.run(rows, heights, self.rtol, drag=drag, everything=everything)
         along: Array | None = None
         if self.drive == "displacement":
             along = run.base_stress
         elif self._along and (everything or "stress_strain" in self.counted):
-            along = self._along[damped].run(rows, heights, self.rtol, inner=False).base_stress
+            plan = self._along[damped]
+            along = plan.run(rows, heights, self.rtol, everything=False).base_stress
         return Simulated(
             stress_time=None if self.drive == "stress" else self._timed(run.base_stress),
             displacement_time=None if self.drive == "displacement" else run.displacement[-1],
@@ -273,22 +284,14 @@ class Objective:
             curves = self.simulate(values)
         except SimulationError:
             self.failures += 1
-            return np.full(self.n_data, self._penalty())
+            return np.full(self.n_data, self.penalty)
         parts = []
         for name in self.counted:
             simulated = getattr(curves, name)
             factor = self.weights[name] ** 0.5 / self.scale[name]
             parts.append((simulated - self.measured[name]) * factor)
-        return np.concatenate(parts)
-
-    def _penalty(self) -> float:
-        """Residual per sample that is worse than any curve which stays within ten ranges."""
-        return max(
-            PENALTY
-            * float(self.weights[name] ** 0.5 * np.ptp(self._curve(name)))
-            / self.scale[name]
-            for name in self.counted
-        )
+        # A stress near the pole of branch c is as bad as none.
+        return np.asarray(np.clip(np.concatenate(parts), -self.penalty, self.penalty))
 
     def jacobian(
         self,

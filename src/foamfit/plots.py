@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 import textwrap
 import warnings
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from foamfit.comparison import Comparison, Row, Section
     from foamfit.result import FitResult
     from foamfit.simulation import Response
 
@@ -55,6 +57,13 @@ UNITS = {
     "m": ((1.0, "m"), (1e-3, "mm"), (1e-6, "µm")),
 }
 BESIDE = {"a": (-6, 4), "d": (-6, 4), "c": (7, -3), "e": (4, -7)}  # points from the branch
+MARKS = ((BLUE, "o"), (VERMILION, "s"), ("black", "^"), (GREY, "D"))  # of results in a comparison
+MATH = {
+    "k0": "$k_0$", "σ_a": r"$\sigma_a$", "ε_a": r"$\varepsilon_a$", "ε_c": r"$\varepsilon_c$",
+    "k_h+": "$k_{h+}$", "k_h−": "$k_{h-}$", "k_c": "$k_c$", "Δσ": r"$\Delta\sigma$",
+    "η": r"$\eta$",
+}  # fmt: skip
+IN_MATH = re.compile("|".join(map(re.escape, MATH)))
 DPI = 250  # of a PNG
 MARKERS = 60  # of a measured curve: more of them blot
 
@@ -184,7 +193,10 @@ def plot_response(response: Response, path: str | Path | None = None) -> Figure:
         for i, node in enumerate(nodes[:-1]):
             axes[1].plot(time / ft, node / fw, color=str(shades[i]), lw=1.0, label=f"node {i + 1}")
         axes[1].plot(time / ft, nodes[-1] / fw, color=VERMILION, lw=1.3, label="top")
-        axes[2].plot(response.strain, stress / fs, color=VERMILION, lw=1.3)
+        end = (
+            time.size if response.contact_end is None else int(np.sum(time <= response.contact_end))
+        )
+        axes[2].plot(response.strain[:end], stress[:end] / fs, color=VERMILION, lw=1.3)
         for ax, x_label, y_label in (
             (axes[0], f"time ({t_unit})", f"base stress ({s_unit})"),
             (axes[1], f"time ({t_unit})", f"displacement ({w_unit})"),
@@ -203,6 +215,51 @@ def plot_response(response: Response, path: str | Path | None = None) -> Figure:
             )  # fmt: skip
         if len(nodes) > 1:
             axes[1].legend(loc="best", handlelength=1.4)
+    if path is not None:
+        _save(figure, Path(path))
+    return figure
+
+
+def plot_comparison(comparison: Comparison, path: str | Path | None = None) -> Figure:
+    """Draw how far each parameter is from its reference, in standard errors, and in percent.
+
+    Parameters
+    ----------
+    comparison : Comparison
+        From `foamfit.comparison.compare`.
+    path : str or Path, optional
+        Where to save the figure; the suffix gives the format.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        One panel for each reference, 7 in wide; shaded are one and three standard errors. What is
+        not compared is left out, what is not determined is named.
+    """
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    groups: dict[str, list[Section]] = {}
+    for section in comparison.sections:
+        groups.setdefault(section.reference, []).append(section)
+    columns = min(len(groups), 2)
+    rows = [list(groups.items())[i : i + columns] for i in range(0, len(groups), columns)]
+    lines = [max(_comparison_lines(sections) for _, sections in row) for row in rows]
+    with matplotlib.rc_context(STYLE):
+        size = (7.0, 0.5 + sum(0.6 + 0.12 * n for n in lines))
+        figure = Figure(figsize=size, layout="constrained")
+        grid = figure.add_gridspec(len(rows), columns, height_ratios=[n + 2 for n in lines])
+        for i, row in enumerate(rows):
+            for j, (reference, sections) in enumerate(row):
+                ax = figure.add_subplot(grid[i, j])
+                _draw_comparison(ax, sections)
+                title = textwrap.fill(f"beside {reference}", 58 if columns == 2 else 110)
+                ax.set_title(
+                    title, loc="left", fontsize=7.5, pad=4, weight="bold", parse_math=False
+                )
+                if i == len(rows) - 1 or len(rows[i + 1]) <= j:
+                    ax.set_xlabel("deviation (standard errors)")
+        _name_results(figure, list(groups.values()))
     if path is not None:
         _save(figure, Path(path))
     return figure
@@ -285,6 +342,101 @@ def _panels(result: FitResult) -> Iterator[_Panel]:
         lines = [_Line(x, y, kind) for kind, x, y in curves if x is not None and y is not None]
         if lines:
             yield _Panel(key, x_name, x_unit, y_name, y_unit, lines)
+
+
+def _shown(sections: list[Section]) -> list[str]:
+    """Return the parameters of which some result has something to show, in their order."""
+    rows = [row for section in sections for row in section.rows]
+    there = {r.label for r in rows if r.standard_errors is not None or _lost(r)}
+    return list(dict.fromkeys(row.label for row in rows if row.label in there))
+
+
+def _lost(row: Row) -> bool:
+    return row.state == "not determined" and row.reference is not None
+
+
+def _comparison_lines(sections: list[Section]) -> int:
+    return max(len(_shown(sections)), 1) * (len(sections) + 1)
+
+
+def _draw_comparison(ax: Axes, sections: list[Section]) -> None:
+    """One line for each parameter of each result; results of a parameter stand together."""
+    labels = _shown(sections)
+    if not labels:
+        _say_nothing_there(ax)
+        return
+    found = [row.standard_errors for section in sections for row in section.rows]
+    reach = max(4.0, 1.1 * max((abs(z) for z in found if z is not None), default=0.0))
+    for half, shade in ((3.0, "0.95"), (1.0, "0.88")):
+        ax.axvspan(-half, half, color=shade, lw=0, zorder=0)
+    ax.axvline(0.0, color=GREY, lw=0.6, zorder=1)
+    step = len(sections) + 1
+    for k, section in enumerate(sections):
+        color, mark = MARKS[k % len(MARKS)]
+        for row in section.rows:
+            if row.label not in labels:
+                continue
+            y = labels.index(row.label) * step + k
+            if _lost(row):
+                ax.annotate(
+                    "not determined", (0.0, y), ha="center", va="center", fontsize=6.5,
+                    color=color, style="italic",
+                )  # fmt: skip
+            elif row.standard_errors is not None:
+                ax.plot([0.0, row.standard_errors], [y, y], color=color, lw=0.9, zorder=2)
+                ax.plot(
+                    row.standard_errors, y, mark, ms=3.4, color=color, zorder=3,
+                    mfc="white" if row.state == "weak" else color,
+                )  # fmt: skip
+                ax.annotate(
+                    _percent(row), (1.0, y), (2, 0), xycoords=("axes fraction", "data"),
+                    textcoords="offset points", ha="left", va="center", fontsize=6.5, color=color,
+                )  # fmt: skip
+    ax.set_xlim(-reach, reach)
+    ax.set_ylim(step * len(labels) - 0.5, -1.0)
+    ax.set_yticks(
+        [i * step + 0.5 * (step - 2) for i in range(len(labels))],
+        [IN_MATH.sub(lambda found: MATH[found[0]], label) for label in labels],
+    )
+    ax.tick_params(axis="y", length=0)
+    ax.spines["left"].set_visible(False)
+
+
+def _name_results(figure: Figure, groups: list[list[Section]]) -> None:
+    """Say once what the colours mean: the drives, where these are the same in every panel."""
+    drives = [[f"{section.drive} drive" for section in sections] for sections in groups]
+    longest = max(drives, key=len)
+    alike = all(names == longest[: len(names)] for names in drives)
+    if alike and len(set(longest)) == len(longest):
+        names = longest
+    elif len(groups) == 1:
+        names = [f"{s.test}: {s.model}, {s.drive} drive" for s in groups[0]]
+    else:
+        names = [f"result {k + 1}" for k in range(len(longest))]
+    for k, name in enumerate(names):
+        color, mark = MARKS[k % len(MARKS)]
+        figure.axes[0].plot([], [], mark, ms=3.4, color=color, label=name)
+    if any(row.state == "weak" for group in groups for section in group for row in section.rows):
+        figure.axes[0].plot(
+            [], [], "o", ms=3.4, color=GREY, mfc="white", label="hollow: weakly determined"
+        )
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(
+        handles, [label.replace("$", r"\$") for label in labels], loc="outside lower center",
+        ncols=1 if max(map(len, labels)) > 30 else len(labels), handletextpad=0.2,
+    )  # fmt: skip
+
+
+def _percent(row: Row) -> str:
+    """Return the difference with its standard error, in percent of the reference."""
+    if row.percent is None or not row.reference:
+        return ""
+    spread = 100.0 * math.hypot(row.stderr or 0.0, row.reference_stderr or 0.0)
+    spread /= abs(row.reference)
+    places = 0 if spread >= 10.0 else 1 if spread >= 1.0 else 2
+    shown = f"{row.percent:+.{places}f}"
+    shown = shown[1:] if float(shown) == 0.0 else shown.replace("-", "−")
+    return f"{shown} ± {spread:.{places}f} %"
 
 
 def _row(figure: Figure, n: int) -> list[Axes]:

@@ -196,7 +196,7 @@ def _unit_row(grid: list[list[str]], i: int) -> tuple[int, list[str]]:
 
 
 def _assign(table: _Table, given: dict[str, Column], toml: Path | None) -> dict[str, int]:
-    """Which column each channel is in: as ``[columns]`` of the TOML says, else as the headers do."""
+    """Which column each channel is in: as the TOML says, else as the headers do."""
     found: dict[str, int] = {}
     for channel in _CHANNELS:
         if channel in given:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import base64
 import math
 import textwrap
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
+from foamfit.conditioning import engineering
 from foamfit.plots import DPI, image, origin_word, plot_fit, plot_residuals, readable_unit
 
 if TYPE_CHECKING:
@@ -40,9 +42,22 @@ SYMBOLS = {
     "height": ("h", ""), "site_eta": ("η", "site"),
 }  # fmt: skip
 STATISTICS = {
-    "n_data": "data points", "n_vary": "parameters varied", "redchi": "reduced χ²", "aic": "AIC",
-    "aicc": "AICc", "bic": "BIC",
+    "n_data": "data points", "n_effective": "effective samples", "n_vary": "parameters varied",
+    "chisqr": "χ²", "redchi": "reduced χ²", "aic": "AIC", "aicc": "AICc", "bic": "BIC",
+    "n_failed": "trials that could not be simulated", "n_descents": "valleys searched",
+    "n_agreeing": "descents that agree",
 }  # fmt: skip
+ENERGY = {  # of the audit: label and unit
+    "striker_energy": ("striker's energy", "J/m³"),
+    "absorbed_energy": ("absorbed energy", "J/m³"),
+    "dissipated_energy": ("dissipated energy", "J/m³"),
+    "dissipated_fraction": ("dissipated over absorbed", ""),
+    "absorbed_over_striker": ("absorbed over striker's", ""),
+    "rebound_velocity": ("rebound velocity", "m/s"),
+    "impulse": ("impulse of the force", "N·s"),
+    "momentum_change": ("change of momentum", "N·s"),
+    "impulse_ratio": ("impulse over change of momentum", ""),
+}
 CITATION = (
     "Thevamaran, R., Fraternali, F., Daraio, C. (2014). Multiscale Mass-Spring Model for "
     "High-Rate Compression of Vertically Aligned Carbon Nanotube Foams. "
@@ -110,7 +125,7 @@ def render_report(result: FitResult, *, fit_png: bytes | None = None) -> str:
         parameters=[readable(name, p) for name, p in result.parameters.items()],
         points={name: _points(spring) for name, spring in result.bistable_springs.items()},
         energy_sentences=energy.pop("sentences", None) or [],
-        energy={name.replace("_", " "): value for name, value in energy.items()},
+        energy=dict(_energies(energy)),
         drive_meaning=DRIVES.get(result.drive, ""),
         branches=BRANCHES,
         fit_figure=_figure(fit_png or image(plot_fit(result), "png")),
@@ -223,6 +238,14 @@ def _points(spring: Any) -> list[tuple[tuple[str, str], str, str, str]]:
         shown = "does not exist" if value is None else number(value / factor)
         rows.append((symbol, meaning, shown, unit or "–"))
     return rows
+
+
+def _energies(energy: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """Give label and value of the numbers of an audit; its texts are in its sentences."""
+    for name, value in energy.items():
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            label, unit = ENERGY.get(name, (name.replace("_", " "), ""))
+            yield label, engineering(value, unit) if unit else number(value)
 
 
 def _visited(result: FitResult) -> dict[str, tuple[str, ...] | None]:

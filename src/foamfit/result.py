@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -67,6 +68,14 @@ class Curves:
     stress_along: Array | None
 
 
+@dataclass(frozen=True, eq=False)
+class Correlation:
+    """Correlation matrix of the identified parameters, in the order of `names`."""
+
+    names: tuple[str, ...]
+    matrix: Array
+
+
 @dataclass(frozen=True)
 class Switch:
     """A change of branch in the fitted response: which spring, when, and where on the curves."""
@@ -100,6 +109,7 @@ class FitResult:
     runtime_s: float
     curves: Curves
     switches: tuple[Switch, ...]
+    correlation: Correlation | None = None
 
     @property
     def bistable_springs(self) -> dict[str, BistableSpring]:
@@ -136,6 +146,7 @@ class FitResult:
                 "status": self.status,
                 "warnings": self.warnings,
                 "parameters": {name: asdict(p) for name, p in self.parameters.items()},
+                **({"correlation": vars(self.correlation)} if self.correlation else {}),
                 "derived": derived,
                 "visited": self.visited,
                 "misfit": self.misfit,
@@ -190,6 +201,13 @@ def check_target(folder: str | Path) -> None:
                 )
         elif folder.exists():
             raise InputError(f"{folder} is a file; choose a new or an empty folder")
+        there = next(path for path in folder.absolute().parents if path.exists())
+        if not there.is_dir():
+            raise InputError(f"{folder} cannot be written: {there} is a file; choose another folder")
+        if not os.access(there, os.W_OK | os.X_OK):
+            raise InputError(
+                f"{folder} cannot be written: Permission denied in {there}; choose another folder"
+            )
     except OSError as error:
         raise InputError(f"{folder} cannot be read: {error.strerror or error}") from error
 

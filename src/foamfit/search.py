@@ -16,7 +16,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 from scipy.signal import savgol_filter
 from scipy.stats import qmc
 
@@ -30,6 +29,8 @@ Progress = Callable[[float, str], None]
 LOOP_SAMPLES = 240
 LAST_STRAIN = 0.999
 CURVE_STARTS = 300
+# Valleys of the loop whose cost on the drive's curves is within this factor of the best go on.
+PROMISING = 100.0
 
 
 class SearchStoppedError(Exception):
@@ -163,7 +164,7 @@ class Space:
 
     @cached_property
     def coordinates(self) -> list[tuple[int, str, int]]:
-        """Place, short name, place of the spring's first parameter; what others need comes first."""
+        """Place, short name, place of the spring's first parameter; what others need is first."""
         out = []
         for name in sorted(self.free, key=lambda name: list(BOX).index(split_name(name)[1])):
             spring, short = split_name(name)
@@ -325,12 +326,17 @@ def _stiffness_between(rise: float, low: float, high: float) -> float:
 
 
 def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> list[Array]:
-    """Vectors of parameters read off the measured loop, from a Latin hypercube of marks."""
+    """Vectors of parameters read off the measured loop, from a Latin hypercube of marks.
+
+    Linear springs take a share of the largest displacement; each bistable spring is then read off
+    what is left with marks of its own. Springs in series that each follow the loop follow it
+    together.
+    """
     assert loop.displacement is not None
     assert loop.stress is not None
     kinds, index = space.model.kinds, space.model.index
     count = len(kinds)
-    marks = qmc.LatinHypercube(5 + 2 * count, rng=rng).random(CURVE_STARTS)
+    marks = qmc.LatinHypercube(7 * count, rng=rng).random(CURVE_STARTS)
     starts = []
     for mark in marks:
         values = space.values.copy()
@@ -339,24 +345,22 @@ def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> l
             given = [index[f"s{i}_height"] for i in range(1, count + 1)]
             for i, at in enumerate(given):
                 if space.model.names[at] in space.free:
-                    values[at] = heights[i] * (0.5 + mark[5 + i])
+                    values[at] = heights[i] * (0.3 + 1.4 * mark[7 * i + 5])
             values = space.tied(values)
             heights = np.maximum(values[given], 1e-3 * space.scales.height)
         motion = loop.displacement.copy()
         for i, kind in enumerate(kinds):
             if kind != "bistable":
-                share = 10.0 ** (-3.0 + 2.7 * mark[5 + count + i])
+                share = 10.0 ** (-3.0 + 2.7 * mark[7 * i + 6])
                 k0 = heights[i] * space.scales.stress / (share * motion.max())
                 values[index[f"s{i + 1}_k0"]] = k0
                 motion = motion - heights[i] * loop.stress / k0
         soft = sum(h for h, kind in zip(heights, kinds, strict=True) if kind == "bistable")
-        if soft:
-            spring = read_spring(Loop(motion / soft, loop.stress), mark, space.scales)
         for i, kind in enumerate(kinds):
             if kind == "bistable":
-                jitter = np.exp(0.4 * rng.standard_normal(8)) if kinds.count(kind) > 1 else 1.0
                 first = index[f"s{i + 1}_k0"]
-                values[first : first + 8] = spring * jitter
+                own = Loop(motion / soft, loop.stress)
+                values[first : first + 8] = read_spring(own, mark[7 * i : 7 * i + 5], space.scales)
         starts.append(space.encode(values))
     return starts
 
@@ -377,34 +381,66 @@ def box_starts(space: Space, rng: np.random.Generator, count: int) -> list[Array
 # ---------------------------------------------------------------- descent
 
 
-def descend(tracker: Tracker, space: Space, start: Array, evaluations: int) -> tuple[float, Array]:
-    """Least-squares descent in the box from one start; returns (cost, coordinates) of its best."""
+def descend(
+    tracker: Tracker, space: Space, start: Array, iterations: int, enough: float = 1e-5
+) -> tuple[float, Array]:
+    """Levenberg-Marquardt descent inside the box; returns (cost, coordinates) of its end.
+
+    Coordinates at an edge of the box that the gradient presses outwards are held. The damping
+    follows the gain ratio (Nielsen 1999, IMM-REP-1999-05). It ends when two steps in a row lower
+    the cost by less than the share `enough`.
+    """
     low, high = space.box
-    best = (np.inf, start)
 
-    def residual(point: Array) -> Array:
-        nonlocal best
-        value = tracker.residual(space.decode(point))
-        cost = float(value @ value)
-        if cost < best[0]:
-            best = (cost, point.copy())
-        return value
+    def cost_at(point: Array) -> tuple[float, Array]:
+        residual = tracker.residual(space.decode(point))
+        return float(residual @ residual), residual
 
-    def jacobian(point: Array) -> Array:
-        here = residual(point)
-        columns = np.empty((here.size, point.size))
-        for j in range(point.size):
-            moved = point.copy()
-            step = 1e-5 if point[j] + 1e-5 < high[j] else -1e-5
-            moved[j] += step
-            columns[:, j] = (residual(moved) - here) / step
-        return columns
+    point = start
+    cost, residual = cost_at(point)
+    damping, growth, idle = 1e-3, 2.0, 0
+    jacobian = _slopes(tracker, space, point, residual)
+    for _ in range(iterations):
+        gradient = jacobian.T @ residual
+        held = ((point <= low) & (gradient > 0.0)) | ((point >= high) & (gradient < 0.0))
+        free = np.flatnonzero(~held)
+        if free.size == 0:
+            break
+        normal = jacobian[:, free].T @ jacobian[:, free]
+        scale = np.maximum(np.diag(normal), 1e-12 * max(float(np.trace(normal)), 1e-300))
+        step = np.zeros(point.size)
+        step[free] = -np.linalg.solve(normal + damping * np.diag(scale), gradient[free])
+        trial = np.clip(point + step, low, high)
+        moved = trial - point
+        expected = -float(moved @ (2.0 * gradient + jacobian.T @ (jacobian @ moved)))
+        new_cost, new_residual = cost_at(trial)
+        if new_cost < cost:
+            gain = (cost - new_cost) / max(expected, 1e-300)
+            idle = idle + 1 if cost - new_cost < enough * cost else 0
+            point, cost, residual = trial, new_cost, new_residual
+            damping *= max(1.0 / 3.0, 1.0 - (2.0 * min(gain, 1.0) - 1.0) ** 3)
+            growth = 2.0
+            if idle == 2:
+                break
+            jacobian = _slopes(tracker, space, point, residual)
+        else:
+            damping *= growth
+            growth *= 2.0
+            if damping > 1e8 or float(np.max(np.abs(moved))) < 1e-9:
+                break
+    return cost, point
 
-    least_squares(
-        residual, start, jac=jacobian, bounds=(low, high), max_nfev=evaluations,
-        ftol=1e-5, xtol=1e-6, gtol=1e-10,
-    )  # fmt: skip
-    return best
+
+def _slopes(tracker: Tracker, space: Space, point: Array, here: Array) -> Array:
+    """Forward differences of the residual over the coordinates, (n_data, n_free)."""
+    high = space.box[1]
+    columns = np.empty((here.size, point.size))
+    for j in range(point.size):
+        step = 1e-5 if point[j] + 1e-5 < high[j] else -1e-5
+        moved = point.copy()
+        moved[j] += step
+        columns[:, j] = (tracker.residual(space.decode(moved)) - here) / step
+    return columns
 
 
 def rank(tracker: Tracker, space: Space, points: list[Array]) -> list[tuple[float, Array]]:
@@ -462,7 +498,7 @@ def search(
     space : Space
         The box.
     starts : int
-        Descents on the loop; the best half of the valleys go on to the curves of the drive.
+        Descents on the loop; the best quarter of them go on to the curves of the drive.
     rng : Generator
         Source of all chance.
     progress : callable
@@ -486,7 +522,9 @@ def search(
         points = [point for _, point in valleys(ends)]
     else:
         counts = {}
-    points = [point for _, point in valleys(rank(tracker, space, points))][: max(3, starts // 2)]
+    ranked = rank(tracker, space, points)
+    promising = [item for item in ranked if item[0] <= PROMISING * ranked[0][0]]
+    points = [point for _, point in valleys(promising)][: max(3, starts // 4)]
     out = []
     for i, point in enumerate(points):
         progress(0.7 + 0.25 * i / len(points), "curves")

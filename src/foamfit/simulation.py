@@ -113,12 +113,12 @@ class Plan:
         rtol: float = 1e-6,
         *,
         drag: float | None = None,
-        inner: bool = True,
+        everything: bool = True,
     ) -> Motion:
         """Run the scene with the springs in `rows` (n_springs, columns) and their heights (m).
 
-        `drag` replaces the scene's own. With `inner` false only the displacement of the top is
-        computed, shape (1, n_t).
+        `drag` replaces the scene's own. With `everything` false only the base stress and the
+        displacement of the top, shape (1, n_t), are sure to be there.
 
         Raises
         ------
@@ -126,10 +126,10 @@ class Plan:
             If the scene has no finite answer; the message says why.
         """
         if self.solver == CLOSED_FORM:
-            motion = self._closed_form(rows, heights, inner)
+            motion = self._closed_form(rows, heights, everything)
         else:
             motion = self._integrate(
-                rows, heights, rtol, self.drag if drag is None else drag, inner
+                rows, heights, rtol, self.drag if drag is None else drag, everything
             )
         if not (
             math.isfinite(float(motion.base_stress.sum()))
@@ -138,7 +138,7 @@ class Plan:
             raise SimulationError(_OUTCOMES[taylor.NOT_FINITE])
         return motion
 
-    def _closed_form(self, rows: Array, heights: Array, inner: bool) -> Motion:
+    def _closed_form(self, rows: Array, heights: Array, everything: bool) -> Motion:
         """Undamped and massless: one stress in all springs; or one spring under known motion."""
         count, n = len(heights), self.time.size
         if self.top == taylor.MOTION:
@@ -151,21 +151,19 @@ class Plan:
             strain, branches = np.empty((count, n)), np.empty((count, n), np.int64)
             for i in range(count):
                 strain[i], branches[i] = kernels.strain_along(rows[i], stress)
+        if not everything:
+            top = (heights @ strain)[None, :]
+            return Motion(top, np.array(stress), math.nan, np.empty((0, 5)), 0)
         nodes = np.cumsum(heights[:, None] * strain, axis=0)
-        return Motion(
-            nodes if inner else nodes[-1:],
-            np.array(stress),
-            math.nan,
-            _switches(self.time, strain, branches),
-            0,
-        )
+        switches = _switches(self.time, strain, branches)
+        return Motion(nodes, np.array(stress), math.nan, switches, 0)
 
     def _integrate(
-        self, rows: Array, heights: Array, rtol: float, drag: float, inner: bool
+        self, rows: Array, heights: Array, rtol: float, drag: float, everything: bool
     ) -> Motion:
         tolerance = max(0.01 * rtol, 1e-16)
         order = min(max(round(4.0 - 0.5 * math.log(tolerance)), 6), 24)
-        displacement = np.empty((len(heights) if inner else 1, self.time.size))
+        displacement = np.empty((len(heights) if everything else 1, self.time.size))
         stress = np.empty(self.time.size)
         log = np.empty((1024, 5))
         outcome, contact_end, steps, switches = taylor.integrate(

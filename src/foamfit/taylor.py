@@ -16,7 +16,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from foamfit.kernels import (
     ETA,
@@ -27,6 +26,7 @@ from foamfit.kernels import (
     branch_at_strain,
     branch_at_stress,
     branch_shape,
+    compiled,
     equilibrate,
     first_branch,
     interval,
@@ -41,7 +41,7 @@ FREE, VISCOUS, STRESS, MOTION = range(4)
 DONE, TOO_MANY_STEPS, STEP_UNDERFLOW, FLAT_UNDER_STRESS, NOT_FINITE = range(5)
 
 
-@njit(cache=True)
+@compiled
 def _product(x: Array, y: Array, n: int, first: int, last: int) -> float:
     """Σ x_j y_{n-j} for j from first to last."""
     total = 0.0
@@ -50,7 +50,7 @@ def _product(x: Array, y: Array, n: int, first: int, last: int) -> float:
     return total
 
 
-@njit(cache=True)
+@compiled
 def _stress_term(rows: Array, i: int, branch: int, eps: Array, sig: Array, n: int) -> float:
     """Order n of a spring's stress from its strain up to order n."""
     if n == 0:
@@ -63,7 +63,7 @@ def _stress_term(rows: Array, i: int, branch: int, eps: Array, sig: Array, n: in
     return (k * eps[i, n] + known) / (1.0 - x)
 
 
-@njit(cache=True)
+@compiled
 def _strain_term(
     rows: Array, i: int, branch: int, eps: Array, sig: Array, n: int
 ) -> tuple[float, float]:
@@ -79,7 +79,7 @@ def _strain_term(
     return -known / stiff, (1.0 - (eps[i, 0] - x0)) / stiff
 
 
-@njit(cache=True)
+@compiled
 def _share_elongation(
     rows: Array,
     branches: Branches,
@@ -120,7 +120,7 @@ def _share_elongation(
     return s_n
 
 
-@njit(cache=True)
+@compiled
 def _group_term(
     rows: Array,
     branches: Branches,
@@ -170,7 +170,7 @@ def _group_term(
     return _share_elongation(rows, branches, heights, i0, i1, eps, sig, u_n, n)
 
 
-@njit(cache=True)
+@compiled
 def _stressed_term(
     rows: Array, branches: Branches, i0: int, i1: int, eps: Array, sig: Array, s_n: float, n: int
 ) -> bool:
@@ -187,7 +187,7 @@ def _stressed_term(
     return True
 
 
-@njit(cache=True)
+@compiled
 def _expand(
     rows: Array,
     branches: Branches,
@@ -248,7 +248,7 @@ def _expand(
     return True
 
 
-@njit(cache=True)
+@compiled
 def _value(c: Array, order: int, tau: float) -> float:
     """Value of a polynomial."""
     total = c[order]
@@ -257,7 +257,7 @@ def _value(c: Array, order: int, tau: float) -> float:
     return total
 
 
-@njit(cache=True)
+@compiled
 def _slope(c: Array, order: int, tau: float) -> float:
     """Return the derivative of a polynomial."""
     total = order * c[order]
@@ -266,7 +266,7 @@ def _slope(c: Array, order: int, tau: float) -> float:
     return total
 
 
-@njit(cache=True)
+@compiled
 def _root(c: Array, order: int, level: float, lo: float, hi: float) -> float:
     """Root of polynomial - level in [lo, hi], whose ends lie on either side: guarded Newton."""
     rising = _value(c, order, hi) > level
@@ -290,7 +290,7 @@ def _root(c: Array, order: int, level: float, lo: float, hi: float) -> float:
     return tau
 
 
-@njit(cache=True)
+@compiled
 def _turn(c: Array, order: int, lo: float, hi: float) -> float:
     """Bisect for the turning point of a polynomial whose slope changes sign in [lo, hi]."""
     rising = _slope(c, order, lo) > 0.0
@@ -303,7 +303,7 @@ def _turn(c: Array, order: int, lo: float, hi: float) -> float:
     return 0.5 * (lo + hi)
 
 
-@njit(cache=True)
+@compiled
 def _crossing(c: Array, order: int, low: float, high: float, span: float) -> tuple[float, int]:
     """First time in [0, span] at which a polynomial leaves [low, high], and the side (-1, 0, 1).
 
@@ -337,7 +337,7 @@ def _crossing(c: Array, order: int, low: float, high: float, span: float) -> tup
     return span, 0
 
 
-@njit(cache=True)
+@compiled
 def _longest(c: Array, order: int, scale: float, tol: float, span: float) -> float:
     """Step at which the last two terms of a series fall below tol × scale."""
     for n in (order - 1, order):
@@ -347,7 +347,7 @@ def _longest(c: Array, order: int, scale: float, tol: float, span: float) -> flo
     return span
 
 
-@njit(cache=True)
+@compiled
 def _step_length(
     heights: Array,
     w: Array,
@@ -384,7 +384,7 @@ def _step_length(
     return span
 
 
-@njit(cache=True)
+@compiled
 def _sample(
     heights: Array,
     ends: Branches,
@@ -415,7 +415,7 @@ def _sample(
         out_w[0, j] = node
 
 
-@njit(cache=True)
+@compiled
 def _fly(
     out_w: Array, out_s: Array, t: Array, first: int, t_end: float, w_end: Array, speed: float
 ) -> None:
@@ -426,7 +426,7 @@ def _fly(
             out_w[i, j] = w_end[i] + speed * (t[j] - t_end)
 
 
-@njit(cache=True)
+@compiled
 def _settle(
     rows: Array,
     branches: Branches,
@@ -462,7 +462,7 @@ def _settle(
         i0 = i1
 
 
-@njit(cache=True)
+@compiled
 def _start(
     rows: Array,
     branches: Branches,
@@ -492,7 +492,7 @@ def _start(
                 eps[i, 0] = strain_on(rows[i], branches[i], value)
 
 
-@njit(cache=True)
+@compiled
 def integrate(
     rows: Array,
     heights: Array,

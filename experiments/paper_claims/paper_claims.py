@@ -1,0 +1,750 @@
+"""What the paper says, checked: the claims of its section 4 that can be tested without its data.
+
+No measured curve of the paper is available. Everything here is simulated from the published
+parameters (Thevamaran, Fraternali & Daraio 2014, Tables 1-3). The script writes the figures and
+README.md beside itself; every number on that page is computed here.
+
+    python experiments/paper_claims/paper_claims.py
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.signal import find_peaks
+
+import foamfit as ff
+from foamfit.kernels import BRANCH_NAMES
+from foamfit.literature import PublishedSet
+
+Array = NDArray[np.float64]
+
+HERE = Path(__file__).parent
+MODEL_1, MODEL_2, MODEL_3, FOAM_2 = "foam-1/model-1", "foam-1/model-2", "foam-1/model-3", "foam-2"
+SETS = (MODEL_2, MODEL_3, FOAM_2)  # those with a damper
+STRIKER, OWN_MASS = 7e-3, ff.published[MODEL_1].specimen_mass  # kg
+ETA = 1e4  # Pa·s, published for model-2 and foam-2
+
+DRIVE_VELOCITY = 2.0  # m/s, just fast enough to close the loop of foam-1
+OTHER_VELOCITIES = (1.75, 1.9, 2.0, 2.1, 2.3, 2.5)  # m/s, for how much the drive matters
+SAMPLES = 4001  # of a drive, over the contact
+RTOL = 1e-9
+TURN = 1e-3  # of the range: a smaller turn of a curve is not counted
+
+BLACK, GREY, BLUE, SKY = "#000000", "#8c8c8c", "#0072B2", "#56B4E9"
+VERMILION, ORANGE, GREEN, PURPLE = "#D55E00", "#E69F00", "#009E73", "#CC79A7"
+STYLE: Any = {
+    "font.size": 8,
+    "axes.labelsize": 8,
+    "axes.titlesize": 8,
+    "legend.fontsize": 7.5,
+    "legend.frameon": False,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.titlelocation": "left",
+    "lines.linewidth": 1.2,
+}
+
+
+# ------------------------------------------------------------------- stress drive: claims 1, 2
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A simulated base-stress history and the motion that belongs to it, SI."""
+
+    spring: ff.BistableSpring
+    height: float
+    area: float
+    time: Array
+    stress: Array
+    displacement: Array
+
+
+def drive_of_impact(
+    name: str = MODEL_2, velocity: float = DRIVE_VELOCITY, samples: int = SAMPLES
+) -> Drive:
+    """Base stress and motion while a 7 g striker is on an undamped one-spring model."""
+    item = ff.published[name]
+    chain = ff.Chain(item.chain.springs, item.chain.heights, item.chain.area)
+    hit = ff.Impact(STRIKER, velocity)
+    long = np.linspace(0.0, 20.0 * chain.height / velocity, 101)
+    end = ff.simulate(chain, hit, long, rtol=RTOL).contact_end
+    assert end is not None
+    time = np.linspace(0.0, end, samples)
+    got = ff.simulate(chain, hit, time, rtol=RTOL)
+    stress = np.maximum(got.base_stress, 0.0)
+    return Drive(item.bistable, chain.height, chain.area, time, stress, got.displacement[-1])
+
+
+def driven(drive: Drive, mass: float, damper: float, rtol: float = RTOL) -> ff.Response:
+    """The spring of the drive under its stress, with a mass (kg) and an onsite damper (Pa·s)."""
+    chain = ff.Chain([drive.spring], [drive.height], drive.area, [mass], site_damping=damper)
+    return ff.simulate(chain, ff.StressDrive(drive.stress), drive.time, rtol=rtol)
+
+
+def rms(difference: Array, reference: Array) -> float:
+    """RMS of a difference over the samples of the contact, in % of the peak of the reference."""
+    return float(100.0 * np.sqrt(np.mean(difference**2)) / np.max(reference))
+
+
+def displacement_error(drive: Drive, mass: float, damper: float) -> float:
+    """RMS error of the displacement, % of its peak."""
+    got = driven(drive, mass, damper)
+    return rms(got.displacement[-1] - drive.displacement, drive.displacement)
+
+
+def extra_turns(curve: Array, reference: Array, share: float = TURN) -> int:
+    """Count the maxima and minima, larger than a share of the range, that the reference lacks."""
+
+    def turns(x: Array) -> int:
+        least = share * float(np.ptp(reference))
+        return sum(find_peaks(sign * x, prominence=least)[0].size for sign in (1.0, -1.0))
+
+    return turns(curve) - turns(reference)
+
+
+def oscillation(drive: Drive, mass: float, damper: float) -> dict[str, float]:
+    """Deviation from equilibrium, parted into ringing and lag; all in % of the peak.
+
+    Ringing is what the mass adds to the massless answer with the same damper; lag is what the
+    damper does to the massless answer.
+    """
+    got, massless = driven(drive, mass, damper), driven(drive, 0.0, damper)
+    w, w_0 = got.displacement[-1], massless.displacement[-1]
+    stress, stress_0 = got.base_stress, massless.base_stress
+    return {
+        "damper": damper,
+        "stress": rms(stress - drive.stress, drive.stress),
+        "largest": float(100 * np.max(abs(stress - drive.stress)) / np.max(drive.stress)),
+        "displacement": rms(w - drive.displacement, drive.displacement),
+        "ringing": rms(stress - stress_0, drive.stress),
+        "ringing_w": rms(w - w_0, drive.displacement),
+        "lag": rms(stress_0 - drive.stress, drive.stress),
+        "lag_w": rms(w_0 - drive.displacement, drive.displacement),
+        "turns": extra_turns(stress, drive.stress),
+        "turns_w": extra_turns(w, drive.displacement),
+    }
+
+
+def damper_needed(drive: Drive, mass: float = OWN_MASS, share: float = TURN) -> float:
+    """Least onsite damper (Pa·s) with which stress and displacement no longer turn to and fro."""
+
+    def turns(damper: float) -> int:
+        got = driven(drive, mass, damper)
+        return extra_turns(got.base_stress, drive.stress, share) + extra_turns(
+            got.displacement[-1], drive.displacement, share
+        )
+
+    low, high = 0.1, 1000.0
+    while high / low > 1.01:
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if turns(middle) > 0 else (low, middle)
+    return high
+
+
+def ringing_by_branch(drive: Drive, mass: float = OWN_MASS) -> dict[str, float]:
+    """Largest deviation of the stress from the drive on each branch, undamped, % of the peak."""
+    got = driven(drive, mass, 0.0)
+    branches = drive.spring.branches(got.strain)
+    off = 100.0 * abs(got.base_stress - drive.stress) / np.max(drive.stress)
+    return {name: float(np.max(off[branches == name])) for name in "adce"}
+
+
+def free_period(drive: Drive, mass: float, slope: float) -> float:
+    """Period of free vibration of a mass on the spring at a slope dσ/dε (Pa), s."""
+    return 2.0 * math.pi * math.sqrt(mass * drive.height / (drive.area * slope))
+
+
+def slowed(drive: Drive, damper: float, slower: float) -> float:
+    """Displacement error (%) of 7 g and a damper if the drive is played so many times slower.
+
+    Time in units of the drive: a drive played s times slower on a mass m with a damper η is the
+    drive itself on m/s² with η/s.
+    """
+    return displacement_error(drive, STRIKER / slower**2, damper / slower)
+
+
+# ------------------------------------------------------------------------- damping ratios: claim 3
+
+READINGS = {
+    "the formula: k_c, H, ρ of the striker": lambda q: ratio(q, q["kc"]),
+    "striker and foam together in ρ": lambda q: ratio(q, q["kc"], mass=STRIKER + q["own"]),
+    "ρ = bulk density of the foam": lambda q: ratio(q, q["kc"], mass=q["own"]),
+    "k₀ for k_c": lambda q: ratio(q, q["k0"]),
+    "k_h+ for k_c": lambda q: ratio(q, q["kh_plus"]),
+    "k_h− (branch e) for k_c": lambda q: ratio(q, q["kh_minus"]),
+    "tangent of branch c at C2 for k_c": lambda q: ratio(q, q["tangent_c2"]),
+    "tangent of branch c at C1 for k_c": lambda q: ratio(q, q["tangent_c1"]),
+    "secant of branch c, C2 to C1, for k_c": lambda q: ratio(q, q["secant"]),
+    "secant from zero to C1 for k_c": lambda q: ratio(q, q["secant_0"]),
+    "secant of branch c from ε_* to C1": lambda q: ratio(q, q["secant_c"]),
+    "k_c − k₀ for k_c": lambda q: ratio(q, q["kc"] - q["k0"]),
+    "k_c − k_h+ for k_c": lambda q: ratio(q, q["kc"] - q["kh_plus"]),
+    "height of the bistable spring for H": lambda q: ratio(q, q["kc"], height=q["h"]),
+    "height at C2, H(1 − ε_c)": lambda q: ratio(q, q["kc"], height=q["H"] * (1 - q["eps_c"])),
+    "height at A1, H(1 − ε_a)": lambda q: ratio(q, q["kc"], height=q["H"] * (1 - q["eps_a"])),
+    "height of the other specimen": lambda q: ratio(q, q["kc"], height=q["other_H"]),
+    "other specimen's height in 2h only": lambda q: ratio(q, q["kc"]) * q["H"] / q["other_H"],
+    "other specimen's height in ρ only": lambda q: (
+        ratio(q, q["kc"]) * math.sqrt(q["other_H"] / q["H"])
+    ),
+}
+
+
+def quantities(item: PublishedSet) -> dict[str, float]:
+    """What a reading of the damping ratio may be made of, SI."""
+    s, chain = item.bistable, item.chain
+    other = ff.published[MODEL_1 if item.name == FOAM_2 else FOAM_2].chain.height
+    return {
+        "eta": item.eta or 0.0,
+        "A": chain.area,
+        "H": chain.height,
+        "h": chain.heights[-1],
+        "other_H": other,
+        "own": item.specimen_mass,
+        "k0": s.k0,
+        "kc": s.kc,
+        "kh_plus": s.kh_plus,
+        "kh_minus": s.kh_minus,
+        "eps_a": s.eps_a,
+        "eps_c": s.eps_c,
+        "tangent_c2": (s.kc + s.sigma_c) ** 2 / s.kc,
+        "tangent_c1": (s.kc + s.sigma_hat_c) ** 2 / s.kc,
+        "secant": (s.sigma_hat_c - s.sigma_c) / (s.eps_hat_c - s.eps_c),
+        "secant_0": s.sigma_hat_c / s.eps_hat_c,
+        "secant_c": s.sigma_hat_c / (s.eps_hat_c - s.eps_star),
+    }
+
+
+def ratio(
+    q: dict[str, float], stiffness: float, mass: float = STRIKER, height: float | None = None
+) -> float:
+    """ζ = η/(2 H √(ρ k)) with ρ = m/(A H)."""
+    height = q["H"] if height is None else height
+    return q["eta"] / (2.0 * height * math.sqrt(mass / (q["A"] * height) * stiffness))
+
+
+def ratio_readings() -> dict[str, dict[str, float]]:
+    """ζ of the three damped sets by each reading."""
+    sets = {name: quantities(ff.published[name]) for name in SETS}
+    return {label: {name: read(q) for name, q in sets.items()} for label, read in READINGS.items()}
+
+
+def ratio_wanted() -> dict[str, float]:
+    """What one printed number of model-2 would have to be for its ratio to be the paper's, SI."""
+    item = ff.published[MODEL_2]
+    by_formula, printed = item.damping_ratio_by_formula(), item.damping_ratio
+    assert by_formula is not None
+    assert printed is not None
+    factor = printed / by_formula  # ζ ~ η / √(m k_c H / A)
+    return {
+        "eta": ETA * factor,
+        "kc_over_k0": item.bistable.kc / item.bistable.k0 / factor**2,
+        "mass": STRIKER / factor**2,
+        "height": item.chain.height / factor**2,
+        "diameter": math.sqrt(4.0 / math.pi * item.chain.area) * factor,
+    }
+
+
+# ------------------------------------------------------------------------- energy: claim 4
+
+
+def impact_scene(name: str, interior: bool = True, **spring: float) -> ff.Chain:
+    """The chain of a published set without its numerical damper, with or without interior mass."""
+    chain = ff.published[name].chain
+    springs = [replace(s, **spring) for s in chain.springs]
+    return ff.Chain(springs, chain.heights, chain.area, chain.masses if interior else None)
+
+
+def struck(chain: ff.Chain, velocity: float, samples: int = 101) -> ff.Response:
+    """An impact of the 7 g striker, long enough to see it fly off."""
+    end = 1.2e-3 * 1.75 / velocity * max(1.0, chain.height / 1.19e-3)
+    return ff.simulate(
+        chain, ff.Impact(STRIKER, velocity), np.linspace(0.0, end, samples), rtol=RTOL
+    )
+
+
+def spring_strain(chain: ff.Chain, got: ff.Response) -> Array:
+    """Strain of the bistable spring, the uppermost, (n_t,)."""
+    below = got.displacement[-2] if len(chain.heights) > 1 else 0.0
+    return (got.displacement[-1] - below) / chain.heights[-1]
+
+
+def closes(chain: ff.Chain, velocity: float) -> bool:
+    """Tell whether the bistable spring reaches branch c."""
+    return bool(np.any(struck(chain, velocity).switches[:, 3] == BRANCH_NAMES.index("c")))
+
+
+def closing_velocity(name: str, interior: bool = True) -> float:
+    """Least velocity (m/s) at which the simulated impact reaches C1, by bisection."""
+    chain = impact_scene(name, interior)
+    low, high = 1.0, 8.0
+    while high - low > 1e-6:
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if closes(chain, middle) else (middle, high)
+    return high
+
+
+def work_to_c1(name: str) -> float:
+    """Work per cross-section (J/m²) to bring massless springs in series to C1, closed form."""
+    item, total = ff.published[name], 0.0
+    top = item.bistable.sigma_hat_c
+    for s, h in zip(item.chain.springs, item.chain.heights, strict=True):
+        if isinstance(s, ff.LinearSpring):
+            total += h * top**2 / (2.0 * s.k0)
+        else:
+            on_a = s.k0 * (-math.log1p(-s.eps_a) - s.eps_a)
+            total += h * (on_a + 0.5 * (s.sigma_a + top) * (s.eps_hat_c - s.eps_a))
+    return total
+
+
+def closing_velocity_by_energy(name: str) -> float:
+    """Velocity (m/s) whose kinetic energy is the work to C1."""
+    return math.sqrt(2.0 * ff.published[name].chain.area * work_to_c1(name) / STRIKER)
+
+
+def loop_area(name: str) -> float:
+    """Work lost per cross-section (J/m²) by the smallest closed loop: to C1, back to σ = 0."""
+    item = ff.published[name]
+    top = item.bistable.eps_hat_c
+    strain = np.concatenate([np.linspace(0, top, 20001), np.linspace(top * (1 + 1e-12), 0, 20001)])
+    stress = np.maximum(item.bistable.stress(strain), 0.0)
+    return float(item.chain.heights[-1] * np.trapezoid(stress, strain))
+
+
+def energy_row(name: str, interior: bool = True) -> dict[str, float]:
+    """The published impact of one set, simulated, against its loop; SI."""
+    item, chain = ff.published[name], impact_scene(name, interior)
+    velocity = item.striker_velocity
+    got = struck(chain, velocity, 4001)
+    flight = np.diff(got.displacement[-1])[-1] / np.diff(got.time)[-1]
+    brought = 0.5 * STRIKER * velocity**2 / chain.area
+    needed = closing_velocity(name, interior)
+    return {
+        "velocity": velocity,
+        "strain": float(np.max(spring_strain(chain, got))),
+        "left": float(spring_strain(chain, got)[np.searchsorted(got.time, got.contact_end)]),
+        "c1": item.bistable.eps_hat_c,
+        "peak": float(np.max(got.base_stress)),
+        "rebound": -float(flight),
+        "needed": needed,
+        "needed_energy": closing_velocity_by_energy(name),
+        "excess": 100.0 * ((needed / velocity) ** 2 - 1.0),
+        "brought": brought,
+        "work": work_to_c1(name),
+        "loop": loop_area(name),
+    }
+
+
+def lost_share(chain: ff.Chain, velocity: float) -> float:
+    """Share (%) of the striker's energy that it does not get back."""
+    got = struck(chain, velocity)
+    flight = np.diff(got.displacement[-1])[-1] / np.diff(got.time)[-1]
+    return float(100.0 * (1.0 - (flight / velocity) ** 2))
+
+
+def published_viscosity() -> dict[str, float]:
+    """What η = 1e4 Pa·s would do as a real-time dashpot in the published impact of model-2; SI."""
+    item = ff.published[MODEL_2]
+    got = struck(impact_scene(MODEL_2, eta=ETA), item.striker_velocity, 2001)
+    return {
+        "stress": ETA * item.striker_velocity / item.chain.height,
+        "first": float(got.base_stress[0]),
+        "strain": float(np.max(got.strain)),
+        "c1": item.bistable.sigma_hat_c,
+        "foam_2": ETA * ff.published[FOAM_2].striker_velocity / ff.published[FOAM_2].chain.height,
+    }
+
+
+# ------------------------------------------------------------------------- figures
+
+
+def draw_oscillation(drive: Drive, needed: float, path: Path) -> None:
+    """Stress and displacement with the foam's own mass, with and without damper; errors over η."""
+    figure = Figure(figsize=(7.0, 4.9), layout="constrained")
+    axes = figure.subplots(2, 2)
+    t = 1e3 * drive.time
+    free, damped = driven(drive, OWN_MASS, 0.0), driven(drive, OWN_MASS, needed)
+    style = [
+        (free, VERMILION, "5.56 mg, no damper"),
+        (damped, BLUE, f"5.56 mg, damper of {needed:.2g} Pa·s"),
+    ]
+    for ax, curve, exact, label in (
+        (axes[0, 0], lambda r: r.base_stress / 1e6, drive.stress / 1e6, "spring stress (MPa)"),
+        (axes[0, 1], lambda r: 1e3 * r.displacement[-1], 1e3 * drive.displacement, None),
+        (axes[1, 0], lambda r: (r.base_stress - drive.stress) / 1e6, 0 * t, None),
+    ):
+        for got, colour, name in style:
+            ax.plot(t, curve(got), color=colour, lw=0.9, label=name)
+        ax.plot(t, exact, color=BLACK, lw=0.8, ls="--", label="equilibrium")
+        ax.set_xlabel("time (ms)")
+        ax.set_ylabel(label or "")
+    axes[0, 0].legend(loc="upper right")
+    axes[0, 0].set_ylim(top=1.75 * np.max(drive.stress) / 1e6)
+    axes[0, 0].set_title("(a) stress")
+    axes[0, 1].set_title("(b) displacement")
+    axes[0, 1].set_ylabel("displacement (mm)")
+    axes[1, 0].set_title("(c) stress minus that of equilibrium")
+    axes[1, 0].set_ylabel("difference (MPa)")
+    axes[1, 0].set_ylim(bottom=-0.9)
+    for at, source, target in free.switches[:3, [0, 2, 3]]:  # the last one is at the very end
+        name = f"{BRANCH_NAMES[int(source)]}→{BRANCH_NAMES[int(target)]}"
+        axes[1, 0].axvline(1e3 * at, color=GREY, lw=0.7, ls=":")
+        axes[1, 0].annotate(
+            name, (1e3 * at, 0.02), xycoords=("data", "axes fraction"), xytext=(2, 0),
+            textcoords="offset points", color="0.35", fontsize=7.5,
+        )  # fmt: skip
+    ax = axes[1, 1]
+    dampers = np.geomspace(1.0, ETA, 33)
+    rows = [oscillation(drive, OWN_MASS, damper) for damper in dampers]
+    for key, colour, marker, name in (
+        ("ringing", VERMILION, "o", "ringing (what the mass adds)"),
+        ("lag", BLUE, "s", "lag (what the damper does)"),
+    ):
+        ax.loglog(
+            dampers, [row[key] for row in rows], marker, color=colour, ms=3, ls="-", lw=0.9,
+            label=name,
+        )  # fmt: skip
+    ax.axvline(needed, color=GREY, lw=0.8, ls=":")
+    ax.annotate(
+        "no more\nturns", (needed, 0.03), xycoords=("data", "axes fraction"), xytext=(3, 0),
+        textcoords="offset points", color="0.35", fontsize=7.5,
+    )  # fmt: skip
+    ax.axvline(ETA, color=GREY, lw=0.8, ls=":")
+    ax.annotate(
+        "published", (ETA, 0.6), xycoords=("data", "axes fraction"), xytext=(-3, 0),
+        textcoords="offset points", color="0.35", ha="right", fontsize=7.5,
+    )  # fmt: skip
+    ax.set(xlabel="onsite damper η (Pa·s)", ylabel="RMS stress error (% of peak)")
+    ax.set_ylim(top=1e3)
+    ax.set_title("(d) two errors of the damper")
+    ax.legend(loc="upper left")
+    figure.savefig(path, dpi=200)
+
+
+def draw_literal(drive: Drive, path: Path) -> None:
+    """Displacement by the literal reading, and its error when the drive is played slower."""
+    figure = Figure(figsize=(7.0, 2.8), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    t = 1e3 * drive.time
+    for mass, damper, colour, style, name in (
+        (STRIKER, 0.0, VERMILION, "-", "7 g, η = 0"),
+        (STRIKER, ETA, PURPLE, "-", "7 g, η = 10⁴ Pa·s"),
+        (OWN_MASS, 0.0, SKY, "-", "5.56 mg, η = 0"),
+        (0.0, 0.0, BLACK, "--", "equilibrium"),
+    ):
+        got = driven(drive, mass, damper)
+        left.plot(t, 1e3 * got.displacement[-1], color=colour, ls=style, label=name)
+    left.set(xlabel="time (ms)", ylabel="displacement (mm)")
+    left.set_ylim(top=0.68)
+    left.set_title("(a) the same stress history in real time")
+    left.legend(loc="upper left", ncols=2, columnspacing=1.0, handlelength=1.6)
+    factors = np.geomspace(1.0, 1000.0, 25)
+    for damper, colour, marker, name in (
+        (0.0, VERMILION, "o", "7 g, η = 0"),
+        (ETA, PURPLE, "s", "7 g, η = 10⁴ Pa·s"),
+    ):
+        errors = [slowed(drive, damper, s) for s in factors]
+        right.loglog(factors, errors, marker, color=colour, ls="-", ms=3, lw=0.9, label=name)
+    right.axvline(math.sqrt(STRIKER / OWN_MASS), color=GREY, lw=0.8, ls=":")
+    right.annotate(
+        "= 5.56 mg\nin real time", (math.sqrt(STRIKER / OWN_MASS), 0.03),
+        xycoords=("data", "axes fraction"), xytext=(3, 0), textcoords="offset points",
+        color="0.35", fontsize=7.5,
+    )  # fmt: skip
+    right.set(
+        xlabel="how many times slower the drive is played (–)",
+        ylabel="RMS displacement error (% of peak)",
+    )
+    right.set_title("(b) 7 g under a slowed drive")
+    right.legend(loc="upper right")
+    figure.savefig(path, dpi=200)
+
+
+def draw_ratios(readings: dict[str, dict[str, float]], path: Path) -> None:
+    """Every reading of the damping ratio over the paper's value: those near it, and all."""
+    figure = Figure(figsize=(7.0, 4.4), layout="constrained")
+    near, wide = figure.subplots(1, 2, sharey=True)
+    rows = np.arange(len(readings))[::-1]
+    for ax in (near, wide):
+        ax.axvline(1.0, color=BLACK, lw=0.8)
+        ax.grid(axis="y", color="0.92", lw=0.6)
+        ax.set_axisbelow(True)
+        for name, colour, marker, size in (
+            (FOAM_2, GREEN, "D", 6.5),
+            (MODEL_3, BLUE, "s", 4.5),
+            (MODEL_2, VERMILION, "o", 4.5),
+        ):
+            paper = ff.published[name].damping_ratio or math.nan
+            values = [reading[name] / paper for reading in readings.values()]
+            ax.plot(
+                values, rows, marker, color=colour, mfc="white" if marker == "D" else colour,
+                ms=size, ls="none", label=f"{name} (paper {paper})",
+            )  # fmt: skip
+    near.set_xlim(0.88, 1.12)
+    near.set_yticks(rows, [in_mathtext(label) for label in readings])
+    near.set_ylim(-0.7, len(rows) - 0.3)
+    near.set_title("(a) near the paper's values")
+    wide.set_xscale("log")
+    wide.set_xticks([1, 3, 10, 30], ["1", "3", "10", "30"])
+    wide.set_title("(b) all")
+    wide.legend(loc="lower right", frameon=True, framealpha=1.0, edgecolor="0.8")
+    figure.supxlabel("ζ by this reading over ζ in the paper (–)", fontsize=8)
+    figure.savefig(path, dpi=200)
+
+
+def in_mathtext(label: str) -> str:
+    """Set the symbols of a label as matplotlib does."""
+    for plain, tex in (
+        ("k_h+", "$k_{h+}$"),
+        ("k_h−", "$k_{h-}$"),
+        ("k_c", "$k_c$"),
+        ("k₀", "$k_0$"),
+        ("ε_c", r"$\varepsilon_c$"),
+        ("ε_a", r"$\varepsilon_a$"),
+        ("ε_*", r"$\varepsilon_*$"),
+    ):
+        label = label.replace(plain, tex)
+    return label
+
+
+def draw_energy(path: Path) -> None:
+    """Published loops and how far the published impact goes; energy lost over velocity."""
+    figure = Figure(figsize=(7.0, 2.9), layout="constrained")
+    axes = figure.subplots(1, 3)
+    for ax, name, title in (
+        (axes[0], MODEL_2, "(a) foam-1 model-2, 1.75 m/s"),
+        (axes[1], FOAM_2, "(b) foam-2, S2, 4.44 m/s"),
+    ):
+        item, chain = ff.published[name], impact_scene(name)
+        s, got = item.bistable, struck(impact_scene(name), item.striker_velocity, 4001)
+        top = s.eps_hat_c
+        loop = np.concatenate([np.linspace(0, top, 800), np.linspace(top * (1 + 1e-9), 0, 800)])
+        stress = s.stress(loop)
+        there = stress >= 0
+        ax.plot(loop[there], stress[there] / 1e6, color=GREY, lw=2.6, alpha=0.6, label="loop")
+        strain = spring_strain(chain, got)[got.time <= (got.contact_end or math.inf)]
+        ax.plot(strain, s.stress(strain) / 1e6, color=VERMILION, lw=1.1, label="impact")
+        ax.plot([s.eps_hat_c], [s.sigma_hat_c / 1e6], "o", color=BLACK, ms=3.5)
+        ax.annotate(
+            "C1", (s.eps_hat_c, s.sigma_hat_c / 1e6), xytext=(-6, 3), ha="right",
+            textcoords="offset points",
+        )  # fmt: skip
+        ax.set(xlabel="strain of the spring (–)", ylabel="spring stress (MPa)")
+        ax.set_title(title)
+        ax.legend(loc="upper left")
+        ax.margins(y=0.12)
+    ax = axes[2]
+    for name, colour, style in (
+        (MODEL_1, SKY, "-"),
+        (MODEL_2, BLUE, "--"),
+        (MODEL_3, ORANGE, "-"),
+        (FOAM_2, GREEN, "-"),
+    ):
+        chain, velocity = impact_scene(name), ff.published[name].striker_velocity
+        factors = np.linspace(0.9, 1.25, 141)
+        lost = [lost_share(chain, velocity * f) for f in factors]
+        ax.plot(factors, lost, color=colour, ls=style, label=name)
+    ax.axvline(1.0, color=GREY, lw=0.8, ls=":")
+    ax.annotate(
+        "published", (1.0, 0.12), xycoords=("data", "axes fraction"), xytext=(3, 0),
+        textcoords="offset points", color="0.35", fontsize=7.5, rotation=90,
+    )  # fmt: skip
+    ax.set(xlabel="velocity over the published one (–)", ylabel="energy lost (% of striker's)")
+    ax.set_ylim(-4, 132)
+    ax.set_yticks([0, 25, 50, 75, 100])
+    ax.set_title("(c) energy lost")
+    ax.legend(loc="upper left", ncols=2, columnspacing=0.8, handlelength=1.2, fontsize=6.5)
+    figure.savefig(path, dpi=200)
+
+
+# ------------------------------------------------------------------------- the page
+
+
+def main() -> None:
+    with matplotlib.rc_context(STYLE):
+        drive = drive_of_impact()
+        draw_oscillation(drive, damper_needed(drive), HERE / "oscillation.png")
+        draw_literal(drive, HERE / "literal.png")
+        draw_ratios(ratio_readings(), HERE / "ratios.png")
+        draw_energy(HERE / "energy.png")
+    page = (HERE / "page.template.md").read_text(encoding="utf-8")
+    values = of_oscillation() | of_literal() | of_ratios() | of_energy()
+    (HERE / "README.md").write_text(page.format(**values), encoding="utf-8")
+    print(f"wrote {HERE / 'README.md'} and its figures")
+
+
+def of_oscillation() -> dict[str, Any]:
+    """Numbers and table of the first claim."""
+    drive, first = drive_of_impact(MODEL_2), drive_of_impact(MODEL_1)
+    needed = damper_needed(drive)
+    free, damped = oscillation(drive, OWN_MASS, 0.0), oscillation(drive, OWN_MASS, needed)
+    fewer = driven(drive_of_impact(samples=1001), OWN_MASS, 0.0, rtol=1e-6).base_stress
+    undamped, exact = driven(drive, OWN_MASS, 0.0), driven(drive, 0.0, 0.0)
+    early = 1e6 * (exact.switches[:2, 0] - undamped.switches[:2, 0])
+    dampers = np.geomspace(0.3, 300.0, 61)
+    errors = [displacement_error(drive, OWN_MASS, damper) for damper in dampers]
+    best = float(dampers[np.argmin(errors)])
+    lines = []
+    for label, given, damper in (
+        ("model-1, no damper", first, 0.0),
+        ("model-2, no damper", drive, 0.0),
+        ("model-2, damper nearest to equilibrium", drive, best),
+        ("model-2, least damper without turns", drive, needed),
+        ("model-2, published damper of model-3", drive, 3e2),
+        ("model-2, its published damper", drive, ETA),
+    ):
+        row = oscillation(given, OWN_MASS, damper)
+        lines.append(
+            f"| {label} | {damper:.3g} | {row['stress']:.2f} | {row['displacement']:.2f} "
+            f"| {row['ringing']:.3f} | {row['lag']:.2f} | {row['turns']} | {row['turns_w']} |"
+        )
+    slopes = {"": drive.spring.k0, "_c": drive.spring.kc}
+    return {
+        "velocity": DRIVE_VELOCITY,
+        "samples": SAMPLES,
+        "contact": 1e3 * drive.time[-1],
+        "turn": 100 * TURN,
+        "turn_kpa": 1e-3 * TURN * float(np.ptp(drive.stress)),
+        "needed": needed,
+        "needed_1": damper_needed(first),
+        "needed_175": damper_needed(drive_of_impact(MODEL_2, 1.75)),
+        "needed_coarse": damper_needed(drive, share=0.01),
+        "needed_ratio": ratio(
+            quantities(ff.published[MODEL_2]) | {"eta": needed}, drive.spring.kc, mass=OWN_MASS
+        ),
+        "free": free,
+        "damped": damped,
+        "quieter": free["ringing"] / damped["ringing"],
+        "by_branch": ", ".join(f"{k} {v:.1f} %" for k, v in ringing_by_branch(drive).items()),
+        "early": early,
+        "moved": float(100 * np.max(abs(undamped.base_stress[::4] - fewer)) / drive.stress.max()),
+        "eta_over_needed": round(ETA / needed, -2),
+        "published_own": displacement_error(drive, OWN_MASS, ETA),
+        "best": best,
+        "at_best": min(errors),
+        "table_oscillation": "\n".join(lines),
+    } | {
+        f"period_{name}{suffix}": scale * free_period(drive, mass, slope)
+        for suffix, slope in slopes.items()
+        for name, mass, scale in (("own", OWN_MASS, 1e6), ("striker", STRIKER, 1e3))
+    }
+
+
+def of_literal() -> dict[str, Any]:
+    """Numbers and tables of the second claim."""
+    cases = ((0.0, 0.0), (STRIKER, 0.0), (STRIKER, ETA), (OWN_MASS, 0.0))
+    drives = {velocity: drive_of_impact(MODEL_2, velocity) for velocity in OTHER_VELOCITIES}
+    errors = {v: [displacement_error(d, *case) for case in cases] for v, d in drives.items()}
+    lines = []
+    for velocity, drive in drives.items():
+        closed = np.max(drive.displacement) / drive.height > drive.spring.eps_hat_c
+        cells = " | ".join(f"{error:.1f}" for error in errors[velocity])
+        lines.append(f"| {velocity:.2f} | {'yes' if closed else 'no'} | {cells} |")
+    drive = drives[DRIVE_VELOCITY]
+    slow = {s: [slowed(drive, eta, s) for eta in (0.0, ETA)] for s in (1, 10, 100, 1000)}
+    own = [row[3] for v, row in errors.items() if v != 1.9]
+    return {
+        "literal": errors[DRIVE_VELOCITY][1],
+        "literal_low": min(row[1] for row in errors.values()),
+        "literal_high": max(row[1] for row in errors.values()),
+        "literal_damped_low": min(row[2] for row in errors.values()),
+        "literal_damped_high": max(row[2] for row in errors.values()),
+        "literal_eta_only": displacement_error(drive, 0.0, ETA),
+        "own_low": min(own),
+        "own_high": max(own),
+        "own_jump": errors[1.9][3],
+        "slowing": math.sqrt(STRIKER / OWN_MASS),
+        "slow": slow[1000][1],
+        "table_literal": "\n".join(lines),
+        "table_slow": "\n".join(f"| {s} | {a:.2f} | {b:.2f} |" for s, (a, b) in slow.items()),
+    }
+
+
+def of_ratios() -> dict[str, Any]:
+    """Numbers and table of the third claim."""
+    readings = ratio_readings()
+    paper = {name: ff.published[name].damping_ratio or math.nan for name in SETS}
+    off = {
+        label: {name: 100 * (row[name] / paper[name] - 1) for name in SETS}
+        for label, row in readings.items()
+    }
+    formula = next(iter(readings))
+    nearest = min(off, key=lambda label: abs(off[label][MODEL_2]))
+    wanted = ratio_wanted()
+    return {
+        "ratio": readings[formula],
+        "readings": len(readings),
+        "nearest": nearest,
+        "nearest_value": readings[nearest][MODEL_2],
+        "spread": max(abs(off[formula][name]) for name in (MODEL_3, FOAM_2)),
+        "short": -off[formula][MODEL_2],
+        "wanted": wanted,
+        "wanted_mass": 1e3 * wanted["mass"],
+        "wanted_height": 1e3 * wanted["height"],
+        "wanted_diameter": 1e3 * wanted["diameter"],
+        "table_ratios": "\n".join(
+            f"| {label} | {row[MODEL_2]:.3f} | {row[MODEL_3]:.4f} | {row[FOAM_2]:.3f} |"
+            for label, row in readings.items()
+        ),
+    }
+
+
+def of_energy() -> dict[str, Any]:
+    """Numbers and tables of the fourth claim."""
+    rows = {
+        "foam-1 model-1": energy_row(MODEL_1),
+        "foam-1 model-2": energy_row(MODEL_2),
+        "foam-1 model-3, S2, 5.56 mg between": energy_row(MODEL_3),
+        "foam-1 model-3, S2, massless": energy_row(MODEL_3, interior=False),
+        "foam-2, S2, 5.05 mg between": energy_row(FOAM_2),
+        "foam-2, S2, massless": energy_row(FOAM_2, interior=False),
+    }
+    m2, m3, f2 = (list(rows.values())[i] for i in (1, 3, 4))
+    eta = published_viscosity()
+    lines = [
+        f"| {label} | {row['velocity']:.2f} | {row['strain']:.4f} | {row['c1']:.4f} "
+        f"| {row['peak'] / 1e6:.2f} | {row['rebound']:.3f} | {row['needed']:.4f} "
+        f"| {row['excess']:+.1f} |".replace("-", "−")
+        for label, row in rows.items()
+    ]
+    works = [
+        f"| {label.removesuffix(', S2, massless')} | {row['brought']:.0f} | {row['work']:.0f} "
+        f"| {row['loop']:.0f} |"
+        for label, row in rows.items()
+        if "between" not in label
+    ]
+    return {
+        "m2": m2,
+        "m3": m3,
+        "f2": f2,
+        "f2_left": f2["left"],
+        "f2_spare": -f2["excess"],
+        "f2_peak": 1e-6 * f2["peak"],
+        "f2_lost": 100 * (1 - (f2["rebound"] / f2["velocity"]) ** 2),
+        "m2_mass": 1e3 * STRIKER * (1 + m2["excess"] / 100),
+        "eta_mpa": 1e-6 * eta["stress"],
+        "eta_first": 1e-6 * eta["first"],
+        "eta_strain": eta["strain"],
+        "eta_times": eta["stress"] / eta["c1"],
+        "eta_foam_2": 1e-6 * eta["foam_2"],
+        "check_energy": max(
+            abs(row["needed"] / row["needed_energy"] - 1)
+            for label, row in rows.items()
+            if "between" not in label
+        ),
+        "table_energy": "\n".join(lines),
+        "table_work": "\n".join(works),
+    }
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,529 @@
+"""The command line as a user calls it: what it prints, what it writes, how it refuses."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from conftest import EXPERIMENTS
+from foamfit.cli import main
+from foamfit.report import STATISTICS
+
+RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
+FILES = {"fit.json", "parameters.csv", "curves.csv", "report.html", "fit.png", "fit.pdf"}
+COMMANDS = ("check", "fit", "simulate", "published")
+
+SPECIMEN = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\n'
+STRIKER = '[striker]\nmass = "1 kg"\nvelocity = "1 m/s"\n'
+HEADER = "time (ms),stress (MPa),displacement (mm)"
+LOOP = np.sin(np.linspace(0.0, np.pi, 41))
+ROWS = [f"{i},{2 * y:.6f},{4 * y:.6f}" for i, y in enumerate(LOOP)]
+
+
+def run(*args: object) -> Result:
+    return CliRunner().invoke(main, [str(arg) for arg in args])
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+def accepted(*args: object) -> Result:
+    result = run(*args)
+    assert (result.exit_code, result.stderr) == (0, "")
+    return result
+
+
+def refused(folder: Path, *args: object, words: tuple[str, ...]) -> None:
+    """One sentence on stderr that holds the words, exit code 1, nothing else anywhere."""
+    before, folders = files(folder), {p for p in folder.rglob("*") if p.is_dir()}
+    result = run(*args)
+    assert isinstance(result.exception, SystemExit), result.exception
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert re.fullmatch(r"foamfit: [^\n]+\n", result.stderr)
+    assert "defect" not in result.stderr
+    for word in words:
+        assert word in result.stderr
+    assert files(folder) == before
+    assert {p for p in folder.rglob("*") if p.is_dir()} == folders
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty working directory."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Result]:
+    """A reconstruction fitted once, without --out: where, and what was printed."""
+    folder = tmp_path_factory.mktemp("fitted")
+    before = Path.cwd()
+    os.chdir(folder)
+    try:
+        result = run("fit", RECONSTRUCTION, "--seed", 1)
+    finally:
+        os.chdir(before)
+    assert result.exit_code == 0, result.output
+    return folder, result
+
+
+def write(
+    folder: Path, header: str = HEADER, rows: list[str] = ROWS, toml: str | None = SPECIMEN
+) -> Path:
+    path = folder / "test.csv"
+    path.write_text("\n".join([header, *rows]) + "\n")
+    if toml is not None:
+        path.with_suffix(".toml").write_text(toml)
+    return path
+
+
+# What it does.
+
+
+@pytest.mark.parametrize("args", [[], *([command] for command in COMMANDS)])
+def test_help_shows_an_example(args: list[str]) -> None:
+    text = accepted(*args, "--help").stdout
+    assert text.startswith(f"Usage: foamfit {' '.join(args)}".rstrip())
+    assert "foamfit" in text.splitlines()[0]
+    for line in text.splitlines():
+        assert len(line) <= 100
+    if args in ([], ["check"], ["fit"]):
+        assert re.search(r"\n {6}foamfit (fit|check) \S+\.csv", text)
+
+
+def test_without_a_command_it_shows_its_help() -> None:
+    assert accepted().stdout == accepted("--help").stdout
+
+
+def test_the_files_that_the_help_names_are_there() -> None:
+    named = re.findall(r"experiments/\S+\.csv", accepted("--help").stdout)
+    assert named
+    assert all((EXPERIMENTS.parent / name).is_file() for name in named)
+
+
+def test_version() -> None:
+    assert re.fullmatch(r"foamfit \d+\.\d+\.\d+\S*\n", accepted("--version").stdout)
+
+
+def test_published() -> None:
+    text = accepted("published").stdout
+    for name in ("foam-1/model-1", "foam-1/model-2", "foam-1/model-3", "foam-2"):
+        assert text.count(name) >= 2
+
+
+def test_check(here: Path) -> None:
+    text = accepted("check", RECONSTRUCTION).stdout
+    for words in ("height 1.19 mm", "7 g, 2 m/s", "'force (N)'", "1.00 of what the striker"):
+        assert words in text
+    assert "impossible" not in text
+    assert files(here) == {}
+
+
+def test_check_with_another_specimen(here: Path) -> None:
+    path = write(here, toml=None)
+    (here / "other.toml").write_text('name = "another"\n' + SPECIMEN)
+    assert "another" in accepted("check", path, "--specimen", "other.toml").stdout
+
+
+def test_fit_writes_beneath_the_current_directory(fitted: tuple[Path, Result]) -> None:
+    folder, result = fitted
+    at = f"fits/{RECONSTRUCTION.stem}/bistable"
+    assert set(files(folder)) == {f"{at}/{name}" for name in FILES}
+    assert f"written to {at}" in result.stdout
+    assert "s1_kh_minus" in result.stdout
+    assert result.stderr == ""  # no terminal, no progress
+    content = json.loads((folder / at / "fit.json").read_text())
+    assert (content["schema"], content["model"], content["drive"]) == (1, "bistable", "impact")
+    assert (content["seed"], content["status"]) == (1, "ok")
+    assert set(content["visited"]["s1"]) == set("adce")
+    assert set(content["statistics"]) - set(STATISTICS) == {"nfev", "n_starts"}  # all have labels
+
+
+def test_json_is_all_there_is_and_the_seed_repeats(here: Path, fitted: tuple[Path, Result]) -> None:
+    result = accepted("fit", RECONSTRUCTION, "--seed", 1, "--json", "--out", "a/b")
+    content = json.loads(result.stdout)
+    assert content == json.loads((here / "a/b/fit.json").read_text())
+    before = json.loads(next(fitted[0].rglob("fit.json")).read_text())
+    del content["runtime_s"], before["runtime_s"]
+    assert content == before
+
+
+def test_an_older_result_is_replaced_and_quiet_is_quiet(
+    here: Path, fitted: tuple[Path, Result]
+) -> None:
+    shutil.copytree(next(fitted[0].rglob("fit.json")).parent, "old")
+    (here / "old" / "stale").write_text("x")
+    args = ("--drive", "displacement", "--fix", "s1_k0=5.5e6", "--vary", "s1_eta", "--starts", 3)
+    result = accepted("fit", RECONSTRUCTION, "--out", "old", "--quiet", *args)
+    assert result.stdout == ""
+    assert set(files(here)) == {f"old/{name}" for name in FILES}
+    content = json.loads((here / "old" / "fit.json").read_text())
+    assert (content["drive"], content["statistics"]["n_starts"]) == ("displacement", 3)
+    held, freed = (content["parameters"][name] for name in ("s1_k0", "s1_eta"))
+    assert (held["value"], held["vary"], held["state"]) == (5.5e6, False, "fixed")
+    assert freed["vary"]
+
+
+@pytest.mark.usefixtures("fitted")  # it has the solver compiled
+def test_the_time_limit_gives_the_best_so_far(here: Path) -> None:
+    args = ("--model", " linear + bistable", "--starts", 900, "--max-time", 2, "--json")
+    result = run("fit", EXPERIMENTS / "foam-1" / "model-3-2.0mps-reconstruction.csv", *args)
+    content = json.loads(result.stdout)
+    assert result.exit_code == (2 if content["status"] == "failed" else 0)
+    assert content["model"] == "linear+bistable"
+    assert "stopped by the time limit" in content["warnings"][0]
+    assert content["runtime_s"] < 10
+    assert (here / "fits/model-3-2.0mps-reconstruction/linear+bistable/fit.json").is_file()
+
+
+def test_what_no_spring_follows_fails_and_is_written(here: Path) -> None:
+    strain = np.concatenate([np.linspace(0, 0.4, 100), np.linspace(0.4, 0, 100)])
+    stress = np.abs(np.random.default_rng(0).standard_normal(200))
+    rows = [f"{s:.6f},{10 * e:.6f}" for s, e in zip(stress, strain, strict=True)]
+    path = write(here, "stress (MPa),displacement (mm)", rows)
+    result = run("fit", path, "--starts", 2, "--out", "out")
+    assert result.exit_code == 2
+    assert result.stderr == "foamfit: no acceptable fit was found; see out\n"
+    assert set(files(here / "out")) == FILES
+    content = json.loads((here / "out" / "fit.json").read_text())
+    assert content["status"] == "failed"
+    assert "not acceptable" in content["warnings"][0]
+
+
+# Scenes.
+
+SPRING = """\
+[[chain.springs]]
+kind = "bistable"
+height = "1.19 mm"
+k0 = "5.5 MPa"
+kc = "82.5 MPa"
+dsigma = "-0.17907 MPa"
+eps_a = 0.14
+eps_c = 0.31
+kh_plus = "14.3 MPa"
+kh_minus = "2.475 MPa"
+"""
+OWN = '[chain]\ndiameter = "5 mm"\n' + SPRING
+PUBLISHED = '[chain]\npublished = "foam-1/model-1"\n'
+IMPACT = '[drive]\nkind = "impact"\nmass = "7 g"\nvelocity = "2 m/s"\n[time]\nend = "1 ms"\n'
+
+
+def scene(folder: Path, text: str) -> Path:
+    path = folder / "scene.toml"
+    path.write_text(text)
+    return path
+
+
+def table(path: Path) -> np.ndarray:
+    return np.loadtxt(path, delimiter=",", skiprows=1)
+
+
+def test_simulate_an_impact_on_a_published_chain(here: Path) -> None:
+    result = accepted("simulate", scene(here, PUBLISHED + IMPACT), "--plot", "response.png")
+    assert "501 samples, written to scene.csv" in result.stdout
+    assert (here / "response.png").read_bytes().startswith(b"\x89PNG")
+    header = (here / "scene.csv").read_text().splitlines()[0]
+    assert header == "time (s),base stress (Pa),strain,displacement_1 (m)"
+    assert table(here / "scene.csv")[:, 1].max() == pytest.approx(4.93e6, rel=0.01)
+
+
+def test_simulate_own_springs(here: Path) -> None:
+    accepted("simulate", scene(here, PUBLISHED + IMPACT))
+    accepted("simulate", scene(here, OWN + IMPACT + "samples = 501\n"), "--out", "own.csv")
+    assert table(here / "own.csv") == pytest.approx(table(here / "scene.csv"), rel=1e-3, abs=50)
+
+
+def test_what_is_simulated_can_be_read(here: Path) -> None:
+    accepted("simulate", scene(here, PUBLISHED + IMPACT), "--out", "test.csv")
+    (here / "test.toml").write_text('[specimen]\nheight = "1.19 mm"\ndiameter = "5 mm"\n')
+    assert "peak 4.9" in accepted("check", "test.csv").stdout
+
+
+@pytest.mark.parametrize(
+    ("kind", "header", "scale"),
+    [
+        ("displacement", "t,displacement", (1e-3, 0.42e-3)),
+        ("displacement", "time (ms),displacement (mm)", (1.0, 0.42)),
+        ("stress", "t,stress", (1e-3, 3e6)),
+        ("stress", "Time [ms];Stress [MPa]", (1.0, 3.0)),
+    ],
+)
+def test_simulate_a_drive_from_a_file(
+    here: Path, kind: str, header: str, scale: tuple[float, float]
+) -> None:
+    comma = ";" if ";" in header else ","
+    rows = [f"{scale[0] * i}{comma}{scale[1] * y}" for i, y in enumerate(LOOP)]
+    (here / "drive.csv").write_text("\n".join([header, *rows]) + "\n")
+    drive = f'[drive]\nkind = "{kind}"\nfile = "drive.csv"\n'
+    accepted("simulate", scene(here, OWN + drive))
+    time, stress, strain, displacement = table(here / "scene.csv").T
+    assert time[-1] == pytest.approx(0.04)
+    if kind == "displacement":
+        assert displacement.max() == pytest.approx(0.42e-3)
+        assert stress.max() > 4e6
+    else:
+        assert stress.max() == pytest.approx(3e6)
+        assert 0.14 < strain.max() < 0.36
+
+
+# What is wrong is refused in one sentence.
+
+
+@pytest.mark.parametrize("command", ["check", "fit"])
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", ("test.csv", "empty")),
+        (HEADER.encode(), ("test.csv", "row 1", "no rows of numbers")),
+        (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR", ("test.csv", "binary")),
+    ],
+)
+def test_refuses_files(here: Path, command: str, content: bytes, words: tuple[str, ...]) -> None:
+    path = write(here)
+    path.write_bytes(content)
+    refused(here, command, path, words=words)
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        ("time (ms),stress (xyz),displacement (mm)", ("'stress (xyz)'", "'xyz'", "stress (MPa)")),
+        ("time (ms),stress (mm),displacement (mm)", ("stress (mm)", "another kind", "(MPa)")),
+        ("time (ms),torque (N m),displacement (mm)", ("no column is a stress", "'torque (N m)'")),
+        ("time (ms),stress (MPa),torque (N m)", ("no column is a displacement", "[striker]")),
+        ("time (ms),stress (MPa),stress (MPa)", ("'stress (MPa)' and 'stress (MPa)'", "keep one")),
+    ],
+)
+def test_refuses_headers(here: Path, header: str, words: tuple[str, ...]) -> None:
+    refused(here, "fit", write(here, header), words=("test.csv", *words))
+
+
+@pytest.mark.parametrize(
+    ("row", "words"),
+    [
+        ("7,abc,1", ("row 9", "'stress (MPa)'", "'abc'", "must be a number")),
+        ("7,1,NaN", ("row 9", "'displacement (mm)'", "finite number")),
+        ("5,1,1", ("row 9", "'time (ms)'", "must increase")),
+    ],
+)
+def test_refuses_rows(here: Path, row: str, words: tuple[str, ...]) -> None:
+    rows = [*ROWS[:7], row, *ROWS[8:]]
+    refused(here, "fit", write(here, rows=rows), words=("test.csv", *words))
+
+
+@pytest.mark.parametrize(
+    ("factors", "words"),
+    [
+        ((-2, 4), ("stress", "scale = -1")),
+        ((2, -4), ("displacement", "scale = -1")),
+        ((2, 40), ("strain reaches 4", "height")),
+        ((0, 4), ("'stress (MPa)' is constant",)),
+    ],
+)
+def test_refuses_values(here: Path, factors: tuple[int, int], words: tuple[str, ...]) -> None:
+    rows = [f"{i},{factors[0] * y},{factors[1] * y}" for i, y in enumerate(LOOP)]
+    refused(here, "fit", write(here, rows=rows), words=("test.csv", *words))
+
+
+@pytest.mark.parametrize(
+    ("toml", "args", "words"),
+    [
+        (None, (), ("test.toml", "no such file", "height")),
+        ("[specimen\n", (), ("test.toml", "no valid TOML", "line 1")),
+        ('[specimen]\narea = "1 mm^2"\n', (), ("test.toml", "height is missing", '"1.19 mm"')),
+        (SPECIMEN.replace('"10', '"-10'), (), ("test.toml", "height", "must be positive")),
+        (
+            SPECIMEN + STRIKER.replace('"1 m/s', '"0 m/s'),
+            ("--drive", "impact"),
+            ("test.toml", "[striker] velocity", "must be positive"),
+        ),
+        (SPECIMEN, ("--drive", "impact"), ("impact drive needs", "[striker] mass and", "velocity")),
+        (
+            SPECIMEN + 'heights = ["4 mm", "6 mm"]\n',
+            ("--model", "linear+bistable", "--vary", "s1_height"),
+            ("'s1_height' is given by the specimen", "leave [specimen] heights out"),
+        ),
+        (SPECIMEN + 'heights = ["4 mm", "6 mm"]\n', (), ()),  # one spring needs no heights
+    ],
+)
+def test_refuses_tomls(
+    here: Path, toml: str | None, args: tuple[str, ...], words: tuple[str, ...]
+) -> None:
+    path = write(here, toml=toml)
+    if words:
+        refused(here, "fit", path, *args, words=words)
+    else:
+        accepted("check", path)
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (["--model", "rubber"], ("model 'rubber'", "bistable, linear")),
+        (["--model", "../../x"], ("model '../../x'", "bistable, linear")),
+        (["--drive", "push"], ("'--drive'", "'push'", "'displacement'")),
+        (["--modle", "bistable"], ("'--modle'", "--model", "foamfit fit --help")),
+        (["--fix", "s1_k9=1"], ("'s1_k9'", "s1_k0")),
+        (["--fix", "s1_k0"], ("'s1_k0'", "NAME=VALUE")),
+        (["--fix", "s1_k0=nan"], ("'s1_k0=nan'", "NAME=VALUE")),
+        (["--vary", "s2_eta"], ("'s2_eta'", "s1_eta")),
+        (["--fix", "s1_eta=0", "--vary", "s1_eta"], ("'s1_eta'", "both fixed and varied")),
+        (["--model", "linear+bistable", "--fix", "s2_height=1e-3"], ("s2_height", "s1_height")),
+        (["--fix", "s1_eps_a=2"], ("could be simulated",)),
+        (["--starts", "0"], ("'--starts'", "x>=1")),
+        (["--seed", "-1"], ("'--seed'", "x>=0")),
+        (["--max-time", "-1"], ("max_time", "positive")),
+        (["--max-time", "soon"], ("'--max-time'", "'soon'")),
+        (["--out", "test.csv"], ("test.csv", "is a file", "choose")),
+        (["--out", "test.csv/in/it"], ("test.csv is a file", "choose")),
+        (["--out", "thesis"], ("thesis", "no foamfit result", "choose")),
+        (["--specimen", "none.toml"], ("none.toml", "no such file")),
+        (["another.csv"], ("another.csv", "foamfit fit --help")),
+    ],
+)
+def test_refuses_calls_of_fit(here: Path, args: list[str], words: tuple[str, ...]) -> None:
+    (here / "thesis").mkdir()
+    (here / "thesis" / "thesis.tex").write_text("all of it")
+    refused(here, "fit", write(here), *args, words=words)
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (["fit"], ("TEST.csv",)),
+        (["simulate"], ("SCENE.toml",)),
+        (["fitt", "x"], ("'fitt'", "foamfit --help")),
+        (["--verbose"], ("--verbose", "foamfit --help")),
+        (["check", "none.csv"], ("none.csv", "no such file")),
+        (["check", "."], ("directory",)),
+        (["simulate", "none.toml"], ("none.toml", "no such file")),
+    ],
+)
+def test_refuses_calls(here: Path, args: list[str], words: tuple[str, ...]) -> None:
+    refused(here, *args, words=words)
+
+
+DRIVE = '[drive]\nkind = "stress"\nfile = "drive.csv"\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[chain\n", ("no valid TOML", "line 1")),
+        (OWN, ("[drive] is missing",)),
+        (IMPACT, ("[chain] is missing",)),
+        (OWN + "[drive]\n", ("[drive] kind", "impact, stress or displacement")),
+        (OWN + IMPACT + "[tyme]\n", ("'tyme'", "time")),
+        (OWN + "colour = 1\n" + IMPACT, ("spring 1", "'colour'")),
+        ("[chain]\nspring = 1\n" + IMPACT, ("[chain]", "'spring'", "springs")),
+        ('[chain]\narea = "1 mm^2"\n' + IMPACT, ("[[chain.springs]]",)),
+        (OWN.replace("0.14", "0.4") + IMPACT, ("spring 1", "eps_a")),
+        (OWN.replace('"5.5 MPa"', '"5.5 mm"') + IMPACT, ("spring 1", "k0", "another kind")),
+        (OWN.replace('"5.5 MPa"', "5.5") + IMPACT, ("spring 1", "k0 = 5.5", '"1 MPa"')),
+        (OWN + 'eta = "1 Pa"\n' + IMPACT, ("spring 1", "eta", "another kind", "Pa*s")),
+        (OWN.replace('"bistable"', '"rubber"') + IMPACT, ("spring 1", "'rubber'", "bistable")),
+        (OWN.replace('"1.19 mm"', '"0 mm"') + IMPACT, ("[chain]", "heights", "greater than 0")),
+        (OWN.replace('"5 mm"', '"5 mm"\narea = "1 mm^2"') + IMPACT, ("diameter and an area",)),
+        ('[chain]\npublished = "foam-9"\n' + IMPACT, ("'foam-9'", "foam-1/model-1")),
+        ('[chain]\npublished = ["foam-2"]\n' + IMPACT, ("foam-1/model-1",)),
+        (OWN + IMPACT.replace('"2 m/s"', '"0 m/s"'), ("[drive]", "velocity", "greater than 0")),
+        (OWN + IMPACT.split("[time]")[0], ("[time] is missing",)),
+        (OWN + IMPACT.replace('"1 ms"', '"-1 ms"'), ("[time] end", "positive")),
+        (OWN + IMPACT + "samples = 1\n", ("[time] samples", "from 2")),
+        (
+            OWN + DRIVE.replace("drive.csv", "none.csv"),
+            ("none.csv", "no such file", "stress (MPa)"),
+        ),
+        (OWN + DRIVE.replace("file", "# file"), ("[drive] file is missing", "drive.csv")),
+        (OWN + DRIVE, ("drive.csv", "row 3", "'stress (MPa)'", "'abc'")),
+        (OWN + DRIVE.replace('"stress"', '"displacement"'), ("drive.csv", "displacement (mm)")),
+        (OWN + DRIVE + '[time]\nend = "1 ms"\n', ("[time] must be left out",)),
+    ],
+)
+def test_refuses_scenes(here: Path, text: str, words: tuple[str, ...]) -> None:
+    (here / "drive.csv").write_text("time (ms),stress (MPa)\n0,0\n1,abc\n2,0\n")
+    name = "drive.csv" if "drive.csv" in words else "scene.toml"
+    if "none.csv" in words:
+        name = "none.csv"
+    refused(here, "simulate", scene(here, text), words=(name, *words))
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (["--plot", "x.docx"], ("x.docx", ".png, .pdf or .svg")),
+        (["--plot", "no/x.png"], ("no/x.png", "no folder no")),
+        (["--out", "no/x.csv"], ("no/x.csv", "no folder no")),
+        (["--out", "."], ("is a folder",)),
+        (["--rtol", "0"], ("rtol = 0", "between")),
+    ],
+)
+def test_refuses_calls_of_simulate(here: Path, args: list[str], words: tuple[str, ...]) -> None:
+    refused(here, "simulate", scene(here, PUBLISHED + IMPACT), *args, words=words)
+
+
+def test_a_defect_is_one_line_too(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise KeyError("two\nlines")
+
+    monkeypatch.setattr("foamfit.reading.read_test", broken)
+    result = run("check", "x.csv")
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert re.fullmatch(r"foamfit: [^\n]*KeyError[^\n]+\n", result.stderr)
+    monkeypatch.setenv("FOAMFIT_TRACEBACK", "1")
+    assert isinstance(run("check", "x.csv").exception, KeyError)
+
+
+# As a process of its own.
+
+
+def process(*args: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "foamfit", *map(str, args)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def test_the_process_keeps_stdout_and_stderr_apart(here: Path) -> None:
+    good = process("fit", RECONSTRUCTION, "--json", "--starts", 1, "--max-time", 5)
+    assert (good.returncode, good.stderr) == (0, "")
+    assert json.loads(good.stdout)["test"].endswith("(reconstruction)")
+    bad = process("fit", write(here, rows=["x"]), "--out", "no")
+    assert (bad.returncode, bad.stdout, bad.stderr.count("\n")) == (1, "", 1)
+    assert "Traceback" not in bad.stderr
+    assert not (here / "no").exists()
+
+
+@pytest.mark.parametrize("args", ["['--help']", "['published']"])
+def test_the_light_commands_import_nothing_heavy(args: str) -> None:
+    heavy = "{'numba', 'pandas', 'matplotlib', 'scipy', 'lmfit', 'pint'}"
+    script = (
+        "import sys\nfrom foamfit.cli import main\n"
+        f"try:\n    main({args})\nexcept SystemExit as leaving:\n    assert leaving.code == 0\n"
+        f"print(sorted({heavy} & set(sys.modules)))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_a_reader_that_has_enough_is_no_error() -> None:
+    command = f"{sys.executable} -m foamfit published | head -n 1"
+    done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("Published")
+    assert done.stderr == ""
