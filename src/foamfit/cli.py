@@ -339,6 +339,47 @@ def _check_file(path: Path) -> None:
 
 
 @main.command()
+@click.argument(
+    "results", metavar="RESULT [RESULT …]", nargs=-1, required=True, type=click.Path(path_type=Path)
+)
+@click.option(
+    "--published",
+    "name",
+    metavar="NAME",
+    help="The published set to compare with. Default: the one that the name of the test contains.",
+)
+@click.option("--plot", type=click.Path(path_type=Path), help="Also draw a PNG, PDF or SVG.")
+@click.option("--csv", "table", type=click.Path(path_type=Path), help="Also write a table.")
+def compare(
+    results: tuple[Path, ...], name: str | None, plot: Path | None, table: Path | None
+) -> None:
+    """Put result folders beside the published parameters, or beside the first of them.
+
+    \b
+    Examples:
+        foamfit compare fits/foam-1/model-1/impact fits/foam-1/model-1/stress
+        foamfit compare fits/TEST/bistable --published foam-1/model-1 --plot comparison.png
+    """
+    from foamfit.comparison import compare as side_by_side
+    from foamfit.comparison import comparison_text, write_csv
+    from foamfit.plots import figure_format, plot_comparison
+
+    for path in (plot, table):
+        if path is not None:
+            _check_file(path)
+    if plot is not None:
+        figure_format(plot)
+    comparison = side_by_side(results, name)
+    click.echo(comparison_text(comparison))
+    if plot is not None:
+        plot_comparison(comparison, plot)
+        click.echo(f"\ndrawn in {plot}")
+    if table is not None:
+        write_csv(comparison, table)
+        click.echo(f"\nwritten to {table}")
+
+
+@main.command()
 def published() -> None:
     """Print the published parameter sets and their derived points."""
     from foamfit.literature import table
