@@ -11,10 +11,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 import fabricated
 import foamfit as ff
 from conftest import synthetic_impact
+from foamfit.cli import main
 from foamfit.comparison import (
     Comparison,
     Row,
@@ -139,6 +141,14 @@ def test_what_is_not_determined_has_no_deviation_also_in_a_ratio() -> None:
     section = only(compare([weak]))
     assert {row(section, name).state for name in ("k0", "k_c/k0", "Δσ/σ_a")} == {"weak"}
     assert row(section, "ε_a").state == "determined"
+
+
+def test_an_error_of_many_times_the_value_leaves_nothing_to_compare() -> None:
+    for times, compared in ((2.0, True), (4.0, False)):
+        vague = with_parameter(published_fit(), "s1_k0", stderr=times * 5.5e6, state="weak")
+        found = row(only(compare([vague])), "k0")
+        assert (found.percent is not None) is compared
+        assert found.lost is not compared
 
 
 def test_the_published_damping_is_answered_in_words() -> None:
@@ -276,3 +286,35 @@ def test_a_real_fit_recovers_its_spring(tmp_path: Path) -> None:
     ]  # fmt: skip
     assert all(abs(r.standard_errors or 0.0) < 4.0 for r in compared)
     assert only(compare([result], published="foam-1/model-1")) == section
+
+
+def test_the_command_prints_draws_and_writes(tmp_path: Path) -> None:
+    (tmp_path / "one").mkdir()
+    (tmp_path / "one" / "fit.json").write_text(json.dumps(published_fit().to_json_dict()))
+    one, plot, table = (str(tmp_path / name) for name in ("one", "c.svg", "c.csv"))
+    done = CliRunner().invoke(main, ["compare", one, "--plot", plot, "--csv", table])
+    assert done.exit_code == 0
+    assert "beside published foam-1/model-1" in done.stdout
+    assert Path(plot).is_file()
+    assert Path(table).is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere"], "nowhere is not a result folder"),
+        (["{one}", "--published", "foam-3"], "there is no published set 'foam-3'"),
+        (["{one}", "--plot", "c.txt"], ".png, .pdf or .svg"),
+        ([], "Missing argument"),
+    ],
+)
+def test_the_command_refuses_in_one_line(
+    tmp_path: Path, arguments: list[str], message: str
+) -> None:
+    (tmp_path / "fit.json").write_text(json.dumps(published_fit().to_json_dict()))
+    filled = [argument.format(one=tmp_path) for argument in arguments]
+    done = CliRunner().invoke(main, ["compare", *filled])
+    assert done.exit_code == 1
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert done.stdout == ""

@@ -9,7 +9,17 @@ import numpy as np
 import pytest
 
 import fabricated
-from foamfit.plots import STYLE, image, origin_word, plot_fit, plot_residuals, readable_unit
+import foamfit as ff
+from foamfit.errors import InputError
+from foamfit.plots import (
+    STYLE,
+    image,
+    origin_word,
+    plot_fit,
+    plot_residuals,
+    plot_response,
+    readable_unit,
+)
 from foamfit.result import FitResult
 
 
@@ -152,6 +162,41 @@ def test_the_pdf_embeds_truetype_and_no_setting_leaks(tmp_path: Path) -> None:
 def test_a_format_that_is_not_made_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"not 'fit\.docx'"):
         plot_fit(fabricated.result(), tmp_path / "fit.docx")
+
+
+def test_a_figure_that_cannot_be_written_is_an_input_error(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"fit\.png cannot be written"):
+        plot_fit(fabricated.result(), tmp_path / "none" / "fit.png")
+
+
+@pytest.mark.parametrize("name", ["foam-1/model-1", "foam-1/model-3"])
+def test_a_response_has_three_panels(name: str, tmp_path: Path) -> None:
+    chain = ff.published[name].chain
+    time = np.linspace(0.0, 1.2e-3, 301)
+    response = ff.simulate(chain, ff.Impact(7e-3, 2.0), time)
+    figure = plot_response(response, tmp_path / "response.png")
+    assert (tmp_path / "response.png").read_bytes().startswith(b"\x89PNG")
+    stress, motion, loop = figure.axes
+    assert [ax.get_xlabel() for ax in figure.axes] == ["time (ms)"] * 2 + ["overall strain (–)"]
+    assert (stress.get_ylabel(), motion.get_ylabel()) == ("base stress (MPa)", "displacement (µm)")
+    assert np.allclose(stress.lines[0].get_ydata(), response.base_stress / 1e6)
+    labelled = [str(line.get_label()) for line in motion.lines[: len(chain.springs)]]
+    assert labelled == [*(f"node {i}" for i in range(1, len(chain.springs))), "top"]
+    assert np.allclose(
+        motion.lines[len(chain.springs) - 1].get_ydata(), 1e6 * response.displacement[-1]
+    )
+    assert (motion.get_legend() is not None) == (len(chain.springs) > 1)
+    # Past the end of contact the striker flies: that is no stress-strain curve.
+    assert response.contact_end is not None
+    assert len(loop.lines[0].get_xdata()) == int(np.sum(time <= response.contact_end))
+
+
+def test_a_response_of_a_drive_has_no_end_of_contact() -> None:
+    chain = ff.published["foam-1/model-1"].chain
+    time = np.linspace(0.0, 1.0, 101)
+    response = ff.simulate(chain, ff.DisplacementDrive(0.4e-3 * np.sin(np.pi * time)), time)
+    figure = plot_response(response)
+    assert [len(ax.lines) for ax in figure.axes] == [1, 1, 1]
 
 
 @pytest.mark.parametrize(

@@ -186,6 +186,7 @@ def _hold_and_vary(
 @click.option("--max-time", type=float, metavar="SECONDS", help="Then the best so far is taken.")
 @click.option("--fix", multiple=True, metavar="NAME=VALUE", callback=_fixes, help="Hold one (SI).")
 @click.option("--vary", multiple=True, metavar="NAME", help="Vary one that is held by default.")
+@click.option("--interior-mass", is_flag=True, help="Put the specimen's mass between the springs.")
 @click.option("--json", "as_json", is_flag=True, help="Print fit.json on stdout, nothing else.")
 @click.option("--quiet", is_flag=True, help="Print nothing but warnings of failure.")
 def fit(
@@ -199,6 +200,7 @@ def fit(
     max_time: float | None,
     fix: dict[str, float],
     vary: tuple[str, ...],
+    interior_mass: bool,
     as_json: bool,
     quiet: bool,
 ) -> int:
@@ -234,6 +236,7 @@ def fit(
             starts=starts,
             max_time=max_time,
             params=params,
+            interior_mass=interior_mass,
             progress=progress,
         )
     result.save(folder)

@@ -28,6 +28,7 @@ from foamfit.spring import LinearSpring
 Result = FitResult | Mapping[str, Any] | str | Path
 
 WIDTH = 100
+NOTHING = 3.0  # standard error over value past which a difference says nothing
 WORST_FIRST = ("not determined", "weak", "determined", "fixed")
 ETA_PUBLISHED = (
     "the published η is numerical, it sets how the paper's relaxation under a held stress "
@@ -42,6 +43,7 @@ PAPER_DRIVE = (
     "The paper drove its model by the measured stress, this fit by the {drive}: the springs' "
     "parameters mean the same in both, the damping does not."
 )
+VAGUE = "its standard error is many times its value, so the test says nothing of it"
 INPUT = (
     "The measured {channel} is the input of this fit: its noise can bias the parameters, which the "
     "standard errors do not count."
@@ -83,6 +85,12 @@ class Row:
     def label(self) -> str:
         """Name with its spring, for example "s2 k0"."""
         return f"s{self.spring} {self.name}" if self.spring else self.name
+
+    @property
+    def lost(self) -> bool:
+        """Whether there is a reference, but the test says nothing of the parameter."""
+        nothing = self.state == "not determined" or self.remark == VAGUE
+        return nothing and self.reference is not None
 
     @property
     def difference(self) -> float | None:
@@ -384,7 +392,7 @@ def _incomparable(side: _Side, other: _Side) -> str:
     if _families(side) != _families(other):
         return (
             f"the springs differ ({'+'.join(side.kinds)} and {'+'.join(other.kinds)}), so their "
-            "parameters are not those of the same thing"
+            "parameters do not mean the same"
         )
     for one in (side, other):
         if one.status == "failed":
@@ -482,6 +490,10 @@ def _remark(value: _Value, reference: _Value | None, eta: bool, side: _Side, oth
         return ETA_DRIVES
     if value.state == "fixed":
         return f"not identified, {value.why or 'held fixed'}"
+    if value.stderr is not None and reference is not None:
+        size = max(abs(value.value), abs(reference.value))
+        if value.stderr > NOTHING * size:
+            return VAGUE
     return ""
 
 

@@ -18,7 +18,7 @@ from foamfit.errors import InputError, SimulationError
 from foamfit.measurement import Measurement
 from foamfit.model import BRANCHES, Model, split_name, unit_of
 from foamfit.objective import Objective, Simulated, choose_drive, default_weights
-from foamfit.result import Curves, FitResult, ParameterEstimate, Switch
+from foamfit.result import Correlation, Curves, FitResult, ParameterEstimate, Switch
 from foamfit.search import Scales, SearchStoppedError, Space, Tracker, search
 
 Array = NDArray[np.float64]
@@ -195,6 +195,7 @@ def fit(
     max_time: float | None = None,
     params: lmfit.Parameters | None = None,
     weights: Mapping[str, float] | None = None,
+    interior_mass: bool = False,
     progress: Callable[[float, str], None] | None = None,
 ) -> FitResult:
     """Identify the parameters of a chain of springs from a test.
@@ -218,6 +219,9 @@ def fit(
         Values, bounds, fixed values and expressions; see `make_params`.
     weights : mapping, optional
         Weight of each curve; see `foamfit.objective.default_weights`.
+    interior_mass : bool
+        Whether the specimen's mass sits between the springs of a chain, in equal parts; by default
+        it is left out, and the result's notes say what it would change.
     progress : callable, optional
         Told the fraction done and what is going on.
 
@@ -238,7 +242,7 @@ def fit(
         raise InputError(f"starts = {starts} is not admissible; it must be at least 1")
     if max_time is not None and not max_time > 0:
         raise InputError(f"max_time = {max_time:g} s is not admissible; it must be positive")
-    problem = _problem(measurement, model, drive, params, weights)
+    problem = _problem(measurement, model, drive, params, weights, interior_mass)
     starts = STARTS * len(problem.model.kinds) if starts is None else starts
     deadline = None if max_time is None else time.monotonic() + max_time
     tracker = Tracker(problem.objective, deadline)
@@ -248,8 +252,9 @@ def fit(
             f"{measurement.name}: none of the {problem.objective.evaluations} sets of parameters "
             "that were tried could be simulated; check the drive, the heights and the bounds"
         )
-    problem.put(tracker.best_values)
-    return _conclude(problem, tracker.best_values, seed, starts, costs, stopped, began)
+    values = _ordered(problem, tracker.best_values)
+    problem.put(values)
+    return _conclude(problem, values, seed, starts, costs, stopped, began)
 
 
 def _problem(
@@ -258,11 +263,12 @@ def _problem(
     drive: str | None,
     params: lmfit.Parameters | None,
     weights: Mapping[str, float] | None,
+    interior_mass: bool,
 ) -> _Problem:
     model = Model.parse(model_name)
     drive = choose_drive(measurement) if drive is None else drive
     chosen = default_weights(measurement, drive) if weights is None else dict(weights)
-    objective = Objective(measurement, model, drive, chosen)
+    objective = Objective(measurement, model, drive, chosen, interior_mass=interior_mass)
     wanted = make_params(measurement, model, drive)
     for name in params or ():
         if name not in wanted:
@@ -351,6 +357,37 @@ def _move_inside(params: lmfit.Parameters, names: tuple[str, ...]) -> None:
             )
 
 
+def _ordered(problem: _Problem, values: Array) -> Array:
+    """Order springs that the data cannot tell apart by their σ_a, the softest at the base.
+
+    Two springs can be exchanged if they are of one kind and the curves stay the same; the foam of
+    the paper buckles first at its base.
+    """
+    model = problem.model
+    bistable = [i for i, kind in enumerate(model.kinds) if kind == "bistable"]
+    if len(bistable) < 2:
+        return values
+    held = {name for name in model.names if not problem.params[name].vary}
+    if any(
+        split_name(name)[0] in bistable for name in held if not name.endswith(("eta", "height"))
+    ):
+        return values
+
+    def onset(spring: int) -> float:
+        k0, eps_a = (values[model.index[f"s{spring + 1}_{short}"]] for short in ("k0", "eps_a"))
+        return float(k0 * eps_a / (1.0 - eps_a))
+
+    moved = values.copy()
+    for place, spring in zip(bistable, sorted(bistable, key=onset), strict=True):
+        for name in model.names:
+            at, short = split_name(name)
+            if at == place:
+                moved[model.index[name]] = values[model.index[f"s{spring + 1}_{short}"]]
+    before, after = (problem.objective.residual(v) for v in (values, moved))
+    same = np.allclose(before, after, rtol=0.0, atol=1e-9 * max(float(np.max(np.abs(before))), 1.0))
+    return moved if same else values
+
+
 def _visited(problem: _Problem, simulated: Simulated) -> dict[str, tuple[str, ...]]:
     """Branches that each spring went through, in the order of the first visit."""
     seen = {
@@ -392,7 +429,7 @@ def _conclude(
     objective, measurement = problem.objective, problem.measurement
     simulated = objective.simulate(values, everything=True)
     residual = objective.residual(values)
-    estimates, spread = _estimate(problem, values, residual)
+    estimates, spread, correlation = _estimate(problem, values, residual)
     misfit = objective.misfit(simulated)
     balance = audit(measurement)
     n_vary = sum(1 for item in estimates.values() if item.vary and item.stderr is not None)
@@ -424,12 +461,43 @@ def _conclude(
             stress_along=simulated.stress_strain,
         ),
         switches=_switches(problem, simulated),
+        correlation=correlation,
+        notes=_notes(problem, values, simulated),
+    )
+
+
+def _notes(problem: _Problem, values: Array, simulated: Simulated) -> tuple[str, ...]:
+    """What was left out of the model, and what it would change."""
+    objective, specimen = problem.objective, problem.measurement.specimen
+    if len(problem.model.kinds) == 1 or objective.drive != "impact" or objective.interior_mass:
+        return ()
+    left_out = "The interior masses are left out"
+    if specimen.mass is None:
+        return (f"{left_out}; with [specimen] mass foamfit could say what they would change.",)
+    heavy = Objective(
+        problem.measurement, problem.model, "impact", objective.weights, interior_mass=True
+    )
+    try:
+        other = heavy.simulate(values)
+    except SimulationError as error:
+        return (f"{left_out}; with them the simulation ends: {error}.",)
+    changes = [
+        f"{name} by {np.sqrt(np.mean((one - two) ** 2)) / np.ptp(one):.2%}"
+        for name, one, two in (
+            ("the base stress", simulated.stress_time, other.stress_time),
+            ("the displacement", simulated.displacement_time, other.displacement_time),
+        )
+        if one is not None and two is not None
+    ]
+    return (
+        f"{left_out}; the specimen's {specimen.mass * 1e6:.3g} mg between the springs would change "
+        f"{' and '.join(changes)} (RMS over range).",
     )
 
 
 def _estimate(
     problem: _Problem, values: Array, residual: Array
-) -> tuple[dict[str, ParameterEstimate], uncertainty.Covariance | None]:
+) -> tuple[dict[str, ParameterEstimate], uncertainty.Covariance | None, Correlation | None]:
     """Value, uncertainty and state of every parameter; also put into lmfit's parameters."""
     params, objective = problem.params, problem.objective
     unreached = _unreached(problem, values)
@@ -459,7 +527,7 @@ def _estimate(
             estimate = _varied(problem, name, value, spread, names.index(name), sizes)
             parameter.stderr = estimate.stderr
         out[name] = estimate
-    return out, spread
+    return out, spread, None if spread is None else Correlation(names, spread.correlation)
 
 
 def _varied(

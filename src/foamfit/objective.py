@@ -129,6 +129,8 @@ class Objective:
         Weight of each curve; see `default_weights`. A weight w multiplies the curve's squares.
     rtol : float
         Tolerance of the simulation.
+    interior_mass : bool
+        Whether the specimen's mass sits between the springs, in equal parts, as in the paper.
 
     Attributes
     ----------
@@ -141,6 +143,7 @@ class Objective:
     drive: str
     weights: dict[str, float]
     rtol: float = 1e-6
+    interior_mass: bool = False
     evaluations: int = field(default=0, init=False)
     failures: int = field(default=0, init=False)
 
@@ -209,12 +212,23 @@ class Objective:
         return DisplacementDrive(self.measurement.displacement)
 
     def _scene(self, loading: Drive, *, damped: bool) -> Plan:
-        """Make a scene ready; only which springs have a dashpot matters here, not their values."""
+        """Make a scene ready; only which springs have a dashpot matters here, not their values.
+
+        Interior masses move in an impact only; along a given motion the springs are in equilibrium.
+        """
         specimen = self.measurement.specimen
         count = len(self.model.kinds)
         springs = [LinearSpring(1.0, eta=1.0 if damped else 0.0)] * count
         heights = [specimen.height / count] * count
-        return make_plan(Chain(springs, heights, specimen.area), loading, self.time)
+        masses = [0.0] * count
+        if self.interior_mass and count > 1 and isinstance(loading, Impact):
+            if specimen.mass is None:
+                raise InputError(
+                    f"{self.measurement.name}: interior masses need [specimen] mass, "
+                    'like mass = "5.56 mg"'
+                )
+            masses = [specimen.mass / (count - 1)] * (count - 1) + [0.0]
+        return make_plan(Chain(springs, heights, specimen.area, masses), loading, self.time)
 
     def _measured(self) -> dict[str, Array | None]:
         """Measured curves that the drive leaves free."""

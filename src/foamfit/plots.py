@@ -182,10 +182,8 @@ def plot_response(response: Response, path: str | Path | None = None) -> Figure:
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(7.0, 2.75), layout="constrained")
         axes = figure.subplots(1, 3)
-        (ft, t_unit), (fs, s_unit) = (
-            readable_unit(_size(time), "s"),
-            readable_unit(_size(stress), "Pa"),
-        )
+        ft, t_unit = readable_unit(_size(time), "s")
+        fs, s_unit = readable_unit(_size(stress), "Pa")
         fw, w_unit = readable_unit(_size(nodes), "m")
         axes[0].plot(time / ft, stress / fs, color=VERMILION, lw=1.3)
         # From the base up: light to dark, the top in the colour of what is simulated.
@@ -193,10 +191,9 @@ def plot_response(response: Response, path: str | Path | None = None) -> Figure:
         for i, node in enumerate(nodes[:-1]):
             axes[1].plot(time / ft, node / fw, color=str(shades[i]), lw=1.0, label=f"node {i + 1}")
         axes[1].plot(time / ft, nodes[-1] / fw, color=VERMILION, lw=1.3, label="top")
-        end = (
-            time.size if response.contact_end is None else int(np.sum(time <= response.contact_end))
-        )
-        axes[2].plot(response.strain[:end], stress[:end] / fs, color=VERMILION, lw=1.3)
+        end = np.inf if response.contact_end is None else response.contact_end
+        loop = time <= end  # then the striker flies
+        axes[2].plot(response.strain[loop], stress[loop] / fs, color=VERMILION, lw=1.3)
         for ax, x_label, y_label in (
             (axes[0], f"time ({t_unit})", f"base stress ({s_unit})"),
             (axes[1], f"time ({t_unit})", f"displacement ({w_unit})"),
@@ -347,12 +344,8 @@ def _panels(result: FitResult) -> Iterator[_Panel]:
 def _shown(sections: list[Section]) -> list[str]:
     """Return the parameters of which some result has something to show, in their order."""
     rows = [row for section in sections for row in section.rows]
-    there = {r.label for r in rows if r.standard_errors is not None or _lost(r)}
+    there = {r.label for r in rows if r.standard_errors is not None or r.lost}
     return list(dict.fromkeys(row.label for row in rows if row.label in there))
-
-
-def _lost(row: Row) -> bool:
-    return row.state == "not determined" and row.reference is not None
 
 
 def _comparison_lines(sections: list[Section]) -> int:
@@ -377,7 +370,7 @@ def _draw_comparison(ax: Axes, sections: list[Section]) -> None:
             if row.label not in labels:
                 continue
             y = labels.index(row.label) * step + k
-            if _lost(row):
+            if row.lost:
                 ax.annotate(
                     "not determined", (0.0, y), ha="center", va="center", fontsize=6.5,
                     color=color, style="italic",

@@ -110,6 +110,7 @@ class FitResult:
     curves: Curves
     switches: tuple[Switch, ...]
     correlation: Correlation | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def bistable_springs(self) -> dict[str, BistableSpring]:
@@ -145,6 +146,7 @@ class FitResult:
                 "seed": self.seed,
                 "status": self.status,
                 "warnings": self.warnings,
+                "notes": self.notes,
                 "parameters": {name: asdict(p) for name, p in self.parameters.items()},
                 **({"correlation": vars(self.correlation)} if self.correlation else {}),
                 "derived": derived,
@@ -203,7 +205,9 @@ def check_target(folder: str | Path) -> None:
             raise InputError(f"{folder} is a file; choose a new or an empty folder")
         there = next(path for path in folder.absolute().parents if path.exists())
         if not there.is_dir():
-            raise InputError(f"{folder} cannot be written: {there} is a file; choose another folder")
+            raise InputError(
+                f"{folder} cannot be written: {there} is a file; choose another folder"
+            )
         if not os.access(there, os.W_OK | os.X_OK):
             raise InputError(
                 f"{folder} cannot be written: Permission denied in {there}; choose another folder"
