@@ -5,13 +5,15 @@ loop (foam-1 at 2.0 m/s, foam-2 at 4.5 m/s; see experiments/reconstruct.py) in t
 impact drive, where nothing measured enters the simulation, and in the paper's way, where the
 measured stress drives the model and the displacement is fitted. The models are the paper's, whose
 one damper is the onsite one of the striker: it varies in the impact drive, and the springs have
-none. Between two springs the fit has no mass, the reconstruction has the specimen's. The base spring of foam-2 bears no tension; the noise of the measured stress goes below zero, where such
-a spring has no equilibrium, so in the stress drive a linear one stands in for it.
+none. Between two springs the fit has no mass; the reconstruction has the specimen's.
+
+The base spring of foam-2 bears no tension. The noise of the measured stress goes below zero, where
+such a spring has no equilibrium, so in the stress drive a linear one stands in for it.
 
     python fits/published_cases.py
 
 writes fits/<case>/<drive>/ (fit.json, parameters.csv, fit.png; `foamfit fit` writes the rest of a
-result folder), fits/comparison.md and fits/comparison.png. It takes some minutes on two cores.
+result folder), fits/comparison.md and fits/comparison.png. It takes half a minute on two cores.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ from pathlib import Path
 import foamfit as ff
 from foamfit.comparison import Comparison, compare, comparison_text
 from foamfit.plots import plot_comparison
+from foamfit.result import load_result
 
 HERE = Path(__file__).parent
 TESTS = HERE.parent / "experiments"
@@ -33,6 +36,7 @@ CASES = {
 }
 INSTEAD = {("foam-2", "stress"): "linear+bistable"}
 DRIVES = ("impact", "stress")
+RUNS = [(case, drive) for case in CASES for drive in DRIVES]
 LEFT_OUT = ("curves.csv", "fit.pdf", "report.html")  # large, and made again by this script
 LIMIT = 3.0  # standard errors
 
@@ -45,6 +49,10 @@ from the published parameters in the impact drive with 1 % noise on both channel
 an error of the identification.
 
 {verdict}
+
+In the stress drive the measured stress is the input, and its noise is taken for stress that acted:
+where the foam is soft, on branch e above all, the fitted slope comes out too steep. The impact
+drive does not have this bias, since nothing measured enters it.
 
 ![deviations in standard errors](comparison.png)
 
@@ -92,17 +100,34 @@ def verdict(comparison: Comparison) -> str:
     return "\n".join(lines)
 
 
+def in_parts(folders: list[Path]) -> str:
+    """Name the parameters that are off by themselves; a ratio of two can hide it."""
+    found = []
+    for (case, drive), folder in zip(RUNS, folders, strict=True):
+        for name, fitted in load_result(folder)["parameters"].items():
+            spring = ff.published[case].chain.springs[int(name[1]) - 1 if name[1].isdigit() else 0]
+            true = getattr(spring, name[3:], None)
+            if fitted["stderr"] is None or name.endswith("eta") or true is None:
+                continue
+            errors = (fitted["value"] - true) / fitted["stderr"]
+            if abs(errors) > LIMIT:
+                found.append(f"- {case}, {drive} drive: {name}, {errors:+.1f} standard errors")
+    if not found:
+        return f"All are within {LIMIT:g} also in SI units, before ratios are formed."
+    return "\n".join(["Farther off in SI units, before ratios are formed:", "", *found])
+
+
 def main() -> None:
     """Fit all cases, then write and print the comparison."""
-    runs = [(case, drive) for case in CASES for drive in DRIVES]
     with ProcessPoolExecutor() as pool:
-        folders = list(pool.map(fit, *zip(*runs, strict=True)))
+        folders = list(pool.map(fit, *zip(*RUNS, strict=True)))
     comparison = compare(folders)
     text = comparison_text(comparison)
-    page = PAGE.format(verdict=verdict(comparison), text=text)
+    summary = f"{verdict(comparison)}\n\n{in_parts(folders)}"
+    page = PAGE.format(verdict=summary, text=text)
     (HERE / "comparison.md").write_text(page, encoding="utf-8")
     plot_comparison(comparison, HERE / "comparison.png")
-    print(text, verdict(comparison), sep="\n\n")
+    print(text, summary, sep="\n\n")
 
 
 if __name__ == "__main__":

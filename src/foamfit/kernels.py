@@ -351,8 +351,8 @@ def equilibrate(
 
     Along a monotone stretch each spring follows one monotone function of the common stress, so the
     sum of their elongations has one root, whatever switches lie on the way. Newton's method finds
-    it, from the eighth trial on inside a shrinking bracket. Where the root lies in a jump of that function (k_h± = 0), the
-    springs share it from the base up. `branches` is brought up to date.
+    it, from the eighth trial on inside a shrinking bracket. Where the root lies in a jump of that
+    function (k_h± = 0), the springs share it from the base up. `branches` is brought up to date.
     """
     found = False
     low, high = -math.inf, math.inf

@@ -8,7 +8,7 @@ much, is in `weights`, so that nothing is counted twice silently.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,8 @@ CURVES = ("stress_time", "displacement_time", "stress_strain")
 DRIVES = ("impact", "stress", "displacement")
 # What a residual is, in units of the curve's scale, where a simulation failed.
 PENALTY = 10.0
+# A trial that needs more steps than this is too stiff to be worth waiting for.
+MAX_STEPS = 20_000
 
 
 def choose_drive(measurement: Measurement) -> str:
@@ -228,7 +230,8 @@ class Objective:
                     'like mass = "5.56 mg"'
                 )
             masses = [specimen.mass / (count - 1)] * (count - 1) + [0.0]
-        return make_plan(Chain(springs, heights, specimen.area, masses), loading, self.time)
+        chain = Chain(springs, heights, specimen.area, masses)
+        return replace(make_plan(chain, loading, self.time), max_steps=MAX_STEPS)
 
     def _measured(self) -> dict[str, Array | None]:
         """Measured curves that the drive leaves free."""

@@ -31,6 +31,8 @@ LAST_STRAIN = 0.999
 CURVE_STARTS = 300
 # Valleys of the loop whose cost on the drive's curves is within this factor of the best go on.
 PROMISING = 100.0
+# Pitches at which the ringing of an interior mass is tried, up to twice the stiffness and its half.
+PITCHES = np.geomspace(1.0, 2.0, 71)[1:]
 
 
 class SearchStoppedError(Exception):
@@ -381,6 +383,10 @@ def box_starts(space: Space, rng: np.random.Generator, count: int) -> list[Array
 # ---------------------------------------------------------------- descent
 
 
+def _cost(item: tuple[float, Array]) -> float:
+    return item[0]
+
+
 def descend(
     tracker: Tracker, space: Space, start: Array, iterations: int, enough: float = 1e-5
 ) -> tuple[float, Array]:
@@ -449,7 +455,7 @@ def rank(tracker: Tracker, space: Space, points: list[Array]) -> list[tuple[floa
     for point in points:
         residual = tracker.residual(space.decode(point))
         ranked.append((float(residual @ residual), point))
-    return sorted(ranked, key=lambda item: item[0])
+    return sorted(ranked, key=_cost)
 
 
 def spread_out(space: Space, points: list[Array], count: int) -> list[Array]:
@@ -472,7 +478,7 @@ def valleys(ends: list[tuple[float, Array]], apart: float = 1e-3) -> list[tuple[
     """Ends of descents, best first, one of each cost with their number: one cost, one valley."""
     chosen: list[tuple[int, Array]] = []
     last = 0.0
-    for cost, point in sorted(ends, key=lambda item: item[0]):
+    for cost, point in sorted(ends, key=_cost):
         if chosen and cost <= (1.0 + apart) * last:
             chosen[-1] = (chosen[-1][0] + 1, chosen[-1][1])
         else:
@@ -523,6 +529,9 @@ def search(
     else:
         counts = {}
     ranked = rank(tracker, space, points)
+    if tracker.objective.interior_mass:
+        progress(0.7, "ringing")
+        ranked = sorted(ranked + _scan_ringing(tracker, space, points[0]), key=_cost)
     promising = [item for item in ranked if item[0] <= PROMISING * ranked[0][0]]
     points = [point for _, point in valleys(promising)][: max(3, starts // 4)]
     out = []
@@ -562,3 +571,34 @@ def _search_loop(
         if inner.best_values is not None:
             tracker.consider(inner.best_values)
     return ends
+
+
+def _scan_ringing(tracker: Tracker, space: Space, start: Array) -> list[tuple[float, Array]]:
+    """Points along the valley of the massless chain, ranked by the curves with interior masses.
+
+    An interior mass rings on a stiff linear spring, and the cost has a valley for every cycle that
+    the simulated ringing gains on the measured one: no descent crosses from one to the next. The
+    massless chain fixes all that does not ring, for each stiffness of a linear spring in turn.
+    """
+    ringing = tracker.objective
+    quiet = Objective(ringing.measurement, ringing.model, ringing.drive, ringing.weights)
+    massless = Tracker(quiet, tracker.deadline)
+    _, start = descend(massless, space, start, 40)
+    out: list[tuple[float, Array]] = []
+    for spring, kind in enumerate(space.model.kinds, start=1):
+        name = f"s{spring}_k0"
+        if kind == "bistable" or name not in space.free:
+            continue
+        at = space.model.index[name]
+        for pitches in (PITCHES, 1.0 / PITCHES):
+            values = space.decode(start)
+            for stiffness in values[at] * pitches:
+                values[at] = np.clip(stiffness, space.low[at], space.high[at])
+                free = tuple(other for other in space.free if other != name)
+                held = replace(space, values=values.copy(), free=free)
+                _, point = descend(massless, held, held.encode(values), 3, enough=1e-3)
+                values = held.decode(point)
+                out += rank(tracker, space, [space.encode(values)])
+    ringing.evaluations += quiet.evaluations
+    ringing.failures += quiet.failures
+    return out

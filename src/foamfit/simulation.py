@@ -94,6 +94,8 @@ class Plan:
         The drive and its samples.
     speed : float
         Velocity of the striker, m/s; 0 = no impact.
+    max_steps : int
+        Bound on the steps of the integrator.
     """
 
     solver: str
@@ -105,6 +107,7 @@ class Plan:
     values: Array
     time: Array
     speed: float
+    max_steps: int = MAX_STEPS
 
     def run(
         self,
@@ -178,7 +181,7 @@ class Plan:
             self.time,
             tolerance,
             order,
-            MAX_STEPS,
+            self.max_steps,
             displacement,
             stress,
             log,
