@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from foamfit.uncertainty import autocorrelation_time, covariance, interval, state
+from foamfit.uncertainty import autocorrelation_time, covariance, half_width, state
 
 
 def ar1(n: int, rho: float, seed: int) -> np.ndarray:
@@ -61,21 +61,21 @@ def test_a_direction_without_trace_is_not_a_number():
     assert np.isfinite(spread.stderr[2])
 
 
-def test_the_interval_stays_within_the_limits():
-    low, high = interval(1.0, 1.0, 1e6, 0.0, 10.0)
-    assert low == 0.0
-    assert high == pytest.approx(1 + 1.95996, abs=1e-4)
+def test_the_half_width_is_that_of_students_t():
+    assert half_width(2.0, 1e6) == pytest.approx(2 * 1.95996, abs=1e-4)
+    assert half_width(1.0, 5.0) == pytest.approx(2.57058, abs=1e-4)
 
 
 @pytest.mark.parametrize(
-    ("ci95", "value", "expected"),
+    ("half", "value", "expected"),
     [
-        ((0.9, 1.1), 1.0, "determined"),
-        ((0.2, 1.8), 1.0, "weak"),
-        ((-4.0, 6.0), 1.0, "not determined"),
-        (None, 1.0, "not determined"),
-        ((0.0, 0.1), 0.0, "weak"),
+        (0.1, 1.0, "determined"),
+        (0.8, 1.0, "weak"),
+        (5.0, 1.0, "not determined"),
+        (float("nan"), 1.0, "not determined"),
+        (0.1, 0.0, "weak"),
+        (1e6, 10.0, "not determined"),
     ],
 )
-def test_states(ci95, value, expected):
-    assert state(value, ci95, 1.0, 0.0, 10.0)[0] == expected
+def test_states(half, value, expected):
+    assert state(value, half, 1.0, 0.0, 10.0)[0] == expected

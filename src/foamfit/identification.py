@@ -471,6 +471,8 @@ def _conclude(
 def _notes(problem: _Problem, values: Array, simulated: Simulated) -> tuple[str, ...]:
     """What was left out of the model, and what it would change."""
     objective, specimen = problem.objective, problem.measurement.specimen
+    if objective.drive == "stress":
+        return ("The driving stress is smoothed by a parabola over a twenty-fifth of the samples.",)
     if len(problem.model.kinds) == 1 or objective.drive != "impact" or objective.interior_mass:
         return ()
     left_out = "The interior masses are left out"
@@ -555,17 +557,13 @@ def _varied(
     sizes: Array,
 ) -> ParameterEstimate:
     """Estimate of a parameter that was varied and whose branch was reached."""
-    parameter = problem.params[name]
-    stderr: float | None = float(spread.stderr[column])
-    ci95 = None
-    if stderr is not None and math.isfinite(stderr):
-        freedom = spread.effective - len(sizes)
-        ci95 = uncertainty.interval(value, stderr, freedom, parameter.min, parameter.max)
-    verdict, why = uncertainty.state(
-        value, ci95, float(sizes[column]), parameter.min, parameter.max
-    )
+    low, high = problem.params[name].min, problem.params[name].max
+    stderr = float(spread.stderr[column])
+    half = uncertainty.half_width(stderr, spread.effective - len(sizes))
+    verdict, why = uncertainty.state(value, half, float(sizes[column]), low, high)
     if verdict == "not determined":
-        stderr = ci95 = None
+        return ParameterEstimate(value, None, None, unit_of(name), True, verdict, why)
+    ci95 = (max(value - half, low), min(value + half, high))
     return ParameterEstimate(value, stderr, ci95, unit_of(name), True, verdict, why)
 
 

@@ -160,7 +160,9 @@ def summary_text(result: FitResult) -> str:
     lines += _wrap("", "misfit (RMS over range): " + (", ".join(misfits) or "no curve to compare"))
     lines += ["", *_aligned([row for row in rows if row.state != "fixed"])]
     lines += _wrap("", "fixed: " + ", ".join(fixed)) if fixed else []
-    lines += [""] if result.warnings else []
+    lines += [""] if result.warnings or result.notes else []
+    for note in result.notes:
+        lines += _wrap("note: ", note)
     for warning in result.warnings:
         lines += _wrap("warning: ", warning)
     return "\n".join(lines)

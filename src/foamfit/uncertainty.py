@@ -7,6 +7,7 @@ number of samples, n/τ, with τ the autocorrelation time of the residuals of ea
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -124,33 +125,27 @@ def _parts(sizes: tuple[int, ...]) -> list[slice]:
     return [slice(int(end - size), int(end)) for size, end in zip(sizes, ends, strict=True)]
 
 
-def interval(
-    value: float, stderr: float, freedom: float, low: float, high: float
-) -> tuple[float, float]:
-    """95 % interval by Student's t with `freedom` degrees of freedom, within [low, high]."""
-    half = float(stats.t.ppf(0.975, max(freedom, 1.0))) * stderr
-    return max(value - half, low), min(value + half, high)
+def half_width(stderr: float, freedom: float) -> float:
+    """Half of the 95 % interval by Student's t with `freedom` degrees of freedom."""
+    return float(stats.t.ppf(0.975, max(freedom, 1.0))) * stderr
 
 
-def state(
-    value: float, ci95: tuple[float, float] | None, size: float, low: float, high: float
-) -> tuple[str, str]:
+def state(value: float, half: float, size: float, low: float, high: float) -> tuple[str, str]:
     """State of a parameter that was varied and whose branch was reached, and why.
 
     Parameters
     ----------
     value : float
         Identified value.
-    ci95 : tuple of float or None
-        Its interval; None where the data fix only a combination.
+    half : float
+        Half of its 95 % interval, not cut at the limits; NaN where the data fix only a combination.
     size : float
         Its natural size.
     low, high : float
         Its limits.
     """
-    if ci95 is None:
+    if not math.isfinite(half):
         return "not determined", "the data fix only a combination of it with other parameters"
-    half = 0.5 * (ci95[1] - ci95[0])
     edge = 1e-6 * size
     if half > NOTHING * size:
         return "not determined", f"its 95 % interval is ±{half / size:.0%} of its natural size"
