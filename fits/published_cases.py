@@ -50,9 +50,9 @@ an error of the identification.
 
 {verdict}
 
-In the stress drive the measured stress is the input, and its noise is taken for stress that acted:
-where the foam is soft, on branch e above all, the fitted slope comes out too steep. The impact
-drive does not have this bias, since nothing measured enters it.
+In the stress drive the measured stress is the input, and its noise would be taken for stress that
+acted: where the foam is soft, on branch e above all, the fitted slope would come out too steep. The
+driving stress is therefore smoothed. Nothing measured enters the impact drive.
 
 ![deviations in standard errors](comparison.png)
 
