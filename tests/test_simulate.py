@@ -155,6 +155,8 @@ def test_against_reference(name: str, drive: str, rtol: float, bar: float) -> No
     got = ff.simulate(built(CHAINS[name]), load, TIME, rtol=rtol)
     if ", mass" in name and rtol == 1e-6 and len(CHAINS[name].springs) == 2:
         bar = 1e-5
+    if "mass" not in name and rtol == 1e-6:
+        bar = 1e-8  # few steps: a margin costs little
     displacement, stress = errors(got, want)
     assert displacement <= bar
     assert stress <= bar

@@ -123,7 +123,7 @@ def picture(table: pd.DataFrame, path: Path) -> None:
     axes.axhline(1.0, color="0.6", linewidth=0.8)
     axes.set(xlabel="run time of the fit (s)", ylabel="χ² over χ² of the true parameters (–)")
     axes.set_title(f"{len(table)} synthetic impacts, 1 % noise", fontsize=10)
-    axes.legend(frameon=False, fontsize=8)
+    figure.legend(frameon=False, fontsize=8, loc="outside lower center", ncols=2)
     figure.savefig(path, dpi=200)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from foamfit.spring import BISTABLE, LINEAR, UNILATERAL, admissible, derived_points
+from foamfit.law import BISTABLE, LINEAR, UNILATERAL, admissible, derived_points
 
 Array = NDArray[np.float64]
 Row = Array
