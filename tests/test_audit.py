@@ -149,6 +149,13 @@ def test_the_description_holds_what_a_person_asks():
     assert max(map(len, text.splitlines())) <= 100
 
 
+def test_the_description_names_the_masses_inside():
+    test = bounce()
+    text = describe(replace(test, interior={1: 0.5 * test.displacement}), audit(test))
+    assert "displacement_1" in text
+    assert f"mass 1    peak {0.5e6 * test.displacement.max():.4g} µm" in text
+
+
 @pytest.mark.skipif(not DATA.is_dir(), reason="the measured data are not here")
 @pytest.mark.parametrize(("number", "velocity"), [(1, 0.785), (3, 0.905)])
 def test_cartilage_does_not_close(tmp_path, number, velocity):

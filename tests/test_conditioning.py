@@ -1,6 +1,7 @@
 """Each step from samples to one loading and unloading, on pulses whose truth is known."""
 
 import contextlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -176,6 +177,66 @@ def test_a_true_hold_stays_a_hold():
 def test_a_smooth_displacement_is_no_staircase():
     record = impact()
     assert fill_staircase(record) == (record, [])
+
+
+# Masses inside.
+
+
+def followed(record, share=0.4, zero=3e-3, noise=0.0):
+    """Add a mass inside that is at rest at `zero` and from contact goes a share of the top."""
+    moved = np.where(record.time < 0, 0.0, pulse(np.maximum(record.time, 0.0))[1])
+    random = np.random.default_rng(1)
+    inside = zero + share * moved + noise * share * moved.max() * random.normal(size=moved.size)
+    return replace(record, interior={1: inside})
+
+
+@pytest.mark.parametrize(
+    ("before", "n", "noise"), [(0.4, 600, 0.01), (0.4, 5000, 0.0), (0.0, 600, 0.0)]
+)
+def test_a_mass_inside_goes_through_the_same_steps(before, n, noise):
+    conditioned = run(followed(impact(n, before=before, after=0.3), noise=noise))
+    record = conditioned.record
+    assert record.interior[1].shape == record.time.shape
+    truth = 0.4 * pulse(np.minimum(record.time, DURATION))[1]
+    inside = record.time <= DURATION
+    away = np.abs(np.mean(record.interior[1] - truth, where=inside)) / truth.max()
+    assert away < 2e-3  # its own zero, 3 mm by the file, is gone
+    assert any("displacement_1 at contact, 3 mm, is taken off" in n for n in conditioned.notes)
+
+
+def test_a_mass_inside_that_starts_at_zero_keeps_its_zero():
+    record = followed(impact(noise=0.01), zero=0.0, noise=0.01)
+    np.testing.assert_array_equal(
+        run(record).record.interior[1], record.interior[1][: len(run(record).record)]
+    )
+
+
+def test_a_later_cycle_keeps_the_zero_of_a_mass_inside():
+    record = cycles()
+    half = replace(record, interior={1: 0.5 * record.displacement + 7e-3})
+    inside = condition(half, SPECIMEN, window=Window(cycle=3)).record.interior[1]
+    assert inside.max() == pytest.approx(0.5e-3, rel=2e-3)
+    assert inside[-1] == pytest.approx(1e-5, abs=3e-6)  # not zero: the foam has set
+
+
+def test_a_staircase_of_a_camera_becomes_its_ramp():
+    record = followed(impact(1000))
+    inside = record.interior[1]
+    held = inside[np.arange(inside.size) // 10 * 10]
+    filled, notes = fill_staircase(replace(record, interior={1: held}))
+    assert np.abs(filled.interior[1] - inside)[:-10].max() < 0.1 * np.abs(held - inside).max()
+    assert notes[0].startswith("displacement_1 is held for about 10 samples")
+
+
+def test_a_mass_inside_that_overtakes_the_top_is_noted():
+    notes = run(followed(impact(), share=1.2, zero=0.0)).notes
+    assert any(note.startswith("Check: displacement_1 goes farther") for note in notes)
+
+
+def test_a_mass_inside_that_rests_within_the_window_is_refused():
+    still = replace(impact(), interior={1: np.r_[np.zeros(590), np.ones(11)]})
+    with pytest.raises(InputError, match="displacement_1 is constant within"):
+        run(still, end=580 * DURATION / 600)
 
 
 # Slow tests.

@@ -12,7 +12,7 @@ import foamfit as ff
 from conftest import DATA, needs_data, synthetic_impact, synthetic_loop
 from foamfit import search
 from foamfit.identification import make_params
-from foamfit.measurement import Noise
+from foamfit.measurement import Measurement, Noise, Specimen
 
 NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
 
@@ -147,6 +147,70 @@ def test_wrong_calls_are_refused(options, message):
         ff.fit(synthetic_loop()[1], **options)
 
 
+SOFT = ff.published["foam-1/model-1"].bistable
+STIFF = ff.BistableSpring(
+    k0=9e6, kc=120e6, dsigma=-0.4e6, eps_a=0.16, eps_c=0.33, kh_plus=9e6, kh_minus=4e6
+)
+
+
+def two_springs(*springs, noise=0.005):
+    """A slow loop without time on two springs of equal height, the mass between them followed."""
+    height = 1.19e-3
+    strain = np.concatenate([np.linspace(0, 0.4, 150), np.linspace(0.4, 0.02, 150)[1:]])
+    chain = ff.Chain(springs, [0.5 * height] * 2, 1.9635e-5)
+    run = ff.simulate(chain, ff.DisplacementDrive(strain * height), np.arange(strain.size))
+    rng = np.random.default_rng(1)
+    noisy = [
+        y + noise * np.ptp(y) * rng.standard_normal(y.size)
+        for y in (run.base_stress, run.displacement[0])
+    ]
+    return Measurement(
+        name="synthetic loop of two springs",
+        path=None,
+        data_sha256="",
+        time=None,
+        stress=noisy[0],
+        displacement=strain * height,
+        specimen=Specimen(height, 1.9635e-5, heights=(0.5 * height,) * 2),
+        motion="measured",
+        interior={1: noisy[1]},
+    )
+
+
+@pytest.mark.parametrize("springs", [(STIFF, SOFT), (SOFT, STIFF)])
+def test_a_mass_inside_shows_which_spring_is_at_the_base(springs):
+    measurement = two_springs(*springs)
+    result = ff.fit(measurement, model="bistable+bistable", starts=12)
+    for spring, true in zip(result.chain.springs, springs, strict=True):
+        assert spring.sigma_a == pytest.approx(true.sigma_a, rel=0.05)
+        assert spring.kc == pytest.approx(true.kc, rel=0.05)
+    assert result.misfit["displacement_1_time"] == pytest.approx(0.005, rel=0.15)
+    measured, fitted = result.curves.interior[1]
+    assert measured is measurement.interior[1]
+    off = np.sqrt(np.mean((fitted - measured) ** 2)) / np.ptp(measured)
+    assert off == pytest.approx(result.misfit["displacement_1_time"], rel=1e-12)
+    assert result.weights["displacement_1_time"] == 1.0
+
+
+def test_without_a_mass_inside_the_softest_spring_is_put_at_the_base():
+    blind = replace(two_springs(STIFF, SOFT), interior={})
+    result = ff.fit(blind, model="bistable+bistable", starts=12)
+    base, top = result.chain.springs
+    assert base.sigma_a < 0.7 * top.sigma_a
+    assert result.curves.interior == {}
+    assert "displacement_1_time" not in result.misfit
+
+
+def test_a_mass_inside_is_left_out_of_a_single_spring_and_refused_as_the_top():
+    measurement = two_springs(STIFF, SOFT)
+    result = ff.fit(measurement, starts=2)
+    assert any("displacement_1 is left out" in note for note in result.notes)
+    assert "displacement_1_time" not in result.misfit
+    top = replace(measurement, interior={2: measurement.interior[1]})
+    with pytest.raises(ff.InputError, match="node 2 of a 2-spring chain is the top"):
+        ff.fit(top, model="linear+bistable")
+
+
 FOAMS = {
     "turbo-comp-1": (7.63, 10.53),
     "leap-comp-2": (7.62, 10.65),
@@ -165,3 +229,40 @@ def test_one_spring_follows_the_first_cycle_of_a_shoe_foam(name, tmp_path):
     result = ff.fit(measurement)
     assert result.drive == "displacement"
     assert result.misfit["stress_strain"] <= 0.035
+
+
+CARTILAGE = """\
+[specimen]
+height = "0.563 mm"
+diameter = "8.5 mm"
+[striker]
+mass = "358.39 g"
+velocity = "0.785 m/s"
+"""
+VOLTS = """\
+[columns]
+time = { column = "X_Value", unit = "s" }
+acceleration = { column = "Acceleration", unit = "V", scale = "9586.5 m/s^2/V" }
+force = { column = "Load", unit = "V", scale = "4444.4 N/V" }
+"""
+
+
+@needs_data
+@pytest.mark.parametrize(
+    ("name", "columns", "motion"),
+    [
+        ("test_1_impact.csv", "", "measured"),
+        ("test_1_raw.txt", VOLTS, "integrated from acceleration"),
+    ],
+)
+def test_a_striker_on_cartilage_is_fitted_and_its_impulse_doubted(name, columns, motion, tmp_path):
+    """Measurements of JoVE 64450, also from the instrument's own text in volts."""
+    toml = tmp_path / "cartilage.toml"
+    toml.write_text(CARTILAGE + columns)
+    measurement = ff.read_test(DATA / "cartilage-impact" / name, toml)
+    assert measurement.motion == motion
+    result = ff.fit(measurement)
+    assert result.drive == "impact"
+    assert result.energy["impulse_ratio"] == pytest.approx(0.78, abs=0.02)
+    assert any("momentum" in warning for warning in result.warnings)
+    assert result.misfit["stress_time"] < 0.2

@@ -9,12 +9,13 @@ import pytest
 
 import foamfit as ff
 from conftest import synthetic_impact, synthetic_loop
-from foamfit.measurement import Noise
+from foamfit.measurement import Noise, Striker
 from foamfit.model import Model
 from foamfit.objective import (
     PENALTY,
     Objective,
     check_drive,
+    check_interior,
     choose_drive,
     default_weights,
 )
@@ -105,6 +106,98 @@ def test_the_jacobian_agrees_with_the_law_in_closed_form():
         column[on_a], strain[on_a] / (1 - strain[on_a]), rtol=1e-6, atol=1e-9
     )
     np.testing.assert_allclose(column[on_d], 0.14 / 0.86, rtol=1e-6)
+
+
+def followed_chain(drive, noise=None):
+    """A chain of two springs at its true parameters, whose mass inside was followed."""
+    spring, loop = synthetic_loop()
+    stiff = replace(spring, k0=9e6, eps_a=0.16)
+    height, area = loop.specimen.height, loop.specimen.area
+    chain = ff.Chain([stiff, spring], [0.5 * height] * 2, area)
+    if drive == "impact":
+        time = np.linspace(0.0, 0.6e-3, 301)
+        response = ff.simulate(chain, ff.Impact(7e-3, 2.0), time)
+    else:
+        time = np.arange(loop.displacement.size, dtype=float)
+        response = ff.simulate(chain, ff.DisplacementDrive(loop.displacement), time)
+    measurement = replace(
+        loop,
+        time=time if drive == "impact" else None,
+        stress=response.base_stress,
+        displacement=response.displacement[-1],
+        striker=Striker(7e-3, 2.0) if drive == "impact" else None,
+        noise=noise or Noise(),
+        interior={1: response.displacement[0] + 3e-6},
+    )
+    heights = [0.5 * height] * 2
+    values = np.array([*stiff.seven, 0.0, *spring.seven, 0.0, *heights, 0.0])
+    return values, measurement
+
+
+TWO = Model.parse("bistable+bistable")
+
+
+@pytest.mark.parametrize(
+    ("drive", "counted"),
+    [
+        ("impact", ("stress_time", "displacement_time", "displacement_1_time")),
+        ("displacement", ("stress_strain", "displacement_1_time")),
+        ("stress", ("displacement_time", "displacement_1_time")),
+    ],
+)
+def test_a_mass_inside_counts_in_every_drive(drive, counted):
+    values, measurement = followed_chain(drive)
+    one = Objective(measurement, TWO, drive, default_weights(measurement, drive, 2))
+    assert one.counted == counted
+    off = one.residual(values)[-one.sizes[-1] :]  # measured 3 um too far, everywhere
+    expected = -3e-6 / np.ptp(measurement.interior[1])
+    if drive == "stress":  # it is smoothed
+        assert np.median(off) == pytest.approx(expected, rel=0.1)
+    else:
+        np.testing.assert_allclose(off, expected, rtol=1e-3)
+    misfit = one.misfit(one.simulate(values))
+    assert misfit["displacement_1_time"] == pytest.approx(np.sqrt(np.mean(off**2)), rel=1e-12)
+
+
+def test_stated_noise_is_the_scale_of_a_mass_inside_too():
+    values, measurement = followed_chain("displacement", Noise(displacement=1.5e-6))
+    one = Objective(measurement, TWO, "displacement", {"displacement_1_time": 1.0})
+    np.testing.assert_allclose(one.residual(values), -2.0, rtol=1e-3)
+
+
+def test_a_mass_inside_tells_springs_apart():
+    values, measurement = followed_chain("displacement")
+    other = np.concatenate([values[8:16], values[:8], values[16:]])
+    blind = Objective(measurement, TWO, "displacement", {"stress_strain": 1.0})
+    np.testing.assert_allclose(blind.residual(values), blind.residual(other), atol=1e-9)
+    seeing = Objective(
+        measurement, TWO, "displacement", default_weights(measurement, "displacement", 2)
+    )
+    off = np.abs(seeing.residual(values) - seeing.residual(other)).max()
+    assert off > 0.1
+    assert "displacement_1_time" in blind.misfit(blind.simulate(values, everything=True))
+    assert blind.misfit(blind.simulate(values))["displacement_1_time"] is None
+
+
+def test_a_single_spring_has_nothing_inside():
+    _, measurement = followed_chain("displacement")
+    one = objective(measurement, "displacement")
+    assert one.counted == ("stress_strain",)
+    assert "displacement_1_time" not in one.weights
+    with pytest.raises(ff.InputError, match="displacement_1_time"):
+        objective(measurement, "displacement", {"displacement_1_time": 1.0})
+
+
+def test_a_node_beyond_the_chain_is_refused():
+    _, measurement = followed_chain("displacement")
+    check_interior(measurement, 1)  # left out with a note
+    check_interior(measurement, 2)
+    beyond = replace(measurement, interior={1: measurement.stress, 2: measurement.stress})
+    with pytest.raises(ff.InputError, match="node 2 of a 2-spring chain is the top") as caught:
+        check_interior(beyond, 2)
+    assert "displacement_2" in str(caught.value)
+    assert "'displacement' column" in str(caught.value)
+    check_interior(beyond, 3)
 
 
 def test_the_drive_is_chosen_by_what_the_test_has():

@@ -56,6 +56,24 @@ def test_the_curves_are_drawn_in_these_units() -> None:
     np.testing.assert_allclose(line(loop, "springs along measured strain").get_xdata(), strain)
 
 
+def test_masses_inside_are_drawn_with_the_top() -> None:
+    time = fabricated.result().curves.time
+    measured, fitted = 1e-4 * np.sin(time / time[-1]), 1.1e-4 * np.sin(time / time[-1])
+    result = with_curves(fabricated.chain_result(), interior={1: (measured, fitted)})
+    figure = plot_fit(result)
+    _, displacement_time, _ = figure.axes
+    np.testing.assert_allclose(line(displacement_time, "mass 1").get_ydata(), fitted * 1e6)
+    points = line(displacement_time, "_measured inside")
+    expected = np.interp(points.get_xdata() / 1e6, time, measured * 1e6)
+    np.testing.assert_allclose(points.get_ydata(), expected, atol=1e-9)
+    legend = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert legend == ["measured", "fitted", "mass 1", "springs along measured strain"]
+    titles = [ax.get_title(loc="left") for ax in plot_residuals(result).axes]
+    assert titles[-1] == "displacement-time of mass 1: fitted − measured"
+    without = with_curves(result, time=None)
+    assert [ax.get_xlabel() for ax in plot_fit(without).axes] == ["strain (–)"]
+
+
 def test_switches_and_branches_are_named() -> None:
     *in_time, loop = plot_fit(fabricated.result()).axes
     for ax in in_time:

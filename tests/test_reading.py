@@ -158,6 +158,68 @@ def test_a_million_rows_take_seconds(tmp_path):
     assert test.stress.max() == pytest.approx(2e6, rel=1e-3)
 
 
+# Masses inside that a camera followed.
+
+INSIDE = "time (ms),stress (MPa),displacement (mm),"
+PLAIN = INSIDE + "displacement_1 (mm)"
+
+
+def inside(*factors, offset=0.0):
+    """Rows of `numbers` and, for each factor, a mass inside that goes so many mm."""
+    return [
+        ",".join([row, *(f"{factor * y + offset:.9g}" for factor in factors)])
+        for row, y in zip(numbers(), LOOP, strict=True)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("header", "scale"),
+    [
+        ("displacement_1 (mm)", 1),
+        ("Displacement 1 [mm]", 1),
+        ("displacement_1_um", 1000),
+        ("disp_1 (um)", 1000),
+        ("camera displacement 01 / mm", 1),
+    ],
+)
+def test_a_mass_inside_is_read(tmp_path, header, scale):
+    test = read_test(write(tmp_path, INSIDE + header, inside(1.5 * scale)))
+    expect(test)  # it is not taken for the top
+    assert list(test.interior) == [1]
+    np.testing.assert_allclose(test.interior[1], 1.5e-3 * LOOP, atol=1e-11)
+    assert f"displacement_1 from {header!r}" in test.notes[0]
+
+
+def test_masses_inside_are_told_apart_and_may_stand_in_the_toml(tmp_path):
+    toml = SPECIMEN + '[columns]\ndisplacement_2 = { column = "lower mark", unit = "um" }\n'
+    header = INSIDE + "displacement_1 (mm),lower mark"
+    test = read_test(write(tmp_path, header, inside(1.0, 3000.0), toml))
+    peaks = {node: values.max() for node, values in test.interior.items()}
+    assert peaks == pytest.approx({1: 1e-3, 2: 3e-3})
+
+
+def test_a_column_that_the_toml_names_otherwise_is_not_taken_twice(tmp_path):
+    toml = SPECIMEN + '[columns]\ndisplacement = { column = "displacement_1 (mm)" }\n'
+    test = read_test(write(tmp_path, "time (ms),stress (MPa),displacement_1 (mm)", toml=toml))
+    expect(test)
+    assert test.interior == {}
+    toml = SPECIMEN + '[columns]\ndisplacement_2 = { column = "displacement_1 (mm)" }\n'
+    assert list(read_test(write(tmp_path, PLAIN, inside(1.0), toml)).interior) == [2]
+
+
+def test_the_top_by_another_name_is_not_inside(tmp_path):
+    test = read_test(write(tmp_path, INSIDE + "displacement_2 (mm)", inside(4.0)))
+    assert test.interior == {}
+    assert any(
+        note.startswith("displacement_2 is the displacement of the top") for note in test.notes
+    )
+
+
+def test_without_a_mass_inside_there_is_none(tmp_path):
+    header = INSIDE + "displacement_1_std (mm)"
+    assert read_test(write(tmp_path, header, inside(1.0))).interior == {}
+
+
 # What is refused: one sentence that names what is wrong.
 
 
@@ -260,6 +322,34 @@ def test_row_numbers_count_titles_and_blank_lines(tmp_path):
 def test_refuses_values_that_cannot_be(tmp_path, factors, words):
     rows = [f"{i},{factors[0] * y},{factors[1] * y}" for i, y in enumerate(LOOP)]
     refused(write(tmp_path, rows=rows), "test.csv", *words)
+
+
+@pytest.mark.parametrize(
+    ("header", "factors", "words"),
+    [
+        (INSIDE + "displacement_1", [1], ["'displacement_1' has no unit", "displacement_1 (mm)"]),
+        (INSIDE + "displacement_1 (MPa)", [1], ["as displacement_1", "another kind"]),
+        (PLAIN, [0], ["'displacement_1 (mm)' is constant", "a displacement_1 must vary"]),
+        (PLAIN, [-1], ["displacement_1 is negative", "scale = -1"]),
+        (PLAIN, [20], ["displacement_1 reaches 20 mm", "height 10 mm", "unit"]),
+        (PLAIN + ",disp 1 (mm)", [1, 2], []),
+        (PLAIN + ",displacement_01 (mm)", [1, 2], ["could both be the displacement_1"]),
+    ],
+)
+def test_refuses_masses_inside(tmp_path, header, factors, words):
+    path = write(tmp_path, header, inside(*factors))
+    if words:
+        refused(path, "test.csv", *words)
+    else:  # the better name of two wins
+        assert read_test(path).interior[1].max() == pytest.approx(1e-3)
+
+
+def test_refuses_text_in_the_column_of_a_mass_inside(tmp_path):
+    rows = inside(1.0)
+    rows[7] = "7,1,1,lost"
+    refused(write(tmp_path, PLAIN, rows), "row 9", "'displacement_1 (mm)'", "'lost'")
+    toml = SPECIMEN + '[columns]\ndisplacement_0 = { column = "A" }\n'
+    refused(write(tmp_path, PLAIN, inside(1.0), toml), "no key 'displacement_0'")
 
 
 def test_refuses_too_few_rows(tmp_path):

@@ -102,6 +102,19 @@ def test_the_page_says(said: str) -> None:
     assert said in page().words
 
 
+def test_masses_inside_are_in_the_table_of_misfits() -> None:
+    result = fabricated.result()
+    inside = 0.4 * result.curves.displacement
+    changed = {
+        "curves": replace(result.curves, interior={1: (inside, inside)}),
+        "misfit": result.misfit | {"displacement_1_time": 0.021},
+    }
+    assert "displacement-time of mass 1 2.1" in page(**changed).words
+    summary = summary_text(fabricated.result(**changed))
+    assert "displacement-time of mass 1 2.1 %" in " ".join(summary.split())
+    assert "mass 1" not in summary_text(result)
+
+
 def test_the_statistics_and_the_energy_are_labelled() -> None:
     statistics = {"n_effective": 986.0, "chisqr": 979.9, "n_failed": 1, "n_descents": 2}
     balance = audit(fabricated.result().measurement)

@@ -119,6 +119,18 @@ def test_curves_csv_gives_the_curves_back(saved: Path) -> None:
 
 
 @pytest.mark.usefixtures("no_figures")
+def test_masses_inside_have_their_columns(tmp_path: Path) -> None:
+    result = fabricated.result()
+    inside = 0.4 * result.curves.displacement
+    curves = replace(result.curves, interior={1: (inside + 1e-6, inside)})
+    table = rows(replace(result, curves=curves).save(tmp_path / "r") / "curves.csv")
+    names = ["measured displacement_1 (m)", "fitted displacement_1 (m)"]
+    assert list(table[0])[-2:] == names
+    assert [float(row[names[1]]) for row in table] == inside.tolist()
+    assert float(table[0][names[0]]) == 1e-6
+
+
+@pytest.mark.usefixtures("no_figures")
 def test_a_curve_that_is_not_there_has_no_column(tmp_path: Path) -> None:
     result = fabricated.result()
     result = replace(result, curves=replace(result.curves, time=None, displacement=None))

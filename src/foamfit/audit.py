@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from foamfit.conditioning import engineering, line_at, noise_level
-from foamfit.measurement import Array, Measurement, Striker
+from foamfit.measurement import Array, Measurement, Striker, interior_channel
 
 
 @dataclass(frozen=True)
@@ -243,7 +243,7 @@ def describe(measurement: Measurement, audit: EnergyAudit) -> str:
     test = measurement
     lines = [("test", test.name), ("file", str(test.path or "none"))]
     lines += [("specimen", _specimen(test)), ("striker", _striker(test))]
-    lines += [("samples", _sampling(test.time, test.stress, test.displacement))]
+    lines += [("samples", _sampling(test))]
     lines += _peaks(test)
     noise = [(n, getattr(test.noise, n), u) for n, u in (("stress", "Pa"), ("displacement", "m"))]
     if any(value for _, value, _ in noise):
@@ -281,8 +281,10 @@ def _striker(test: Measurement) -> str:
     return f"{mass}, {speed}" if test.striker else "none given"
 
 
-def _sampling(time: Array | None, stress: Array | None, displacement: Array | None) -> str:
-    channels = {"time": time, "stress": stress, "displacement": displacement}
+def _sampling(test: Measurement) -> str:
+    time = test.time
+    channels = {"time": time, "stress": test.stress, "displacement": test.displacement}
+    channels |= {interior_channel(node): values for node, values in test.interior.items()}
     present = [name for name, values in channels.items() if values is not None]
     n = max(len(values) for values in channels.values() if values is not None)
     text = f"{n} of {', '.join(present)}"
@@ -303,6 +305,9 @@ def _peaks(test: Measurement) -> list[tuple[str, str]]:
         at = _moment(test.time, top)
         text = f"peak {w / test.specimen.height:.4g} ({engineering(w, 'm')}){at}, {test.motion}"
         lines.append(("strain", text))
+    for node, values in test.interior.items():
+        top, w = largest_motion(values, test.time)
+        lines.append((f"mass {node}", f"peak {engineering(w, 'm')}{_moment(test.time, top)}"))
     return lines
 
 

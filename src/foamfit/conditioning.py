@@ -6,13 +6,13 @@ Each step is a function that returns a new `Record` and a sentence for each thin
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.errors import InputError
-from foamfit.measurement import Array, Specimen, Striker
+from foamfit.measurement import Array, Specimen, Striker, interior_channel
 
 _MIN_ROWS = 10
 _MIN_REST = 20
@@ -25,7 +25,8 @@ class Record:
     """The channels of a test in SI, each of shape (n,) or None where the file lacks it.
 
     Time in s, stress in Pa, displacement of the top in m, velocity of the top in m/s and its
-    deceleration in m/s² (like the stress that causes it, it is positive in compression).
+    deceleration in m/s² (like the stress that causes it, it is positive in compression). `interior`
+    holds the displacement of masses inside in m, 1 for the one above spring 1.
     """
 
     time: Array | None
@@ -33,11 +34,14 @@ class Record:
     displacement: Array | None
     velocity: Array | None = None
     acceleration: Array | None = None
+    interior: dict[int, Array] = field(default_factory=dict)
 
     def rows(self, which: slice | NDArray[np.bool_]) -> Record:
         """Keep some rows of every channel."""
         channels = {f.name: getattr(self, f.name) for f in fields(self)}
-        return replace(self, **{k: v[which] for k, v in channels.items() if v is not None})
+        inside = {node: values[which] for node, values in channels.pop("interior").items()}
+        kept = {k: v[which] for k, v in channels.items() if v is not None}
+        return replace(self, **kept, interior=inside)
 
     def __len__(self) -> int:
         """Count the samples."""
@@ -119,7 +123,9 @@ def condition(
     record = done(fill_staircase(record))
     if impact and window.cycle != 1:
         raise InputError("[window] cycle is for slow tests; for an impact give start and end.")
-    start = find_start(record if impact else select_cycle(record, 1)[0], impact)
+    first = record if impact else select_cycle(record, 1)[0]
+    start = find_start(first, impact)
+    record = done(zero_interior(record, first, start))
     record = done(remove_offset(record, start, impact))
     if not impact:
         record = done(select_cycle(record, window.cycle))
@@ -176,7 +182,12 @@ def check_signs(record: Record) -> None:
         moved = record.displacement[peak] - record.displacement[0]
         if moved < -0.5 * np.ptp(record.displacement[: peak + 1]):
             raise InputError(f"the displacement or strain {hint} in [columns].")
-    elif record.acceleration is not None:
+    for node, values in record.interior.items():
+        if values[peak] - values[0] < -0.5 * np.ptp(values[: peak + 1]):
+            raise InputError(f"{interior_channel(node)} {hint} in [columns].")
+    if record.displacement is not None:
+        return
+    if record.acceleration is not None:
         if np.dot(stress - first, record.acceleration) < 0:
             raise InputError(f"the acceleration {hint} in [columns] (braking is positive).")
     elif record.velocity is not None and record.velocity[0] < record.velocity[-1]:
@@ -194,6 +205,13 @@ def checks(record: Record, specimen: Specimen, striker: Striker | None, motion: 
         cause = "the unit of displacement or strain" if motion == "measured" else "the striker"
         raise InputError(f"strain reaches {strain:.3g}, beyond one; check height and {cause}.")
     notes = []
+    for node, values in record.interior.items():
+        name, most = interior_channel(node), float(values.max())
+        if most >= specimen.height:
+            told = f"{engineering(most, 'm')}, the height {engineering(specimen.height, 'm')}"
+            raise InputError(f"{name} reaches {told}; check its unit.")
+        if most > 1.05 * displacement.max():
+            notes.append(f"Check: {name} goes farther than the top; check its unit and its node.")
     peak, last = float(stress.max()), int(np.argmax(stress))
     if stress[:3].mean() > 0.05 * peak:
         share = stress[:3].mean() / peak
@@ -252,32 +270,44 @@ def cut_to_window(record: Record, window: Window) -> tuple[Record, list[str]]:
         values = getattr(record, name)
         if values is not None and np.ptp(values) == 0:
             raise InputError(f"the {name} is constant within [window]; it must vary.")
+    for node, values in record.interior.items():
+        if np.ptp(values) == 0:
+            name = interior_channel(node)
+            raise InputError(f"{name} is constant within [window]; it must vary.")
     return record, [note]
 
 
 def fill_staircase(record: Record) -> tuple[Record, list[str]]:
-    """Interpolate a displacement that is held while the stress goes on.
+    """Interpolate displacements that are held while the stress goes on.
 
-    The instants where its value is fresh are kept. A much longer hold is a real one: it lasts
+    The instants where a value is fresh are kept. A much longer hold is a real one: it lasts
     until one usual step before the next fresh value.
     """
-    displacement = record.displacement
-    if displacement is None:
-        return record, []
-    fresh = np.append(0, np.flatnonzero(np.diff(displacement) != 0) + 1)
-    lengths = np.diff(np.append(fresh, len(record)))
+    notes: list[str] = []
+    if record.displacement is not None:
+        filled = _filled(record.clock, record.displacement, "The displacement", notes)
+        record = record if filled is None else replace(record, displacement=filled)
+    for node, values in record.interior.items():
+        filled = _filled(record.clock, values, interior_channel(node), notes)
+        if filled is not None:
+            record = replace(record, interior=record.interior | {node: filled})
+    return record, notes
+
+
+def _filled(clock: Array, values: Array, name: str, notes: list[str]) -> Array | None:
+    """Ramps in the place of the steps of a signal, None if it has no steps."""
+    fresh = np.append(0, np.flatnonzero(np.diff(values) != 0) + 1)
+    lengths = np.diff(np.append(fresh, len(values)))
     step = int(np.median(lengths))
     if len(lengths) < _MIN_ROWS or step < 2:
-        return record, []
+        return None
     held = lengths > 3 * step
     knots = np.union1d(fresh, (fresh + lengths - step)[held])
-    clock = record.clock
-    filled = np.interp(clock, clock[knots], displacement[knots])
-    note = (
-        f"The displacement is held for about {step} samples at a time; it is interpolated between "
+    notes.append(
+        f"{name} is held for about {step} samples at a time; it is interpolated between "
         f"the {len(fresh)} instants where it is fresh."
     )
-    return replace(record, displacement=filled), [note]
+    return np.asarray(np.interp(clock, clock[knots], values[knots]))
 
 
 def select_cycle(record: Record, cycle: int) -> tuple[Record, list[str]]:
@@ -426,6 +456,38 @@ def _passage(time: Array, w: Array, top: int) -> tuple[int, slice]:
     return crossing, slice(max(0, min(first, crossing - 5)), max(last, crossing + 5))
 
 
+def _zero_time(record: Record, start: Start) -> float:
+    """Time of contact by the file's clock."""
+    if start.time is not None:
+        return start.time
+    # A file whose first sample is a step or so after time zero has its zero right.
+    time = record.clock
+    return 0.0 if 0 <= time[0] <= 2 * (time[1] - time[0]) else float(time[0])
+
+
+def zero_interior(record: Record, first: Record, start: Start) -> tuple[Record, list[str]]:
+    """Take from each interior displacement its value where contact starts in `first`.
+
+    That is the median of its rest before contact; without a rest it is where a line through the
+    first samples starts, unless this is zero within their noise.
+    """
+    before = 0 if start.time is None else int(np.searchsorted(first.clock, start.time)) - 2
+    inside, notes = dict(record.interior), []
+    for node, values in first.interior.items():
+        if before >= _MIN_ROWS:
+            zero = float(np.median(values[:before]))
+        else:
+            early = slice(max(before, 0), max(before, 0) + 5)
+            zero = line_at(first.clock[early], values[early], _zero_time(first, start))[0]
+            if abs(zero) < max(3 * noise_level(values), 2e-3 * np.ptp(values)):
+                continue
+        inside[node] = inside[node] - zero
+        if abs(zero) > 1e-3 * np.ptp(values):
+            name = interior_channel(node)
+            notes.append(f"{name} at contact, {engineering(zero, 'm')}, is taken off.")
+    return replace(record, interior=inside), notes
+
+
 def remove_offset(record: Record, start: Start, impact: bool) -> tuple[Record, list[str]]:
     """Take from the stress (and the acceleration) its median before contact."""
     if start.time is None or not (impact or start.free):
@@ -482,10 +544,7 @@ def contact_end(stress: Array) -> tuple[int, bool]:
 def cut_to_contact(record: Record, start: Start, impact: bool) -> tuple[Record, list[str]]:
     """Cut what lies before and after contact; time and displacement are zero where it starts."""
     time, w = record.clock, record.displacement
-    if start.time is not None:
-        zero_time = start.time
-    else:  # a file whose first sample is a step or so after time zero has its zero right
-        zero_time = 0.0 if 0 <= time[0] <= 2 * (time[1] - time[0]) else float(time[0])
+    zero_time = _zero_time(record, start)
     first = 0 if start.time is None else int(np.searchsorted(time, start.time))
     notes: list[str] = []
     end = len(record)
@@ -551,5 +610,6 @@ def thin(record: Record) -> tuple[Record, list[str]]:
 
     stress = mean(record.stress)
     assert stress is not None
-    thinned = Record(mean(record.time), stress, mean(record.displacement))
+    inside = {node: np.add.reduceat(v, edges) / counts for node, v in record.interior.items()}
+    thinned = Record(mean(record.time), stress, mean(record.displacement), interior=inside)
     return thinned, [f"{n} samples are averaged in {len(edges)} blocks of {size}."]

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 import math
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -28,9 +27,10 @@ MPA = 1e6
 NAMES = ("k0", "eps_a", "kh_plus", "dsigma", "kc", "eps_c", "kh_minus")  # in the order of the loop
 STIFFNESSES = ("k0", "kh_plus", "kc", "kh_minus")
 SMOOTH = 200  # samples, each way, of the loop without the noise of the measured strain
-ROOM = 0.12  # above and to the right of the measured loop, as a share of it
-WIDTH, HEIGHT = 640, 430  # of the picture in a notebook, px
+ROOM = 0.1  # about the measured loop, as a share of it
+WIDTH, HEIGHT = 560, 400  # of the picture in a notebook, px
 SHARPNESS = 1.5  # its own pixels for each of them
+ROUGH = np.array([0.2, 0.6, 0.4, 0.5, 0.0])  # where the points are taken to lie at first
 BESIDE = {  # where the name of a point stands, in typographic points from it
     "A1": (-5, 6, "right"), "C1": (-6, 4, "right"), "C2": (7, -4, "left"), "A2": (6, -8, "left"),
 }  # fmt: skip
@@ -48,8 +48,6 @@ class Turned:
         Pa, along the measured strain; None where there is no answer.
     misfit : float or None
         RMS of simulated minus measured over the measured range.
-    seconds : float
-        What it took to compute.
     trouble : str
         Why there is no answer, in one sentence; "" where there is one.
     """
@@ -57,7 +55,6 @@ class Turned:
     spring: BistableSpring | None
     stress: Array | None
     misfit: float | None
-    seconds: float
     trouble: str = ""
 
 
@@ -76,15 +73,14 @@ def turn(strain: Array, measured: Array, values: Mapping[str, float]) -> Turned:
     Turned
         Values that are not admissible raise nothing: `trouble` is the sentence that says why.
     """
-    began = time.perf_counter()
     spring = None
     try:
         spring = BistableSpring(**values)
         stress = spring.stress(strain)
     except (ValueError, SimulationError) as error:
-        return Turned(spring, None, None, time.perf_counter() - began, str(error))
+        return Turned(spring, None, None, str(error))
     misfit = math.sqrt(float(np.mean((stress - measured) ** 2))) / float(np.ptp(measured))
-    return Turned(spring, stress, misfit, time.perf_counter() - began)
+    return Turned(spring, stress, misfit)
 
 
 def points(spring: BistableSpring) -> dict[str, tuple[float, float]]:
@@ -118,8 +114,8 @@ def loop_of(measurement: Measurement) -> tuple[Array, Array]:
 class LoopPicture:
     """A measured loop with a spring over it, of which only the spring is drawn again.
 
-    Bold is the spring's loop up to the largest measured strain, pale its stress along the measured
-    strain with all its noise, from which the misfit is computed.
+    The spring is drawn along a smooth history up to the largest measured strain and back to A2 or
+    the left edge.
 
     Parameters
     ----------
@@ -134,51 +130,47 @@ class LoopPicture:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
-        self._strain = strain
+        left, right = _limits(strain)
         largest = float(strain.max())
-        up = np.linspace(0.0, largest, SMOOTH)
-        self._there_and_back = np.concatenate((up, up[-2::-1]))
+        up, down = np.linspace(0.0, largest, SMOOTH), np.linspace(largest, left, SMOOTH)
+        self._history = np.concatenate((up, down[1:]))
         style = STYLE | {"font.size": 9, "axes.labelsize": 9, "axes.titlesize": 9}
         with matplotlib.rc_context(style | {"xtick.labelsize": 8, "ytick.labelsize": 8}):
             size = (WIDTH / 100, HEIGHT / 100)
             self.figure = Figure(figsize=size, dpi=100 * SHARPNESS, layout="constrained")
-            self._canvas = FigureCanvasAgg(self.figure)
+            self._canvas: Any = FigureCanvasAgg(self.figure)  # matplotlib types it in part
             self._ax = ax = self.figure.subplots()
             ax.set_title(title, loc="left", weight="bold", parse_math=False)
             ax.set_xlabel("strain (–)")
             ax.set_ylabel("stress (MPa)")
-            ax.set_xlim(_limits(strain))
+            ax.set_xlim(left, right)
             ax.set_ylim(_limits(measured / MPA))
             ax.plot(strain, measured / MPA, "o", ms=2.8, mfc="white", mec=GREY, mew=0.5)
-            (self._along,) = ax.plot([], [], color=VERMILION, lw=0.6, alpha=0.5)
             (self._loop,) = ax.plot([], [], color=VERMILION, lw=1.6)
             (self._dots,) = ax.plot([], [], "o", ms=5, color="black", zorder=5)
             self._names = {
                 name: ax.annotate(
-                    name, (0.0, 0.0), (dx, dy), textcoords="offset points", ha=side, va="center",
-                    annotation_clip=True,
+                    name, (0.0, 0.0), (dx, dy), textcoords="offset points", ha=side, va="center"
                 )
                 for name, (dx, dy, side) in BESIDE.items()
             }  # fmt: skip
             self._misfit = ax.text(
                 0.02, 0.98, "", transform=ax.transAxes, va="top", color=BLUE, weight="bold"
             )
-        self._moving = (self._along, self._loop, self._dots, self._misfit, *self._names.values())
+        self._moving = (self._loop, self._dots, self._misfit, *self._names.values())
         self._still: Any = None
 
     def show(self, turned: Turned) -> None:
         """Put a spring into the lines; where there is no answer the last one stays, pale."""
-        spring, stress = turned.spring, turned.stress
-        if spring is None or stress is None:
-            self._fade(0.25)
+        spring = turned.spring
+        for artist in self._moving:
+            artist.set_alpha(0.25 if turned.trouble else 1.0)
+        if spring is None or turned.misfit is None:
             self._misfit.set_text("")
             return
-        self._fade(1.0)
-        self._along.set_data(self._strain, stress / MPA)
-        smooth = self._there_and_back  # it reaches no strain that the measured one does not
-        self._loop.set_data(smooth, spring.stress(smooth) / MPA)
-        marked = points(spring)
-        places = {name: (x, y / MPA) for name, (x, y) in marked.items()}
+        # It goes no farther than the measured strain, along which there is an answer.
+        self._loop.set_data(self._history, spring.stress(self._history) / MPA)
+        places = {name: (x, y / MPA) for name, (x, y) in points(spring).items()}
         self._dots.set_data(*zip(*places.values(), strict=True))
         for name, annotation in self._names.items():
             annotation.set_visible(name in places)
@@ -199,20 +191,15 @@ class LoopPicture:
         self._canvas.restore_region(self._still)
         for artist in self._moving:
             self._ax.draw_artist(artist)
-        pixels = np.asarray(self._canvas.buffer_rgba())[..., :3]
+        pixels = np.asarray(self._canvas.buffer_rgba())
         buffer = io.BytesIO()
-        imsave(buffer, pixels, format="png", pil_kwargs={"compress_level": 1})
+        imsave(buffer, pixels, format="png", pil_kwargs={"compress_level": 1})  # the time goes here
         return buffer.getvalue()
-
-    def _fade(self, alpha: float) -> None:
-        for artist in self._moving:
-            artist.set_alpha(alpha)
-        self._along.set_alpha(0.5 * alpha)
 
 
 def _limits(values: Array) -> tuple[float, float]:
     room = ROOM * float(np.ptp(values))
-    return float(values.min()) - 0.3 * room, float(values.max()) + room
+    return float(values.min()) - 0.7 * room, float(values.max()) + room
 
 
 class Turner:
@@ -247,7 +234,7 @@ class Turner:
 
         self.measurement = measurement
         self.strain, self.measured = loop_of(measurement)
-        self.start = _values(start) if start is not None else _guess(measurement)
+        self.start = _values(start) if start is not None else rough_guess(measurement)
         self.picture = LoopPicture(self.strain, self.measured, measurement.name)
         self.result: FitResult | None = None
         self.sliders = {name: self._slider(name) for name in NAMES}
@@ -261,7 +248,7 @@ class Turner:
         reset.on_click(lambda _: self.reset())
         fit.on_click(lambda _: self.fit_from_here())
         self.buttons = {"reset": reset, "fit from here": fit}
-        self._image = ipywidgets.Image(
+        self.image = ipywidgets.Image(
             format="png", width=WIDTH, height=HEIGHT, layout=ipywidgets.Layout(flex="0 0 auto")
         )
         self._sentence = ipywidgets.HTML()
@@ -270,11 +257,11 @@ class Turner:
             layout=ipywidgets.Layout(flex="0 0 auto"),
         )
         row = ipywidgets.HBox(
-            [controls, self._image],
+            [controls, self.image],
             layout=ipywidgets.Layout(flex_flow="row wrap", align_items="center"),
         )
         self.panel = ipywidgets.VBox([row, self._sentence])
-        self._silent = False
+        self._silent, self._fitted = False, ""
         self.turned = self.update()
 
     @property
@@ -284,8 +271,8 @@ class Turner:
 
     @property
     def sentence(self) -> str:
-        """What stands below the picture, as plain text."""
-        return self._said
+        """What stands below the picture: what is not admissible, or how the last fit went."""
+        return self.turned.trouble or self._fitted
 
     def set(self, values: Mapping[str, float]) -> None:
         """Move sliders to values in SI, wider than they were made where need be; draws once."""
@@ -300,23 +287,23 @@ class Turner:
 
     def reset(self) -> None:
         """Move the sliders back to where they started."""
+        self._fitted = ""
         self.set(self.start)
 
     def update(self) -> Turned:
         """Compute and draw what the sliders say."""
         self.turned = turn(self.strain, self.measured, self.values)
         self.picture.show(self.turned)
-        self._image.value = self.picture.png()
-        self._say(self.turned.trouble or f"Computed in {1e6 * self.turned.seconds:.0f} µs.")
+        self.image.value = self.picture.png()
+        self._say()
         return self.turned
 
     def fit_from_here(self) -> None:
         """Fit the spring, without a dashpot, from where the sliders stand; move them to the fit."""
         from foamfit.identification import fit, make_params
 
-        if self.turned.stress is None:
-            self._say(f"No fit from here: {self.turned.trouble}")
-            return
+        if self.turned.trouble:
+            return  # it is said already
         self.buttons["fit from here"].disabled = True
         self._say("Fitting …")
         try:
@@ -324,15 +311,16 @@ class Turner:
             for name, value in self.values.items():
                 params[f"s1_{name}"].value = value
             params["s1_eta"].set(value=0.0, vary=False)
-            self.result = fit(self.measurement, model="bistable", params=params)
+            result = fit(self.measurement, model="bistable", params=params)
         except (InputError, SimulationError) as error:
-            self._say(str(error))
+            self._say(f"No fit: {error}")
             return
         finally:
             self.buttons["fit from here"].disabled = False
-        self.set(_values(self.result.bistable_springs["s1"]))
-        said = f"Fitted in the {self.result.drive} drive in {self.result.runtime_s:.1f} s."
-        self._say(" ".join((said, *self.result.warnings)))
+        self.result = result
+        took = f"Fitted in the {result.drive} drive in {result.runtime_s:.1f} s."
+        self._fitted = " ".join((took, *result.warnings))
+        self.set(_values(result.bistable_springs["s1"]))
 
     def _slider(self, name: str) -> Any:
         import ipywidgets
@@ -340,13 +328,13 @@ class Turner:
         value = self.start[name] / _unit(name)
         common = {
             "description": name + (" (MPa)" if _unit(name) == MPA else ""),
-            "style": {"description_width": "110px"},
-            "layout": ipywidgets.Layout(width="370px"),
+            "style": {"description_width": "105px"},
+            "layout": ipywidgets.Layout(width="320px"),
         }
         if name in STIFFNESSES:
             middle = math.log10(max(value, 1e-6))
             return ipywidgets.FloatLogSlider(
-                value=value, min=middle - 1.5, max=middle + 1.5, step=0.005,
+                value=value, min=middle - 1.5, max=middle + 1.5, step=0.002,
                 readout_format=".4g", **common,
             )  # fmt: skip
         if name == "dsigma":
@@ -354,19 +342,19 @@ class Turner:
         else:
             low, high = 0.0, max(1.2 * float(self.strain.max()), 1.2 * value)
         return ipywidgets.FloatSlider(
-            value=value, min=low, max=high, step=(high - low) / 1000, readout_format=".4f", **common
+            value=value, min=low, max=high, step=(high - low) / 2000, readout_format=".4f", **common
         )
 
     def _moved(self, _: object) -> None:
         if not self._silent:
             self.update()
 
-    def _say(self, sentence: str) -> None:
+    def _say(self, passing: str = "") -> None:
         from html import escape
 
-        self._said = sentence
         colour = VERMILION if self.turned.trouble else "inherit"
-        self._sentence.value = f'<span style="color: {colour}">{escape(sentence)}</span>'
+        said = escape(passing or self.sentence)
+        self._sentence.value = f'<span style="color: {colour}">{said}</span>'
 
 
 def _unit(name: str) -> float:
@@ -377,11 +365,15 @@ def _values(spring: BistableSpring) -> dict[str, float]:
     return {name: getattr(spring, name) for name in NAMES}
 
 
-def _guess(measurement: Measurement) -> dict[str, float]:
-    from foamfit.identification import make_params
+def rough_guess(measurement: Measurement) -> dict[str, float]:
+    """Read a spring off the loop as the fit does for its starts, the points only roughly placed."""
+    from foamfit.model import BISTABLE_NAMES
+    from foamfit.search import Loop, Scales, read_spring, smooth_loop
 
-    params = make_params(measurement, "bistable")
-    return {name: float(params[f"s1_{name}"].value) for name in NAMES}
+    strain, stress = loop_of(smooth_loop(measurement))
+    spring = read_spring(Loop(strain, stress), ROUGH, Scales.of(measurement))
+    values = dict(zip(BISTABLE_NAMES, map(float, spring), strict=True))
+    return {name: values[name] for name in NAMES}
 
 
 def _widen(slider: Any, value: float, logarithmic: bool) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -15,9 +16,15 @@ from numpy.typing import NDArray
 from foamfit import kernels, uncertainty
 from foamfit.audit import EnergyAudit, audit
 from foamfit.errors import InputError, SimulationError
-from foamfit.measurement import Measurement
+from foamfit.measurement import Measurement, interior_channel
 from foamfit.model import BRANCHES, Model, split_name, unit_of
-from foamfit.objective import Objective, Simulated, choose_drive, default_weights
+from foamfit.objective import (
+    Objective,
+    Simulated,
+    check_interior,
+    choose_drive,
+    default_weights,
+)
 from foamfit.result import Correlation, Curves, FitResult, ParameterEstimate, Switch
 from foamfit.search import Scales, SearchStoppedError, Space, Tracker, search
 
@@ -269,7 +276,9 @@ def _problem(
 ) -> _Problem:
     model = Model.parse(model_name)
     drive = choose_drive(measurement) if drive is None else drive
-    chosen = default_weights(measurement, drive) if weights is None else dict(weights)
+    count = len(model.kinds)
+    check_interior(measurement, count)
+    chosen = default_weights(measurement, drive, count) if weights is None else dict(weights)
     objective = Objective(measurement, model, drive, chosen, interior_mass=interior_mass)
     wanted = make_params(measurement, model, drive)
     for name in params or ():
@@ -341,10 +350,12 @@ def _refine(problem: _Problem, tracker: Tracker) -> None:
     def jacobian(p: lmfit.Parameters) -> Array:
         return problem.objective.jacobian(problem.vector(p), steps, places, tied)
 
-    lmfit.minimize(
-        residual, params, method="least_squares", jac=jacobian, x_scale=sizes,
-        ftol=1e-10, xtol=1e-10, gtol=1e-12, max_nfev=60,
-    )  # fmt: skip
+    with warnings.catch_warnings():  # of its covariance, which `uncertainty` does better
+        warnings.simplefilter("ignore", RuntimeWarning)
+        lmfit.minimize(
+            residual, params, method="least_squares", jac=jacobian, x_scale=sizes,
+            ftol=1e-10, xtol=1e-10, gtol=1e-12, max_nfev=60,
+        )  # fmt: skip
 
 
 def _move_inside(params: lmfit.Parameters, names: tuple[str, ...]) -> None:
@@ -359,11 +370,22 @@ def _move_inside(params: lmfit.Parameters, names: tuple[str, ...]) -> None:
             )
 
 
+def _moved(model: Model, values: Array, sources: Mapping[int, int]) -> Array:
+    """Put other springs in some places of a chain: {place: spring}, 0 at the base."""
+    moved = values.copy()
+    for name in model.names:
+        place, short = split_name(name)
+        if place in sources:
+            moved[model.index[name]] = values[model.index[f"s{sources[place] + 1}_{short}"]]
+    return moved
+
+
 def _ordered(problem: _Problem, values: Array) -> Array:
     """Order springs that the data cannot tell apart by their σ_a, the softest at the base.
 
-    Two springs can be exchanged if they are of one kind and the curves stay the same; the foam of
-    the paper buckles first at its base.
+    Two springs can be exchanged if they are of one kind and the curves stay the same, so never
+    across a mass inside whose displacement is counted; the foam of the paper buckles first at its
+    base.
     """
     model = problem.model
     bistable = [i for i, kind in enumerate(model.kinds) if kind == "bistable"]
@@ -379,12 +401,13 @@ def _ordered(problem: _Problem, values: Array) -> Array:
         k0, eps_a = (values[model.index[f"s{spring + 1}_{short}"]] for short in ("k0", "eps_a"))
         return float(k0 * eps_a / (1.0 - eps_a))
 
-    moved = values.copy()
-    for place, spring in zip(bistable, sorted(bistable, key=onset), strict=True):
-        for name in model.names:
-            at, short = split_name(name)
-            if at == place:
-                moved[model.index[name]] = values[model.index[f"s{spring + 1}_{short}"]]
+    counted = problem.objective.counted
+    nodes = [node for name, node in problem.objective.interior.items() if name in counted]
+
+    def order(spring: int) -> tuple[int, float]:
+        return sum(node <= spring for node in nodes), onset(spring)
+
+    moved = _moved(model, values, dict(zip(bistable, sorted(bistable, key=order), strict=True)))
     before, after = (problem.objective.residual(v) for v in (values, moved))
     same = np.allclose(before, after, rtol=0.0, atol=1e-9 * max(float(np.max(np.abs(before))), 1.0))
     return moved if same else values
@@ -461,6 +484,10 @@ def _conclude(
             stress=simulated.stress_time,
             displacement=simulated.displacement_time,
             stress_along=simulated.stress_strain,
+            interior={
+                node: (measurement.interior[node], simulated.interior[name])
+                for name, node in objective.interior.items()
+            },
         ),
         switches=_switches(problem, simulated),
         correlation=correlation,
@@ -471,10 +498,17 @@ def _conclude(
 def _notes(problem: _Problem, values: Array, simulated: Simulated) -> tuple[str, ...]:
     """What was left out of the model, and what it would change."""
     objective, specimen = problem.objective, problem.measurement.specimen
+    unused: tuple[str, ...] = ()
+    if len(problem.model.kinds) == 1 and problem.measurement.interior:
+        names = ", ".join(map(interior_channel, sorted(problem.measurement.interior)))
+        unused = (f"A single spring has no mass inside, so {names} is left out.",)
     if objective.drive == "stress":
-        return ("The driving stress is smoothed by a parabola over a twenty-fifth of the samples.",)
+        return (
+            *unused,
+            "The driving stress is smoothed by a parabola over a twenty-fifth of the samples.",
+        )
     if len(problem.model.kinds) == 1 or objective.drive != "impact" or objective.interior_mass:
-        return ()
+        return unused
     left_out = "The interior masses are left out"
     if specimen.mass is None:
         return (f"{left_out}; with [specimen] mass foamfit could say what they would change.",)
@@ -490,6 +524,7 @@ def _notes(problem: _Problem, values: Array, simulated: Simulated) -> tuple[str,
         for name, one, two in (
             ("the base stress", simulated.stress_time, other.stress_time),
             ("the displacement", simulated.displacement_time, other.displacement_time),
+            *((c.removesuffix("_time"), w, other.curve(c)) for c, w in simulated.interior.items()),
         )
         if one is not None and two is not None
     ]

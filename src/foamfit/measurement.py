@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -9,6 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+
+
+def interior_channel(node: int) -> str:
+    """Name of the channel that holds the displacement of an interior mass, 1 above the base."""
+    return f"displacement_{node}"
+
+
+def interior_node(channel: str) -> int | None:
+    """Interior mass that a channel belongs to, None for any other channel."""
+    match = re.fullmatch(r"displacement_([1-9]\d{0,3})", channel, re.ASCII)
+    return int(match[1]) if match else None
 
 
 @dataclass(frozen=True)
@@ -67,6 +79,8 @@ class Measurement:
         Nominal base stress, Pa.
     displacement : (n,) array or None
         Displacement of the top, m.
+    interior : dict of int to (n,) array
+        Displacement of the masses inside that a camera followed, m: 1 is the one above spring 1.
     specimen, striker, noise
         What the TOML says; `striker` is None where nothing of it is known.
     motion : str or None
@@ -86,3 +100,4 @@ class Measurement:
     noise: Noise = field(default_factory=Noise)
     motion: str | None = None
     notes: tuple[str, ...] = ()
+    interior: dict[int, Array] = field(default_factory=dict)

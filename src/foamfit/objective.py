@@ -1,8 +1,9 @@
 """The objective: how far a model's curves are from the measured ones, sample by sample.
 
 Curves are compared in time (or sample by sample along a history), never by interpolating across
-the loop. Two channels were measured, stress and displacement; what is counted of them, and how
-much, is in `weights`, so that nothing is counted twice silently.
+the loop. Two channels were measured, stress and displacement, and perhaps displacements of masses
+inside; what is counted of them, and how much, is in `weights`, so that nothing is counted twice
+silently.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from scipy.signal import savgol_filter
 from foamfit import kernels
 from foamfit.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.errors import InputError, SimulationError
-from foamfit.measurement import Measurement
+from foamfit.measurement import Measurement, interior_channel
 from foamfit.model import Model
 from foamfit.simulation import Motion, Plan
 from foamfit.simulation import plan as make_plan
@@ -25,6 +26,7 @@ from foamfit.spring import LinearSpring
 
 Array = NDArray[np.float64]
 
+# Of every objective; to them come displacement_1_time … where masses inside were followed.
 CURVES = ("stress_time", "displacement_time", "stress_strain")
 DRIVES = ("impact", "stress", "displacement")
 # What a residual is, in units of the curve's scale, where a simulation failed.
@@ -84,14 +86,43 @@ def check_drive(measurement: Measurement, drive: str) -> None:
         raise InputError(f"{measurement.name}: the {drive} drive needs {' and '.join(missing)}")
 
 
-def default_weights(measurement: Measurement, drive: str) -> dict[str, float]:
-    """Weights that count each measured channel once.
+def interior_curves(measurement: Measurement, springs: int) -> dict[str, int]:
+    """Curves of the masses inside a chain of so many springs that were followed, and their node."""
+    nodes = sorted(node for node in measurement.interior if node < springs)
+    return {f"{interior_channel(node)}_time": node for node in nodes}
+
+
+def check_interior(measurement: Measurement, springs: int) -> None:
+    """Refuse the displacement of a mass that is not inside a chain of so many springs.
+
+    Raises
+    ------
+    InputError
+        Naming the node. A single spring has nothing inside; the result's notes say so.
+    """
+    wrong = [node for node in sorted(measurement.interior) if node >= springs]
+    if not wrong or springs == 1:
+        return
+    name = interior_channel(wrong[0])
+    top = (
+        f"node {springs} of a {springs}-spring chain is the top, which is the 'displacement' column"
+    )
+    raise InputError(
+        f"{measurement.name}: {name} is no mass inside a chain of {springs} springs: {top}; take "
+        "a model of more springs, or rename or leave out that column"
+    )
+
+
+def default_weights(measurement: Measurement, drive: str, springs: int = 1) -> dict[str, float]:
+    """Weights that count each measured channel once, for a chain of so many springs.
 
     In the impact drive stress and displacement are compared in time; a displacement that was
     integrated from the force is no second measurement. In the displacement drive the stress along
-    the measured displacement is the one curve, in the stress drive the displacement.
+    the measured displacement is the one curve, in the stress drive the displacement. Displacements
+    of masses inside count in all drives: they tell the springs apart.
     """
     weights = dict.fromkeys(CURVES, 0.0)
+    weights |= dict.fromkeys(interior_curves(measurement, springs), 1.0)
     if drive == "impact":
         weights["stress_time"] = 1.0
         if measurement.displacement is not None and measurement.motion != "integrated from force":
@@ -120,12 +151,21 @@ class Simulated:
     """The curves of one set of parameters; None where the drive prescribes or the test lacks them.
 
     `stress_strain` is the stress (Pa) along the measured displacement. `motion` is the run itself.
+    `interior` holds the displacements (m) of the masses inside that the test has too.
     """
 
     stress_time: Array | None
     displacement_time: Array | None
     stress_strain: Array | None
     motion: Motion
+    interior: dict[str, Array] = field(default_factory=dict)
+
+    def curve(self, name: str) -> Array | None:
+        """Return a curve by its name in `Objective.curves`."""
+        if name not in CURVES:
+            return self.interior.get(name)
+        values: Array | None = getattr(self, name)
+        return values
 
 
 @dataclass(eq=False)
@@ -149,6 +189,10 @@ class Objective:
 
     Attributes
     ----------
+    curves : tuple of str
+        Names of the curves that can be counted.
+    interior : dict of str to int
+        Those of masses inside, and their node.
     evaluations, failures : int
         How many sets of parameters were simulated, and how many of them could not be.
     """
@@ -165,6 +209,8 @@ class Objective:
     def __post_init__(self) -> None:
         """Make the scenes ready and fix the scale of each curve."""
         check_drive(self.measurement, self.drive)
+        self.interior = interior_curves(self.measurement, len(self.model.kinds))
+        self.curves = (*CURVES, *self.interior)
         self._check_weights()
         self.time = self._time()
         loading = self._loading()
@@ -175,14 +221,17 @@ class Objective:
             self._along = {damped: self._scene(along, damped=damped) for damped in (False, True)}
         self.measured = self._measured()
         self.counted = tuple(
-            name for name in CURVES if self.weights[name] > 0 and self.measured[name] is not None
+            name
+            for name in self.curves
+            if self.weights[name] > 0 and self.measured[name] is not None
         )
+        self._inside = any(name in self.interior for name in self.counted)
         if not self.counted:
             raise InputError(
                 f"{self.measurement.name}: no curve is left to fit; give one that the "
                 f"{self.drive} drive has a weight above zero"
             )
-        self.scale = {name: self._scale(name) for name in CURVES}
+        self.scale = {name: self._scale(name) for name in self.curves}
         self.sizes = tuple(self._curve(name).size for name in self.counted)
         self.n_data = sum(self.sizes)
         # Worse per sample than any curve that stays within ten ranges.
@@ -196,12 +245,12 @@ class Objective:
 
     def _check_weights(self) -> None:
         for name, weight in self.weights.items():
-            if name not in CURVES or not 0 <= weight < np.inf:
+            if name not in self.curves or not 0 <= weight < np.inf:
                 raise InputError(
-                    f"weights: '{name}' = {weight} is not admissible; give {', '.join(CURVES)} "
-                    "a weight of zero or more"
+                    f"weights: '{name}' = {weight} is not admissible; give "
+                    f"{', '.join(self.curves)} a weight of zero or more"
                 )
-        self.weights = dict.fromkeys(CURVES, 0.0) | self.weights
+        self.weights = dict.fromkeys(self.curves, 0.0) | self.weights
 
     def _time(self) -> Array:
         """Time of the samples, s; their number where the test has no time."""
@@ -249,10 +298,12 @@ class Objective:
     def _measured(self) -> dict[str, Array | None]:
         """Measured curves that the drive leaves free."""
         motion = self.measurement.displacement
+        inside = self.measurement.interior
         return {
             "stress_time": None if self.drive == "stress" else self._timed(self._stress),
             "displacement_time": None if self.drive == "displacement" else motion,
             "stress_strain": None if motion is None else self._stress,
+            **{name: inside[node] for name, node in self.interior.items()},
         }
 
     def _timed(self, values: Array) -> Array | None:
@@ -266,7 +317,7 @@ class Objective:
     def _scale(self, name: str) -> float:
         """One standard deviation of a curve if the test states it, else the curve's range."""
         noise = self.measurement.noise
-        given = noise.displacement if name == "displacement_time" else noise.stress
+        given = noise.displacement if name.startswith("displacement") else noise.stress
         curve = self.measured[name]
         if given is not None or curve is None:
             return given or 1.0
@@ -289,7 +340,9 @@ class Objective:
         damped = bool(rows[:, kernels.ETA].any())
         drag = float(values[-1]) / self.measurement.specimen.height
         plan = self._plans[damped]
-        run = plan.run(rows, heights, self.rtol, drag=drag, everything=everything)
+        everywhere = everything or self._inside
+        run = plan.run(rows, heights, self.rtol, drag=drag, everything=everywhere)
+        inside = self.interior if everywhere else {}
         along: Array | None = None
         if self.drive == "displacement":
             along = run.base_stress
@@ -301,6 +354,7 @@ class Objective:
             displacement_time=None if self.drive == "displacement" else run.displacement[-1],
             stress_strain=along,
             motion=run,
+            interior={name: run.displacement[node - 1] for name, node in inside.items()},
         )
 
     def residual(self, values: Array) -> Array:
@@ -317,9 +371,10 @@ class Objective:
             return np.full(self.n_data, self.penalty)
         parts = []
         for name in self.counted:
-            simulated = getattr(curves, name)
+            simulated = curves.curve(name)
+            assert simulated is not None  # a curve is counted only if the drive leaves it free
             factor = self.weights[name] ** 0.5 / self.scale[name]
-            parts.append((simulated - self.measured[name]) * factor)
+            parts.append((simulated - self._curve(name)) * factor)
         # A stress near the pole of branch c is as bad as none.
         return np.asarray(np.clip(np.concatenate(parts), -self.penalty, self.penalty))
 
@@ -356,8 +411,8 @@ class Objective:
     def misfit(self, curves: Simulated) -> dict[str, float | None]:
         """RMS of simulated minus measured over the measured range, per curve; None if not there."""
         out: dict[str, float | None] = {}
-        for name in CURVES:
-            measured, simulated = self.measured[name], getattr(curves, name)
+        for name in self.curves:
+            measured, simulated = self.measured[name], curves.curve(name)
             if measured is None or simulated is None:
                 out[name] = None
             else:

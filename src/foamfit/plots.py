@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 GREY, BLUE, VERMILION = "#6b6b6b", "#0072B2", "#D55E00"  # of Okabe and Ito, told apart by all
+INSIDE = ("#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # of masses inside, from the base up
 STYLE: Any = {  # matplotlib types its keys one by one
     "font.family": "DejaVu Sans",
     "font.size": 7.5,
@@ -296,6 +297,7 @@ class _Line:
     x: Array
     y: Array
     kind: Literal["measured", "fitted", "along"]
+    node: int = 0  # the mass inside that it belongs to, 0 = the top
 
 
 @dataclass(frozen=True)
@@ -337,6 +339,10 @@ def _panels(result: FitResult) -> Iterator[_Panel]:
     ]
     for key, x_name, x_unit, y_name, y_unit, curves in everything:
         lines = [_Line(x, y, kind) for kind, x, y in curves if x is not None and y is not None]
+        if key == "displacement_time" and c.time is not None:
+            for node, (measured, fitted) in c.interior.items():
+                lines.append(_Line(c.time, measured, "measured", node))
+                lines.append(_Line(c.time, fitted, "fitted", node))
         if lines:
             yield _Panel(key, x_name, x_unit, y_name, y_unit, lines)
 
@@ -448,15 +454,17 @@ def _draw(ax: Axes, panel: _Panel) -> None:
     fx, x_label, fy, y_label = panel.scale()
     for line in panel.lines:
         x, y = line.x / fx, line.y / fy
+        color = INSIDE[(line.node - 1) % len(INSIDE)] if line.node else VERMILION
         if line.kind == "measured":
             some = _evenly(x, y, MARKERS)
             ax.plot(x, y, color=GREY, lw=0.5, alpha=0.6, zorder=1)
             ax.plot(
                 x[some], y[some], "o", ms=2.6, mfc="white", mec=GREY, mew=0.6, zorder=2,
-                label="measured",
+                label="_measured inside" if line.node else "measured",
             )  # fmt: skip
         elif line.kind == "fitted":
-            ax.plot(x, y, color=VERMILION, lw=1.3, zorder=3, label="fitted")
+            name = f"mass {line.node}" if line.node else "fitted"
+            ax.plot(x, y, color=color, lw=1.3, zorder=3, label=name)
         else:
             ax.plot(
                 x, y, color=BLUE, lw=1.0, ls=(0, (4, 2)), zorder=4,
@@ -478,7 +486,11 @@ def _evenly(x: Array, y: Array, n: int) -> NDArray[np.intp]:
 
 
 def _mark_switches(ax: Axes, panel: _Panel, result: FitResult) -> None:
+    from matplotlib.patheffects import withStroke
+
     fx, _, fy, _ = panel.scale()
+    inside = any(line.node for line in panel.lines)  # then the name of A1 may lie on its line
+    halo = [withStroke(linewidth=1.5, foreground="white")]
     at: dict[str, list[tuple[float, float]]] = {}
     for switch in result.switches:
         point = POINTS.get((switch.source, switch.target), f"{switch.source}→{switch.target}")
@@ -495,6 +507,7 @@ def _mark_switches(ax: Axes, panel: _Panel, result: FitResult) -> None:
         ax.annotate(  # a spring that goes to and fro is named where it first does
             name, places[0], offset, textcoords="offset points", zorder=6,
             ha="left" if offset[0] > 0 else "right", va="center", fontsize=7,
+            path_effects=halo if name.endswith("A1") and inside else None,
         )  # fmt: skip
 
 
@@ -574,6 +587,9 @@ def _residuals(result: FitResult) -> Iterator[tuple[str, Array]]:
         compared = result.misfit.get(key) is not None  # else the drive prescribes this curve
         if compared and fitted is not None and measured is not None:
             yield name, (fitted - measured) / (float(np.ptp(measured)) or 1.0)
+    for node, (measured, fitted) in c.interior.items():
+        name = f"displacement-time of mass {node}"
+        yield name, (fitted - measured) / (float(np.ptp(measured)) or 1.0)
 
 
 def _size(values: Array) -> float:

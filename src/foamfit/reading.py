@@ -22,7 +22,7 @@ import numpy as np
 
 from foamfit.conditioning import Record, condition
 from foamfit.errors import InputError
-from foamfit.measurement import Array, Measurement, Striker
+from foamfit.measurement import Array, Measurement, Striker, interior_channel, interior_node
 from foamfit.settings import Column, Settings, read_settings
 from foamfit.units import factor, is_unit
 
@@ -99,17 +99,35 @@ def _parse_header(text: str) -> _Header:
     return _Header(text, tuple(t.lower() for t in tokens), None)
 
 
+def _kind(channel: str) -> tuple[str, str, tuple[str, ...]]:
+    """SI unit, example of a header and words of a channel, of displacement_1 and so on too."""
+    if interior_node(channel) is None:
+        return _CHANNELS[channel]
+    si, _, words = _CHANNELS["displacement"]
+    return si, f"{channel} (mm)", words
+
+
 def _rank(header: _Header, channel: str) -> int | None:
     """How well a header names a channel: 0 is best, None not at all."""
-    words = _CHANNELS[channel][2]
-    if len(header.words) == 1 and header.words[0] in words:
-        return 0 if header.words[0] == words[0] else 1
-    named = [w for w in header.words if w in _WORDS and len(w) > 1]
-    if len(named) != 1 or named[0] not in words or _OTHER & set(header.words):
+    words, node = _kind(channel)[2], interior_node(channel)
+    numbers = [word for word in header.words if word.isdecimal()]
+    if [int(number) for number in numbers] != ([] if node is None else [node]):
+        return None  # displacement_1 is inside the specimen
+    rest = [word for word in header.words if word not in numbers]
+    if len(rest) == 1 and rest[0] in words:
+        return 0 if rest[0] == words[0] else 1
+    named = [w for w in rest if w in _WORDS and len(w) > 1]
+    if len(named) != 1 or named[0] not in words or _OTHER & set(rest):
         return None
-    if any(word.isdigit() for word in header.words):
-        return None  # displacement_1 and so on: inside the specimen
     return 2
+
+
+def _channels(table: _Table, given: dict[str, Column]) -> list[str]:
+    """List the channels to look for: the usual ones, then the masses inside that are named."""
+    numbers = {int(w) for h in table.headers for w in h.words if w.isdecimal()}
+    inside = {c for c in map(interior_channel, numbers) if interior_node(c)}
+    inside |= {c for c in given if interior_node(c)}
+    return [*_CHANNELS, *sorted(inside, key=lambda c: (c not in given, interior_node(c) or 0))]
 
 
 def _decode(path: Path, raw: bytes) -> tuple[bytes, str]:
@@ -198,7 +216,7 @@ def _unit_row(grid: list[list[str]], i: int) -> tuple[int, list[str]]:
 def _assign(table: _Table, given: dict[str, Column], toml: Path | None) -> dict[str, int]:
     """Which column each channel is in: as the TOML says, else as the headers do."""
     found: dict[str, int] = {}
-    for channel in _CHANNELS:
+    for channel in _channels(table, given):
         if channel in given:
             name = given[channel].column
             matches = [k for k, h in enumerate(table.headers) if _is_named(h, name)]
@@ -212,6 +230,9 @@ def _assign(table: _Table, given: dict[str, Column], toml: Path | None) -> dict[
             found[channel] = matches[0]
             continue
         ranks = {k: r for k, h in enumerate(table.headers) if (r := _rank(h, channel)) is not None}
+        if interior_node(channel):  # a column that the TOML calls the top is not inside
+            taken = {found[c] for c in given if c in found}
+            ranks = {k: r for k, r in ranks.items() if k not in taken}
         best = [k for k, r in ranks.items() if r == min(ranks.values())]
         if len(best) > 1:
             both = " and ".join(repr(table.headers[k].text) for k in best)
@@ -231,7 +252,7 @@ def _assign(table: _Table, given: dict[str, Column], toml: Path | None) -> dict[
 
 def _factor(table: _Table, channel: str, header: _Header, given: Column | None) -> float:
     """Return what the numbers of a column are multiplied by to be SI."""
-    si, example, _ = _CHANNELS[channel]
+    si, example, _ = _kind(channel)
     unit = given.unit if given and given.unit is not None else header.unit
     scale, scale_unit = (given.scale, given.scale_unit) if given else (1.0, "")
     where = f"{table.path}: column {header.text!r}"
@@ -334,7 +355,16 @@ def _record(
     displacement = _one_of(numbers, "displacement", "strain", 1 / specimen.height, "height", notes)
     assert stress is not None  # _needed has seen to it
     velocity, acceleration = numbers.get("velocity"), numbers.get("acceleration")
-    return Record(time, stress, displacement, velocity, acceleration), tuple(notes)
+    inside = {node: values for c, values in numbers.items() if (node := interior_node(c))}
+    for node, values in tuple(inside.items()):
+        if displacement is not None and np.allclose(
+            values, displacement, rtol=0.0, atol=1e-9 * float(np.ptp(displacement))
+        ):
+            del inside[node]
+            notes.append(
+                f"{interior_channel(node)} is the displacement of the top; it is left out."
+            )
+    return Record(time, stress, displacement, velocity, acceleration, inside), tuple(notes)
 
 
 def _needed(table: _Table, columns: dict[str, int], settings: Settings) -> dict[str, int]:
@@ -521,4 +551,5 @@ def read_test(path: str | Path, specimen: str | Path | None = None) -> Measureme
         noise=settings.noise,
         motion=conditioned.motion,
         notes=(*notes, *conditioned.notes),
+        interior=conditioned.record.interior,
     )

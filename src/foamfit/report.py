@@ -11,6 +11,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 from foamfit.conditioning import engineering
+from foamfit.measurement import interior_channel
 from foamfit.plots import DPI, image, origin_word, plot_fit, plot_residuals, readable_unit
 
 if TYPE_CHECKING:
@@ -115,7 +116,7 @@ def render_report(result: FitResult, *, fit_png: bytes | None = None) -> str:
         result=result,
         version=version("foamfit"),
         origin=origin_word(result),
-        misfits={name: result.misfit.get(key) for key, name in CURVES.items()},
+        misfits={name: result.misfit.get(key) for key, name in _curves(result).items()},
         statistics={
             STATISTICS.get(name, name.replace("_", " ")): value
             for name, value in plain["statistics"].items()
@@ -151,7 +152,7 @@ def summary_text(result: FitResult) -> str:
     head = f"{m.name}: {result.model}, {result.drive} drive, seed {result.seed}: {result.status}"
     misfits = [
         f"{name} {100 * misfit:.2g} %"
-        for key, name in CURVES.items()
+        for key, name in _curves(result).items()
         if (misfit := result.misfit.get(key)) is not None
     ]
     rows = [readable(name, p) for name, p in result.parameters.items()]
@@ -205,6 +206,12 @@ def number(value: Any) -> str:
         decimals = 0 if value == 0 else max(0, 3 - math.floor(math.log10(abs(value))))
         return _fixed(value, decimals)
     return f"{value:.3e}".replace("-", "−")
+
+
+def _curves(result: FitResult) -> dict[str, str]:
+    """Return the keys of the misfits and what they are called, masses inside last."""
+    inside = {f"{interior_channel(i)}_time": f"mass {i}" for i in result.curves.interior}
+    return CURVES | {key: f"displacement-time of {name}" for key, name in inside.items()}
 
 
 def _symbol(name: str) -> tuple[str, str]:

@@ -9,7 +9,7 @@ import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.errors import InputError
+from foamfit.measurement import interior_channel
 
 if TYPE_CHECKING:
     import lmfit
@@ -57,7 +58,8 @@ class Curves:
 
     `stress` and `displacement` are what the drive gives (base stress in Pa, top displacement in m);
     `stress_along` is the stress (Pa) that the identified springs give along the measured
-    displacement.
+    displacement. `interior` holds measured and fitted displacement (m) of masses inside, 1 above
+    spring 1.
     """
 
     time: Array | None
@@ -66,6 +68,7 @@ class Curves:
     stress: Array | None
     displacement: Array | None
     stress_along: Array | None
+    interior: dict[int, tuple[Array, Array]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,6 +295,9 @@ def _curve_rows(curves: Curves) -> Iterator[Iterable[object]]:
         "fitted displacement (m)": curves.displacement,
         "stress along measured displacement (Pa)": curves.stress_along,
     }
+    for node, (measured, fitted) in curves.interior.items():
+        columns[f"measured {interior_channel(node)} (m)"] = measured
+        columns[f"fitted {interior_channel(node)} (m)"] = fitted
     there = {name: column for name, column in columns.items() if column is not None}
     yield there.keys()
     # Python floats are written with as many digits as they have, numpy's with their type's name.

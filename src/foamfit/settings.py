@@ -12,7 +12,7 @@ from typing import Any
 
 from foamfit.conditioning import Window
 from foamfit.errors import InputError
-from foamfit.measurement import Noise, Specimen, Striker
+from foamfit.measurement import Noise, Specimen, Striker, interior_node
 from foamfit.units import is_unit, parse_quantity, split_quantity
 
 # Section, key: SI unit and an example.
@@ -98,7 +98,7 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
     test : Path
         The test file that it describes.
     channels : iterable of str
-        What [columns] may name.
+        What [columns] may name besides displacement_1, displacement_2, …
 
     Raises
     ------
@@ -167,7 +167,8 @@ def _specimen(path: Path, values: dict[str, Any]) -> Specimen:
 def _columns(path: Path, table: Any, channels: Iterable[str]) -> dict[str, Column]:
     if not isinstance(table, dict):
         raise InputError(f"{path}: columns must be a table, [columns].")
-    check_keys(f"{path}: [columns]", table, channels)
+    inside = [key for key in table if interior_node(key)]
+    check_keys(f"{path}: [columns]", table, [*channels, *inside])
     columns: dict[str, Column] = {}
     for channel, spec in table.items():
         where = f"{path}: [columns] {channel}"

@@ -9,18 +9,22 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foamfit import kernels, taylor
+from foamfit import implicit, kernels, taylor
 from foamfit.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.errors import SimulationError
 
 Array = NDArray[np.float64]
 
 CLOSED_FORM, FIRST_ORDER, SECOND_ORDER = "closed form", "first order", "second order"
+TAYLOR, RADAU = "Taylor series", "Radau IIA"
 MAX_STEPS = 2_000_000
+# Explicit steps are given up where something relaxes, or vibrates, so many times (in radians) while
+# the scene lasts, or after so many steps.
+MOST_RELAXATION, MOST_VIBRATION, MOST_EXPLICIT = 1e4, 1e5, 200_000
 
 _OUTCOMES = {
-    taylor.TOO_MANY_STEPS: "the bound of {steps} steps was reached: the scene is too stiff for "
-    "explicit steps (a light mass or a heavy dashpot)",
+    taylor.TOO_MANY_STEPS: "the bound of {steps} steps was reached: something in the scene is "
+    "too fast to be followed (a light mass or a heavy dashpot)",
     taylor.STEP_UNDERFLOW: "the step shrank to nothing near t = {time:g} s: a strain comes too "
     "close to the end of its branch",
     taylor.FLAT_UNDER_STRESS: "a prescribed stress acts on a flat branch (kh_plus or kh_minus = 0) "
@@ -48,6 +52,9 @@ class Response:
         When an impact's base stress returned to zero, s; None if it has not, or in other drives.
     solver : str
         "closed form", "first order" or "second order": the least that the scene needs.
+    method : str
+        "closed form", "Taylor series" (explicit steps) or "Radau IIA" (implicit steps, where light
+        masses or dashpots make the scene stiff; a vibration too fast to be followed is damped out).
     switches : (m, 5) array
         Time (s), spring (0 at the base), branch left, branch entered, strain of that spring.
     steps : int
@@ -60,6 +67,7 @@ class Response:
     strain: Array
     contact_end: float | None
     solver: str
+    method: str
     switches: Array
     steps: int
 
@@ -72,6 +80,7 @@ class Motion(NamedTuple):
     contact_end: float
     switches: Array
     steps: int
+    method: str = CLOSED_FORM
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +105,8 @@ class Plan:
         Velocity of the striker, m/s; 0 = no impact.
     max_steps : int
         Bound on the steps of the integrator.
+    implicit : bool or None
+        Whether to take implicit steps; None = where explicit ones are the wrong tool.
     """
 
     solver: str
@@ -108,6 +119,7 @@ class Plan:
     time: Array
     speed: float
     max_steps: int = MAX_STEPS
+    implicit: bool | None = None
 
     def run(
         self,
@@ -165,32 +177,66 @@ class Plan:
         self, rows: Array, heights: Array, rtol: float, drag: float, everything: bool
     ) -> Motion:
         # Without an interior mass there are few steps: a margin costs little.
-        tolerance = max((1e-2 if len(self.ends) > 1 else 1e-4) * rtol, 1e-16)
-        order = min(max(round(4.0 - 0.5 * math.log(tolerance)), 6), 24)
+        margin = 1.0 if len(self.ends) > 1 else 1e-2
         displacement = np.empty((len(heights) if everything else 1, self.time.size))
         stress = np.empty(self.time.size)
         log = np.empty((1024, 5))
-        outcome, contact_end, steps, switches = taylor.integrate(
-            rows,
-            heights,
-            self.ends,
-            self.mass,
-            drag,
-            self.top,
-            self.values,
-            self.speed,
-            self.time,
-            tolerance,
-            order,
-            self.max_steps,
-            displacement,
-            stress,
-            log,
-        )
+        method = RADAU if self._is_stiff(rows, heights, drag) else TAYLOR
+        outcome, contact_end, steps, switches = taylor.TOO_MANY_STEPS, math.nan, 0, 0
+        if method == TAYLOR:
+            tolerance = max(1e-2 * margin * rtol, 1e-16)
+            order = min(max(round(4.0 - 0.5 * math.log(tolerance)), 6), 24)
+            most = MOST_EXPLICIT + 20 * self.time.size
+            outcome, contact_end, steps, switches = taylor.integrate(
+                rows,
+                heights,
+                self.ends,
+                self.mass,
+                drag,
+                self.top,
+                self.values,
+                self.speed,
+                self.time,
+                tolerance,
+                order,
+                min(self.max_steps, most) if self.implicit is None else self.max_steps,
+                displacement,
+                stress,
+                log,
+            )
+            if outcome in (taylor.TOO_MANY_STEPS, taylor.STEP_UNDERFLOW) and self.implicit is None:
+                method = RADAU
+        if method == RADAU:
+            outcome, contact_end, steps, switches = implicit.integrate_implicit(
+                rows,
+                heights,
+                self.ends,
+                self.mass,
+                drag,
+                self.top,
+                self.values,
+                self.speed,
+                self.time,
+                max(3e-2 * margin * rtol, 1e-14),
+                self.max_steps,
+                displacement,
+                stress,
+                log,
+                np.zeros(2, np.int64),
+            )
         if outcome != taylor.DONE:
             last = log[min(switches, len(log)) - 1, 0] if switches else self.time[0]
             raise SimulationError(_OUTCOMES[outcome].format(steps=steps, time=last))
-        return Motion(displacement, stress, contact_end, log[:switches], steps)
+        return Motion(displacement, stress, contact_end, log[:switches], steps, method)
+
+    def _is_stiff(self, rows: Array, heights: Array, drag: float) -> bool:
+        """Tell whether explicit steps would have to follow what is long over."""
+        if self.implicit is not None:
+            return self.implicit
+        vibration, relaxation = implicit.hurry_of(
+            rows, heights, self.ends, self.mass, drag, self.top, self.speed, self.time
+        )
+        return bool(vibration > MOST_VIBRATION or relaxation > MOST_RELAXATION)
 
 
 def _switches(time: Array, strain: Array, branches: NDArray[np.int64]) -> Array:
@@ -314,6 +360,7 @@ def simulate(chain: Chain, drive: Drive, t: ArrayLike, rtol: float = 1e-6) -> Re
         strain=motion.displacement[-1] / chain.height,
         contact_end=None if math.isnan(motion.contact_end) else motion.contact_end,
         solver=scene.solver,
+        method=motion.method,
         switches=motion.switches,
         steps=motion.steps,
     )

@@ -34,6 +34,7 @@ from foamfit.kernels import (
     strain_on,
     stress_on,
 )
+from foamfit.polynomial import add_values, first_crossing, value_at
 
 # What is known of the top node.
 FREE, VISCOUS, STRESS, MOTION = range(4)
@@ -249,95 +250,6 @@ def _expand(
 
 
 @compiled
-def _value(c: Array, order: int, tau: float) -> float:
-    """Value of a polynomial."""
-    total = c[order]
-    for n in range(order - 1, -1, -1):
-        total = total * tau + c[n]
-    return total
-
-
-@compiled
-def _slope(c: Array, order: int, tau: float) -> float:
-    """Return the derivative of a polynomial."""
-    total = order * c[order]
-    for n in range(order - 1, 0, -1):
-        total = total * tau + n * c[n]
-    return total
-
-
-@compiled
-def _root(c: Array, order: int, level: float, lo: float, hi: float) -> float:
-    """Root of polynomial - level in [lo, hi], whose ends lie on either side: guarded Newton."""
-    rising = _value(c, order, hi) > level
-    tau = 0.5 * (lo + hi)
-    for _ in range(100):
-        f = _value(c, order, tau) - level
-        if f == 0.0:
-            break
-        if (f > 0.0) == rising:
-            hi = tau
-        else:
-            lo = tau
-        d = _slope(c, order, tau)
-        trial = tau - f / d if d != 0.0 else lo
-        if not lo < trial < hi:
-            trial = 0.5 * (lo + hi)
-        if abs(trial - tau) <= 4e-16 * abs(tau) or trial in (lo, hi):
-            tau = trial
-            break
-        tau = trial
-    return tau
-
-
-@compiled
-def _turn(c: Array, order: int, lo: float, hi: float) -> float:
-    """Bisect for the turning point of a polynomial whose slope changes sign in [lo, hi]."""
-    rising = _slope(c, order, lo) > 0.0
-    for _ in range(50):
-        mid = 0.5 * (lo + hi)
-        if (_slope(c, order, mid) > 0.0) == rising:
-            lo = mid
-        else:
-            hi = mid
-    return 0.5 * (lo + hi)
-
-
-@compiled
-def _crossing(c: Array, order: int, low: float, high: float, span: float) -> tuple[float, int]:
-    """First time in [0, span] at which a polynomial leaves [low, high], and the side (-1, 0, 1).
-
-    A start outside by rounding, or on an end, counts as inside until it moves outwards.
-    """
-    reach = 0.0
-    power = 1.0
-    for n in range(1, order + 1):
-        power *= span
-        reach += abs(c[n]) * power
-    if c[0] - reach > low and c[0] + reach < high:
-        return span, 0
-    low, high = min(low, c[0]), max(high, c[0])
-    pieces = 8
-    lo = 0.0
-    slope_lo = c[1]
-    for piece in range(1, pieces + 1):
-        hi = span * piece / pieces
-        slope_hi = _slope(c, order, hi)
-        mid = hi
-        if slope_lo * slope_hi < 0.0:  # a turning point may reach beyond both ends
-            mid = _turn(c, order, lo, hi)
-        for end in (mid, hi):
-            value = _value(c, order, end)
-            if value > high:
-                return _root(c, order, high, lo, end), 1
-            if value < low:
-                return _root(c, order, low, lo, end), -1
-            lo = end
-        slope_lo = slope_hi
-    return span, 0
-
-
-@compiled
 def _longest(c: Array, order: int, scale: float, tol: float, span: float) -> float:
     """Step at which the last two terms of a series fall below tol × scale."""
     for n in (order - 1, order):
@@ -389,34 +301,33 @@ def _sample(
     heights: Array,
     ends: Branches,
     order: int,
-    tau: float,
+    t: Array,
+    first: int,
+    last: int,
+    now: float,
     w: Array,
     eps: Array,
     group: Array,
     top: int,
     out_w: Array,
     out_s: Array,
-    j: int,
 ) -> None:
-    """Write displacements and base stress at time tau of the step into column j."""
-    out_s[j] = _value(group[0], order, tau)
+    """Write displacements and base stress at the samples first … last-1 of a step."""
+    out_s[first:last] = 0.0
+    add_values(group[0], order, t, first, last, now, 1.0, out_s)
+    out_w[:, first:last] = 0.0
     if out_w.shape[0] == 1 and top != STRESS:
-        out_w[0, j] = _value(w[ends.size - 1], order, tau)
+        add_values(w[ends.size - 1], order, t, first, last, now, 1.0, out_w[0])
         return
-    node = 0.0
-    i0 = 0
-    for g in range(ends.size):
-        for i in range(i0, ends[g]):
-            node += heights[i] * _value(eps[i], order, tau)
-            if out_w.shape[0] > 1:
-                out_w[i, j] = node
-        i0 = ends[g]
-    if out_w.shape[0] == 1:
-        out_w[0, j] = node
+    for i in range(heights.size):
+        node = min(i, out_w.shape[0] - 1)
+        if node > 0:
+            out_w[node, first:last] = out_w[node - 1, first:last]
+        add_values(eps[i], order, t, first, last, now, heights[i], out_w[node])
 
 
 @compiled
-def _fly(
+def fly(
     out_w: Array, out_s: Array, t: Array, first: int, t_end: float, w_end: Array, speed: float
 ) -> None:
     """After contact the chain keeps its shape and moves with the striker; nothing presses."""
@@ -463,7 +374,7 @@ def _settle(
 
 
 @compiled
-def _start(
+def start(
     rows: Array,
     branches: Branches,
     heights: Array,
@@ -564,7 +475,7 @@ def integrate(
         done += 1
     v[groups - 1, 0] = speed
     if not struck:
-        _start(rows, branches, heights, ends, top, values[0], w, eps)
+        start(rows, branches, heights, ends, top, values[0], w, eps)
     w_scale, s_scale, pressed, knot, switches = 0.0, 0.0, False, 0, 0
     contact_end = math.nan
     stalled = 0
@@ -597,12 +508,12 @@ def integrate(
         spring, side = -1, 0
         for i in range(count):
             low, high = interval(rows[i], branches[i])
-            when, where = _crossing(eps[i], order, low, high, span)
+            when, where = first_crossing(eps[i], order, low, high, span)
             if where != 0 and (spring < 0 or when < span):
                 span, spring, side = when, i, where
         leaves = False
         if struck:
-            when, where = _crossing(group[0], order, 0.0, math.inf, span)
+            when, where = first_crossing(group[0], order, 0.0, math.inf, span)
             if pressed and group[0, 0] <= 0.0 and group[0, 1] <= 0.0:
                 when, where = 0.0, -1  # a unilateral spring has just opened
             pressed = pressed or group[0, 0] > 0.0
@@ -617,14 +528,15 @@ def integrate(
         last = end >= horizon and not leaves and spring < 0
         if last:
             end = horizon
+        first = done
         while done < t.size and (t[done] < end or (last and t[done] <= end)):
-            _sample(heights, ends, order, t[done] - now, w, eps, group, top, out_w, out_s, done)
             done += 1
+        _sample(heights, ends, order, t, first, done, now, w, eps, group, top, out_w, out_s)
         for g in range(groups):
-            w[g, 0], v[g, 0] = _value(w[g], order, span), _value(v[g], order, span)
+            w[g, 0], v[g, 0] = value_at(w[g], order, span), value_at(v[g], order, span)
         for i in range(count):
-            s_scale = max(s_scale, abs(_value(sig[i], order, span)))
-            eps[i, 0] = _value(eps[i], order, span)
+            s_scale = max(s_scale, abs(value_at(sig[i], order, span)))
+            eps[i, 0] = value_at(eps[i], order, span)
         w_scale = max(w_scale, abs(w[groups - 1, 0]) if top != STRESS else 0.0)
         for i in range(count):
             w_scale = max(w_scale, heights[i] * abs(eps[i, 0]))
@@ -635,7 +547,7 @@ def integrate(
             for i in range(count):
                 node += heights[i] * eps[i, 0]
                 w_end[i if out_w.shape[0] > 1 else 0] = node
-            _fly(out_w, out_s, t, done, now, w_end, v[groups - 1, 0])
+            fly(out_w, out_s, t, done, now, w_end, v[groups - 1, 0])
             return DONE, now, step + 1, switches
         _settle(rows, branches, heights, ends, w, eps, top, push[0])
         if spring >= 0:
