@@ -24,7 +24,7 @@ _HOME = {
     "read_test": "reading",
     "FitResult": "result",
     "fit": "identification",
-    "make_params": "identification",
+    "make_params": "problem",
 }
 
 __all__ = sorted(_HOME)

@@ -224,8 +224,9 @@ def fit(
     folder = Path("fits", test.stem, model) if out is None else out
     check_target(folder)
     from foamfit import identification
+    from foamfit.problem import make_params
 
-    params = identification.make_params(measurement, model, drive)
+    params = make_params(measurement, model, drive)
     _hold_and_vary(params, model, fix, vary)
     with _progress(quiet or as_json) as progress:
         result = identification.fit(

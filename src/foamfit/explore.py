@@ -300,7 +300,8 @@ class Turner:
 
     def fit_from_here(self) -> None:
         """Fit the spring, without a dashpot, from where the sliders stand; move them to the fit."""
-        from foamfit.identification import fit, make_params
+        from foamfit.identification import fit
+        from foamfit.problem import make_params
 
         if self.turned.trouble:
             return  # it is said already

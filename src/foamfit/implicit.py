@@ -305,7 +305,7 @@ def _collocate(
             if size <= 1e-8 * moved + 1e-15 * reach:
                 return True
             slow = slow + 1 if size > 0.5 * before else 0
-            if slow > 2:
+            if slow > 5:  # near a pole corrections double before they halve
                 return False
             before = size
     return False

@@ -1,0 +1,207 @@
+"""What is fitted: the parameters of a model, their bounds, and the objective that they feed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import lmfit
+import numpy as np
+from numpy.typing import NDArray
+
+from foamfit.errors import InputError
+from foamfit.measurement import Measurement
+from foamfit.model import Model, split_name
+from foamfit.objective import Objective, check_interior, choose_drive, default_weights
+from foamfit.search import Scales, Space
+
+Array = NDArray[np.float64]
+
+
+def make_params(
+    measurement: Measurement, model: str | Model = "bistable", drive: str | None = None
+) -> lmfit.Parameters:
+    """Parameters of a model for a test, with bounds from its scales; change them, then `fit`.
+
+    One damper varies in the impact drive: the dashpot of a single spring, and in a chain the onsite
+    damper of the striker, as in the paper. The other drives are rate-independent unless told
+    otherwise. Heights are the specimen's where it states them, else they vary with their sum fixed.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        The test.
+    model : str or Model
+        For example "linear+bistable".
+    drive : str, optional
+        "impact", "stress" or "displacement"; see `foamfit.objective.choose_drive`.
+
+    Returns
+    -------
+    lmfit.Parameters
+        Values in SI, named s1_k0 … site_eta.
+    """
+    model = Model.parse(model) if isinstance(model, str) else model
+    drive = choose_drive(measurement) if drive is None else drive
+    scales = Scales.of(measurement)
+    stress, slope = scales.stress, scales.slope
+    guess = {
+        "k0": (3.0 * slope, 1e-3 * stress, 1e4 * stress),
+        "kc": (20.0 * slope, 1e-2 * stress, 1e5 * stress),
+        "dsigma": (-0.1 * stress, -10.0 * stress, 0.0),
+        "eps_a": (0.15 * scales.strain, 1e-3, 0.95),
+        "eps_c": (0.8 * scales.strain, 2e-3, 0.999),
+        "kh_plus": (slope, 0.0, 100.0 * slope),
+        "kh_minus": (0.3 * slope, 0.0, 100.0 * slope),
+        "eta": (0.0, 0.0, 10.0 * scales.eta),
+    }
+    params = lmfit.Parameters()
+    count = len(model.kinds)
+    for name in model.names:
+        spring, short = split_name(name)
+        if short == "height":
+            continue
+        value, low, high = guess[short]
+        vary = short != "eta" or (drive == "impact" and (spring >= 0) == (count == 1))
+        params.add(name, value=value, min=low, max=high, vary=vary)
+    _add_heights(params, measurement, model)
+    for name in model.names:
+        if name.endswith("_dsigma"):
+            own = name.removesuffix("dsigma")
+            eps_a = params[own + "eps_a"].value
+            params[name].value = -0.2 * params[own + "k0"].value * eps_a / (1.0 - eps_a)
+    return params
+
+
+def _add_heights(params: lmfit.Parameters, measurement: Measurement, model: Model) -> None:
+    """Heights of a chain: the specimen's, or varied with their sum fixed."""
+    count = len(model.kinds)
+    if count == 1:
+        return
+    specimen = measurement.specimen
+    if specimen.heights is not None:
+        if len(specimen.heights) != count:
+            raise InputError(
+                f"{measurement.name}: [specimen] heights has {len(specimen.heights)} values for "
+                f"a model of {count} springs; give one per spring, base first"
+            )
+        for i, height in enumerate(specimen.heights, start=1):
+            params.add(f"s{i}_height", value=height, vary=False)
+        return
+    low = 0.02 * specimen.height
+    for i in range(1, count):
+        value = specimen.height / count
+        params.add(f"s{i}_height", value=value, min=low, max=specimen.height - low)
+    params.add(f"s{count}_height", expr=_rest_of_height(measurement, model))
+
+
+def _rest_of_height(measurement: Measurement, model: Model) -> str:
+    """Expression of the last spring's height: what the others leave of the specimen."""
+    others = [f"s{i}_height" for i in range(1, len(model.kinds))]
+    return " - ".join([repr(measurement.specimen.height), *others])
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What a fit works on, and the way between lmfit's parameters and the flat vector."""
+
+    measurement: Measurement
+    model: Model
+    objective: Objective
+    params: lmfit.Parameters
+    scales: Scales
+
+    def vector(self, params: lmfit.Parameters | None = None) -> Array:
+        """Flat vector of these parameters, or of the problem's own."""
+        values = (self.params if params is None else params).valuesdict()
+        return np.array([values[name] for name in self.model.names])
+
+    def put(self, values: Array) -> None:
+        """Write a flat vector into the parameters that vary."""
+        for name, value in zip(self.model.names, values, strict=True):
+            if self.params[name].expr is None:
+                self.params[name].value = float(value)
+        self.params.update_constraints()
+
+    def free(self) -> tuple[str, ...]:
+        """Names of the parameters that vary."""
+        return tuple(name for name in self.model.names if self.params[name].vary)
+
+    def tied(self) -> Callable[[Array], Array]:
+        """Completion of a vector by the expressions among the parameters."""
+        tied = [name for name in self.model.names if self.params[name].expr is not None]
+        if not tied:
+            return lambda values: values
+        places = [self.model.index[name] for name in tied]
+        rest = _rest_of_height(self.measurement, self.model)
+        if [self.params[name].expr for name in tied] == [rest]:
+            return self._last_height
+        scratch = self.params.copy()
+
+        def complete(values: Array) -> Array:
+            for name in self.free():
+                scratch[name].value = values[self.model.index[name]]
+            scratch.update_constraints()
+            for name, place in zip(tied, places, strict=True):
+                values[place] = scratch[name].value
+            return values
+
+        return complete
+
+    def _last_height(self, values: Array) -> Array:
+        """Complete the heights to that of the specimen; the expression itself, but fast."""
+        count = len(self.model.kinds)
+        values[-2] = self.measurement.specimen.height - values[-1 - count : -2].sum()
+        return values
+
+    def space(self) -> Space:
+        """The box in which the search moves."""
+        return Space(
+            model=self.model,
+            scales=self.scales,
+            values=self.vector(),
+            free=self.free(),
+            low=np.array([self.params[name].min for name in self.model.names]),
+            high=np.array([self.params[name].max for name in self.model.names]),
+            tied=self.tied(),
+        )
+
+    def sizes(self, names: tuple[str, ...], values: Array) -> Array:
+        """Natural sizes of some parameters at a point."""
+        at = dict(zip(self.model.names, map(float, values), strict=True))
+        return np.array([self.scales.of_parameter(name, at) for name in names])
+
+
+def make_problem(
+    measurement: Measurement,
+    model_name: str,
+    drive: str | None,
+    params: lmfit.Parameters | None,
+    weights: Mapping[str, float] | None,
+    interior_mass: bool,
+) -> Problem:
+    """Make a problem ready; see `foamfit.fit` for the arguments.
+
+    Raises
+    ------
+    InputError
+        If the test cannot feed the drive or a parameter is unknown; the message names it.
+    """
+    model = Model.parse(model_name)
+    drive = choose_drive(measurement) if drive is None else drive
+    count = len(model.kinds)
+    check_interior(measurement, count)
+    chosen = default_weights(measurement, drive, count) if weights is None else dict(weights)
+    objective = Objective(measurement, model, drive, chosen, interior_mass=interior_mass)
+    wanted = make_params(measurement, model, drive)
+    for name in params or ():
+        if name not in wanted:
+            raise InputError(
+                f"parameter '{name}' is not one of the model {model.name}; "
+                f"its parameters are {', '.join(model.names)}"
+            )
+    for name in params or ():
+        wanted[name] = params[name]  # type: ignore[index]
+    if not any(parameter.vary for parameter in wanted.values()):
+        raise InputError("no parameter varies; let at least one vary")
+    return Problem(measurement, model, objective, wanted, Scales.of(measurement))

@@ -1,0 +1,351 @@
+"""The implicit integrator: its order, and its answers where others have them, and where not."""
+
+import dataclasses
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+import foamfit as ff
+from foamfit import implicit, taylor
+from foamfit.simulation import RADAU, TAYLOR, Motion, plan
+from reference import Bistable, Chain, Impact, Linear, energy_balance
+from test_simulate import (
+    AREA,
+    BASE_2,
+    BASE_3,
+    CASES,
+    CHAINS,
+    FOAM_1,
+    FOAM_2,
+    MODEL_1,
+    THREE,
+    TIME,
+    TOP_2,
+    TOP_3,
+    TWO,
+    built,
+    case,
+    damped,
+    history,
+)
+
+PAIRS = {"model-3": (BASE_3, TOP_3, THREE, FOAM_1), "foam-2": (BASE_2, TOP_2, TWO, FOAM_2)}
+
+
+def run(
+    chain: Chain,
+    load: ff.Impact | ff.StressDrive | ff.DisplacementDrive,
+    rtol: float,
+    implicit: bool | None = True,
+    time: np.ndarray = TIME,
+) -> Motion:
+    """Run a scene with the integrator that is asked for (None: that the scene asks for)."""
+    scene = dataclasses.replace(plan(built(chain), load, time), implicit=implicit)
+    rows = np.array([spring.row for spring in built(chain).springs])
+    return scene.run(rows, np.array(chain.heights), rtol)
+
+
+def errors(got: Motion, want: object) -> tuple[float, float]:
+    """Largest error over range of the displacements (worst node) and of the base stress."""
+    miss = np.abs(got.displacement - want.displacement).max(axis=1)
+    return (
+        float((miss / np.ptp(want.displacement, axis=1)).max()),
+        float(np.abs(got.base_stress - want.base_stress).max() / np.ptp(want.base_stress)),
+    )
+
+
+def struck(name: str, eta: float = 0.0, mass: float = 0.0) -> tuple[Chain, ff.Impact]:
+    base, top, heights, blow = PAIRS[name]
+    springs = (damped(base, eta), damped(top, eta))
+    return Chain(springs, heights, AREA, (mass, 0.0)), ff.Impact(blow.mass, blow.velocity)
+
+
+# ---------------------------------------------------------------------------------------- the method
+
+
+def test_order_conditions() -> None:
+    """B(2s - 1), C(s) and D(s - 1) make the order 2s - 1; the last stage is the step's end."""
+    c, a = implicit.radau(implicit.STAGES)
+    s, b = implicit.STAGES, a[-1]
+    assert c[-1] == 1.0
+    assert (np.diff(c) > 0.0).all()
+    for k in range(1, 2 * s):
+        assert b @ c ** (k - 1) == pytest.approx(1 / k, rel=1e-13)
+    for k in range(1, s + 1):
+        np.testing.assert_allclose(a @ c ** (k - 1), c**k / k, rtol=1e-11)
+    for k in range(1, s):
+        np.testing.assert_allclose((b * c ** (k - 1)) @ a, b / k * (1 - c**k), atol=1e-13)
+
+
+def test_two_stages_are_the_known_ones() -> None:
+    c, a = implicit.radau(2)
+    np.testing.assert_allclose(c, [1 / 3, 1])
+    np.testing.assert_allclose(a, [[5 / 12, -1 / 12], [3 / 4, 1 / 4]])
+
+
+# -------------------------------------------------------------------- scenes that others can do too
+
+
+@pytest.mark.parametrize(("rtol", "bar"), [(1e-6, 1e-6), (1e-9, 1e-8)])
+@pytest.mark.parametrize(("name", "drive"), CASES)
+def test_against_reference(name: str, drive: str, rtol: float, bar: float) -> None:
+    want, load = case(name, drive)
+    if plan(built(CHAINS[name]), load, TIME).solver == "closed form":
+        pytest.skip("nothing to integrate")
+    if name == "foam-2, mass" and drive == "displacement" and rtol == 1e-6:
+        bar = 1e-5  # it opens and closes 56 times
+    got = run(CHAINS[name], load, rtol)
+    assert max(errors(got, want)) <= bar
+    assert got.method == RADAU
+    assert len(got.switches) >= len(want.switches) - (want.contact_end is not None)
+    if want.contact_end is not None:
+        assert got.contact_end == pytest.approx(want.contact_end, rel=bar)
+    ringing = (", mass" in name and "dashpot" not in name) or "own mass" in name
+    assert got.steps < (8000 if ringing and rtol < 1e-6 else 3000)
+
+
+@pytest.mark.parametrize("name", PAIRS)
+@pytest.mark.parametrize("eta", [1e6, 1e4, 100.0, 1.0])
+@pytest.mark.parametrize(("rtol", "bar"), [(1e-6, 1e-8), (1e-9, 1e-10)])
+def test_dashpots_like_explicit_steps(name: str, eta: float, rtol: float, bar: float) -> None:
+    scene = struck(name, eta)
+    want = run(*scene, 1e-11, implicit=False)
+    got = run(*scene, rtol)
+    assert max(errors(got, want)) <= bar
+    assert got.contact_end == pytest.approx(want.contact_end, rel=bar, nan_ok=True)
+    assert got.steps < 500
+
+
+@pytest.mark.parametrize("name", PAIRS)
+@pytest.mark.parametrize("mass", [5.56e-6, 1e-6])
+def test_vibrations_like_explicit_steps(name: str, mass: float) -> None:
+    scene = struck(name, mass=mass)
+    want = run(*scene, 1e-11, implicit=False)
+    got = run(*scene, 1e-6)
+    assert max(errors(got, want)) <= 1e-6
+    assert got.steps < 2000
+    assert max(errors(run(*scene, 1e-9), want)) <= 1e-9
+
+
+def test_flat_branches_like_explicit_steps() -> None:
+    flat = Bistable(2e6, 60e6, -0.3e6, 0.35, 0.66, 0.0, 0.0)
+    for chain in (
+        Chain((flat,), (1e-3,), AREA),
+        Chain((BASE_3, flat), THREE, AREA),
+        Chain((damped(BASE_3, 100.0), flat), THREE, AREA),
+        Chain((damped(BASE_3, 100.0), damped(flat, 10.0)), THREE, AREA),
+    ):
+        want = run(chain, ff.Impact(7e-3, 1.75), 1e-11, implicit=False)
+        assert max(errors(run(chain, ff.Impact(7e-3, 1.75), 1e-8), want)) <= 1e-8
+
+
+def test_flat_branch_under_stress_is_refused() -> None:
+    flat = Bistable(2e6, 60e6, -0.3e6, 0.35, 0.66, 0.0, 0.0)
+    chain = Chain((damped(BASE_3, 100.0), flat), THREE, AREA)
+    load = ff.StressDrive(history() * 3e6)
+    for choice in (True, False):
+        with pytest.raises(ff.SimulationError, match="flat branch"):
+            run(chain, load, 1e-6, implicit=choice)
+
+
+# ------------------------------------------------------------------------------------- limits
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_light_dashpots_tend_to_none(name: str) -> None:
+    limit = run(*struck(name), 1e-10, implicit=False)
+    miss = []
+    for eta in (1.0, 1e-2, 1e-4, 1e-6):
+        got = run(*struck(name, eta), 1e-9, implicit=None)
+        assert got.method == RADAU
+        assert got.steps < 500
+        miss.append(max(errors(got, limit)))
+    for more, less in pairwise(miss):  # linear in eta
+        assert less == pytest.approx(0.01 * more, rel=0.2)
+    got = run(*struck(name, 1e-8), 1e-9, implicit=None)
+    assert max(errors(got, limit)) <= 1e-9
+    assert got.contact_end == pytest.approx(limit.contact_end, rel=1e-9)
+
+
+@pytest.mark.parametrize("name", PAIRS)
+@pytest.mark.parametrize("mass", [1e-11, 1e-12, 1e-14, 1e-20])
+def test_light_masses_tend_to_none(name: str, mass: float) -> None:
+    limit = run(*struck(name), 1e-10, implicit=False)
+    got = run(*struck(name, mass=mass), 1e-6, implicit=None)
+    assert got.method == RADAU
+    assert got.steps < 2000
+    assert max(errors(got, limit)) <= 1e-6
+    assert got.contact_end == pytest.approx(limit.contact_end, rel=1e-6)
+
+
+@pytest.mark.parametrize("mass", [1e-12, 1e-10, 1e-8, 1e-7])
+def test_steps_are_bounded_where_a_mass_rings(mass: float) -> None:
+    assert run(*struck("foam-2", mass=mass), 1e-6).steps < 8000
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_heavy_dashpots(name: str) -> None:
+    """The striker stops before the springs feel anything: its motion is that of the dashpots."""
+    chain, blow = struck(name, 1e8)
+    got = run(chain, blow, 1e-9, implicit=None)
+    assert got.method == RADAU
+    assert got.steps < 500
+    stopping = blow.mass / AREA * sum(chain.heights) / 1e8
+    np.testing.assert_allclose(got.displacement[-1, 1:], blow.velocity * stopping, rtol=2e-4)
+    want = run(chain, blow, 1e-9, implicit=False)
+    assert max(errors(got, want)) <= 1e-9
+
+
+def test_heavy_damper_on_the_mass_of_the_foam() -> None:
+    chain = Chain((damped(MODEL_1, 1e5),), (1.19e-3,), AREA, (5.56e-6,))
+    load = ff.StressDrive(history() * 3.8e6)
+    want = run(chain, load, 1e-11, implicit=False)
+    got = run(chain, load, 1e-6, implicit=None)
+    assert got.method == RADAU
+    assert got.steps < 2000
+    assert max(errors(got, want)) <= 1e-6
+    assert max(errors(run(chain, load, 1e-9), want)) <= 1e-8
+
+
+@pytest.mark.parametrize("eta", [1e-6, 1e-2, 1.0])
+def test_prescribed_motion_of_light_dashpots(eta: float) -> None:
+    chain = Chain((damped(BASE_3, eta), damped(TOP_3, eta)), THREE, AREA)
+    still = Chain((BASE_3, TOP_3), THREE, AREA)
+    load = ff.DisplacementDrive(3.6e-4 * history())
+    got = run(chain, load, 1e-8, implicit=None)
+    limit = run(still, load, 1e-8)  # in closed form
+    assert got.method == (RADAU if eta < 1.0 else TAYLOR)
+    assert got.steps < 12000
+    assert max(errors(got, limit)) <= 1e-9 + 1e-4 * eta
+    np.testing.assert_allclose(got.displacement[-1], load.displacement, rtol=0, atol=1e-18)
+
+
+# ------------------------------------------------------------------------------------- the choice
+
+
+def test_the_choice() -> None:
+    blow = ff.Impact(7e-3, 1.75)
+    methods = {
+        name: ff.simulate(built(CHAINS[name]), blow, TIME).method
+        for name in ("model-1", "model-2, dashpot", "model-3", "model-3, mass", "foam-2, mass")
+    }
+    assert set(methods.values()) == {TAYLOR}
+    still = ff.simulate(built(CHAINS["model-3"]), ff.StressDrive(0.0 * TIME), TIME)
+    assert still.method == "closed form"
+    for scene in (struck("foam-2", 1e-2), struck("foam-2", mass=1e-12), struck("model-3", 1e8)):
+        got = ff.simulate(built(scene[0]), scene[1], TIME)
+        assert got.method == RADAU
+        assert got.steps < 500
+        assert got.solver == "second order"
+
+
+def test_explicit_steps_that_fail_are_taken_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("foamfit.simulation.MOST_RELAXATION", np.inf)
+    monkeypatch.setattr("foamfit.simulation.MOST_EXPLICIT", 100)
+    got = run(*struck("foam-2", 1e-2), 1e-6, implicit=None)
+    assert got.method == RADAU
+
+
+def test_the_bound_on_steps() -> None:
+    scene = struck("foam-2", 1e-2)
+    few = dataclasses.replace(plan(built(scene[0]), scene[1], TIME), implicit=True, max_steps=5)
+    rows = np.array([spring.row for spring in built(scene[0]).springs])
+    with pytest.raises(ff.SimulationError, match="bound of 5 steps"):
+        few.run(rows, np.array(scene[0].heights))
+
+
+# ----------------------------------------------------------------------------- energy and contact
+
+
+@pytest.mark.parametrize(
+    ("name", "speed"), [("model-1", 1.75), ("model-3", 2.1), ("foam-2", 4.44), ("two loops", 2.6)]
+)
+def test_energy_of_an_undamped_impact(name: str, speed: float) -> None:
+    chain = CHAINS[name]
+    time = np.linspace(0.0, 1.2e-3, 601)
+    got = run(chain, ff.Impact(7e-3, speed), 1e-9, time=time)
+    free = time > got.contact_end
+    rebound = np.polyfit(time[free], got.displacement[-1, free], 1)[0]
+    velocity = np.zeros_like(got.displacement)
+    velocity[-1] = rebound
+    energy = energy_balance(chain, Impact(7e-3, speed), got.displacement, velocity)
+    total = (energy["kinetic"] + energy["work"])[free][0]
+    assert total == pytest.approx(energy["brought"][0], rel=1e-6)
+    assert rebound < 0.0
+
+
+def test_samples_do_not_change_the_motion() -> None:
+    scene = struck("foam-2", 1e-2)
+    every = run(*scene, 1e-8)
+    some = np.arange(1, TIME.size, 7)
+    few = run(*scene, 1e-8, time=TIME[[0, *some]])
+    bar = 1e-8 * every.displacement.max()
+    np.testing.assert_allclose(few.displacement, every.displacement[:, [0, *some]], atol=bar)
+
+
+def test_a_single_sample() -> None:
+    chain = CHAINS["model-3, dashpots"]
+    for load in (ff.StressDrive([1e5]), ff.DisplacementDrive([1e-5]), ff.Impact(7e-3, 1.0)):
+        want = run(chain, load, 1e-6, implicit=False, time=np.zeros(1))
+        got = run(chain, load, 1e-6, time=np.zeros(1))
+        np.testing.assert_allclose(got.displacement, want.displacement)
+        np.testing.assert_allclose(got.base_stress, want.base_stress)
+
+
+# ------------------------------------------------------------------------------------- long chains
+
+
+def long_chain(n: int, kind: str) -> Chain:
+    eta = 1.0 if kind == "damped" else 0.0
+    springs: list[Bistable | Linear] = [damped((MODEL_1, TOP_3)[i % 2], eta) for i in range(n)]
+    masses = (1e-12,) * (n - 1) + (0.0,) if kind == "masses" else None
+    return Chain(tuple(springs), (1.19e-3 / n,) * n, AREA, masses)
+
+
+@pytest.mark.parametrize("kind", ["massless", "damped", "masses"])
+def test_cost_of_a_long_chain_is_linear(kind: str) -> None:
+    counts = []
+    for n in (100, 1000) if kind != "masses" else (20, 200):
+        chain = long_chain(n, kind)
+        scene = plan(built(chain), ff.Impact(7e-3, 2.0), TIME)
+        rows = np.array([spring.row for spring in built(chain).springs])
+        tally, stress = np.zeros(2, np.int64), np.empty(TIME.size)
+        outcome, end, steps, switches = implicit.integrate_implicit(
+            rows, np.array(chain.heights), scene.ends, scene.mass, scene.drag, scene.top,
+            scene.values, scene.speed, scene.time, 3e-8, 10_000, np.empty((1, TIME.size)),
+            stress, np.empty((4, 5)), tally,
+        )  # fmt: skip
+        assert outcome == taylor.DONE
+        assert switches == 2 * n
+        assert tally[1] == n * tally[0]  # one block per spring and correction
+        counts.append((end, stress.max(), tally[0], steps))
+    short, long = counts
+    # alternating springs in equal parts: the same foam, however finely divided
+    assert long[0] == pytest.approx(short[0], rel=1e-3 if kind == "masses" else 1e-6)
+    assert long[1] == pytest.approx(short[1], rel=1e-3 if kind == "masses" else 1e-6)
+    assert long[2] <= 1.5 * short[2] + 100 or kind == "masses"
+    assert max(short[3], long[3]) < 4000
+
+
+EXTREME = [
+    ff.Impact(7e-3, 60.0),
+    ff.Impact(1e-9, 1e-3),
+    ff.StressDrive([0.0, -1e9, 0.0]),
+    ff.StressDrive([0.0, 1e12, 0.0]),
+    ff.DisplacementDrive([0.0, 1.7e-3, 0.0]),
+    ff.DisplacementDrive([0.0, -1e-3, 0.0]),
+]
+
+
+@pytest.mark.parametrize("load", EXTREME, ids=repr)
+@pytest.mark.parametrize("name", ["model-2, dashpot", "model-3, dashpot", "foam-2, mass"])
+def test_an_extreme_scene_is_finite_or_refused(name: str, load: ff.Impact) -> None:
+    time = np.array([0.0, 1e-4, 2e-4])
+    try:
+        got = run(CHAINS[name], load, 1e-6, time=time)
+    except ff.SimulationError as error:
+        assert str(error)  # noqa: PT017
+        return
+    assert np.isfinite(got.displacement).all()
+    assert np.isfinite(got.base_stress).all()
