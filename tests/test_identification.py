@@ -90,8 +90,9 @@ def test_fixed_values_bounds_and_expressions_are_kept():
     assert result.parameters["s1_eps_c"].state == "weak"  # the true value lies past the bound
 
 
-def test_the_best_point_survives_the_time_limit():
-    result = ff.fit(synthetic_impact()[1], max_time=0.02)
+@pytest.mark.parametrize(("model", "max_time"), [("bistable", 0.02), ("bistable+bistable", 1e-6)])
+def test_the_best_point_survives_the_time_limit(model, max_time):
+    result = ff.fit(synthetic_impact()[1], model=model, max_time=max_time)
     assert "time limit" in result.warnings[0]
     assert np.isfinite(result.misfit["stress_time"])
 

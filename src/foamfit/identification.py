@@ -16,7 +16,7 @@ from foamfit.measurement import Measurement
 from foamfit.model import Model, split_name
 from foamfit.problem import Problem, make_problem
 from foamfit.result import FitResult
-from foamfit.search import SearchStoppedError, Tracker, search
+from foamfit.search import SearchStoppedError, Tracker, salvage, search
 from foamfit.verdict import Costs, conclude, unreached
 
 Array = NDArray[np.float64]
@@ -117,6 +117,7 @@ def _identify(
         progress(0.95, "refinement")
         _refine(problem, tracker)
     except SearchStoppedError:
+        salvage(tracker, problem.space(), np.random.default_rng(seed))
         return costs, "the time limit"
     except KeyboardInterrupt:
         return costs, "Ctrl-C"

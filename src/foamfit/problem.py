@@ -13,7 +13,7 @@ from foamfit.errors import InputError
 from foamfit.measurement import Measurement
 from foamfit.model import Model, split_name
 from foamfit.objective import Objective, check_interior, choose_drive, default_weights
-from foamfit.search import Scales, Space
+from foamfit.space import Scales, Space
 
 Array = NDArray[np.float64]
 
