@@ -369,7 +369,8 @@ def _values(spring: BistableSpring) -> dict[str, float]:
 def rough_guess(measurement: Measurement) -> dict[str, float]:
     """Read a spring off the loop as the fit does for its starts, the points only roughly placed."""
     from foamfit.model import BISTABLE_NAMES
-    from foamfit.search import Loop, Scales, read_spring, smooth_loop
+    from foamfit.search import Loop, read_spring, smooth_loop
+    from foamfit.space import Scales
 
     strain, stress = loop_of(smooth_loop(measurement))
     spring = read_spring(Loop(strain, stress), ROUGH, Scales.of(measurement))

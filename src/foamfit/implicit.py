@@ -447,7 +447,7 @@ def _first_event(
         if out != 0 and (which < 0 or at < when):
             when, which, side = at, i, out
     if struck:
-        low = -slack[count] if abs(base[0]) <= slack[count] else 0.0
+        low = 0.0 if pressed else -slack[count]
         at, out = first_crossing(base, STAGES, low, math.inf, 1.0)
         risen = pressed or value_at(base, STAGES, 0.5 * at) > 10.0 * slack[count]
         if out != 0 and at <= when and risen:
@@ -725,7 +725,7 @@ def integrate_implicit(
             )  # fmt: skip
             if target >= 0:
                 value = total[0, STAGES - 1] if target == count else eps[target, STAGES - 1]
-                fine = 1e-13 * (max(load, 1e-300) if target == count else max(1.0, abs(level)))
+                fine = 1e-13 * (abs(base0) if target == count else max(1.0, abs(level)))
                 same = which < 0 or which == target or when > 1.0 - 1e-9
                 if same and abs(value - level) <= fine:
                     arrived = True
