@@ -312,3 +312,11 @@ def test_linear_spring() -> None:
 def test_inadmissible_linear_springs_are_refused(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=rf"\b{name}\b"):
         ff.LinearSpring(**{"k0": 60e6, name: value})
+
+
+def test_a_single_number_gives_a_single_number() -> None:
+    spring = ff.published["foam-1/model-1"].bistable
+    assert float(spring.stress(0.1)) == pytest.approx(5.5e6 * 0.1 / 0.9, rel=1e-15)
+    assert float(spring.strain(1e5)) == pytest.approx(1e5 / 5.6e6, rel=1e-15)
+    assert str(spring.branches(0.2)) == "d"
+    assert float(spring.tangent(0.2)) == 14.3e6

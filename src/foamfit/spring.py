@@ -164,13 +164,14 @@ class BistableSpring:
         """Stress (Pa) of the spring without its dashpot along a strain history, shape (n,).
 
         One flag is carried along the history (eqs. 2 and 3); the first sample starts with flag a.
+        A single strain gives a single stress.
 
         Raises
         ------
         SimulationError
             If a strain is at or past the end of its branch (1 on a, 1 + ε_* on c).
         """
-        return _along_strain(self, strain)[0]
+        return _along_strain(self, strain)[0].reshape(np.shape(strain))
 
     def strain(self, stress: ArrayLike) -> Array:
         """Strain of the spring along a stress history (Pa), shape (n,); the inverse of `stress`.
@@ -182,20 +183,22 @@ class BistableSpring:
         SimulationError
             If a tension is beyond the pole of branch a (-k0).
         """
-        return _along_stress(self, stress)
+        return _along_stress(self, stress).reshape(np.shape(stress))
 
     def tangent(self, strain: ArrayLike) -> Array:
         """Slope dσ/dε (Pa) on the branch of each sample of a strain history, shape (n,)."""
         from foamfit import kernels
 
         history = _as_history(strain, "strain")
-        return kernels.tangent_along(self.row, history, _along_strain(self, history)[1])
+        slope = kernels.tangent_along(self.row, history, _along_strain(self, history)[1])
+        return slope.reshape(np.shape(strain))
 
     def branches(self, strain: ArrayLike) -> NDArray[np.str_]:
         """Name the branch, "a", "d", "c" or "e", of each sample of a strain history, shape (n,)."""
         from foamfit import kernels
 
-        return np.array(kernels.BRANCH_NAMES)[_along_strain(self, strain)[1]]
+        names = np.array(kernels.BRANCH_NAMES)[_along_strain(self, strain)[1]]
+        return names.reshape(np.shape(strain))
 
 
 @dataclass(frozen=True)
@@ -244,7 +247,7 @@ class LinearSpring:
 
     def stress(self, strain: ArrayLike) -> Array:
         """Stress (Pa) of the spring without its dashpot along a strain history, shape (n,)."""
-        return _along_strain(self, strain)[0]
+        return _along_strain(self, strain)[0].reshape(np.shape(strain))
 
     def strain(self, stress: ArrayLike) -> Array:
         """Strain along a stress history (Pa), shape (n,).
@@ -254,14 +257,15 @@ class LinearSpring:
         SimulationError
             If a unilateral spring is asked for its strain under tension, which it cannot carry.
         """
-        return _along_stress(self, stress)
+        return _along_stress(self, stress).reshape(np.shape(stress))
 
     def tangent(self, strain: ArrayLike) -> Array:
         """Slope dσ/dε (Pa) at each sample of a strain history, shape (n,)."""
         from foamfit import kernels
 
         history = _as_history(strain, "strain")
-        return kernels.tangent_along(self.row, history, _along_strain(self, history)[1])
+        slope = kernels.tangent_along(self.row, history, _along_strain(self, history)[1])
+        return slope.reshape(np.shape(strain))
 
 
 Spring = BistableSpring | LinearSpring
