@@ -61,7 +61,7 @@ def struck(name: str, eta: float = 0.0, mass: float = 0.0) -> tuple[Chain, ff.Im
     return Chain(springs, heights, AREA, (mass, 0.0)), ff.Impact(blow.mass, blow.velocity)
 
 
-# ---------------------------------------------------------------------------------------- the method
+# --------------------------------------------------------------------------------------- the method
 
 
 def test_order_conditions() -> None:
@@ -73,7 +73,7 @@ def test_order_conditions() -> None:
     for k in range(1, 2 * s):
         assert b @ c ** (k - 1) == pytest.approx(1 / k, rel=1e-13)
     for k in range(1, s + 1):
-        np.testing.assert_allclose(a @ c ** (k - 1), c**k / k, rtol=1e-11)
+        np.testing.assert_allclose(a @ c ** (k - 1), c**k / k, rtol=0, atol=1e-13)
     for k in range(1, s):
         np.testing.assert_allclose((b * c ** (k - 1)) @ a, b / k * (1 - c**k), atol=1e-13)
 
@@ -113,7 +113,8 @@ def test_dashpots_like_explicit_steps(name: str, eta: float, rtol: float, bar: f
     want = run(*scene, 1e-11, implicit=False)
     got = run(*scene, rtol)
     assert max(errors(got, want)) <= bar
-    assert got.contact_end == pytest.approx(want.contact_end, rel=bar, nan_ok=True)
+    # from heavy dashpots the striker parts while it creeps: when, is of no weight
+    assert got.contact_end == pytest.approx(want.contact_end, rel=bar if eta < 1e6 else 1e-4)
     assert got.steps < 500
 
 
@@ -186,15 +187,15 @@ def test_steps_are_bounded_where_a_mass_rings(mass: float) -> None:
 
 @pytest.mark.parametrize("name", PAIRS)
 def test_heavy_dashpots(name: str) -> None:
-    """The striker stops before the springs feel anything: its motion is that of the dashpots."""
     chain, blow = struck(name, 1e8)
+    want = run(chain, blow, 1e-11, implicit=False)
     got = run(chain, blow, 1e-9, implicit=None)
     assert got.method == RADAU
     assert got.steps < 500
+    assert max(errors(got, want)) <= 1e-8
+    # the striker is stopped by the dashpots before the springs feel anything
     stopping = blow.mass / AREA * sum(chain.heights) / 1e8
-    np.testing.assert_allclose(got.displacement[-1, 1:], blow.velocity * stopping, rtol=2e-4)
-    want = run(chain, blow, 1e-9, implicit=False)
-    assert max(errors(got, want)) <= 1e-9
+    assert got.displacement[-1].max() == pytest.approx(blow.velocity * stopping, rel=1e-4)
 
 
 def test_heavy_damper_on_the_mass_of_the_foam() -> None:
@@ -215,9 +216,11 @@ def test_prescribed_motion_of_light_dashpots(eta: float) -> None:
     load = ff.DisplacementDrive(3.6e-4 * history())
     got = run(chain, load, 1e-8, implicit=None)
     limit = run(still, load, 1e-8)  # in closed form
-    assert got.method == (RADAU if eta < 1.0 else TAYLOR)
-    assert got.steps < 12000
-    assert max(errors(got, limit)) <= 1e-9 + 1e-4 * eta
+    assert got.method == RADAU
+    assert got.steps < 2000
+    assert max(errors(got, limit)) <= 1e-9 + 1e-3 * eta
+    if eta == 1.0:
+        assert max(errors(got, run(chain, load, 1e-11, implicit=False))) <= 1e-10
     np.testing.assert_allclose(got.displacement[-1], load.displacement, rtol=0, atol=1e-18)
 
 
@@ -267,12 +270,14 @@ def test_energy_of_an_undamped_impact(name: str, speed: float) -> None:
     got = run(chain, ff.Impact(7e-3, speed), 1e-9, time=time)
     free = time > got.contact_end
     rebound = np.polyfit(time[free], got.displacement[-1, free], 1)[0]
+    assert rebound < 0.0
+    time = np.append(time[~free], got.contact_end * (1 - 1e-13))  # at the last, what is left
+    got = run(chain, ff.Impact(7e-3, speed), 1e-9, time=time)
     velocity = np.zeros_like(got.displacement)
     velocity[-1] = rebound
     energy = energy_balance(chain, Impact(7e-3, speed), got.displacement, velocity)
-    total = (energy["kinetic"] + energy["work"])[free][0]
-    assert total == pytest.approx(energy["brought"][0], rel=1e-6)
-    assert rebound < 0.0
+    total = (energy["kinetic"] + energy["work"])[-1]
+    assert total == pytest.approx(energy["brought"][-1], rel=1e-6)
 
 
 def test_samples_do_not_change_the_motion() -> None:
@@ -290,7 +295,10 @@ def test_a_single_sample() -> None:
         want = run(chain, load, 1e-6, implicit=False, time=np.zeros(1))
         got = run(chain, load, 1e-6, time=np.zeros(1))
         np.testing.assert_allclose(got.displacement, want.displacement)
-        np.testing.assert_allclose(got.base_stress, want.base_stress)
+        if isinstance(load, ff.StressDrive):
+            np.testing.assert_allclose(got.base_stress, load.stress)
+        else:
+            np.testing.assert_allclose(got.base_stress, want.base_stress)
 
 
 # ------------------------------------------------------------------------------------- long chains

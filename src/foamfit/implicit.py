@@ -70,7 +70,8 @@ def radau(stages: int) -> tuple[Array, Array]:
     nodes[-1] = 1.0
     powers = np.arange(1, stages + 1)
     integrals = nodes[:, None] ** powers / powers
-    return nodes, integrals @ np.linalg.inv(np.vander(nodes, increasing=True))
+    values = nodes[:, None] ** (powers - 1)
+    return nodes, np.asarray(np.linalg.solve(values.T, integrals.T).T, dtype=np.float64)
 
 
 NODES, WEIGHTS = radau(STAGES)
@@ -621,7 +622,7 @@ def integrate_implicit(
     w_scale, s_scale, pressed, knot, switches, rate = 0.0, 0.0, False, -1, 0, 0.0
     contact_end = math.nan
     hurry, shorts, floor, stalled = 0, 0, 0.0, 0
-    proposal, taken = 0.0, 0.0
+    proposal, taken, worst = 0.0, 0.0, 1.0  # worst: the largest error let pass, over tol
     for i in range(count):
         s_scale = max(s_scale, abs(stress_on(rows[i], branches[i], eps0[i])))
         w_scale = max(w_scale, heights[i] * abs(eps0[i]))
@@ -683,6 +684,7 @@ def integrate_implicit(
             tries += 1
             if now + span <= now or tries > 200:
                 if chased > 0:  # the crossing is here, within rounding
+                    arrived, span = True, 0.0
                     break
                 for i in range(count):
                     curved, _, x0, _ = branch_shape(rows[i], branches[i])
@@ -717,9 +719,10 @@ def integrate_implicit(
                 proposal = max(span * min(max(factor, 0.2), 5.0), floor)
                 if error > 1.0:
                     proposal = max(proposal, 2.0 * span)
+                worst = max(worst, error)
             for i in range(count):
                 slack[i] = max(1e-12, tol * reach / heights[i])
-            slack[count] = tol * load
+            slack[count] = min(worst * tol, 1e-3) * load
             when, which, where = _first_event(
                 rows, branches, strains, base, slack, struck, pressed
             )  # fmt: skip
