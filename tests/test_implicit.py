@@ -87,12 +87,20 @@ def test_two_stages_are_the_known_ones() -> None:
 # -------------------------------------------------------------------- scenes that others can do too
 
 
+def integrated(name: str, drive: str) -> bool:
+    """Whether a case needs an integrator at all: an undamped chain in equilibrium does not."""
+    chain = CHAINS[name]
+    masses = (chain.masses or ()) if drive == "stress" else (chain.masses or ())[:-1]
+    dashpots = any(spring.eta for spring in chain.springs)
+    alone = drive == "displacement" and len(chain.springs) == 1
+    onsite = chain.site_damping > 0.0 and drive == "stress"
+    return drive.endswith("impact") or any(masses) or onsite or (dashpots and not alone)
+
+
 @pytest.mark.parametrize(("rtol", "bar"), [(1e-6, 1e-6), (1e-9, 1e-8)])
-@pytest.mark.parametrize(("name", "drive"), CASES)
+@pytest.mark.parametrize(("name", "drive"), [item for item in CASES if integrated(*item)])
 def test_against_reference(name: str, drive: str, rtol: float, bar: float) -> None:
     want, load = case(name, drive)
-    if plan(built(CHAINS[name]), load, TIME).solver == "closed form":
-        pytest.skip("nothing to integrate")
     if name == "foam-2, mass" and drive == "displacement" and rtol == 1e-6:
         bar = 1e-5  # it opens and closes 56 times
     got = run(CHAINS[name], load, rtol)
