@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 import os
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -179,9 +180,7 @@ def _hold_and_vary(
 @click.option(
     "--starts",
     type=click.IntRange(min=1),
-    default=12,
-    show_default=True,
-    help="Descents of the search.",
+    help="Descents of the search. Default: 16 per spring.",
 )
 @click.option("--max-time", type=float, metavar="SECONDS", help="Then the best so far is taken.")
 @click.option("--fix", multiple=True, metavar="NAME=VALUE", callback=_fixes, help="Hold one (SI).")
@@ -240,6 +239,7 @@ def fit(
             interior_mass=interior_mass,
             progress=progress,
         )
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # from here on Ctrl-C could only lose the result
     result.save(folder)
     if as_json:
         import json

@@ -173,7 +173,7 @@ def line_at(time: Array, values: Array, at: float) -> tuple[float, float]:
 
 def check_signs(record: Record) -> None:
     """Refuse a channel that is plainly the other way round: compression is positive."""
-    hint = "is negative in compression; compression must be positive, so set scale = -1 for it"
+    hint = "is negative in compression; it must be positive: give its column and scale = -1"
     stress, peak = record.stress, int(np.argmax(record.stress))
     first = float(np.median(stress[:5]))
     if first - stress.min() > 2 * max(stress[peak] - first, 0) and abs(stress.min()) > stress[peak]:

@@ -92,7 +92,23 @@ def fit(
             f"{measurement.name}: none of the {problem.objective.evaluations} sets of parameters "
             "that were tried could be simulated; check the drive, the heights and the bounds"
         )
-    values = _ordered(problem, tracker.best_values)
+    try:
+        return _finish(problem, tracker.best_values, seed, starts, costs, stopped, began)
+    except KeyboardInterrupt:  # what was found is not given up for a late Ctrl-C
+        return _finish(problem, tracker.best_values, seed, starts, costs, "Ctrl-C", began)
+
+
+def _finish(
+    problem: Problem,
+    values: Array,
+    seed: int,
+    starts: int,
+    costs: Costs,
+    stopped: str | None,
+    began: float,
+) -> FitResult:
+    """Order the springs, write the point into the parameters, and say what is to be said of it."""
+    values = _ordered(problem, values)
     problem.put(values)
     return conclude(problem, values, seed, starts, costs, stopped, began)
 
@@ -120,6 +136,7 @@ def _identify(
         salvage(tracker, problem.space(), np.random.default_rng(seed))
         return costs, "the time limit"
     except KeyboardInterrupt:
+        salvage(tracker, problem.space(), np.random.default_rng(seed))
         return costs, "Ctrl-C"
     progress(1.0, "done")
     return costs, None

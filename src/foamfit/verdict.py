@@ -182,6 +182,8 @@ def _varied(
     stderr = float(spread.stderr[column])
     half = uncertainty.half_width(stderr, spread.effective - len(sizes))
     verdict, why = uncertainty.state(value, half, float(sizes[column]), low, high)
+    if verdict == "determined" and problem.objective.interior_mass:
+        verdict, why = "weak", "the ringing of the interior mass leaves other valleys; " + why
     if verdict == "not determined":
         return ParameterEstimate(value, None, None, unit_of(name), True, verdict, why)
     ci95 = (max(value - half, low), min(value + half, high))
@@ -287,6 +289,11 @@ def _warnings(
         out.append(
             "The residuals are structured: they follow each other over "
             f"{max(spread.tau):.0f} samples, and the intervals count that."
+        )
+    if objective.interior_mass and len(problem.model.kinds) > 1:
+        out.append(
+            "With interior masses the cost has a valley for every cycle of their ringing: trust no "
+            "parameter that other seeds, or the fit without them, do not confirm."
         )
     out.extend(balance.warnings())
     return out
