@@ -391,7 +391,7 @@ def test_refuses_tomls(
         (["--vary", "s2_eta"], ("'s2_eta'", "s1_eta")),
         (["--fix", "s1_eta=0", "--vary", "s1_eta"], ("'s1_eta'", "both fixed and varied")),
         (["--model", "linear+bistable", "--fix", "s2_height=1e-3"], ("s2_height", "s1_height")),
-        (["--fix", "s1_eps_a=2"], ("could be simulated",)),
+        (["--fix", "s1_eps_a=2"], ("s1_eps_a = 2", "between 0 and 1")),
         (["--starts", "0"], ("'--starts'", "x>=1")),
         (["--seed", "-1"], ("'--seed'", "x>=0")),
         (["--max-time", "-1"], ("max_time", "positive")),

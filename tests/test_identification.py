@@ -141,6 +141,8 @@ def test_without_stated_noise_the_errors_come_from_the_residuals():
         ({"model": "rubber"}, "rubber"),
         ({"drive": "sideways"}, "sideways"),
         ({"params": lmfit.create_params(s2_k0=1.0)}, "s2_k0"),
+        ({"params": lmfit.create_params(s1_eps_a={"value": 2.0, "vary": False})}, "s1_eps_a = 2"),
+        ({"params": lmfit.create_params(s1_k0={"value": -1.0, "vary": False})}, "s1_k0 = -1"),
     ],
 )
 def test_wrong_calls_are_refused(options, message):

@@ -172,6 +172,24 @@ class Problem:
         return np.array([self.scales.of_parameter(name, at) for name in names])
 
 
+def _check_held(params: lmfit.Parameters) -> None:
+    """Refuse by name a held value that no spring can have."""
+    for name, parameter in params.items():
+        if parameter.vary or parameter.expr is not None:
+            continue
+        value, short = parameter.value, split_name(name)[1]
+        wanted, fine = {
+            "eps_a": ("between 0 and 1", 0.0 < value < 1.0),
+            "eps_c": ("between 0 and 1", 0.0 < value < 1.0),
+            "dsigma": ("zero or negative", value <= 0.0),
+            "kh_plus": ("zero or positive", value >= 0.0),
+            "kh_minus": ("zero or positive", value >= 0.0),
+            "eta": ("zero or positive", value >= 0.0),
+        }.get(short, ("positive", value > 0.0))
+        if not fine:
+            raise InputError(f"{name} = {value:g} is not admissible: it must be {wanted}")
+
+
 def make_problem(
     measurement: Measurement,
     model_name: str,
@@ -202,6 +220,7 @@ def make_problem(
             )
     for name in params or ():
         wanted[name] = params[name]  # type: ignore[index]
+    _check_held(wanted)
     if not any(parameter.vary for parameter in wanted.values()):
         raise InputError("no parameter varies; let at least one vary")
     return Problem(measurement, model, objective, wanted, Scales.of(measurement))
