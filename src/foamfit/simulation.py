@@ -182,21 +182,15 @@ class Plan:
         stress = np.empty(self.time.size)
         log = np.empty((1024, 5))
         method = RADAU if self._is_stiff(rows, heights, drag) else TAYLOR
+        moved = (self.ends, self.mass, drag, self.top, self.values, self.speed, self.time)
+        scene = (rows, heights, *moved)
         outcome, contact_end, steps, switches = taylor.TOO_MANY_STEPS, math.nan, 0, 0
         if method == TAYLOR:
             tolerance = max(1e-2 * margin * rtol, 1e-16)
             order = min(max(round(4.0 - 0.5 * math.log(tolerance)), 6), 24)
             most = MOST_EXPLICIT + 20 * self.time.size
             outcome, contact_end, steps, switches = taylor.integrate(
-                rows,
-                heights,
-                self.ends,
-                self.mass,
-                drag,
-                self.top,
-                self.values,
-                self.speed,
-                self.time,
+                *scene,
                 tolerance,
                 order,
                 min(self.max_steps, most) if self.implicit is None else self.max_steps,
@@ -208,15 +202,7 @@ class Plan:
                 method = RADAU
         if method == RADAU:
             outcome, contact_end, steps, switches = implicit.integrate_implicit(
-                rows,
-                heights,
-                self.ends,
-                self.mass,
-                drag,
-                self.top,
-                self.values,
-                self.speed,
-                self.time,
+                *scene,
                 max(3e-2 * margin * rtol, 1e-14),
                 self.max_steps,
                 displacement,
