@@ -6,6 +6,7 @@ import math
 import time
 import warnings
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import lmfit
 import numpy as np
@@ -16,8 +17,8 @@ from foamfit.measurement import Measurement
 from foamfit.model import Model, split_name
 from foamfit.problem import Problem, make_problem
 from foamfit.result import FitResult
-from foamfit.search import SearchStoppedError, Tracker, salvage, search
-from foamfit.verdict import Costs, conclude, unreached
+from foamfit.search import SearchRecord, SearchStoppedError, Tracker, salvage, search
+from foamfit.verdict import conclude, unreached
 
 Array = NDArray[np.float64]
 
@@ -86,60 +87,50 @@ def fit(
     starts = STARTS * len(problem.model.kinds) if starts is None else starts
     deadline = None if max_time is None else time.monotonic() + max_time
     tracker = Tracker(problem.objective, deadline)
-    costs, stopped = _identify(problem, tracker, starts, seed, progress or (lambda *_: None))
+    record = SearchRecord(seed, starts, began)
+    record = _identify(problem, tracker, record, progress or (lambda *_: None))
     if tracker.best_values is None:
         raise SimulationError(
             f"{measurement.name}: none of the {problem.objective.evaluations} sets of parameters "
             "that were tried could be simulated; check the drive, the heights and the bounds"
         )
     try:
-        return _finish(problem, tracker.best_values, seed, starts, costs, stopped, began)
+        return _finish(problem, tracker.best_values, record)
     except KeyboardInterrupt:  # what was found is not given up for a late Ctrl-C
-        return _finish(problem, tracker.best_values, seed, starts, costs, "Ctrl-C", began)
+        return _finish(problem, tracker.best_values, replace(record, stopped="Ctrl-C"))
 
 
-def _finish(
-    problem: Problem,
-    values: Array,
-    seed: int,
-    starts: int,
-    costs: Costs,
-    stopped: str | None,
-    began: float,
-) -> FitResult:
+def _finish(problem: Problem, values: Array, record: SearchRecord) -> FitResult:
     """Order the springs, write the point into the parameters, and say what is to be said of it."""
     values = _ordered(problem, values)
     problem.put(values)
-    return conclude(problem, values, seed, starts, costs, stopped, began)
+    return conclude(problem, values, record)
 
 
 def _identify(
     problem: Problem,
     tracker: Tracker,
-    starts: int,
-    seed: int,
+    record: SearchRecord,
     progress: Callable[[float, str], None],
-) -> tuple[Costs, str | None]:
-    """Search, then refine by lmfit; returns the costs of the descents and what stopped it."""
-    costs: Costs = []
+) -> SearchRecord:
+    """Search, then refine by lmfit; returns the record with its costs and what stopped it."""
     try:
         costs = search(
             tracker,
             problem.space(),
-            starts=starts,
-            rng=np.random.default_rng(seed),
+            starts=record.starts,
+            rng=np.random.default_rng(record.seed),
             progress=progress,
         )
+        record = replace(record, costs=tuple(costs))
         progress(0.95, "refinement")
         _refine(problem, tracker)
-    except SearchStoppedError:
-        salvage(tracker, problem.space(), np.random.default_rng(seed))
-        return costs, "the time limit"
-    except KeyboardInterrupt:
-        salvage(tracker, problem.space(), np.random.default_rng(seed))
-        return costs, "Ctrl-C"
+    except (SearchStoppedError, KeyboardInterrupt) as error:
+        salvage(tracker, problem.space(), np.random.default_rng(record.seed))
+        late = isinstance(error, SearchStoppedError)
+        return replace(record, stopped="the time limit" if late else "Ctrl-C")
     progress(1.0, "done")
-    return costs, None
+    return record
 
 
 def _refine(problem: Problem, tracker: Tracker) -> None:
@@ -160,16 +151,12 @@ def _refine(problem: Problem, tracker: Tracker) -> None:
         return
     _move_inside(params, names)
     sizes = problem.sizes(names, tracker.best_values)
-    places = np.array([problem.model.index[name] for name in names])
-    steps = np.zeros(len(problem.model.names))
-    steps[places] = 1e-5 * sizes
-    tied = problem.tied()
 
     def residual(p: lmfit.Parameters) -> Array:
         return tracker.residual(problem.vector(p))
 
     def jacobian(p: lmfit.Parameters) -> Array:
-        return problem.objective.jacobian(problem.vector(p), steps, places, tied)
+        return problem.slopes(problem.vector(p), names)
 
     with warnings.catch_warnings():  # of its covariance, which `uncertainty` does better
         warnings.simplefilter("ignore", RuntimeWarning)

@@ -36,6 +36,35 @@ class SearchStoppedError(Exception):
     """The time is up; the best point so far is the answer."""
 
 
+@dataclass(frozen=True)
+class SearchRecord:
+    """How a search went.
+
+    Attributes
+    ----------
+    seed, starts : int
+        What it was asked for.
+    began : float
+        `time.perf_counter` at its start, s.
+    costs : tuple of (float, int)
+        Final costs of the descents on the drive's curves, best first, and how many descents on the
+        loop led to each.
+    stopped : str or None
+        What ended it before its time: "the time limit", "Ctrl-C".
+    """
+
+    seed: int
+    starts: int
+    began: float
+    costs: tuple[tuple[float, int], ...] = ()
+    stopped: str | None = None
+
+    @property
+    def agreeing(self) -> int:
+        """How many descents led to the best cost, within 2 %."""
+        return sum(count for cost, count in self.costs if cost <= 1.02 * self.costs[0][0])
+
+
 @dataclass(eq=False)
 class Tracker:
     """Counts and times the evaluations of an objective and keeps the best point ever seen."""

@@ -17,9 +17,9 @@ from foamfit.model import BRANCHES, split_name, unit_of
 from foamfit.objective import Objective, Simulated
 from foamfit.problem import Problem
 from foamfit.result import Correlation, Curves, FitResult, ParameterEstimate, Switch
+from foamfit.search import SearchRecord
 
 Array = NDArray[np.float64]
-Costs = list[tuple[float, int]]
 
 # A curve was not fitted if it is off by more than this share of its own standard deviation; it is
 # fitted poorly if it is off by more than this share of its range.
@@ -27,15 +27,7 @@ UNACCEPTABLE = 0.5
 POOR = 0.05
 
 
-def conclude(
-    problem: Problem,
-    values: Array,
-    seed: int,
-    starts: int,
-    costs: Costs,
-    stopped: str | None,
-    began: float,
-) -> FitResult:
+def conclude(problem: Problem, values: Array, record: SearchRecord) -> FitResult:
     """Assemble the result at the best point."""
     objective, measurement = problem.objective, problem.measurement
     simulated = objective.simulate(values, everything=True)
@@ -44,14 +36,14 @@ def conclude(
     misfit = objective.misfit(simulated)
     balance = audit(measurement)
     n_vary = sum(1 for item in estimates.values() if item.vary and item.stderr is not None)
-    warnings = _warnings(problem, estimates, misfit, spread, stopped, costs, balance)
+    warnings = _warnings(problem, estimates, misfit, spread, record, balance)
     missed = any(_missed(objective, misfit, name) for name in objective.counted)
     status = "failed" if missed else ("warnings" if warnings else "ok")
     return FitResult(
         measurement=measurement,
         model=problem.model.name,
         drive=objective.drive,
-        seed=seed,
+        seed=record.seed,
         status=status,
         warnings=tuple(warnings),
         chain=problem.model.chain(values, measurement.specimen.height, measurement.specimen.area),
@@ -60,9 +52,9 @@ def conclude(
         visited=visited(problem, simulated),
         misfit=misfit,
         weights=objective.weights,
-        statistics=_statistics(residual, n_vary, starts, spread, objective, costs),
+        statistics=_statistics(residual, n_vary, spread, objective, record),
         energy=balance.as_dict() | {"sentences": balance.sentences()},
-        runtime_s=time.perf_counter() - began,
+        runtime_s=time.perf_counter() - record.began,
         curves=Curves(
             time=measurement.time,
             measured_stress=measurement.stress,
@@ -130,8 +122,7 @@ def _estimate(
     spread = None
     if names:
         sizes = problem.sizes(names, values)
-        places = np.array([problem.model.index[name] for name in names])
-        jacobian = _slopes(problem, values, places, sizes)
+        jacobian = problem.slopes(values, names)
         spread = uncertainty.covariance(jacobian, residual, objective.sizes, sizes)
     out = {}
     for i, name in enumerate(problem.model.names):
@@ -151,22 +142,6 @@ def _estimate(
             parameter.stderr = estimate.stderr
         out[name] = estimate
     return out, spread, None if spread is None else Correlation(names, spread.correlation)
-
-
-def _slopes(problem: Problem, values: Array, places: NDArray[np.int64], sizes: Array) -> Array:
-    """Derivative of the residual by the parameters, (n_data, n_places).
-
-    Where the response jumps (a ringing mass that just closes a loop or does not), differences over
-    a short step are as large as the step is short. Of two steps the smaller slope is taken.
-    """
-    slopes = []
-    for share in (1e-5, 3e-4):
-        steps = np.zeros(values.size)
-        steps[places] = share * sizes
-        slopes.append(problem.objective.jacobian(values, steps, places, problem.tied()))
-    short, wide = slopes
-    jumps = np.linalg.norm(short, axis=0) > 1.5 * np.linalg.norm(wide, axis=0)
-    return np.where(jumps, wide, short)
 
 
 def _varied(
@@ -193,10 +168,9 @@ def _varied(
 def _statistics(
     residual: Array,
     n_vary: int,
-    starts: int,
     spread: uncertainty.Covariance | None,
     objective: Objective,
-    costs: Costs,
+    record: SearchRecord,
 ) -> dict[str, float | int | None]:
     """Statistics as lmfit defines them (chi-square, AIC, BIC), and what the search cost."""
     n = residual.size
@@ -215,15 +189,10 @@ def _statistics(
         "bic": log_likelihood + n_vary * math.log(n),
         "nfev": objective.evaluations,
         "n_failed": objective.failures,
-        "n_starts": starts,
-        "n_descents": len(costs),
-        "n_agreeing": agreeing(costs),
+        "n_starts": record.starts,
+        "n_descents": len(record.costs),
+        "n_agreeing": record.agreeing,
     }
-
-
-def agreeing(costs: Costs) -> int:
-    """How many descents led to the best cost, within 2 %."""
-    return sum(count for cost, count in costs if cost <= 1.02 * costs[0][0])
 
 
 def _missed(objective: Objective, misfit: Mapping[str, float | None], name: str) -> bool:
@@ -258,15 +227,16 @@ def _warnings(
     estimates: Mapping[str, ParameterEstimate],
     misfit: Mapping[str, float | None],
     spread: uncertainty.Covariance | None,
-    stopped: str | None,
-    costs: Costs,
+    record: SearchRecord,
     balance: EnergyAudit,
 ) -> list[str]:
     """List what a reader must know before trusting the numbers, worst first."""
     objective = problem.objective
     out = []
-    if stopped is not None:
-        out.append(f"The search was stopped by {stopped}; this is the best point until then.")
+    if record.stopped is not None:
+        out.append(
+            f"The search was stopped by {record.stopped}; this is the best point until then."
+        )
     for name in objective.counted:
         off = misfit[name] or 0.0
         if off > POOR:
@@ -283,7 +253,7 @@ def _warnings(
             f"{objective.failures} of {objective.evaluations} trials could not be simulated; "
             "the bounds may be wrong."
         )
-    if agreeing(costs) == 1 and stopped is None:
+    if record.agreeing == 1 and record.stopped is None:
         out.append("Only one of the descents reached the best point; try more starts.")
     if spread is not None and max(spread.tau) > 5.0:
         out.append(
