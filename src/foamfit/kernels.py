@@ -21,6 +21,8 @@ Branches = NDArray[np.int64]
 
 # Division by zero gives infinity, as in NumPy; every loop that can meet it says what it does then.
 compiled = njit(cache=True, error_model="numpy")
+# For what is called in the innermost loops.
+inlined = njit(cache=True, error_model="numpy", forceinline=True)
 
 # Columns of a row.
 KIND, K0, KC, EPS_A, EPS_C, KH_PLUS, KH_MINUS, ETA = range(8)
@@ -242,19 +244,6 @@ def stress_along(row: Row, eps: Array) -> tuple[Array, Branches]:
 
 
 @compiled
-def strain_along(row: Row, sigma: Array) -> tuple[Array, Branches]:
-    """Strain and branch of one spring along a stress history, from rest; -inf if it cannot."""
-    eps = np.empty(sigma.size)
-    branches = np.empty(sigma.size, np.int64)
-    branch = first_branch(row)
-    for j in range(sigma.size):
-        branch = branch_at_stress(row, branch, sigma[j])
-        eps[j] = strain_on(row, branch, sigma[j]) if branch != OPEN else -math.inf
-        branches[j] = branch
-    return eps, branches
-
-
-@compiled
 def tangent_along(row: Row, eps: Array, branches: Branches) -> Array:
     """Slope dσ/dε at each sample of a strain history whose branches are known."""
     slope = np.empty(eps.size)
@@ -385,18 +374,14 @@ def equilibrate(
 
 
 @compiled
-def equilibrium_along(rows: Array, heights: Array, top: Array) -> tuple[Array, Array, Branches]:
+def equilibrium_along(
+    rows: Array, heights: Array, top: Array, sigma: Array, eps: Array, history: Branches
+) -> None:
     """Springs in series, undamped and massless, along a history of the top's displacement (m).
 
-    Returns
-    -------
-    tuple of arrays
-        Common stress (n,), strains (springs, n), branches (springs, n).
+    Fills the common stress (n,), the strains and the branches (springs, n).
     """
     count, n = rows.shape[0], top.size
-    sigma = np.empty(n)
-    eps = np.empty((count, n))
-    history = np.empty((count, n), np.int64)
     branches = np.empty(count, np.int64)
     now = np.empty(count)
     for i in range(count):
@@ -413,4 +398,27 @@ def equilibrium_along(rows: Array, heights: Array, top: Array) -> tuple[Array, A
         for i in range(count):
             eps[i, j] = now[i]
             history[i, j] = branches[i]
-    return sigma, eps, history
+
+
+@compiled
+def strains_along(rows: Array, sigma: Array, eps: Array, history: Branches) -> None:
+    """Springs in series along a history of their stress: fills strains and branches (springs, n).
+
+    A strain that a spring cannot have is -inf.
+    """
+    for i in range(rows.shape[0]):
+        row = rows[i]
+        branch = first_branch(row)
+        for j in range(sigma.size):
+            branch = branch_at_stress(row, branch, sigma[j])
+            eps[i, j] = strain_on(row, branch, sigma[j]) if branch != OPEN else -math.inf
+            history[i, j] = branch
+
+
+@compiled
+def total(values: Array) -> float:
+    """Sum of an array; finite only if all of it is."""
+    out = 0.0
+    for value in values:
+        out += value
+    return out

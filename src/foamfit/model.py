@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from foamfit import kernels
+from foamfit import kernels, series
 from foamfit.chain import Chain
 from foamfit.errors import InputError
 from foamfit.spring import BistableSpring, LinearSpring, Spring
@@ -98,6 +98,20 @@ class Model:
     def index(self) -> dict[str, int]:
         """Place of each parameter in the flat vector."""
         return {name: i for i, name in enumerate(self.names)}
+
+    @cached_property
+    def directions(self) -> NDArray[np.int64]:
+        """What each parameter moves, (n, 2): spring and its own parameter; see `foamfit.series`."""
+        out = []
+        for name in self.names:
+            spring, short = split_name(name)
+            if short == "height":
+                out.append((spring, series.HEIGHT))
+            elif spring < 0:
+                out.append((-1, series.DRAG))
+            else:
+                out.append((spring, BISTABLE_NAMES.index(short)))
+        return np.array(out)
 
     @cached_property
     def _codes(self) -> NDArray[np.int64]:

@@ -8,7 +8,6 @@ silently.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -31,6 +30,7 @@ CURVES = ("stress_time", "displacement_time", "stress_strain")
 DRIVES = ("impact", "stress", "displacement")
 # What a residual is, in units of the curve's scale, where a simulation failed.
 PENALTY = 10.0
+NOWHERE = np.empty(0, np.int64)
 # A trial that needs more steps than this is too stiff to be worth waiting for.
 MAX_STEPS = 20_000
 
@@ -151,7 +151,9 @@ class Simulated:
     """The curves of one set of parameters; None where the drive prescribes or the test lacks them.
 
     `stress_strain` is the stress (Pa) along the measured displacement. `motion` is the run itself.
-    `interior` holds the displacements (m) of the masses inside that the test has too.
+    `interior` holds the displacements (m) of the masses inside that the test has too, `slopes` the
+    derivatives (p, n) of the curves by the parameters that were asked for; None where implicit
+    steps gave none.
     """
 
     stress_time: Array | None
@@ -159,6 +161,7 @@ class Simulated:
     stress_strain: Array | None
     motion: Motion
     interior: dict[str, Array] = field(default_factory=dict)
+    slopes: dict[str, Array] | None = None
 
     def curve(self, name: str) -> Array | None:
         """Return a curve by its name in `Objective.curves`."""
@@ -212,6 +215,8 @@ class Objective:
         self.interior = interior_curves(self.measurement, len(self.model.kinds))
         self.curves = (*CURVES, *self.interior)
         self._check_weights()
+        self._dashpots = np.array([name.endswith("eta") for name in self.model.names])
+        self._dashpots[-1] = False  # the onsite damper is none of a spring
         self.time = self._time()
         loading = self._loading()
         self._plans = {damped: self._scene(loading, damped=damped) for damped in (False, True)}
@@ -325,36 +330,52 @@ class Objective:
 
     # ------------------------------------------------------------------ simulation and residual
 
-    def simulate(self, values: Array, *, everything: bool = False) -> Simulated:
+    def simulate(
+        self, values: Array, *, everything: bool = False, places: NDArray[np.int64] = NOWHERE
+    ) -> Simulated:
         """Simulate a flat vector of parameters; what is not counted only if `everything`.
+
+        `places` are those of the parameters by which derivatives are wanted.
 
         Raises
         ------
         SimulationError
             If the parameters are not admissible or the scene has no finite answer.
         """
+        height = self.measurement.specimen.height
         rows = self.model.rows(values)
-        heights = np.ascontiguousarray(self.model.heights(values, self.measurement.specimen.height))
+        heights = np.ascontiguousarray(self.model.heights(values, height))
         if rows is None or not (np.all(heights > 0.0) and values[-1] >= 0.0):
             raise SimulationError("the parameters are not admissible")
-        damped = bool(rows[:, kernels.ETA].any())
-        drag = float(values[-1]) / self.measurement.specimen.height
-        plan = self._plans[damped]
+        # A dashpot at zero is left out, unless a derivative by it is wanted.
+        damped = bool(rows[:, kernels.ETA].any()) or bool(self._dashpots[places].any())
+        drag = float(values[-1]) / height
         everywhere = everything or self._inside
-        run = plan.run(rows, heights, self.rtol, drag=drag, everything=everywhere)
+        wanted = self.model.directions[places]
+        run = self._plans[damped].run(
+            rows, heights, self.rtol, drag=drag, everything=everywhere, directions=wanted
+        )
         inside = self.interior if everywhere else {}
-        along: Array | None = None
-        if self.drive == "displacement":
-            along = run.base_stress
-        elif self._along and (everything or "stress_strain" in self.counted):
+        along = run if self.drive == "displacement" else None
+        if along is None and self._along and (everything or "stress_strain" in self.counted):
             plan = self._along[damped]
-            along = plan.run(rows, heights, self.rtol, everything=False).base_stress
+            along = plan.run(rows, heights, self.rtol, everything=False, directions=wanted)
+        slopes: dict[str, Array] | None = None
+        if run.slopes is not None and (along is None or along.slopes is not None):
+            moved, pressed = run.slopes
+            slopes = {"stress_time": pressed, "displacement_time": moved[:, -1]}
+            slopes |= {name: moved[:, node - 1] for name, node in inside.items()}
+            if along is not None and along.slopes is not None:
+                slopes["stress_strain"] = along.slopes.base_stress
+            for slope in slopes.values():
+                slope[places == values.size - 1] /= height  # site_eta acts through η_site/H
         return Simulated(
             stress_time=None if self.drive == "stress" else self._timed(run.base_stress),
             displacement_time=None if self.drive == "displacement" else run.displacement[-1],
-            stress_strain=along,
+            stress_strain=None if along is None else along.base_stress,
             motion=run,
             interior={name: run.displacement[node - 1] for name, node in inside.items()},
+            slopes=slopes,
         )
 
     def residual(self, values: Array) -> Array:
@@ -369,36 +390,64 @@ class Objective:
         except SimulationError:
             self.failures += 1
             return np.full(self.n_data, self.penalty)
+        return self._compare(curves)
+
+    def _compare(self, curves: Simulated) -> Array:
+        """Residuals of simulated curves."""
         parts = []
         for name in self.counted:
             simulated = curves.curve(name)
             assert simulated is not None  # a curve is counted only if the drive leaves it free
-            factor = self.weights[name] ** 0.5 / self.scale[name]
-            parts.append((simulated - self._curve(name)) * factor)
+            parts.append((simulated - self._curve(name)) * self._factor(name))
         # A stress near the pole of branch c is as bad as none.
         return np.asarray(np.clip(np.concatenate(parts), -self.penalty, self.penalty))
 
-    def jacobian(
-        self,
-        values: Array,
-        steps: Array,
-        vary: NDArray[np.int64],
-        tied: Callable[[Array], Array] = lambda values: values,
-    ) -> Array:
-        """Central differences of the residual, shape (n_data, n_vary).
+    def _factor(self, name: str) -> float:
+        """What makes a curve's difference a residual."""
+        return float(self.weights[name] ** 0.5 / self.scale[name])
 
-        `steps` (all parameters) holds the half width; where one side cannot be simulated the
-        other side alone is used. `tied` completes a vector in which some parameters hang on others.
+    def jacobian(self, values: Array, places: NDArray[np.int64], steps: Array) -> Array:
+        """Derivative of the residual by the parameters at `places`, (n_data, n_places), SI.
+
+        Carried along with the simulation. Where implicit steps were taken, central differences over
+        `steps` (n_places,) stand in; zeros where the parameters cannot be simulated.
         """
-        columns = np.empty((self.n_data, vary.size))
+        self.evaluations += 1
+        try:
+            curves = self.simulate(values, places=places)
+        except SimulationError:
+            self.failures += 1
+            return np.zeros((self.n_data, places.size))
+        if curves.slopes is None:
+            return self._differences(values, places, steps)
+        parts = [curves.slopes[name] * self._factor(name) for name in self.counted]
+        slopes = np.concatenate(parts, axis=1).T
+        slopes[np.abs(self._compare(curves)) >= self.penalty] = 0.0
+        return slopes
+
+    def jacobian_along(self, values: Array, moves: Array, steps: Array) -> Array:
+        """Derivative of the residual along moves (n_values, m) of the parameters, (n_data, m).
+
+        `steps` (m,) are those of `jacobian`, in units of the moves.
+        """
+        places = np.flatnonzero(moves.any(axis=1))
+        moving = moves[places]
+        return self.jacobian(values, places, np.max(np.abs(moving) * steps, axis=1)) @ moving
+
+    def _differences(self, values: Array, places: NDArray[np.int64], steps: Array) -> Array:
+        """Central differences of the residual, (n_data, n_places).
+
+        Where one side cannot be simulated the other side alone is used.
+        """
+        columns = np.empty((self.n_data, places.size))
         here: Array | None = None
-        for column, i in enumerate(vary):
+        for column, i in enumerate(places):
             sides = []
             for sign in (1.0, -1.0):
                 moved = values.copy()
-                moved[i] += sign * steps[i]
+                moved[i] += sign * steps[column]
                 failures = self.failures
-                value = self.residual(tied(moved))
+                value = self.residual(moved)
                 sides.append((moved[i], value if self.failures == failures else None))
             (up, high), (down, low) = sides
             if high is None or low is None:

@@ -3,10 +3,15 @@
 # mypy: disallow-untyped-decorators=False, warn-return-any=False
 from __future__ import annotations
 
+from numba import njit
+
 from foamfit.kernels import Array, compiled
 
+# A product and a sum in one rounding: faster, and no less exact.
+_fused = njit(cache=True, error_model="numpy", fastmath={"contract"})
 
-@compiled
+
+@_fused
 def value_at(c: Array, order: int, tau: float) -> float:
     """Value of a polynomial."""
     total = c[order]
@@ -15,53 +20,63 @@ def value_at(c: Array, order: int, tau: float) -> float:
     return total
 
 
-@compiled
-def add_values(
-    c: Array, order: int, t: Array, first: int, last: int, now: float, scale: float, out: Array
-) -> None:
-    """Add scale × polynomial at the times t[first:last] - now to `out`, four at a time."""
-    j = first
-    while j + 4 <= last:
-        x0, x1, x2, x3 = t[j] - now, t[j + 1] - now, t[j + 2] - now, t[j + 3] - now
-        y0 = y1 = y2 = y3 = c[order]
-        for n in range(order - 1, -1, -1):
-            y0 = y0 * x0 + c[n]
-            y1 = y1 * x1 + c[n]
-            y2 = y2 * x2 + c[n]
-            y3 = y3 * x3 + c[n]
-        out[j] += scale * y0
-        out[j + 1] += scale * y1
-        out[j + 2] += scale * y2
-        out[j + 3] += scale * y3
-        j += 4
-    while j < last:
-        out[j] += scale * value_at(c, order, t[j] - now)
-        j += 1
+@_fused
+def _value_and_slope(c: Array, order: int, tau: float) -> tuple[float, float]:
+    """Value and derivative of a polynomial."""
+    total, slope = c[order], 0.0
+    for n in range(order - 1, -1, -1):
+        slope = slope * tau + total
+        total = total * tau + c[n]
+    return total, slope
 
 
 @compiled
 def slope_at(c: Array, order: int, tau: float) -> float:
     """Return the derivative of a polynomial."""
-    total = order * c[order]
-    for n in range(order - 1, 0, -1):
-        total = total * tau + n * c[n]
-    return total
+    return _value_and_slope(c, order, tau)[1]
+
+
+@_fused
+def fill_values(
+    c: Array, order: int, t: Array, first: int, last: int, now: float, out: Array
+) -> None:
+    """Write the polynomial at the times t[first:last] - now to `out`, a block at a time.
+
+    The loops over a block hold no dependence from sample to sample, so that they are done four
+    samples at once; three coefficients a pass save reading and writing the block.
+    """
+    while first < last:
+        end = min(first + 512, last)
+        n = order
+        for j in range(first, end):
+            out[j] = c[n]
+        while n >= 3:
+            high, mid, low = c[n - 1], c[n - 2], c[n - 3]
+            for j in range(first, end):
+                x = t[j] - now
+                out[j] = ((out[j] * x + high) * x + mid) * x + low
+            n -= 3
+        while n > 0:
+            n -= 1
+            low = c[n]
+            for j in range(first, end):
+                out[j] = out[j] * (t[j] - now) + low
+        first = end
 
 
 @compiled
-def _root(c: Array, order: int, level: float, lo: float, hi: float) -> float:
+def _root(c: Array, order: int, level: float, lo: float, hi: float, rising: bool) -> float:
     """Root of polynomial - level in [lo, hi], whose ends lie on either side: guarded Newton."""
-    rising = value_at(c, order, hi) > level
     tau = 0.5 * (lo + hi)
     for _ in range(100):
-        f = value_at(c, order, tau) - level
+        f, d = _value_and_slope(c, order, tau)
+        f -= level
         if f == 0.0:
             break
         if (f > 0.0) == rising:
             hi = tau
         else:
             lo = tau
-        d = slope_at(c, order, tau)
         trial = tau - f / d if d != 0.0 else lo
         if not lo < trial < hi:
             trial = 0.5 * (lo + hi)
@@ -74,9 +89,12 @@ def _root(c: Array, order: int, level: float, lo: float, hi: float) -> float:
 
 @compiled
 def _turn(c: Array, order: int, lo: float, hi: float) -> float:
-    """Bisect for the turning point of a polynomial whose slope changes sign in [lo, hi]."""
+    """Bisect for the turning point of a polynomial whose slope changes sign in [lo, hi].
+
+    Half the digits are enough: near it the value changes with their square.
+    """
     rising = slope_at(c, order, lo) > 0.0
-    for _ in range(50):
+    for _ in range(27):
         mid = 0.5 * (lo + hi)
         if (slope_at(c, order, mid) > 0.0) == rising:
             lo = mid
@@ -91,29 +109,35 @@ def first_crossing(c: Array, order: int, low: float, high: float, span: float) -
 
     A start outside by rounding, or on an end, counts as inside until it moves outwards.
     """
-    reach = 0.0
+    reach, bend = 0.0, 0.0
     power = 1.0
     for n in range(1, order + 1):
         power *= span
-        reach += abs(c[n]) * power
+        size = abs(c[n]) * power
+        reach += size
+        if n > 1:
+            bend += n * size
     if c[0] - reach > low and c[0] + reach < high:
         return span, 0
     low, high = min(low, c[0]), max(high, c[0])
-    pieces = 8
+    pieces = 1 if bend < abs(c[1]) * span else 8  # one way all along, or perhaps there and back
     lo = 0.0
     slope_lo = c[1]
     for piece in range(1, pieces + 1):
         hi = span * piece / pieces
-        slope_hi = slope_at(c, order, hi)
-        mid = hi
-        if slope_lo * slope_hi < 0.0:  # a turning point may reach beyond both ends
+        value, slope_hi = _value_and_slope(c, order, hi)
+        if pieces > 1 and slope_lo * slope_hi < 0.0:  # the turning point may lie beyond both ends
             mid = _turn(c, order, lo, hi)
-        for end in (mid, hi):
-            value = value_at(c, order, end)
-            if value > high:
-                return _root(c, order, high, lo, end), 1
-            if value < low:
-                return _root(c, order, low, lo, end), -1
-            lo = end
+            turned = value_at(c, order, mid)
+            if turned > high:
+                return _root(c, order, high, lo, mid, True), 1
+            if turned < low:
+                return _root(c, order, low, lo, mid, False), -1
+            lo = mid
+        if value > high:
+            return _root(c, order, high, lo, hi, True), 1
+        if value < low:
+            return _root(c, order, low, lo, hi, False), -1
+        lo = hi
         slope_lo = slope_hi
     return span, 0

@@ -127,11 +127,11 @@ class Problem:
         """Names of the parameters that vary."""
         return tuple(name for name in self.model.names if self.params[name].vary)
 
-    def tied(self) -> Callable[[Array], Array]:
-        """Completion of a vector by the expressions among the parameters."""
+    def tied(self) -> Callable[[Array], Array] | None:
+        """Completion of a vector by the expressions among the parameters; None if there is none."""
         tied = [name for name in self.model.names if self.params[name].expr is not None]
         if not tied:
-            return lambda values: values
+            return None
         places = [self.model.index[name] for name in tied]
         rest = _rest_of_height(self.measurement, self.model)
         if [self.params[name].expr for name in tied] == [rest]:
@@ -174,19 +174,15 @@ class Problem:
     def slopes(self, values: Array, names: tuple[str, ...]) -> Array:
         """Derivative of the residual by some parameters at a point, (n_data, n_names), per SI unit.
 
-        Where the response jumps (a ringing mass that just closes a loop or does not), differences
-        over a short step are as large as the step is short. Of two steps the smaller one is taken.
+        Exact but for scenes with implicit steps; see `Objective.jacobian`. Parameters that hang on
+        these by expressions move with them.
         """
-        sizes = self.sizes(names, values)
         places = np.array([self.model.index[name] for name in names])
-        slopes = []
-        for share in (1e-5, 3e-4):
-            steps = np.zeros(values.size)
-            steps[places] = share * sizes
-            slopes.append(self.objective.jacobian(values, steps, places, self.tied()))
-        short, wide = slopes
-        jumps = np.linalg.norm(short, axis=0) > 1.5 * np.linalg.norm(wide, axis=0)
-        return np.where(jumps, wide, short)
+        steps = 1e-5 * self.sizes(names, values)
+        moves = np.zeros((values.size, places.size))
+        moves[places, np.arange(places.size)] = 1.0
+        moves = self.space().follow(values, moves, steps)
+        return self.objective.jacobian_along(values, moves, steps)
 
 
 def _check_held(params: lmfit.Parameters) -> None:

@@ -81,6 +81,12 @@ class Tracker:
             raise SearchStoppedError
         return residual
 
+    def slopes(self, space: Space, point: Array) -> Array:
+        """Derivative of the residual by the coordinates of a point, (n_data, n_free)."""
+        values = space.decode(point)
+        moves = space.slopes(point, values)
+        return self.objective.jacobian_along(values, moves, np.full(point.size, 1e-5))
+
     def consider(self, values: Array) -> Array:
         """Residual of the objective, whatever the time."""
         failures = self.objective.failures
@@ -213,7 +219,7 @@ def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> l
             for i, at in enumerate(given):
                 if space.model.names[at] in space.free:
                     values[at] = heights[i] * (0.3 + 1.4 * mark[7 * i + 5])
-            values = space.tied(values)
+            values = space.complete(values)
             heights = np.maximum(values[given], 1e-3 * space.scales.height)
         motion = loop.displacement.copy()
         for i, kind in enumerate(kinds):
@@ -270,7 +276,7 @@ def descend(
     point = start
     cost, residual = cost_at(point)
     damping, growth, idle = 1e-3, 2.0, 0
-    jacobian = _slopes(tracker, space, point, residual)
+    jacobian = tracker.slopes(space, point)
     for _ in range(iterations):
         gradient = jacobian.T @ residual
         held = ((point <= low) & (gradient > 0.0)) | ((point >= high) & (gradient < 0.0))
@@ -293,25 +299,13 @@ def descend(
             growth = 2.0
             if idle == 2:
                 break
-            jacobian = _slopes(tracker, space, point, residual)
+            jacobian = tracker.slopes(space, point)
         else:
             damping *= growth
             growth *= 2.0
             if damping > 1e8 or float(np.max(np.abs(moved))) < 1e-9:
                 break
     return cost, point
-
-
-def _slopes(tracker: Tracker, space: Space, point: Array, here: Array) -> Array:
-    """Forward differences of the residual over the coordinates, (n_data, n_free)."""
-    high = space.box[1]
-    columns = np.empty((here.size, point.size))
-    for j in range(point.size):
-        step = 1e-5 if point[j] + 1e-5 < high[j] else -1e-5
-        moved = point.copy()
-        moved[j] += step
-        columns[:, j] = (tracker.residual(space.decode(moved)) - here) / step
-    return columns
 
 
 def rank(tracker: Tracker, space: Space, points: list[Array]) -> list[tuple[float, Array]]:

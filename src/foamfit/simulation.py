@@ -9,9 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foamfit import implicit, kernels, taylor
+from foamfit import implicit, kernels, series, taylor
 from foamfit.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.errors import SimulationError
+from foamfit.series import equilibrium_tangents
 
 Array = NDArray[np.float64]
 
@@ -72,8 +73,20 @@ class Response:
     steps: int
 
 
+Directions = NDArray[np.int64]
+NO_DIRECTIONS: Directions = np.empty((0, 2), np.int64)
+NO_SWITCHES = np.empty((0, 5))
+
+
+class Slopes(NamedTuple):
+    """Derivatives of displacement (p, nodes, n_t) and base stress (p, n_t) in p directions."""
+
+    displacement: Array
+    base_stress: Array
+
+
 class Motion(NamedTuple):
-    """The bare outcome of a run; see `Response`."""
+    """The bare outcome of a run; see `Response`. `slopes` is None where none were asked for."""
 
     displacement: Array
     base_stress: Array
@@ -81,6 +94,7 @@ class Motion(NamedTuple):
     switches: Array
     steps: int
     method: str = CLOSED_FORM
+    slopes: Slopes | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,58 +143,75 @@ class Plan:
         *,
         drag: float | None = None,
         everything: bool = True,
+        directions: Directions = NO_DIRECTIONS,
     ) -> Motion:
         """Run the scene with the springs in `rows` (n_springs, columns) and their heights (m).
 
         `drag` replaces the scene's own. With `everything` false only the base stress and the
-        displacement of the top, shape (1, n_t), are sure to be there.
+        displacement of the top, shape (1, n_t), are sure to be there. `directions` (p, 2) are those
+        of the derivatives to carry along; see `foamfit.series`.
 
         Raises
         ------
         SimulationError
             If the scene has no finite answer; the message says why.
         """
+        drag = self.drag if drag is None else drag
         if self.solver == CLOSED_FORM:
-            motion = self._closed_form(rows, heights, everything)
-        else:
-            motion = self._integrate(
-                rows, heights, rtol, self.drag if drag is None else drag, everything
-            )
-        if not (
-            math.isfinite(float(motion.base_stress.sum()))
-            and math.isfinite(float(motion.displacement.sum()))
-        ):
-            raise SimulationError(_OUTCOMES[taylor.NOT_FINITE])
-        return motion
+            return self._closed_form(rows, heights, everything, directions)
+        return self._integrate(rows, heights, rtol, drag, everything, directions)
 
-    def _closed_form(self, rows: Array, heights: Array, everything: bool) -> Motion:
+    def _closed_form(
+        self, rows: Array, heights: Array, everything: bool, directions: Directions
+    ) -> Motion:
         """Undamped and massless: one stress in all springs; or one spring under known motion."""
-        count, n = len(heights), self.time.size
-        if self.top == taylor.MOTION:
-            stress, strain, branches = kernels.equilibrium_along(rows, heights, self.values)
-            eta = rows[0, kernels.ETA]
-            if count == 1 and eta > 0.0 and n > 1:
-                stress = stress + eta * np.gradient(strain[0], self.time)
+        moved = self.top == taylor.MOTION
+        strain = np.empty((len(heights), self.time.size))
+        branches = np.empty(strain.shape, np.int64)
+        stress = np.array(self.values)
+        if moved:
+            kernels.equilibrium_along(rows, heights, self.values, stress, strain, branches)
         else:
-            stress = self.values
-            strain, branches = np.empty((count, n)), np.empty((count, n), np.int64)
-            for i in range(count):
-                strain[i], branches[i] = kernels.strain_along(rows[i], stress)
+            kernels.strains_along(rows, stress, strain, branches)
+        slopes: Slopes | None = None
+        if len(directions):
+            slopes = Slopes(
+                *equilibrium_tangents(rows, heights, strain, branches, moved, directions)
+            )
+        eta = rows[0, kernels.ETA]
+        if moved and len(heights) == 1 and stress.size > 1 and (eta > 0.0 or slopes is not None):
+            rate = np.gradient(strain[0], self.time)
+            stress = stress + eta * rate
+            for p, (_, what) in enumerate(directions):
+                if slopes is not None and what == series.OWN_ETA:
+                    slopes.base_stress[p] += rate
+                elif slopes is not None and what == series.HEIGHT:
+                    slopes.base_stress[p] -= eta * rate / heights[0]
+        if not math.isfinite(kernels.total(stress) + kernels.total(strain.ravel())):
+            raise SimulationError(_OUTCOMES[taylor.NOT_FINITE])
         if not everything:
+            if slopes is not None:
+                slopes = Slopes(slopes.displacement[:, -1:], slopes.base_stress)
             top = (heights @ strain)[None, :]
-            return Motion(top, np.array(stress), math.nan, np.empty((0, 5)), 0)
+            return Motion(top, stress, math.nan, NO_SWITCHES, 0, CLOSED_FORM, slopes)
         nodes = np.cumsum(heights[:, None] * strain, axis=0)
         switches = _switches(self.time, strain, branches)
-        return Motion(nodes, np.array(stress), math.nan, switches, 0)
+        return Motion(nodes, stress, math.nan, switches, 0, CLOSED_FORM, slopes)
 
     def _integrate(
-        self, rows: Array, heights: Array, rtol: float, drag: float, everything: bool
+        self,
+        rows: Array,
+        heights: Array,
+        rtol: float,
+        drag: float,
+        everything: bool,
+        directions: Directions,
     ) -> Motion:
         # Without an interior mass there are few steps: a margin costs little.
         margin = 1.0 if len(self.ends) > 1 else 1e-2
-        displacement = np.empty((len(heights) if everything else 1, self.time.size))
-        stress = np.empty(self.time.size)
-        log = np.empty((1024, 5))
+        nodes, n, p = (len(heights) if everything else 1), self.time.size, len(directions)
+        displacement, stress, log = np.empty((nodes, n)), np.empty(n), np.empty((1024, 5))
+        slopes = Slopes(np.empty((p, nodes, n)), np.empty((p, n)))
         method = RADAU if self._is_stiff(rows, heights, drag) else TAYLOR
         moved = (self.ends, self.mass, drag, self.top, self.values, self.speed, self.time)
         scene = (rows, heights, *moved)
@@ -194,8 +225,10 @@ class Plan:
                 tolerance,
                 order,
                 min(self.max_steps, most) if self.implicit is None else self.max_steps,
+                directions,
                 displacement,
                 stress,
+                *slopes,
                 log,
             )
             if outcome in (taylor.TOO_MANY_STEPS, taylor.STEP_UNDERFLOW) and self.implicit is None:
@@ -213,7 +246,10 @@ class Plan:
         if outcome != taylor.DONE:
             last = log[min(switches, len(log)) - 1, 0] if switches else self.time[0]
             raise SimulationError(_OUTCOMES[outcome].format(steps=steps, time=last))
-        return Motion(displacement, stress, contact_end, log[:switches], steps, method)
+        return Motion(
+            displacement, stress, contact_end, log[:switches], steps, method,
+            slopes if p > 0 and method == TAYLOR else None,
+        )  # fmt: skip
 
     def _is_stiff(self, rows: Array, heights: Array, drag: float) -> bool:
         """Tell whether explicit steps would have to follow what is long over."""

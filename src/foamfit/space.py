@@ -108,7 +108,7 @@ class Space:
         Names of the parameters that vary.
     low, high : (n,) arrays
         Limits of every parameter, SI.
-    tied : callable
+    tied : callable or None
         Completes a vector in which some parameters hang on others.
     """
 
@@ -118,7 +118,7 @@ class Space:
     free: tuple[str, ...]
     low: Array
     high: Array
-    tied: Callable[[Array], Array]
+    tied: Callable[[Array], Array] | None
 
     @cached_property
     def coordinates(self) -> list[tuple[int, str, int]]:
@@ -163,18 +163,64 @@ class Space:
         """Vector of parameters (SI) at a point of the box."""
         values = self.values.copy()
         for u, (i, short, first) in zip(point, self.coordinates, strict=True):
-            if short in ("k0", "kc"):
-                value = np.exp(u) * self.scales.stress
-            elif short == "eps_a":
-                value = np.exp(u)
-            elif short == "eps_c":
-                value = values[first + 3] + u * (LAST_STRAIN - values[first + 3])
-            elif short == "dsigma":
-                value = -u * _stress_at_a1(values, first)
-            else:
-                value = u * self._unit(short)
+            value = self._value(u, short, first, values)
             values[i] = min(max(value, self.low[i]), self.high[i])
-        return self.tied(values)
+        return self.complete(values)
+
+    def complete(self, values: Array) -> Array:
+        """Complete a vector by what hangs on others."""
+        return values if self.tied is None else self.tied(values)
+
+    def _value(self, u: float, short: str, first: int, values: Array) -> float:
+        """Parameter of a coordinate, whatever its limits; what it needs of `values` is there."""
+        if short in ("k0", "kc"):
+            return float(np.exp(u)) * self.scales.stress
+        if short == "eps_a":
+            return float(np.exp(u))
+        if short == "eps_c":
+            eps_a = float(values[first + 3])
+            return eps_a + u * (LAST_STRAIN - eps_a)
+        return -u * _stress_at_a1(values, first) if short == "dsigma" else u * self._unit(short)
+
+    def slopes(self, point: Array, values: Array) -> Array:
+        """Derivative of the parameters by the coordinates at a point, (n_values, n_free).
+
+        `values` is the decoded point.
+        """
+        moves = np.zeros((values.size, point.size))
+        for j, (i, short, first) in enumerate(self.coordinates):
+            if short in ("k0", "kc", "eps_a"):
+                moves[i, j] = values[i]
+            elif short == "eps_c":
+                moves[i] = (1.0 - point[j]) * moves[first + 3]
+                moves[i, j] = LAST_STRAIN - values[first + 3]
+            elif short == "dsigma":
+                v = 1.0 - values[first + 3]
+                rise = (
+                    values[first + 3] / v * moves[first]
+                    + values[first] / (v * v) * moves[first + 3]
+                )
+                moves[i] = -point[j] * rise
+                moves[i, j] = -_stress_at_a1(values, first)
+            else:
+                moves[i, j] = self._unit(short)
+            if not self.low[i] <= self._value(point[j], short, first, values) <= self.high[i]:
+                moves[i] = 0.0
+        return self.follow(values, moves, np.full(point.size, 1e-5))
+
+    def follow(self, values: Array, moves: Array, steps: Array) -> Array:
+        """Complete moves (n_values, m) of the parameters by those of what hangs on others.
+
+        Differences of the expressions over `steps` (m,): no simulation is in them.
+        """
+        if self.tied is None:
+            return moves
+        out = np.empty_like(moves)
+        for j, step in enumerate(steps):
+            ahead = self.tied(values + step * moves[:, j])
+            out[:, j] = (ahead - self.tied(values - step * moves[:, j])) / (2.0 * step)
+        # what does not hang on others keeps its move to the last digit
+        return np.where(moves != 0.0, moves, out)
 
 
 def _stress_at_a1(values: Array, first: int) -> float:

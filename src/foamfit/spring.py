@@ -289,7 +289,9 @@ def _along_stress(spring: Spring, stress: ArrayLike) -> Array:
     from foamfit import kernels
 
     history = _as_history(stress, "stress")
-    strain = kernels.strain_along(spring.row, history)[0]
+    strain = np.empty(history.size)
+    branches = np.empty((1, history.size), np.int64)
+    kernels.strains_along(spring.row[None, :], history, strain[None, :], branches)
     if not np.all(np.isfinite(strain)):
         at = _first(~np.isfinite(strain))
         raise SimulationError(

@@ -1,19 +1,15 @@
 """The compiled integrator: Taylor series from switch to switch.
 
-On one branch the law is either a straight line or σ (1 - x) = k x, so every coefficient of the
-Taylor series in time of strains, stresses and motion follows from the lower ones by a short
-recurrence. A step is as long as the series allows at the wanted tolerance; switches of branch, the
-end of contact and the samples are roots and values of the same polynomials. No branch changes
-inside a step.
-
-The nodes are those masses that are there. Between two of them lies a group of springs in series,
-which carry one stress: massless nodes have no state. In a group of several springs those without
-dashpot share the elongation by their compliances, at every order of the series.
+A step is as long as the series of `foamfit.series` allow at the wanted tolerance; switches of
+branch, the end of contact and the samples are roots and values of the same polynomials. No branch
+changes inside a step. Derivatives by parameters are carried along where they are asked for.
 """
 
+# mypy: disallow-untyped-decorators=False, warn-return-any=False
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,228 +21,59 @@ from foamfit.kernels import (
     below,
     branch_at_strain,
     branch_at_stress,
-    branch_shape,
     compiled,
     equilibrate,
     first_branch,
-    interval,
-    slope_on,
     strain_on,
-    stress_on,
 )
-from foamfit.polynomial import add_values, first_crossing, value_at
+from foamfit.polynomial import fill_values, first_crossing, slope_at, value_at
+from foamfit.series import (
+    CURVED,
+    FREE,
+    HIGH,
+    LOW,
+    MOTION,
+    N_LAW,
+    ORIGIN,
+    SLOPE,
+    STRESS,
+    VISCOUS,
+    Links,
+    Series,
+    Tangents,
+    advance,
+    enter,
+    enter_tangents,
+    expand,
+    expand_tangents,
+    make_series,
+    make_tangents,
+    start_tangents,
+)
 
-# What is known of the top node.
-FREE, VISCOUS, STRESS, MOTION = range(4)
+__all__ = ["FREE", "MOTION", "STRESS", "VISCOUS", "integrate"]
+
 # Outcomes.
 DONE, TOO_MANY_STEPS, STEP_UNDERFLOW, FLAT_UNDER_STRESS, NOT_FINITE = range(5)
+# Strains closer than this to the end of a branch are at it.
+CLOSE = 1e-13
 
 
-@compiled
-def _product(x: Array, y: Array, n: int, first: int, last: int) -> float:
-    """Σ x_j y_{n-j} for j from first to last."""
-    total = 0.0
-    for j in range(first, last + 1):
-        total += x[j] * y[n - j]
-    return total
+class Samples(NamedTuple):
+    """The curves to fill, over the samples t (n,).
 
-
-@compiled
-def _stress_term(rows: Array, i: int, branch: int, eps: Array, sig: Array, n: int) -> float:
-    """Order n of a spring's stress from its strain up to order n."""
-    if n == 0:
-        return stress_on(rows[i], branch, eps[i, 0])
-    curved, k, x0, _ = branch_shape(rows[i], branch)
-    if not curved:
-        return k * eps[i, n]
-    x = eps[i, 0] - x0
-    known = _product(eps[i], sig[i], n, 1, n)
-    return (k * eps[i, n] + known) / (1.0 - x)
-
-
-@compiled
-def _strain_term(
-    rows: Array, i: int, branch: int, eps: Array, sig: Array, n: int
-) -> tuple[float, float]:
-    """Order n >= 1 of a spring's strain as (known part, compliance): ε_n = known + compliance σ_n.
-
-    The compliance of a flat branch is infinite.
+    w (springs or 1, n) holds the displacements above each spring, or of the top alone, m; s (n,)
+    the base stress, Pa; dw (p, springs or 1, n) and ds (p, n) their derivatives in p directions.
     """
-    curved, k, x0, _ = branch_shape(rows[i], branch)
-    if not curved:
-        return 0.0, (1.0 / k if k > 0.0 else math.inf)
-    stiff = k + sig[i, 0]
-    known = _product(eps[i], sig[i], n, 1, n - 1)
-    return -known / stiff, (1.0 - (eps[i, 0] - x0)) / stiff
+
+    t: Array
+    w: Array
+    s: Array
+    dw: Array
+    ds: Array
 
 
-@compiled
-def _share_elongation(
-    rows: Array,
-    branches: Branches,
-    heights: Array,
-    i0: int,
-    i1: int,
-    eps: Array,
-    sig: Array,
-    u_n: float,
-    n: int,
-) -> float:
-    """Order n >= 1 of the common stress of a group that has springs without dashpot.
-
-    Fills the strains of those springs; a flat branch takes up all that the others leave.
-    """
-    compliance = 0.0
-    flat = -1
-    rest = u_n
-    for i in range(i0, i1):
-        if rows[i, ETA] > 0.0:
-            rest -= heights[i] * eps[i, n]
-            continue
-        known, soft = _strain_term(rows, i, branches[i], eps, sig, n)
-        rest -= heights[i] * known
-        if soft == math.inf:
-            if flat < 0:
-                flat = i
-        else:
-            compliance += heights[i] * soft
-    s_n = 0.0 if flat >= 0 else rest / compliance
-    for i in range(i0, i1):
-        if rows[i, ETA] == 0.0:
-            known, soft = _strain_term(rows, i, branches[i], eps, sig, n)
-            eps[i, n] = known + (0.0 if soft == math.inf else soft * s_n)
-            sig[i, n] = s_n
-    if flat >= 0:
-        eps[flat, n] = rest / heights[flat]
-    return s_n
-
-
-@compiled
-def _group_term(
-    rows: Array,
-    branches: Branches,
-    heights: Array,
-    i0: int,
-    i1: int,
-    eps: Array,
-    sig: Array,
-    u_n: float,
-    rate_n: float,
-    push_n: float,
-    drag: float,
-    n: int,
-) -> float:
-    """Order n of the common stress of a group whose elongation is known.
-
-    u_n and rate_n are order n of the elongation and of its rate. Where the node above is viscous
-    (drag > 0), rate_n leaves out that node, whose rate is (push - stress)/drag.
-    """
-    damped = 0
-    for i in range(i0, i1):
-        damped += rows[i, ETA] > 0.0
-    if i1 - i0 == 1 and n > 0:
-        eps[i0, n] = u_n / heights[i0]
-    if i1 - i0 == 1 or n == 0 or damped == i1 - i0:
-        for i in range(i0, i1):
-            sig[i, n] = _stress_term(rows, i, branches[i], eps, sig, n)
-    if damped == 0 and i1 - i0 == 1:
-        return sig[i0, n]
-    if damped == i1 - i0:
-        total = rate_n
-        weight = 0.0
-        for i in range(i0, i1):
-            total += heights[i] * sig[i, n] / rows[i, ETA]
-            weight += heights[i] / rows[i, ETA]
-        if drag > 0.0:
-            total += push_n / drag
-            weight += 1.0 / drag
-        return total / weight
-    if n == 0:
-        for i in range(i0, i1):
-            if rows[i, ETA] == 0.0:
-                return sig[i, 0]
-    for i in range(i0, i1):
-        if rows[i, ETA] > 0.0:
-            sig[i, n] = _stress_term(rows, i, branches[i], eps, sig, n)
-    return _share_elongation(rows, branches, heights, i0, i1, eps, sig, u_n, n)
-
-
-@compiled
-def _stressed_term(
-    rows: Array, branches: Branches, i0: int, i1: int, eps: Array, sig: Array, s_n: float, n: int
-) -> bool:
-    """Order n of the strains of a group whose stress is prescribed; false if it cannot be."""
-    for i in range(i0, i1):
-        if rows[i, ETA] > 0.0 or n == 0:
-            sig[i, n] = _stress_term(rows, i, branches[i], eps, sig, n)
-            continue
-        known, soft = _strain_term(rows, i, branches[i], eps, sig, n)
-        if soft == math.inf:
-            return False
-        eps[i, n] = known + soft * s_n
-        sig[i, n] = s_n
-    return True
-
-
-@compiled
-def _expand(
-    rows: Array,
-    branches: Branches,
-    heights: Array,
-    ends: Branches,
-    mass: Array,
-    top: int,
-    drag: float,
-    push: Array,
-    motion: Array,
-    w: Array,
-    v: Array,
-    eps: Array,
-    sig: Array,
-    group: Array,
-    order: int,
-) -> bool:
-    """Fill the Taylor coefficients of all that moves, up to `order`; false if it cannot be.
-
-    w, v (groups, order + 2) hold the nodes above the groups, eps and sig (springs, order + 1) the
-    springs, group (groups, order + 1) the common stresses. Order 0 of w, v and eps is the state.
-    `push` (2,) is the stress on the top and its rate, `motion` (2,) its displacement and rate.
-    """
-    last = ends.size - 1
-    for n in range(order + 1):
-        push_n = push[n] if n < 2 else 0.0
-        if top == MOTION:
-            w[last, n] = motion[n] if n < 2 else 0.0
-            v[last, n] = motion[1] if n == 0 else 0.0
-        i0 = 0
-        for g in range(last + 1):
-            i1 = ends[g]
-            if g == last and top == STRESS:
-                group[g, n] = push_n
-                if not _stressed_term(rows, branches, i0, i1, eps, sig, push_n, n):
-                    return False
-            else:
-                u_n = w[g, n] - (w[g - 1, n] if g > 0 else 0.0)
-                viscous = g == last and top == VISCOUS
-                rate_n = (0.0 if viscous else v[g, n]) - (v[g - 1, n] if g > 0 else 0.0)
-                group[g, n] = _group_term(
-                    rows, branches, heights, i0, i1, eps, sig, u_n, rate_n,
-                    push_n, drag if viscous else 0.0, n,
-                )  # fmt: skip
-            if i1 - i0 > 1 or (g == last and top == STRESS):
-                for i in range(i0, i1):
-                    if rows[i, ETA] > 0.0:
-                        eps[i, n + 1] = (group[g, n] - sig[i, n]) / (rows[i, ETA] * (n + 1))
-            i0 = i1
-        for g in range(last + 1):
-            if g < last or top == FREE:
-                net = (group[g + 1, n] if g < last else push_n - drag * v[g, n]) - group[g, n]
-                v[g, n + 1] = net / (mass[g] * (n + 1))
-                w[g, n + 1] = v[g, n] / (n + 1)
-            elif top == VISCOUS:
-                v[g, n] = (push_n - group[g, n]) / drag
-                w[g, n + 1] = v[g, n] / (n + 1)
-    return True
+# ---------------------------------------------------------------- the length of a step
 
 
 @compiled
@@ -261,69 +88,133 @@ def _longest(c: Array, order: int, scale: float, tol: float, span: float) -> flo
 
 @compiled
 def _step_length(
-    heights: Array,
-    w: Array,
-    eps: Array,
-    sig: Array,
+    links: Links,
+    s: Series,
     push: Array,
     order: int,
     tol: float,
     span: float,
     w_scale: float,
     s_scale: float,
-    top: int,
 ) -> float:
     """Longest step within `span` that truncates below `tol` of the motion and stress so far."""
     reach = w_scale
     load = max(s_scale, abs(push[0]))
+    count = links.heights.size
     for _ in range(60):  # at rest the only scale is what the step itself reaches
         tried = span
         if w_scale == 0.0 or s_scale == 0.0:
-            reach = max(w_scale, abs(w[-1, 1]) * span if top != STRESS else 0.0)
+            reach = max(w_scale, abs(s.w[-1, 1]) * span if links.top != STRESS else 0.0)
             load = max(s_scale, max(abs(push[0]), abs(push[1]) * span))
-            for i in range(heights.size):
-                reach = max(reach, heights[i] * abs(eps[i, 1]) * span)
-                load = max(load, abs(sig[i, 1]) * span)
+            for i in range(count):
+                reach = max(reach, links.heights[i] * abs(s.eps[i, 1]) * span)
+                load = max(load, abs(s.sig[i, 1]) * span)
         if reach == 0.0 and load == 0.0:
             return span
-        for i in range(heights.size):
+        for i in range(count):
             if reach > 0.0:
-                span = _longest(eps[i], order, reach / heights[i], tol, span)
+                span = _longest(s.eps[i], order, reach / links.heights[i], tol, span)
             if load > 0.0:
-                span = _longest(sig[i], order, load, tol, span)
+                span = _longest(s.sig[i], order, load, tol, span)
         if span >= 0.5 * tried or (w_scale > 0.0 and s_scale > 0.0):
             break
     return span
 
 
 @compiled
+def _first_switch(links: Links, s: Series, order: int, span: float) -> tuple[float, int, int]:
+    """First switch of branch within `span`: when, which spring (-1: none), on which side."""
+    spring, side = -1, 0
+    for i in range(links.heights.size):
+        when, where = first_crossing(s.eps[i], order, links.law[i, LOW], links.law[i, HIGH], span)
+        if where != 0 and (spring < 0 or when < span):
+            span, spring, side = when, i, where
+    return span, spring, side
+
+
+# ---------------------------------------------------------------- samples
+
+
+@compiled
 def _sample(
-    heights: Array,
-    ends: Branches,
+    links: Links, s: Series, order: int, out: Samples, first: int, last: int, now: float, c: Array
+) -> None:
+    """Write displacements and base stress at the samples first … last-1 of a step; c is scratch."""
+    if first == last:
+        return
+    fill_values(s.group[0], order, out.t, first, last, now, out.s)
+    if out.w.shape[0] == 1 and links.top != STRESS:
+        fill_values(s.w[links.ends.size - 1], order, out.t, first, last, now, out.w[0])
+        return
+    for n in range(order + 1):
+        c[n] = 0.0
+    count = links.heights.size
+    for i in range(count):
+        for n in range(order + 1):
+            c[n] += links.heights[i] * s.eps[i, n]
+        if out.w.shape[0] > 1 or i == count - 1:
+            fill_values(c, order, out.t, first, last, now, out.w[min(i, out.w.shape[0] - 1)])
+
+
+@compiled
+def _fill_tangent(
+    c: Array, order: int, t: Array, first: int, last: int, now: float, out: Array
+) -> None:
+    """Write the polynomial c at some samples; zeros where it is zero."""
+    for n in range(order + 1):
+        if c[n] != 0.0:
+            fill_values(c, order, t, first, last, now, out)
+            return
+    for j in range(first, last):
+        out[j] = 0.0
+
+
+@compiled
+def _sample_tangents(
+    links: Links,
+    s: Series,
+    d: Tangents,
     order: int,
-    t: Array,
+    out: Samples,
     first: int,
     last: int,
     now: float,
-    w: Array,
-    eps: Array,
-    group: Array,
-    top: int,
-    out_w: Array,
-    out_s: Array,
+    c: Array,
 ) -> None:
-    """Write displacements and base stress at the samples first … last-1 of a step."""
-    out_s[first:last] = 0.0
-    add_values(group[0], order, t, first, last, now, 1.0, out_s)
-    out_w[:, first:last] = 0.0
-    if out_w.shape[0] == 1 and top != STRESS:
-        add_values(w[ends.size - 1], order, t, first, last, now, 1.0, out_w[0])
+    """Write the derivatives of displacements and base stress at some samples of a step."""
+    if first == last:
         return
-    for i in range(heights.size):
-        node = min(i, out_w.shape[0] - 1)
-        if node > 0:
-            out_w[node, first:last] = out_w[node - 1, first:last]
-        add_values(eps[i], order, t, first, last, now, heights[i], out_w[node])
+    nodes, count = out.w.shape[0], links.heights.size
+    top = links.ends.size - 1
+    for p in range(d.drag.size):
+        for n in range(order + 1):
+            c[n] = d.group[0, n, p]
+        _fill_tangent(c, order, out.t, first, last, now, out.ds[p])
+        if nodes == 1 and links.top != STRESS:
+            for n in range(order + 1):
+                c[n] = d.w[top, n, p]
+            _fill_tangent(c, order, out.t, first, last, now, out.dw[p, 0])
+            continue
+        for n in range(order + 1):
+            c[n] = 0.0
+        for i in range(count):
+            for n in range(order + 1):
+                c[n] += links.heights[i] * d.eps[i, n, p] + d.heights[i, p] * s.eps[i, n]
+            if nodes > 1 or i == count - 1:
+                _fill_tangent(c, order, out.t, first, last, now, out.dw[p, min(i, nodes - 1)])
+
+
+@compiled
+def _mend_kink(out: Samples, s: Series, d: Tangents, knot: int) -> None:
+    """A dashpot feels the mean rate where the prescribed motion has a kink."""
+    before, after = out.t[knot] - out.t[knot - 1], out.t[knot + 1] - out.t[knot]
+    share = before / (before + after)
+    out.s[knot] += share * (s.group[0, 0] - out.s[knot])
+    for p in range(d.drag.size):
+        out.ds[p, knot] += share * (d.group[0, 0, p] - out.ds[p, knot])
+
+
+# ---------------------------------------------------------------- the end of contact
 
 
 @compiled
@@ -331,46 +222,99 @@ def fly(
     out_w: Array, out_s: Array, t: Array, first: int, t_end: float, w_end: Array, speed: float
 ) -> None:
     """After contact the chain keeps its shape and moves with the striker; nothing presses."""
+    for i in range(out_w.shape[0]):
+        for j in range(first, t.size):
+            out_w[i, j] = w_end[i] + speed * (t[j] - t_end)
     for j in range(first, t.size):
         out_s[j] = 0.0
-        for i in range(out_w.shape[0]):
-            out_w[i, j] = w_end[i] + speed * (t[j] - t_end)
 
 
 @compiled
-def _settle(
-    rows: Array,
-    branches: Branches,
-    heights: Array,
-    ends: Branches,
-    w: Array,
-    eps: Array,
-    top: int,
-    push0: float,
+def _delay(s: Series, d: Tangents, order: int, span: float, late: Array) -> None:
+    """Derivative of the time at which the base stress meets zero at the end of a step."""
+    fall = slope_at(s.group[0], order, span)
+    if fall == 0.0:
+        return
+    for p in range(late.size):
+        total = d.group[0, order, p]
+        for n in range(order - 1, -1, -1):
+            total = total * span + d.group[0, n, p]
+        late[p] = -total / fall
+
+
+@compiled
+def _depart(
+    links: Links,
+    s: Series,
+    d: Tangents,
+    order: int,
+    span: float,
+    now: float,
+    late: Array,
+    out: Samples,
+    done: int,
 ) -> None:
+    """Fill the samples after contact, which ends at the end of this step, at the time `now`.
+
+    A later end (`late`) leaves the nodes as they move until then, and the top with the velocity
+    that it has then.
+    """
+    nodes, count, top = out.w.shape[0], links.heights.size, links.ends.size - 1
+    pull = slope_at(s.v[top], order, span)
+    rate = np.zeros(nodes)
+    speed = 0.0
+    for i in range(count):
+        speed += links.heights[i] * slope_at(s.eps[i], order, span)
+        rate[min(i, nodes - 1)] = speed
+    advance(s, d, order, span)
+    w_end = np.zeros(nodes)
+    place = 0.0
+    for i in range(count):
+        place += links.heights[i] * s.eps[i, 0]
+        w_end[min(i, nodes - 1)] = place
+    fly(out.w, out.s, out.t, done, now, w_end, s.v[top, 0])
+    for p in range(late.size):
+        away = d.v[top, 0, p] + pull * late[p]
+        moved = 0.0
+        for i in range(count):
+            moved += links.heights[i] * d.eps[i, 0, p] + d.heights[i, p] * s.eps[i, 0]
+            if nodes > 1 or i == count - 1:
+                node = min(i, nodes - 1)
+                there = moved + (rate[node] - s.v[top, 0]) * late[p]
+                for j in range(done, out.t.size):
+                    out.dw[p, node, j] = there + away * (out.t[j] - now)
+        for j in range(done, out.t.size):
+            out.ds[p, j] = 0.0
+
+
+# ---------------------------------------------------------------- the state between steps
+
+
+@compiled
+def _settle(links: Links, s: Series) -> None:
     """Share the elongation of undamped groups anew, so that rounding does not pile up."""
     i0 = 0
-    for g in range(ends.size):
-        i1 = ends[g]
-        plain = i1 - i0 > 1 and not (g == ends.size - 1 and top == STRESS)
+    for g in range(links.ends.size):
+        i1 = links.ends[g]
+        plain = i1 - i0 > 1 and not (g == links.ends.size - 1 and links.top == STRESS)
+        compliance = 0.0
+        miss = s.w[g, 0] - (s.w[g - 1, 0] if g > 0 else 0.0)
         for i in range(i0, i1):
-            plain = plain and rows[i, ETA] == 0.0
+            slope = _slope_now(links.law, i, s.eps[i, 0])
+            plain = plain and links.eta[i] == 0.0 and slope > 0.0
+            compliance += links.heights[i] / slope
+            miss -= links.heights[i] * s.eps[i, 0]
         if plain:
-            u = w[g, 0] - (w[g - 1, 0] if g > 0 else 0.0)
-            compliance = 0.0
-            miss = u
             for i in range(i0, i1):
-                slope = slope_on(rows[i], branches[i], eps[i, 0])
-                if slope == 0.0:
-                    plain = False
-                    break
-                compliance += heights[i] / slope
-                miss -= heights[i] * eps[i, 0]
-            if plain:
-                for i in range(i0, i1):
-                    slope = slope_on(rows[i], branches[i], eps[i, 0])
-                    eps[i, 0] += miss / compliance / slope
+                s.eps[i, 0] += miss / compliance / _slope_now(links.law, i, s.eps[i, 0])
         i0 = i1
+
+
+@compiled
+def _slope_now(law: Array, i: int, eps: float) -> float:
+    """Slope dσ/dε on the branch that spring i is on."""
+    k, y = law[i, SLOPE], 1.0 - (eps - law[i, ORIGIN])
+    return k / (y * y) if law[i, CURVED] != 0.0 else k
 
 
 @compiled
@@ -395,12 +339,54 @@ def start(
             branches[i0] = branch_at_strain(rows[i0], branches[i0], now[0])
         else:
             equilibrate(rows[i0:i1], branches[i0:i1], heights[i0:i1], value, 0.0, now)
-        eps[i0:i1, 0] = now
+        for i in range(i0, i1):
+            eps[i, 0] = now[i - i0]
     elif top == STRESS:
         for i in range(i0, i1):
             if rows[i, ETA] == 0.0:
                 branches[i] = branch_at_stress(rows[i], branches[i], value)
                 eps[i, 0] = strain_on(rows[i], branches[i], value)
+
+
+@compiled
+def _switch(
+    rows: Array,
+    branches: Branches,
+    links: Links,
+    s: Series,
+    d: Tangents,
+    directions: Branches,
+    order: int,
+    span: float,
+    now: float,
+    spring: int,
+    side: int,
+    log: Array,
+    switches: int,
+) -> int:
+    """Change the branch of a spring, and of all that end theirs at the same time; counts them."""
+    for i in range(branches.size):
+        low, high = links.law[i, LOW], links.law[i, HIGH]
+        out = 0
+        if i == spring:
+            out = side
+        elif s.eps[i, 0] >= high - CLOSE and slope_at(s.eps[i], order, span) > 0.0:
+            out = 1
+        elif s.eps[i, 0] <= low + CLOSE and slope_at(s.eps[i], order, span) < 0.0:
+            out = -1
+        if out == 0:
+            continue
+        entered = above(branches[i]) if out > 0 else below(branches[i])
+        s.eps[i, 0] = high if out > 0 else low
+        if switches < log.shape[0]:
+            log[switches, 0], log[switches, 1] = now, i
+            log[switches, 2], log[switches, 3] = branches[i], entered
+            log[switches, 4] = s.eps[i, 0]
+        switches += 1
+        branches[i] = entered
+        enter(rows, i, entered, links.law)
+        enter_tangents(rows, i, entered, directions, d)
+    return switches
 
 
 @compiled
@@ -417,8 +403,11 @@ def integrate(
     tol: float,
     order: int,
     max_steps: int,
+    directions: Branches,
     out_w: Array,
     out_s: Array,
+    out_dw: Array,
+    out_ds: Array,
     log: Array,
 ) -> tuple[int, float, int, int]:
     """Integrate a chain from rest (or struck) over the samples t.
@@ -445,10 +434,10 @@ def integrate(
         Samples, s; an impact starts at 0, every other drive at t[0].
     tol, order, max_steps
         Truncation of a step relative to the motion so far; order of the series; bound on steps.
-    out_w : (springs or 1, n) array
-        Filled with the displacement above each spring, or of the top alone, m.
-    out_s : (n,) array
-        Filled with the base stress, Pa.
+    directions : (p, 2) array
+        What derivatives are carried along: spring and its own parameter, or HEIGHT, or -1 and DRAG.
+    out_w, out_s, out_dw, out_ds : arrays
+        Filled; see `Samples`. The derivatives have p = 0 where none are wanted.
     log : (m, 5) array
         Filled with the switches: time, spring, branch left, branch entered, strain.
 
@@ -458,106 +447,115 @@ def integrate(
         Outcome, end of contact (NaN if none), steps taken, switches (also those past the log).
     """
     count, groups = rows.shape[0], ends.size
-    w, v = np.zeros((groups, order + 2)), np.zeros((groups, order + 2))
-    eps, sig = np.zeros((count, order + 2)), np.zeros((count, order + 1))
-    group = np.zeros((groups, order + 1))
+    out = Samples(t, out_w, out_s, out_dw, out_ds)
+    links = Links(np.empty((count, N_LAW)), np.empty(count), heights, ends, mass, drag, top)
+    s = make_series(count, groups, order)
+    d = make_tangents(count, groups, order, directions)
+    tangent = directions.shape[0] > 0
     branches = np.empty(count, np.int64)
-    push, motion = np.zeros(2), np.zeros(2)
+    push, motion, scratch = np.zeros(2), np.zeros(2), np.zeros(order + 1)
+    late = np.zeros(directions.shape[0])
     for i in range(count):
         branches[i] = first_branch(rows[i])
+        links.eta[i] = rows[i, ETA]
     struck = speed > 0.0
     now = 0.0 if struck else t[0]
     done = 0
     while struck and done < t.size and t[done] < 0.0:  # the striker is still on its way
-        out_s[done] = 0.0
-        for i in range(out_w.shape[0]):
-            out_w[i, done] = speed * t[done] if i == out_w.shape[0] - 1 else 0.0
+        out_w[-1, done] = speed * t[done]
         done += 1
-    v[groups - 1, 0] = speed
+    _fill_before(out, done)
+    s.v[groups - 1, 0] = speed
     if not struck:
-        start(rows, branches, heights, ends, top, values[0], w, eps)
+        start(rows, branches, heights, ends, top, values[0], s.w, s.eps)
+    for i in range(count):
+        enter(rows, i, branches[i], links.law)
+        enter_tangents(rows, i, branches[i], directions, d)
+    if tangent and top == MOTION:
+        start_tangents(links, s, d)
     w_scale, s_scale, pressed, knot, switches = 0.0, 0.0, False, 0, 0
-    contact_end = math.nan
     stalled = 0
     fresh = False
     for step in range(max_steps):
         if done == t.size:
-            return DONE, contact_end, step, switches
+            return DONE, math.nan, step, switches
         horizon = t[t.size - 1]
-        if not struck and t.size > 1:
+        if not struck:
             fresh = False
             while knot < t.size - 2 and now >= t[knot + 1]:
                 knot += 1
                 fresh = True
-            horizon = t[knot + 1]
-            rate = (values[knot + 1] - values[knot]) / (t[knot + 1] - t[knot])
+            rate = 0.0
+            if t.size > 1:
+                horizon = t[knot + 1]
+                rate = (values[knot + 1] - values[knot]) / (t[knot + 1] - t[knot])
             driven = motion if top == MOTION else push
             driven[0], driven[1] = values[knot] + rate * (now - t[knot]), rate
-        if not _expand(
-            rows, branches, heights, ends, mass, top, drag, push, motion,
-            w, v, eps, sig, group, order,
-        ):  # fmt: skip
-            return FLAT_UNDER_STRESS, contact_end, step, switches
-        if top == MOTION and knot > 0 and fresh:  # a dashpot feels the kink in the motion
-            before, after = t[knot] - t[knot - 1], t[knot + 1] - t[knot]
-            out_s[knot] = (after * out_s[knot] + before * group[0, 0]) / (before + after)
+        if not expand(links, s, push, motion, order):
+            return FLAT_UNDER_STRESS, math.nan, step, switches
+        if tangent:
+            expand_tangents(links, s, d, order)
+        if top == MOTION and knot > 0 and fresh:
+            _mend_kink(out, s, d, knot)
         span = horizon - now
-        span = _step_length(heights, w, eps, sig, push, order, tol, span, w_scale, s_scale, top)
-        if not math.isfinite(span) or not math.isfinite(group[0, order]):
-            return NOT_FINITE, contact_end, step, switches
-        spring, side = -1, 0
-        for i in range(count):
-            low, high = interval(rows[i], branches[i])
-            when, where = first_crossing(eps[i], order, low, high, span)
-            if where != 0 and (spring < 0 or when < span):
-                span, spring, side = when, i, where
+        span = _step_length(links, s, push, order, tol, span, w_scale, s_scale)
+        if not math.isfinite(span) or not math.isfinite(s.group[0, order]):
+            return NOT_FINITE, math.nan, step, switches
+        span, spring, side = _first_switch(links, s, order, span)
         leaves = False
         if struck:
-            when, where = first_crossing(group[0], order, 0.0, math.inf, span)
-            if pressed and group[0, 0] <= 0.0 and group[0, 1] <= 0.0:
+            when, where = first_crossing(s.group[0], order, 0.0, math.inf, span)
+            if pressed and s.group[0, 0] <= 0.0 and s.group[0, 1] <= 0.0:
                 when, where = 0.0, -1  # a unilateral spring has just opened
-            pressed = pressed or group[0, 0] > 0.0
+            pressed = pressed or s.group[0, 0] > 0.0
             if where != 0 and when <= span and (pressed or when > 0.0):
                 span, leaves, spring = when, True, -1
         end = now + span
-        if end <= now and span > 0.0:
-            return STEP_UNDERFLOW, contact_end, step, switches
         stalled = stalled + 1 if span == 0.0 else 0
-        if stalled > 4 * count + 8:
-            return STEP_UNDERFLOW, contact_end, step, switches
+        if (end <= now and span > 0.0) or stalled > 4 * count + 8:
+            return STEP_UNDERFLOW, math.nan, step, switches
         last = end >= horizon and not leaves and spring < 0
         if last:
             end = horizon
         first = done
         while done < t.size and (t[done] < end or (last and t[done] <= end)):
             done += 1
-        _sample(heights, ends, order, t, first, done, now, w, eps, group, top, out_w, out_s)
-        for g in range(groups):
-            w[g, 0], v[g, 0] = value_at(w[g], order, span), value_at(v[g], order, span)
-        for i in range(count):
-            s_scale = max(s_scale, abs(value_at(sig[i], order, span)))
-            eps[i, 0] = value_at(eps[i], order, span)
-        w_scale = max(w_scale, abs(w[groups - 1, 0]) if top != STRESS else 0.0)
-        for i in range(count):
-            w_scale = max(w_scale, heights[i] * abs(eps[i, 0]))
+        _sample(links, s, order, out, first, done, now, scratch)
+        if tangent:
+            _sample_tangents(links, s, d, order, out, first, done, now, scratch)
+            _delay(s, d, order, span, late)
         now = end
         if leaves:
-            w_end = np.zeros(out_w.shape[0])
-            node = 0.0
-            for i in range(count):
-                node += heights[i] * eps[i, 0]
-                w_end[i if out_w.shape[0] > 1 else 0] = node
-            fly(out_w, out_s, t, done, now, w_end, v[groups - 1, 0])
+            _depart(links, s, d, order, span, now, late, out, done)
             return DONE, now, step + 1, switches
-        _settle(rows, branches, heights, ends, w, eps, top, push[0])
+        for i in range(count):
+            s_scale = max(s_scale, abs(value_at(s.sig[i], order, span)))
+        advance(s, d, order, span)
+        w_scale = max(w_scale, abs(s.w[groups - 1, 0]) if top != STRESS else 0.0)
+        reached = s.w[groups - 1, 0]
+        for i in range(count):
+            w_scale = max(w_scale, heights[i] * abs(s.eps[i, 0]))
+            reached += s.eps[i, 0]
+        if not math.isfinite(reached):
+            return NOT_FINITE, math.nan, step, switches
+        _settle(links, s)
         if spring >= 0:
-            low, high = interval(rows[spring], branches[spring])
-            entered = above(branches[spring]) if side > 0 else below(branches[spring])
-            eps[spring, 0] = high if side > 0 else low
-            if switches < log.shape[0]:
-                log[switches, 0], log[switches, 1] = now, spring
-                log[switches, 2], log[switches, 3] = branches[spring], entered
-                log[switches, 4] = eps[spring, 0]
-            switches += 1
-            branches[spring] = entered
-    return TOO_MANY_STEPS, contact_end, max_steps, switches
+            switches = _switch(
+                rows, branches, links, s, d, directions, order, span, now, spring, side,
+                log, switches,
+            )  # fmt: skip
+    return TOO_MANY_STEPS, math.nan, max_steps, switches
+
+
+@compiled
+def _fill_before(out: Samples, done: int) -> None:
+    """Before contact nothing presses, and nothing but the striker moves."""
+    nodes = out.w.shape[0]
+    for j in range(done):
+        out.s[j] = 0.0
+        for i in range(nodes - 1):
+            out.w[i, j] = 0.0
+        for p in range(out.ds.shape[0]):
+            out.ds[p, j] = 0.0
+            for i in range(nodes):
+                out.dw[p, i, j] = 0.0
