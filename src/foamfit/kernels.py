@@ -21,8 +21,12 @@ Branches = NDArray[np.int64]
 
 # Division by zero gives infinity, as in NumPy; every loop that can meet it says what it does then.
 compiled = njit(cache=True, error_model="numpy")
-# For what is called in the innermost loops.
-inlined = njit(cache=True, error_model="numpy", forceinline=True)
+# For what only other loops call: without the bridge to Python, which takes long to compile; without
+# counting who holds an array, which takes long to run; and with the body put where it is called.
+BRIDGELESS = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+maker = njit(error_model="numpy", **BRIDGELESS)
+inner = njit(error_model="numpy", _nrt=False, **BRIDGELESS)
+inlined = njit(error_model="numpy", _nrt=False, forceinline=True, **BRIDGELESS)
 
 # Columns of a row.
 KIND, K0, KC, EPS_A, EPS_C, KH_PLUS, KH_MINUS, ETA = range(8)

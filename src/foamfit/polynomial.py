@@ -5,10 +5,10 @@ from __future__ import annotations
 
 from numba import njit
 
-from foamfit.kernels import Array, compiled
+from foamfit.kernels import BRIDGELESS, Array, inner
 
 # A product and a sum in one rounding: faster, and no less exact.
-_fused = njit(cache=True, error_model="numpy", fastmath={"contract"})
+_fused = njit(error_model="numpy", fastmath={"contract"}, _nrt=False, **BRIDGELESS)
 
 
 @_fused
@@ -30,7 +30,7 @@ def _value_and_slope(c: Array, order: int, tau: float) -> tuple[float, float]:
     return total, slope
 
 
-@compiled
+@inner
 def slope_at(c: Array, order: int, tau: float) -> float:
     """Return the derivative of a polynomial."""
     return _value_and_slope(c, order, tau)[1]
@@ -43,28 +43,33 @@ def fill_values(
     """Write the polynomial at the times t[first:last] - now to `out`, a block at a time.
 
     The loops over a block hold no dependence from sample to sample, so that they are done four
-    samples at once; three coefficients a pass save reading and writing the block.
+    samples at once; six coefficients a pass save reading and writing the block.
     """
     while first < last:
         end = min(first + 512, last)
         n = order
         for j in range(first, end):
             out[j] = c[n]
-        while n >= 3:
-            high, mid, low = c[n - 1], c[n - 2], c[n - 3]
+        while n >= 6:
+            c1, c2, c3, c4, c5, c6 = c[n - 1], c[n - 2], c[n - 3], c[n - 4], c[n - 5], c[n - 6]
             for j in range(first, end):
                 x = t[j] - now
-                out[j] = ((out[j] * x + high) * x + mid) * x + low
-            n -= 3
-        while n > 0:
-            n -= 1
-            low = c[n]
+                out[j] = (((((out[j] * x + c1) * x + c2) * x + c3) * x + c4) * x + c5) * x + c6
+            n -= 6
+        while n >= 2:
+            c1, c2 = c[n - 1], c[n - 2]
             for j in range(first, end):
-                out[j] = out[j] * (t[j] - now) + low
+                x = t[j] - now
+                out[j] = (out[j] * x + c1) * x + c2
+            n -= 2
+        if n == 1:
+            c1 = c[0]
+            for j in range(first, end):
+                out[j] = out[j] * (t[j] - now) + c1
         first = end
 
 
-@compiled
+@inner
 def _root(c: Array, order: int, level: float, lo: float, hi: float, rising: bool) -> float:
     """Root of polynomial - level in [lo, hi], whose ends lie on either side: guarded Newton."""
     tau = 0.5 * (lo + hi)
@@ -87,7 +92,7 @@ def _root(c: Array, order: int, level: float, lo: float, hi: float, rising: bool
     return tau
 
 
-@compiled
+@inner
 def _turn(c: Array, order: int, lo: float, hi: float) -> float:
     """Bisect for the turning point of a polynomial whose slope changes sign in [lo, hi].
 
@@ -103,7 +108,7 @@ def _turn(c: Array, order: int, lo: float, hi: float) -> float:
     return 0.5 * (lo + hi)
 
 
-@compiled
+@inner
 def first_crossing(c: Array, order: int, low: float, high: float, span: float) -> tuple[float, int]:
     """First time in [0, span] at which a polynomial leaves [low, high], and the side (-1, 0, 1).
 

@@ -36,10 +36,11 @@ from foamfit.kernels import (
     branch_shape,
     compiled,
     inlined,
+    inner,
     interval,
+    maker,
 )
 from foamfit.law import BISTABLE
-from foamfit.polynomial import value_at
 
 # What is known of the top node.
 FREE, VISCOUS, STRESS, MOTION = range(4)
@@ -84,9 +85,10 @@ class Series(NamedTuple):
 
 
 class Tangents(NamedTuple):
-    """Derivatives of `Links` and `Series` in p directions: the same shapes with an axis p behind.
+    """Derivatives of `Links` and `Series` in p directions: the same shapes with an axis p in front.
 
-    law (springs, 3, p) holds those of k, x0 and s0, and slope (springs, order + 1) the series T.
+    law (p, springs, 3) holds those of k, x0 and s0; `drag` is (p,). slope (springs, order + 1) is
+    the series T of all directions, `live` (p,) tells which directions have left zero.
     """
 
     law: Array
@@ -99,9 +101,28 @@ class Tangents(NamedTuple):
     sig: Array
     group: Array
     slope: Array
+    live: Branches
 
 
-@compiled
+class Moves(NamedTuple):
+    """One direction of derivatives: those of the branches, dashpots, heights and damping."""
+
+    law: Array
+    eta: Array
+    heights: Array
+    drag: float
+
+
+@inner
+def direction(t: Tangents, p: int) -> tuple[Moves, Series]:
+    """What moves in direction p, and its series."""
+    return (
+        Moves(t.law[p], t.eta[p], t.heights[p], t.drag[p]),
+        Series(t.w[p], t.v[p], t.eps[p], t.sig[p], t.group[p]),
+    )
+
+
+@inner
 def enter(rows: Array, i: int, branch: int, law: Array) -> None:
     """Write the branch that spring i enters."""
     curved, law[i, SLOPE], law[i, ORIGIN], law[i, OFFSET] = branch_shape(rows[i], branch)
@@ -109,7 +130,7 @@ def enter(rows: Array, i: int, branch: int, law: Array) -> None:
     law[i, LOW], law[i, HIGH] = interval(rows[i], branch)
 
 
-@compiled
+@inner
 def branch_derivative(row: Row, branch: int, own: int) -> tuple[float, float, float]:
     """Derivatives of (k, x0, s0) of a branch of eq. 2 by a spring's own parameter k0 … kh_minus."""
     if row[KIND] != BISTABLE or branch == A:
@@ -128,18 +149,18 @@ def branch_derivative(row: Row, branch: int, own: int) -> tuple[float, float, fl
     return d_kc, d_eps_star, 0.0
 
 
-@compiled
-def enter_tangents(
-    rows: Array, i: int, branch: int, directions: Branches, tangents: Tangents
-) -> None:
+@inner
+def enter_tangents(rows: Array, i: int, branch: int, directions: Branches, d: Tangents) -> None:
     """Write the derivatives of the branch that spring i enters."""
     for p in range(directions.shape[0]):
         if directions[p, 0] == i and directions[p, 1] < OWN_ETA:
             dk, dx0, ds0 = branch_derivative(rows[i], branch, directions[p, 1])
-            tangents.law[i, 0, p], tangents.law[i, 1, p], tangents.law[i, 2, p] = dk, dx0, ds0
+            d.law[p, i, 0], d.law[p, i, 1], d.law[p, i, 2] = dk, dx0, ds0
+            if dk != 0.0 or dx0 != 0.0 or ds0 != 0.0:
+                d.live[p] = 1
 
 
-@compiled
+@maker
 def make_series(count: int, groups: int, order: int) -> Series:
     """Make series of zeros."""
     return Series(
@@ -151,35 +172,42 @@ def make_series(count: int, groups: int, order: int) -> Series:
     )
 
 
-@compiled
+@maker
 def make_tangents(count: int, groups: int, order: int, directions: Branches) -> Tangents:
     """Make derivatives of a chain at rest; those of the branches are still to be entered."""
     p = directions.shape[0]
-    some = count if p > 0 else 0
-    tangents = Tangents(
-        np.zeros((some, 3, p)),
-        np.zeros((some, p)),
-        np.zeros((some, p)),
+    d = Tangents(
+        np.zeros((p, count, 3)),
+        np.zeros((p, count)),
+        np.zeros((p, count)),
         np.zeros(p),
-        np.zeros((groups, order + 2, p)),
-        np.zeros((groups, order + 2, p)),
-        np.zeros((some, order + 2, p)),
-        np.zeros((some, order + 1, p)),
-        np.zeros((groups, order + 1, p)),
-        np.zeros((some, order + 1)),
+        np.zeros((p, groups, order + 2)),
+        np.zeros((p, groups, order + 2)),
+        np.zeros((p, count, order + 2)),
+        np.zeros((p, count, order + 1)),
+        np.zeros((p, groups, order + 1)),
+        np.zeros((count if p > 0 else 0, order + 1)),
+        np.zeros(p, np.int64),
     )
     for q in range(p):
         i, what = directions[q, 0], directions[q, 1]
+        d.live[q] = what >= OWN_ETA
         if what == OWN_ETA:
-            tangents.eta[i, q] = 1.0
+            d.eta[q, i] = 1.0
         elif what == HEIGHT:
-            tangents.heights[i, q] = 1.0
+            d.heights[q, i] = 1.0
         elif what == DRAG:
-            tangents.drag[q] = 1.0
-    return tangents
+            d.drag[q] = 1.0
+    return d
 
 
 # ---------------------------------------------------------------- the motion
+
+
+@inner
+def springs_of(ends: Branches, g: int) -> tuple[int, int]:
+    """First spring of a group, and one past its last."""
+    return ends[g - 1] if g > 0 else np.int64(0), ends[g]
 
 
 @inlined
@@ -216,7 +244,7 @@ def _strain_term(law: Array, i: int, eps: Array, sig: Array, n: int) -> tuple[fl
     return -known / stiff, (1.0 - (eps[i, 0] - law[i, ORIGIN])) / stiff
 
 
-@compiled
+@inner
 def _share_elongation(
     law: Array,
     eta: Array,
@@ -323,7 +351,7 @@ def _group_term(
     return _share_elongation(law, eta, heights, i0, i1, eps, sig, u_n, n)
 
 
-@compiled
+@inner
 def _stressed_term(
     law: Array, eta: Array, i0: int, i1: int, eps: Array, sig: Array, s_n: float, n: int
 ) -> bool:
@@ -340,7 +368,7 @@ def _stressed_term(
     return True
 
 
-@compiled
+@inner
 def expand(links: Links, s: Series, push: Array, motion: Array, order: int) -> bool:
     """Fill the series up to `order`; false if a prescribed stress meets a flat branch.
 
@@ -354,9 +382,8 @@ def expand(links: Links, s: Series, push: Array, motion: Array, order: int) -> b
         if top == MOTION:
             w[last, n] = motion[n] if n < 2 else 0.0
             v[last, n] = motion[1] if n == 0 else 0.0
-        i0 = 0
         for g in range(last + 1):
-            i1 = ends[g]
+            i0, i1 = springs_of(ends, g)
             stressed = g == last and top == STRESS
             if stressed:
                 group[g, n] = push_n
@@ -376,11 +403,12 @@ def expand(links: Links, s: Series, push: Array, motion: Array, order: int) -> b
                 for i in range(i0, i1):
                     if eta[i] > 0.0:
                         eps[i, n + 1] = (group[g, n] - sig[i, n]) / (eta[i] * (n + 1))
-            i0 = i1
         for g in range(last + 1):
             if g < last or top == FREE:
-                above = group[g + 1, n] if g < last else push_n - drag * v[g, n]
-                v[g, n + 1] = (above - group[g, n]) / (mass[g] * (n + 1))
+                net = (group[g + 1, n] if g < last else push_n) - group[g, n]
+                if g == last and drag > 0.0:
+                    net -= drag * v[g, n]
+                v[g, n + 1] = net / (mass[g] * (n + 1))
                 w[g, n + 1] = v[g, n] / (n + 1)
             elif top == VISCOUS:
                 v[g, n] = (push_n - group[g, n]) / drag
@@ -391,11 +419,12 @@ def expand(links: Links, s: Series, push: Array, motion: Array, order: int) -> b
 # ---------------------------------------------------------------- its derivatives
 
 
-@compiled
-def _fill_slope(law: Array, i: int, sig: Array, order: int, slope: Array) -> None:
+@inner
+def _fill_slope(law: Array, i: int, sig: Array, slope: Array) -> None:
     """Series T of dσ/dε of a spring: k on a straight branch, (k + σ)²/k on a curved one."""
     k = law[i, SLOPE]
     slope[i, 0] = k
+    order = slope.shape[1] - 1
     if law[i, CURVED] == 0.0:
         for n in range(1, order + 1):
             slope[i, n] = 0.0
@@ -406,197 +435,181 @@ def _fill_slope(law: Array, i: int, sig: Array, order: int, slope: Array) -> Non
         slope[i, n] = (2.0 * stiff * sig[i, n] + _product(sig, sig, i, n, 1, n - 1)) / k
 
 
-@compiled
-def _known_tangent(links: Links, s: Series, d: Tangents, i: int, n: int) -> None:
-    """Order n of δσ of a spring, written to d.sig, but for the term T_0 δε_n."""
-    law, out = links.law, d.sig[i, n]
+@inlined
+def _known_tangent(
+    links: Links, s: Series, slope: Array, m: Moves, eps: Array, i: int, n: int
+) -> float:
+    """Order n of δσ of a spring, but for the term T_0 δε_n."""
+    law = links.law
+    known = -slope[i, n] * m.law[i, 1]
     if law[i, CURVED] == 0.0:
-        factor = s.eps[i, n] - (law[i, ORIGIN] if n == 0 else 0.0)
+        known += (s.eps[i, n] - (law[i, ORIGIN] if n == 0 else 0.0)) * m.law[i, 0]
+        known += m.law[i, 2] if n == 0 else 0.0
     else:
-        factor = s.sig[i, n] / law[i, SLOPE]
-    # a dashpot of zero adds to the stress what it would take
-    flow = (n + 1) * s.eps[i, n + 1] if links.eta[i] == 0.0 and n + 1 < d.slope.shape[1] else 0.0
-    for p in range(out.size):
-        out[p] = factor * d.law[i, 0, p] - d.slope[i, n] * d.law[i, 1, p] + flow * d.eta[i, p]
-    if n == 0:
-        for p in range(out.size):
-            out[p] += d.law[i, 2, p]
-    if law[i, CURVED] != 0.0:
+        known += s.sig[i, n] / law[i, SLOPE] * m.law[i, 0]
         for j in range(n):
-            slope = d.slope[i, n - j]
-            for p in range(out.size):
-                out[p] += slope * d.eps[i, j, p]
+            known += slope[i, n - j] * eps[i, j]
+    if links.eta[i] == 0.0 and n + 1 < slope.shape[1]:  # a dashpot of zero adds what it would take
+        known += (n + 1) * s.eps[i, n + 1] * m.eta[i]
+    return known
 
 
-@compiled
-def _share_tangent(links: Links, s: Series, d: Tangents, g: int, i0: int, i1: int, n: int) -> None:
-    """Order n of δε, δσ of the springs without dashpot in a group, and of the common stress.
+@inner
+def _share_tangent(
+    links: Links, slope: Array, d: Series, i0: int, i1: int, rest: float, n: int
+) -> float:
+    """Order n of the derivative of a group's stress, where some springs have no dashpot.
 
-    The known parts of their δσ must be in d.sig, and the rest of the elongation in d.group.
+    `rest` is that of the elongation, but for the moves of the springs. Fills their δε and δσ, whose
+    known parts must be in d.sig.
     """
     compliance, flat = 0.0, -1
-    rest = d.group[g, n]
     for i in range(i0, i1):
         if links.eta[i] > 0.0:
-            for p in range(rest.size):
-                rest[p] -= links.heights[i] * d.eps[i, n, p]
-        elif d.slope[i, 0] > 0.0:
-            compliance += links.heights[i] / d.slope[i, 0]
-            for p in range(rest.size):
-                rest[p] += links.heights[i] / d.slope[i, 0] * d.sig[i, n, p]
+            rest -= links.heights[i] * d.eps[i, n]
+        elif slope[i, 0] > 0.0:
+            compliance += links.heights[i] / slope[i, 0]
+            rest += links.heights[i] / slope[i, 0] * d.sig[i, n]
         elif flat < 0:
             flat = i
-    for p in range(rest.size):
-        left = rest[p]
-        common = d.sig[flat, n, p] if flat >= 0 else left / compliance
-        for i in range(i0, i1):
-            if links.eta[i] == 0.0 and i != flat:
-                known = d.sig[i, n, p]
-                soft = 1.0 / d.slope[i, 0] if d.slope[i, 0] > 0.0 else 0.0
-                d.eps[i, n, p] = (common - known) * soft
-                left -= links.heights[i] * common * soft
-                d.sig[i, n, p] = common
-        if flat >= 0:
-            d.eps[flat, n, p] = left / links.heights[flat]
-        rest[p] = common
+    common = d.sig[flat, n] if flat >= 0 else rest / compliance
+    for i in range(i0, i1):
+        if links.eta[i] == 0.0 and i != flat:
+            soft = 1.0 / slope[i, 0] if slope[i, 0] > 0.0 else 0.0
+            d.eps[i, n] = (common - d.sig[i, n]) * soft
+            d.sig[i, n] = common
+    if flat >= 0:  # the flat branch takes up all that the others leave
+        d.eps[flat, n] = (rest - common * compliance) / links.heights[flat]
+    return common
 
 
-@compiled
+@inner
 def _damped_tangent(
-    links: Links, s: Series, d: Tangents, g: int, i0: int, i1: int, viscous: bool, n: int
-) -> None:
-    """Order n of the derivative of `_damped_term`, written to d.group."""
-    out = d.group[g, n]
-    weight = 1.0 / links.drag if viscous else 0.0
-    for p in range(out.size):
-        out[p] = 0.0 if viscous else d.v[g, n, p]
-        if g > 0:
-            out[p] -= d.v[g - 1, n, p]
-        if viscous:  # v of the top is (push - Σ)/drag
-            out[p] -= s.v[g, n] / links.drag * d.drag[p]
+    links: Links, s: Series, m: Moves, d: Series, g: int, i0: int, i1: int, n: int
+) -> float:
+    """Order n of the derivative of `_damped_term`."""
+    viscous = g == links.ends.size - 1 and links.top == VISCOUS
+    total, weight = (0.0 if viscous else d.v[g, n]), 0.0
+    if g > 0:
+        total -= d.v[g - 1, n]
+    if viscous:  # v of the top is (push - Σ)/drag
+        total -= s.v[g, n] / links.drag * m.drag
+        weight = 1.0 / links.drag
     for i in range(i0, i1):
         share = links.heights[i] / links.eta[i]
-        flow = s.sig[i, n] - s.group[g, n]
+        change = (m.heights[i] - share * m.eta[i]) / links.eta[i]
+        total += share * d.sig[i, n] + change * (s.sig[i, n] - s.group[g, n])
         weight += share
-        for p in range(out.size):
-            change = (d.heights[i, p] - share * d.eta[i, p]) / links.eta[i]
-            out[p] += share * d.sig[i, n, p] + change * flow
-    for p in range(out.size):
-        out[p] /= weight
+    return total / weight
 
 
-@compiled
-def _group_tangent(links: Links, s: Series, d: Tangents, g: int, i0: int, i1: int, n: int) -> None:
+@inlined
+def _group_tangent(
+    links: Links, s: Series, slope: Array, m: Moves, d: Series, g: int, n: int
+) -> None:
     """Order n of the derivative of a group's stress and of its strains that are no state."""
-    last = links.ends.size - 1
-    stressed, viscous = g == last and links.top == STRESS, g == last and links.top == VISCOUS
-    size = d.group.shape[2]
+    i0, i1 = springs_of(links.ends, g)
+    stressed = g == links.ends.size - 1 and links.top == STRESS
+    rest = d.w[g, n] - (d.w[g - 1, n] if g > 0 else 0.0)
+    single = i1 - i0 == 1 and not stressed
     damped = 0
     for i in range(i0, i1):
         damped += links.eta[i] > 0.0
-        _known_tangent(links, s, d, i, n)
-    for p in range(size):
-        d.group[g, n, p] = 0.0
-        if not stressed:
-            d.group[g, n, p] = d.w[g, n, p] - (d.w[g - 1, n, p] if g > 0 else 0.0)
-            for i in range(i0, i1):
-                d.group[g, n, p] -= s.eps[i, n] * d.heights[i, p]
-    for i in range(i0, i1):
-        for p in range(size):
-            if i1 - i0 == 1 and not stressed:
-                d.eps[i, n, p] = d.group[g, n, p] / links.heights[i]
-            elif stressed and links.eta[i] == 0.0:
-                soft = 1.0 / d.slope[i, 0] if d.slope[i, 0] > 0.0 else 0.0
-                d.eps[i, n, p] = -d.sig[i, n, p] * soft
-            if links.eta[i] > 0.0 or i1 - i0 == 1 or stressed:
-                d.sig[i, n, p] += d.slope[i, 0] * d.eps[i, n, p]
+        rest -= s.eps[i, n] * m.heights[i]
+        known = _known_tangent(links, s, slope, m, d.eps, i, n)
+        if single:
+            d.eps[i, n] = rest / links.heights[i]
+        elif stressed and links.eta[i] == 0.0:
+            d.eps[i, n] = -known / slope[i, 0]
+        if single or stressed or links.eta[i] > 0.0:
+            known += slope[i, 0] * d.eps[i, n]
+        d.sig[i, n] = known
     if stressed:
-        return
-    if damped == i1 - i0:
-        _damped_tangent(links, s, d, g, i0, i1, viscous, n)
-    elif i1 - i0 == 1:
-        for p in range(size):
-            d.group[g, n, p] = d.sig[i0, n, p]
+        d.group[g, n] = 0.0
+    elif damped == i1 - i0:
+        d.group[g, n] = _damped_tangent(links, s, m, d, g, i0, i1, n)
+    elif single:
+        d.group[g, n] = d.sig[i0, n]
     else:
-        _share_tangent(links, s, d, g, i0, i1, n)
+        d.group[g, n] = _share_tangent(links, slope, d, i0, i1, rest, n)
 
 
-@compiled
-def start_tangents(links: Links, s: Series, d: Tangents) -> None:
+@inner
+def start_tangents(links: Links, s: Series, t: Tangents, no_eta: Array) -> None:
     """Derivatives of the strains of springs that a prescribed motion finds in equilibrium."""
-    count, last = links.eta.size, links.ends.size - 1
-    calm = Links(
-        links.law, np.zeros(count), links.heights, links.ends, links.mass, links.drag, links.top
-    )
-    for i in range(count):
-        s.sig[i, 0] = _stress_term(links.law, i, s.eps, s.sig, 0)
-        _fill_slope(links.law, i, s.sig, 0, d.slope)
-    _group_tangent(calm, s, d, last, links.ends[last - 1] if last > 0 else 0, count, 0)
-
-
-@compiled
-def expand_tangents(links: Links, s: Series, d: Tangents, order: int) -> None:
-    """Fill the derivatives up to `order`, after `expand`."""
-    last, size = links.ends.size - 1, d.drag.size
+    zero = np.int64(0)
+    calm = Links(links.law, no_eta, links.heights, links.ends, links.mass, links.drag, links.top)
     for i in range(links.eta.size):
-        _fill_slope(links.law, i, s.sig, order, d.slope)
+        s.sig[i, 0] = _stress_term(links.law, i, s.eps, s.sig, zero)
+        _fill_slope(links.law, i, s.sig, t.slope)
+    for p in range(t.drag.size):
+        moves, d = direction(t, p)
+        _group_tangent(calm, s, t.slope, moves, d, links.ends.size - 1, zero)
+
+
+@inner
+def _expand_tangent(links: Links, s: Series, slope: Array, m: Moves, d: Series, order: int) -> None:
+    """Fill the derivatives in one direction up to `order`."""
+    last = links.ends.size - 1
     for n in range(order + 1):
-        i0 = 0
         for g in range(last + 1):
-            i1 = links.ends[g]
-            _group_tangent(links, s, d, g, i0, i1, n)
+            _group_tangent(links, s, slope, m, d, g, n)
+            i0, i1 = springs_of(links.ends, g)
             if i1 - i0 > 1 or (g == last and links.top == STRESS):
                 for i in range(i0, i1):
                     if links.eta[i] > 0.0:
                         flow = (s.group[g, n] - s.sig[i, n]) / links.eta[i]
-                        for p in range(size):
-                            change = d.group[g, n, p] - d.sig[i, n, p] - flow * d.eta[i, p]
-                            d.eps[i, n + 1, p] = change / (links.eta[i] * (n + 1))
-            i0 = i1
+                        net = d.group[g, n] - d.sig[i, n] - flow * m.eta[i]
+                        d.eps[i, n + 1] = net / (links.eta[i] * (n + 1))
         for g in range(last + 1):
-            if g < last or links.top == FREE:
-                inertia = links.mass[g] * (n + 1)
-                for p in range(size):
-                    net = -d.group[g, n, p]
-                    if g < last:
-                        net += d.group[g + 1, n, p]
-                    else:
-                        net -= links.drag * d.v[g, n, p] + s.v[g, n] * d.drag[p]
-                    d.v[g, n + 1, p] = net / inertia
-                    d.w[g, n + 1, p] = d.v[g, n, p] / (n + 1)
+            net = -d.group[g, n]
+            if g < last:
+                net += d.group[g + 1, n]
             elif links.top == VISCOUS:
-                for p in range(size):
-                    change = d.group[g, n, p] + s.v[g, n] * d.drag[p]
-                    d.v[g, n, p] = -change / links.drag
-                    d.w[g, n + 1, p] = d.v[g, n, p] / (n + 1)
+                d.v[g, n] = (net - s.v[g, n] * m.drag) / links.drag
+            elif links.drag > 0.0 or m.drag != 0.0:
+                net -= links.drag * d.v[g, n] + s.v[g, n] * m.drag
+            if g < last or links.top == FREE:
+                d.v[g, n + 1] = net / (links.mass[g] * (n + 1))
+            if g < last or links.top in (FREE, VISCOUS):
+                d.w[g, n + 1] = d.v[g, n] / (n + 1)
+
+
+@inner
+def expand_tangents(links: Links, s: Series, t: Tangents, order: int) -> None:
+    """Fill the derivatives up to `order`, after `expand`; those that are still zero stay so."""
+    for i in range(links.eta.size):
+        _fill_slope(links.law, i, s.sig, t.slope)
+    for p in range(t.drag.size):
+        if t.live[p] != 0:
+            moves, d = direction(t, p)
+            _expand_tangent(links, s, t.slope, moves, d, order)
 
 
 # ---------------------------------------------------------------- the end of a step
 
 
-@compiled
-def _move_tangent(c: Array, order: int, span: float) -> None:
-    """Carry order 0 of the polynomials c (order + 2, p) over a step."""
-    for p in range(c.shape[1]):
-        total = c[order, p]
+@inner
+def _move(c: Array, order: int, span: float) -> None:
+    """Carry order 0 of polynomials c (m, …) over a step."""
+    for i in range(c.shape[0]):
+        total = c[i, order]
         for n in range(order - 1, -1, -1):
-            total = total * span + c[n, p]
-        c[0, p] = total
+            total = total * span + c[i, n]
+        c[i, 0] = total
 
 
-@compiled
-def advance(s: Series, d: Tangents, order: int, span: float) -> None:
-    """Carry the state, and its derivatives, over a step of length `span`."""
-    for g in range(s.w.shape[0]):
-        s.w[g, 0], s.v[g, 0] = value_at(s.w[g], order, span), value_at(s.v[g], order, span)
-    for i in range(s.eps.shape[0]):
-        s.eps[i, 0] = value_at(s.eps[i], order, span)
-    if d.drag.size > 0:
-        for g in range(s.w.shape[0]):
-            _move_tangent(d.w[g], order, span)
-            _move_tangent(d.v[g], order, span)
-        for i in range(s.eps.shape[0]):
-            _move_tangent(d.eps[i], order, span)
+@inner
+def advance(s: Series, d: Tangents, order: int, d_order: int, span: float) -> None:
+    """Carry the state, and its derivatives (to d_order), over a step of length `span`."""
+    _move(s.w, order, span)
+    _move(s.v, order, span)
+    _move(s.eps, order, span)
+    for p in range(d.drag.size):
+        if d.live[p] != 0:
+            _move(d.w[p], d_order, span)
+            _move(d.v[p], d_order, span)
+            _move(d.eps[p], d_order, span)
 
 
 # ---------------------------------------------------------------- without inertia and damping

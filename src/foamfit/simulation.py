@@ -208,7 +208,7 @@ class Plan:
         directions: Directions,
     ) -> Motion:
         # Without an interior mass there are few steps: a margin costs little.
-        margin = 1.0 if len(self.ends) > 1 else 1e-2
+        margin = 1.0 if len(self.ends) > 1 else 0.1
         nodes, n, p = (len(heights) if everything else 1), self.time.size, len(directions)
         displacement, stress, log = np.empty((nodes, n)), np.empty(n), np.empty((1024, 5))
         slopes = Slopes(np.empty((p, nodes, n)), np.empty((p, n)))

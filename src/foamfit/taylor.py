@@ -24,6 +24,8 @@ from foamfit.kernels import (
     compiled,
     equilibrate,
     first_branch,
+    inner,
+    maker,
     strain_on,
 )
 from foamfit.polynomial import fill_values, first_crossing, slope_at, value_at
@@ -48,6 +50,7 @@ from foamfit.series import (
     expand_tangents,
     make_series,
     make_tangents,
+    springs_of,
     start_tangents,
 )
 
@@ -76,7 +79,7 @@ class Samples(NamedTuple):
 # ---------------------------------------------------------------- the length of a step
 
 
-@compiled
+@inner
 def _longest(c: Array, order: int, scale: float, tol: float, span: float) -> float:
     """Step at which the last two terms of a series fall below tol × scale."""
     for n in (order - 1, order):
@@ -86,7 +89,7 @@ def _longest(c: Array, order: int, scale: float, tol: float, span: float) -> flo
     return span
 
 
-@compiled
+@inner
 def _step_length(
     links: Links,
     s: Series,
@@ -121,7 +124,7 @@ def _step_length(
     return span
 
 
-@compiled
+@inner
 def _first_switch(links: Links, s: Series, order: int, span: float) -> tuple[float, int, int]:
     """First switch of branch within `span`: when, which spring (-1: none), on which side."""
     spring, side = -1, 0
@@ -132,10 +135,27 @@ def _first_switch(links: Links, s: Series, order: int, span: float) -> tuple[flo
     return span, spring, side
 
 
+@inner
+def _enough(c: Array, order: int, span: float, tol: float, most: int) -> int:
+    """Orders that the series in the rows of c need over a step, if switches made it short."""
+    for i in range(c.shape[0]):
+        size, power = abs(c[i, 0]), 1.0
+        for n in range(1, order + 1):
+            power *= span
+            size += abs(c[i, n]) * power
+        tail, n = 0.0, order
+        while n > most and tail + abs(c[i, n]) * power <= tol * size:
+            tail += abs(c[i, n]) * power
+            power /= span
+            n -= 1
+        most = n
+    return most
+
+
 # ---------------------------------------------------------------- samples
 
 
-@compiled
+@inner
 def _sample(
     links: Links, s: Series, order: int, out: Samples, first: int, last: int, now: float, c: Array
 ) -> None:
@@ -156,20 +176,7 @@ def _sample(
             fill_values(c, order, out.t, first, last, now, out.w[min(i, out.w.shape[0] - 1)])
 
 
-@compiled
-def _fill_tangent(
-    c: Array, order: int, t: Array, first: int, last: int, now: float, out: Array
-) -> None:
-    """Write the polynomial c at some samples; zeros where it is zero."""
-    for n in range(order + 1):
-        if c[n] != 0.0:
-            fill_values(c, order, t, first, last, now, out)
-            return
-    for j in range(first, last):
-        out[j] = 0.0
-
-
-@compiled
+@inner
 def _sample_tangents(
     links: Links,
     s: Series,
@@ -182,36 +189,36 @@ def _sample_tangents(
     c: Array,
 ) -> None:
     """Write the derivatives of displacements and base stress at some samples of a step."""
-    if first == last:
-        return
     nodes, count = out.w.shape[0], links.heights.size
     top = links.ends.size - 1
     for p in range(d.drag.size):
-        for n in range(order + 1):
-            c[n] = d.group[0, n, p]
-        _fill_tangent(c, order, out.t, first, last, now, out.ds[p])
+        if d.live[p] == 0:
+            for j in range(first, last):
+                out.ds[p, j] = 0.0
+                for i in range(nodes):
+                    out.dw[p, i, j] = 0.0
+            continue
+        fill_values(d.group[p, 0], order, out.t, first, last, now, out.ds[p])
         if nodes == 1 and links.top != STRESS:
-            for n in range(order + 1):
-                c[n] = d.w[top, n, p]
-            _fill_tangent(c, order, out.t, first, last, now, out.dw[p, 0])
+            fill_values(d.w[p, top], order, out.t, first, last, now, out.dw[p, 0])
             continue
         for n in range(order + 1):
             c[n] = 0.0
         for i in range(count):
             for n in range(order + 1):
-                c[n] += links.heights[i] * d.eps[i, n, p] + d.heights[i, p] * s.eps[i, n]
+                c[n] += links.heights[i] * d.eps[p, i, n] + d.heights[p, i] * s.eps[i, n]
             if nodes > 1 or i == count - 1:
-                _fill_tangent(c, order, out.t, first, last, now, out.dw[p, min(i, nodes - 1)])
+                fill_values(c, order, out.t, first, last, now, out.dw[p, min(i, nodes - 1)])
 
 
-@compiled
+@inner
 def _mend_kink(out: Samples, s: Series, d: Tangents, knot: int) -> None:
     """A dashpot feels the mean rate where the prescribed motion has a kink."""
     before, after = out.t[knot] - out.t[knot - 1], out.t[knot + 1] - out.t[knot]
     share = before / (before + after)
     out.s[knot] += share * (s.group[0, 0] - out.s[knot])
     for p in range(d.drag.size):
-        out.ds[p, knot] += share * (d.group[0, 0, p] - out.ds[p, knot])
+        out.ds[p, knot] += share * (d.group[p, 0, 0] - out.ds[p, knot])
 
 
 # ---------------------------------------------------------------- the end of contact
@@ -229,25 +236,23 @@ def fly(
         out_s[j] = 0.0
 
 
-@compiled
+@inner
 def _delay(s: Series, d: Tangents, order: int, span: float, late: Array) -> None:
     """Derivative of the time at which the base stress meets zero at the end of a step."""
     fall = slope_at(s.group[0], order, span)
     if fall == 0.0:
         return
     for p in range(late.size):
-        total = d.group[0, order, p]
-        for n in range(order - 1, -1, -1):
-            total = total * span + d.group[0, n, p]
-        late[p] = -total / fall
+        late[p] = -value_at(d.group[p, 0], order, span) / fall
 
 
-@compiled
+@maker
 def _depart(
     links: Links,
     s: Series,
     d: Tangents,
     order: int,
+    more: int,
     span: float,
     now: float,
     late: Array,
@@ -266,7 +271,7 @@ def _depart(
     for i in range(count):
         speed += links.heights[i] * slope_at(s.eps[i], order, span)
         rate[min(i, nodes - 1)] = speed
-    advance(s, d, order, span)
+    advance(s, d, order, more, span)
     w_end = np.zeros(nodes)
     place = 0.0
     for i in range(count):
@@ -274,10 +279,10 @@ def _depart(
         w_end[min(i, nodes - 1)] = place
     fly(out.w, out.s, out.t, done, now, w_end, s.v[top, 0])
     for p in range(late.size):
-        away = d.v[top, 0, p] + pull * late[p]
+        away = d.v[p, top, 0] + pull * late[p]
         moved = 0.0
         for i in range(count):
-            moved += links.heights[i] * d.eps[i, 0, p] + d.heights[i, p] * s.eps[i, 0]
+            moved += links.heights[i] * d.eps[p, i, 0] + d.heights[p, i] * s.eps[i, 0]
             if nodes > 1 or i == count - 1:
                 node = min(i, nodes - 1)
                 there = moved + (rate[node] - s.v[top, 0]) * late[p]
@@ -290,12 +295,11 @@ def _depart(
 # ---------------------------------------------------------------- the state between steps
 
 
-@compiled
+@inner
 def _settle(links: Links, s: Series) -> None:
     """Share the elongation of undamped groups anew, so that rounding does not pile up."""
-    i0 = 0
     for g in range(links.ends.size):
-        i1 = links.ends[g]
+        i0, i1 = springs_of(links.ends, g)
         plain = i1 - i0 > 1 and not (g == links.ends.size - 1 and links.top == STRESS)
         compliance = 0.0
         miss = s.w[g, 0] - (s.w[g - 1, 0] if g > 0 else 0.0)
@@ -307,10 +311,9 @@ def _settle(links: Links, s: Series) -> None:
         if plain:
             for i in range(i0, i1):
                 s.eps[i, 0] += miss / compliance / _slope_now(links.law, i, s.eps[i, 0])
-        i0 = i1
 
 
-@compiled
+@inner
 def _slope_now(law: Array, i: int, eps: float) -> float:
     """Slope dσ/dε on the branch that spring i is on."""
     k, y = law[i, SLOPE], 1.0 - (eps - law[i, ORIGIN])
@@ -348,7 +351,7 @@ def start(
                 eps[i, 0] = strain_on(rows[i], branches[i], value)
 
 
-@compiled
+@inner
 def _switch(
     rows: Array,
     branches: Branches,
@@ -472,7 +475,7 @@ def integrate(
         enter(rows, i, branches[i], links.law)
         enter_tangents(rows, i, branches[i], directions, d)
     if tangent and top == MOTION:
-        start_tangents(links, s, d)
+        start_tangents(links, s, d, np.zeros(count))
     w_scale, s_scale, pressed, knot, switches = 0.0, 0.0, False, 0, 0
     stalled = 0
     fresh = False
@@ -493,10 +496,6 @@ def integrate(
             driven[0], driven[1] = values[knot] + rate * (now - t[knot]), rate
         if not expand(links, s, push, motion, order):
             return FLAT_UNDER_STRESS, math.nan, step, switches
-        if tangent:
-            expand_tangents(links, s, d, order)
-        if top == MOTION and knot > 0 and fresh:
-            _mend_kink(out, s, d, knot)
         span = horizon - now
         span = _step_length(links, s, push, order, tol, span, w_scale, s_scale)
         if not math.isfinite(span) or not math.isfinite(s.group[0, order]):
@@ -517,20 +516,30 @@ def integrate(
         last = end >= horizon and not leaves and spring < 0
         if last:
             end = horizon
+        enough = order
+        if span > 0.0:
+            enough = _enough(s.eps, order, span, tol, 2)
+            enough = _enough(s.sig, order, span, tol, enough)
+        more = min(enough + 2, order)  # for what is, in time, a derivative of these
+        if tangent:
+            expand_tangents(links, s, d, more)
+        if top == MOTION and knot > 0 and fresh:
+            _mend_kink(out, s, d, knot)
         first = done
         while done < t.size and (t[done] < end or (last and t[done] <= end)):
             done += 1
-        _sample(links, s, order, out, first, done, now, scratch)
+        _sample(links, s, enough, out, first, done, now, scratch)
+        if tangent and first < done:
+            _sample_tangents(links, s, d, more, out, first, done, now, scratch)
         if tangent:
-            _sample_tangents(links, s, d, order, out, first, done, now, scratch)
-            _delay(s, d, order, span, late)
+            _delay(s, d, more, span, late)
         now = end
         if leaves:
-            _depart(links, s, d, order, span, now, late, out, done)
+            _depart(links, s, d, order, more, span, now, late, out, done)
             return DONE, now, step + 1, switches
         for i in range(count):
             s_scale = max(s_scale, abs(value_at(s.sig[i], order, span)))
-        advance(s, d, order, span)
+        advance(s, d, order, more, span)
         w_scale = max(w_scale, abs(s.w[groups - 1, 0]) if top != STRESS else 0.0)
         reached = s.w[groups - 1, 0]
         for i in range(count):
@@ -547,7 +556,7 @@ def integrate(
     return TOO_MANY_STEPS, math.nan, max_steps, switches
 
 
-@compiled
+@inner
 def _fill_before(out: Samples, done: int) -> None:
     """Before contact nothing presses, and nothing but the striker moves."""
     nodes = out.w.shape[0]
