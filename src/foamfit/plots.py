@@ -605,6 +605,13 @@ def figure_format(path: str | Path) -> Literal["png", "pdf", "svg"]:
     return form
 
 
+def save(figure: Figure, path: str | Path | None) -> Figure:
+    """Save a figure, if there is a path, in the format of its suffix; returns the figure."""
+    if path is not None:
+        _save(figure, Path(path))
+    return figure
+
+
 def _save(figure: Figure, path: Path) -> None:
     content = image(figure, figure_format(path))
     try:

@@ -218,6 +218,7 @@ def state_of(
     short = split_name(name)[1]
     if short in MAY_VANISH and abs(value) <= half and (value == 0.0 or value not in limits):
         end = engineering(-abs(value) - half if short == "dsigma" else value + half, unit_of(name))
+        end = end.replace("Pa s", "Pa·s")
         return "weak", f"it is not told from zero: its 95 % interval goes from 0 to {end}"
     together = insight.companion(name) if verdict == "weak" else ""
     return verdict, f"{why}; {together}" if together else why
