@@ -306,7 +306,8 @@ class Insight:
 
     def _group(self, free: Array, member: int) -> list[int]:
         """Parameters that can move together with one, itself included, along free directions."""
-        linked = np.abs(free.T @ free) > PART
+        movable = np.linalg.norm(free, axis=0) > 2.0 * PART
+        linked = (np.abs(free.T @ free) > PART) & np.outer(movable, movable)
         group, fresh = {member}, [member]
         while fresh:
             near = set(np.flatnonzero(linked[fresh.pop()]).tolist()) - group

@@ -26,7 +26,7 @@ SHADES = {
     "e": "#e3f1ea",
 }  # of one spring's branches
 OTHERS = ("#f3f3f3", "#e4e4e4")  # of several springs' branches, in turn
-STRIP = 0.46  # height of a strip, in
+STRIP = 0.4  # height of a strip, in
 CELL = 0.24  # height of a cell, in
 
 
@@ -43,8 +43,8 @@ def plot_sensitivities(insight: Insight, path: str | Path | None = None) -> Figu
     Returns
     -------
     matplotlib.figure.Figure
-        One row for each parameter, one column for each counted curve; a row has one scale, in
-        standard deviations of the noise per 1 % of the parameter's natural size.
+        One row for each parameter, one panel for each counted curve. A row has one scale, its
+        largest value, in standard deviations of the noise per 1 % of the natural size.
     """
     import matplotlib
     from matplotlib.figure import Figure
@@ -114,33 +114,42 @@ def _cells_height(insight: Insight) -> float:
 
 
 def _draw_sensitivities(figure: FigureBase, insight: Insight) -> None:
-    rows, columns = len(insight.names), len(insight.curves)
-    axes = figure.subplots(rows, columns, sharex=True, sharey="row", squeeze=False)
+    """Set all rows of a curve in one panel: as panels of their own they take seconds to lay out."""
+    k = len(insight.names)
+    axes = figure.subplots(1, len(insight.curves), sharey=True, squeeze=False)[0]
     factor, unit = readable_unit(float(insight.clock[-1]), "s") if insight.timed else (1.0, "")
     x = insight.clock / factor
-    for j, curve in enumerate(insight.curves):
+    rows = {
+        name: [0.01 * insight.along(name, curve) for curve in insight.curves]
+        for name in insight.names
+    }
+    reach = {name: max(float(np.max(np.abs(row))) for row in rows[name]) for name in rows}
+    for j, (ax, curve) in enumerate(zip(axes, insight.curves, strict=True)):
+        _shade(ax, x, insight.sections)
         for i, name in enumerate(insight.names):
-            ax = axes[i, j]
-            _shade(ax, x, insight.sections, named=i == 0)
-            ax.axhline(0.0, color=GREY, lw=0.5)
-            ax.plot(x, 0.01 * insight.along(name, curve), color=_color(curve), lw=1.0)
-            ax.margins(x=0.0, y=0.12)
-            ax.locator_params(axis="y", nbins=3)
-            ax.tick_params(axis="y", labelsize=6)
-            if j == 0:
-                ax.set_ylabel(name, rotation=0, ha="right", va="center", fontsize=7)
-        axes[0, j].set_title(curve.replace("_", "-"), loc="left", fontsize=7.5, pad=11)
-        axes[-1, j].set_xlabel(f"time ({unit})" if unit else "sample")
-    figure.supylabel("moves by (standard deviations of noise per 1 % of the parameter)", fontsize=7)
+            ax.axhline(i, color=GREY, lw=0.5)
+            ax.plot(x, i - 0.44 * rows[name][j] / (reach[name] or 1.0), color=_color(curve), lw=1.0)
+        for i in range(1, k):
+            ax.axhline(i - 0.5, color="white", lw=1.6, zorder=1)
+        ax.set_xlim(x[0], x[-1])
+        ax.set_ylim(k - 0.5, -0.5)
+        ax.set_title(curve.replace("_", "-"), loc="left", fontsize=7.5, pad=11)
+        ax.set_xlabel(f"time ({unit})" if unit else "sample")
+        ax.tick_params(axis="y", length=0)
+        ax.spines["left"].set_visible(False)
+    axes[0].set_yticks(range(k), [f"{name}\n±{reach[name]:.2g}" for name in insight.names])
+    figure.supylabel(
+        "standard deviations of noise per 1 % of the parameter, up is more", fontsize=6.5
+    )
 
 
-def _shade(ax: Axes, x: Array, cuts: tuple[Section, ...], *, named: bool) -> None:
+def _shade(ax: Axes, x: Array, cuts: tuple[Section, ...]) -> None:
     last = x.size - 1
     for turn, cut in enumerate(cuts):
         left, right = x[cut.start], x[min(cut.stop, last)]
         shade = SHADES.get(cut.branches, "white" if " " in cut.branches else OTHERS[turn % 2])
         ax.axvspan(left, right, color=shade, lw=0, zorder=0)
-        if named and right - left > 0.03 * (x[-1] - x[0]):
+        if right - left > 0.03 * (x[-1] - x[0]):
             ax.annotate(
                 "flight" if " " in cut.branches else cut.branches, (0.5 * (left + right), 1.0),
                 (0, 2), xycoords=("data", "axes fraction"), textcoords="offset points",

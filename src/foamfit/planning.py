@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from foamfit import kernels, uncertainty
 from foamfit.chain import Chain, Impact
+from foamfit.checklist import ESTIMATED
 from foamfit.conditioning import engineering
 from foamfit.errors import InputError, SimulationError
 from foamfit.insight import Insight, curve_noise, look, unreached, visited
@@ -226,8 +227,8 @@ def planned_test(settings_file: Path) -> Measurement:
         path=settings_file,
         data_sha256="",
         time=np.linspace(0.0, 1e-3, SAMPLES),
-        stress=np.ones(SAMPLES),
-        displacement=np.ones(SAMPLES),
+        stress=np.linspace(0.0, 1e6, SAMPLES),
+        displacement=np.linspace(0.0, 0.1 * settings.specimen.height, SAMPLES),
         specimen=settings.specimen,
         striker=striker,
         noise=settings.noise,
@@ -419,6 +420,7 @@ def describe_plan(plan: Plan) -> str:
         for name, (sd, given) in plan.noise.items()
     )
     out.append(("noise", ", ".join(told)))
+    out += [("", text) for text in _unexplained(plan)]
     out += [("loop" if i == 0 else "", text) for i, text in enumerate(closing_sentences(plan))]
     if plan.outlook.insight is not None:
         worths = list(worth_sentences(plan.outlook.insight))
@@ -426,6 +428,21 @@ def describe_plan(plan: Plan) -> str:
         out.append(("least", plan.outlook.insight.sentence()))
     text = "\n".join(f"{label:<10}{_wrap(sentence)}" for label, sentence in out)
     return "\n".join([text, "", *_table(plan), "", *_reasons(plan)]).rstrip()
+
+
+def _unexplained(plan: Plan) -> Iterator[str]:
+    """Warn where the start values leave more than the noise: then the errors are too small."""
+    objective, at = plan.problem.objective, 0
+    residual = objective.residual(plan.values)
+    for (name, (noise, _)), size in zip(plan.noise.items(), objective.sizes, strict=True):
+        rms = float(np.sqrt(np.mean(residual[at : at + size] ** 2)))
+        rms *= objective.scale[name] / objective.weights[name] ** 0.5
+        at += size
+        if rms > ESTIMATED * noise:
+            yield (
+                f"The start values leave {rms / noise:.1f} times the noise of {_spoken(name)}, so "
+                "the errors to expect are larger than those below."
+            )
 
 
 def closing_sentences(plan: Plan) -> Iterator[str]:

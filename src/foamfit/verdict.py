@@ -220,7 +220,12 @@ def state_of(
         end = engineering(-abs(value) - half if short == "dsigma" else value + half, unit_of(name))
         end = end.replace("Pa s", "Pa·s")
         return "weak", f"it is not told from zero: its 95 % interval goes from 0 to {end}"
-    together = insight.companion(name) if verdict == "weak" else ""
+    if verdict == "determined":
+        return verdict, why
+    open_at = [limit for limit in limits if abs(value - limit) < half]
+    if open_at and "open" not in why:
+        why += f", open on one side: it reaches its limit {engineering(open_at[0], unit_of(name))}"
+    together = insight.combination(name, uncertainty.WEAK / 1.96) or insight.companion(name)
     return verdict, f"{why}; {together}" if together else why
 
 
