@@ -307,7 +307,7 @@ SPOILT = {
     "floor": {"change": lambda t: replace(t, noise=Noise(t.noise.stress / 2, None))},
     "structure": {"change": _wave},
     "visited": {"change": lambda _: synthetic_impact(velocity=1.75, samples=201)[1]},
-    "determined": {"damped": True},  # an eta of zero is not told from zero
+    "determined": {"change": lambda _: synthetic_impact(velocity=1.75, samples=201)[1]},
     "bounds": {"s1_kh_minus": {"min": ff.published["foam-1/model-1"].bistable.kh_minus}},
     "energy": {"change": lambda t: replace(t, striker=Striker(6e-3, 2.0)), "drive": "displacement"},
     "impulse": {"change": lambda t: replace(t, striker=Striker(8e-3, 2.0))},
@@ -371,6 +371,10 @@ def test_a_damper_that_may_be_none_is_not_called_determined() -> None:
     assert item.ci95[0] == 0.0
     assert item.state == "weak"
     assert item.why.startswith("it is not told from zero: its 95 % interval goes from 0 to ")
+    # Its limit is known well, which is nothing to be warned of, but it is said.
+    assert result.status == "ok"
+    told = next(check for check in result.checklist if check.key == "determined")
+    assert told.sentence == "7 of 8 are; small, and not told from zero: s1_eta."
     spring, test = synthetic_impact(eta=60.0)
     problem = problem_of(test, damped=True)
     result = conclude(problem, values_of(problem, spring), SearchRecord(0, 8, 0.0, AGREED))

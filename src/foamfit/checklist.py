@@ -12,6 +12,7 @@ import numpy as np
 
 from foamfit.insight import curve_noise
 from foamfit.model import split_name
+from foamfit.uncertainty import WEAK
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -32,6 +33,8 @@ STATED, ESTIMATED = 1.1, 1.5
 # Autocorrelation time, samples, from which on residuals count as structured.
 STRUCTURED = 5.0
 BRANCHES = ("a", "d", "c", "e")
+# Parameters that may be zero: their interval tells whether there is anything at all.
+MAY_VANISH = ("dsigma", "kh_plus", "kh_minus", "eta")
 
 
 @dataclass(frozen=True)
@@ -74,6 +77,11 @@ class Evidence:
     spread: Covariance | None
     record: SearchRecord
     balance: EnergyAudit
+
+    @property
+    def values(self) -> NDArray[np.float64]:
+        """The best point, SI, in the order of the model's names."""
+        return np.array([item.value for item in self.estimates.values()])
 
 
 def status_of(checklist: Iterable[Check]) -> str:
@@ -212,16 +220,31 @@ def _structure(e: Evidence) -> Check:
 
 
 def _determined(e: Evidence) -> Check:
-    warnings = []
+    """Ask for the states; what is known to be nearly nothing, or nothing, is known well enough."""
+    warnings, vanishing = [], [name for name in e.estimates if _vanishes(e, name)]
     for state in ("not determined", "weak"):
-        of = [(name, item.why) for name, item in e.estimates.items() if item.state == state]
+        of = [
+            (name, item.why)
+            for name, item in e.estimates.items()
+            if item.state == state and name not in vanishing
+        ]
         if of:
             warnings.append(f"{state.capitalize()}: {_by_reason(of)}.")
     varied = [item.state for item in e.estimates.values() if item.state != "fixed"]
-    found = f"{varied.count('determined')} of {len(varied)} are."
-    return Check(
-        "determined", "Are all parameters determined?", not warnings, found, tuple(warnings)
-    )
+    found = f"{varied.count('determined')} of {len(varied)} are"
+    if vanishing:
+        found += f"; small, and not told from zero: {', '.join(vanishing)}"
+    question = "Are all parameters determined?"
+    return Check("determined", question, not warnings, f"{found}.", tuple(warnings))
+
+
+def _vanishes(e: Evidence, name: str) -> bool:
+    """Whether a parameter is small for sure, but not told from zero."""
+    item = e.estimates[name]
+    if item.state != "weak" or item.ci95 is None or split_name(name)[1] not in MAY_VANISH:
+        return False
+    size = float(e.problem.sizes((name,), e.values)[0])
+    return item.ci95[0] <= 0.0 <= item.ci95[1] and max(np.abs(item.ci95)) <= WEAK * size
 
 
 def _by_reason(of: list[tuple[str, str]]) -> str:
@@ -258,16 +281,19 @@ def _visited(e: Evidence) -> Check:
 def _bounds(e: Evidence) -> Check:
     question, params = "Are all parameters off their bounds?", e.problem.params
     varied = [name for name, item in e.estimates.items() if item.vary]
-    sizes = e.problem.sizes(tuple(varied), np.array([item.value for item in e.estimates.values()]))
-    stuck = []
+    sizes = e.problem.sizes(tuple(varied), e.values)
+    stuck, natural = [], []
     for name, size in zip(varied, sizes, strict=True):
         value, edge = e.estimates[name].value, 1e-6 * size
         for bound in (params[name].min, params[name].max):
-            if abs(value - bound) <= edge and e.estimates[name].stderr is not None:
+            if abs(value - bound) > edge or e.estimates[name].stderr is None:
+                continue
+            if bound == 0.0 and split_name(name)[1] in MAY_VANISH:
+                natural.append(f"{name} is zero, which it may be")
+            else:
                 stuck.append(f"{name} lies at {bound:g}")
-    if not stuck:
-        return Check("bounds", question, True, "None lies at one.")
-    return Check("bounds", question, False, f"{', '.join(stuck)}.")
+    found = ", ".join([*stuck, *natural]) or "None lies at one"
+    return Check("bounds", question, not stuck, f"{found}.")
 
 
 # ---------------------------------------------------------------- the test itself

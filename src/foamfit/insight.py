@@ -8,7 +8,7 @@ so that parameters and curves can be compared.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -137,6 +137,8 @@ class Insight:
         changes by its natural size; to first order.
     sections : tuple of Section
         The stretches of the run between switches.
+    silent : tuple of str
+        Parameters that vary but whose branch was never reached.
     """
 
     names: tuple[str, ...]
@@ -147,6 +149,7 @@ class Insight:
     timed: bool
     scaled: Array
     sections: tuple[Section, ...]
+    silent: tuple[str, ...] = ()
 
     @cached_property
     def _directions(self) -> tuple[Array, Array]:
@@ -190,11 +193,7 @@ class Insight:
         scaled = self.scaled.copy()
         at = self.curves.index(quieter)
         scaled[at * n : (at + 1) * n] /= factor
-        other = Insight(
-            self.names, self.values, self.sizes, self.curves, self.clock, self.timed, scaled,
-            self.sections,
-        )  # fmt: skip
-        return other.stderr
+        return replace(self, scaled=scaled).stderr
 
     def along(self, name: str, curve: str) -> Array:
         """Sensitivity of one curve to one parameter, (n_samples,)."""
@@ -252,17 +251,19 @@ class Insight:
             return ""
         error, parts = self.weakest()
         size = "cannot be told at all" if error > 1e3 else f"has a standard error of {error:.2g}"
-        names = list(parts)
+        names, start = list(parts), "The test says least about"
+        if self.silent:
+            start = (
+                f"The test says nothing of {_listed(list(self.silent))}, and least of the rest of"
+            )
         if len(names) == 1:
             of = "" if error > 1e3 else " of its natural size"
-            return f"The test says least about {names[0]}, which {size}{of}."
+            return f"{start} {names[0]}, which {size}{of}."
         joint = ", ".join(
             f"{name} by {part:+.2g}".replace("-", "−") for name, part in parts.items()
         )
-        return (
-            f"The test says least about {_listed(names)} together: a joint change of {joint} "
-            f"(in natural sizes) {size}."
-        )
+        joint += " (in natural sizes)"
+        return f"{start} {_listed(names)} together: a joint change of {joint} {size}."
 
     def combination(self, name: str, loose: float) -> str:
         """Say what the data fix instead of a parameter; "" if it is loose by itself.
@@ -356,6 +357,7 @@ def look(
         weighed = objective.weights[curve] ** 0.5 / objective.scale[curve]
         scaled[c * n : (c + 1) * n] /= weighed * noise[curve]
     simulated = objective.simulate(values, everything=True)
+    lost = unreached(problem, values)
     return Insight(
         names=names,
         values=np.array([values[problem.model.index[name]] for name in names]),
@@ -365,6 +367,7 @@ def look(
         timed=problem.measurement.time is not None,
         scaled=scaled,
         sections=sections(problem, simulated),
+        silent=tuple(name for name in problem.free() if name in lost),
     )
 
 

@@ -138,9 +138,7 @@ def _draw_sensitivities(figure: FigureBase, insight: Insight) -> None:
         ax.tick_params(axis="y", length=0)
         ax.spines["left"].set_visible(False)
     axes[0].set_yticks(range(k), [f"{name}\n±{reach[name]:.2g}" for name in insight.names])
-    figure.supylabel(
-        "standard deviations of noise per 1 % of the parameter, up is more", fontsize=6.5
-    )
+    figure.supylabel("noise s.d. per 1 % of the parameter", fontsize=6.5)
 
 
 def _shade(ax: Axes, x: Array, cuts: tuple[Section, ...]) -> None:
@@ -176,12 +174,12 @@ def _draw_information(figure: FigureBase, insight: Insight, correlation: Array |
     left.set_title("where the information comes from (%)", loc="left", fontsize=7.5, pad=4)
     left.set_yticks(range(k), insight.names)
     labels = ["flight" if " " in branch else branch for _, branch in parts]
-    left.set_xticks(range(len(parts)), labels, rotation=90 if max(map(len, labels)) > 3 else 0)
+    left.set_xticks(range(len(parts)), labels, rotation=90 if max(map(len, labels)) > 6 else 0)
     for curve in dict.fromkeys(curve for curve, _ in parts):
         at = [c for c, part in enumerate(parts) if part[0] == curve]
         if at[0]:
             left.axvline(at[0] - 0.5, color="black", lw=0.8)
-        beneath = -16 if max(map(len, labels)) <= 3 else -4.0 - 4.0 * max(map(len, labels))
+        beneath = -16 if max(map(len, labels)) <= 6 else -4.0 - 4.0 * max(map(len, labels))
         left.annotate(
             curve.replace("_", "-"), (float(np.mean(at)), 0.0), (0, beneath),
             xycoords=("data", "axes fraction"), textcoords="offset points", ha="center", va="top",

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from foamfit import kernels, uncertainty
 from foamfit.audit import audit
-from foamfit.checklist import Evidence, make_checklist, status_of, warnings_of
+from foamfit.checklist import MAY_VANISH, Evidence, make_checklist, status_of, warnings_of
 from foamfit.conditioning import engineering
 from foamfit.errors import SimulationError
 from foamfit.insight import Insight, look, unreached, visited
@@ -22,9 +22,6 @@ from foamfit.result import Correlation, Curves, FitResult, ParameterEstimate, Sw
 from foamfit.search import SearchRecord
 
 Array = NDArray[np.float64]
-
-# Parameters that may be zero: their interval tells whether there is anything at all.
-MAY_VANISH = ("dsigma", "kh_plus", "kh_minus", "eta")
 
 
 def conclude(problem: Problem, values: Array, record: SearchRecord) -> FitResult:
