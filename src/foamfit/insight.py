@@ -113,6 +113,11 @@ def curve_noise(objective: Objective) -> dict[str, tuple[float, bool]]:
     return out
 
 
+def counted_samples(objective: Objective, curve: str) -> NDArray[np.intp]:
+    """Samples of a curve that stand in the residual, in their order."""
+    return np.arange(objective.sizes[objective.counted.index(curve)])
+
+
 # ---------------------------------------------------------------- sensitivities
 
 
@@ -134,7 +139,7 @@ class Insight:
         Whether the clock is a time.
     scaled : (len(curves) * n_samples, k) array
         By how many standard deviations of its noise a curve moves, sample by sample, if a parameter
-        changes by its natural size; to first order.
+        changes by its natural size; to first order. Zero at samples that are not counted.
     sections : tuple of Section
         The stretches of the run between switches.
     silent : tuple of str
@@ -351,11 +356,14 @@ def look(
         its autocorrelation time larger.
     """
     objective = problem.objective
-    n = objective.time.size
-    scaled = slopes * problem.sizes(names, values)
+    n, at = objective.time.size, 0
+    scaled = np.zeros((len(objective.counted) * n, len(names)))
     for c, curve in enumerate(objective.counted):
+        kept = counted_samples(objective, curve)
         weighed = objective.weights[curve] ** 0.5 / objective.scale[curve]
-        scaled[c * n : (c + 1) * n] /= weighed * noise[curve]
+        rows = slopes[at : at + kept.size] * problem.sizes(names, values)
+        scaled[c * n + kept] = rows / (weighed * noise[curve])
+        at += kept.size
     simulated = objective.simulate(values, everything=True)
     lost = unreached(problem, values)
     return Insight(

@@ -381,7 +381,8 @@ def expect(problem: Problem, values: Array, noise: Mapping[str, float]) -> Outlo
             continue
         stderr = float(insight.stderr[names.index(name)])
         half = uncertainty.half_width(stderr, problem.objective.n_data - len(names))
-        state, why = state_of(name, value, half, insight, (params[name].min, params[name].max))
+        limits = (params[name].min, params[name].max)
+        state, why = state_of(name, value, (value - half, value + half), insight, limits)
         told = state != "not determined"
         expected[name] = ParameterEstimate(
             value, stderr if told else None, None, unit, True, state, why

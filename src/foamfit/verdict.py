@@ -133,7 +133,7 @@ def _estimate(
         jacobian = problem.slopes(values, names)
         sizes = problem.sizes(names, values)
         spread = uncertainty.covariance(jacobian, residual, objective.sizes, sizes)
-        noise = _noise(problem, residual, spread)
+        noise = _left_over(problem, residual, spread)
         insight = look(problem, values, names, jacobian, noise)
     out = {}
     for i, name in enumerate(problem.model.names):
@@ -156,7 +156,9 @@ def _estimate(
     return out, spread, insight
 
 
-def _noise(problem: Problem, residual: Array, spread: uncertainty.Covariance) -> dict[str, float]:
+def _left_over(
+    problem: Problem, residual: Array, spread: uncertainty.Covariance
+) -> dict[str, float]:
     """One standard deviation of what is left of each curve, SI, its correlation counted."""
     objective, out, at = problem.objective, {}, 0
     for name, size, tau in zip(objective.counted, objective.sizes, spread.tau, strict=True):
@@ -178,17 +180,22 @@ def _varied(
     column = insight.names.index(name)
     stderr = float(spread.stderr[column])
     half = uncertainty.half_width(stderr, spread.effective - len(insight.names))
-    verdict, why = state_of(name, value, half, insight, (low, high))
+    ends = (value - half, value + half)
+    verdict, why = state_of(name, value, ends, insight, (low, high))
     if verdict == "determined" and problem.objective.interior_mass:
         verdict, why = "weak", "the ringing of the interior mass leaves other valleys; " + why
     if verdict == "not determined":
         return ParameterEstimate(value, None, None, unit_of(name), True, verdict, why)
-    ci95 = (max(value - half, low), min(value + half, high))
+    ci95 = (max(ends[0], low), min(ends[1], high))
     return ParameterEstimate(value, stderr, ci95, unit_of(name), True, verdict, why)
 
 
 def state_of(
-    name: str, value: float, half: float, insight: Insight, limits: tuple[float, float]
+    name: str,
+    value: float,
+    ends: tuple[float, float],
+    insight: Insight,
+    limits: tuple[float, float],
 ) -> tuple[str, str]:
     """State of a parameter that varies and whose branch is reached, and the reason in one sentence.
 
@@ -196,32 +203,35 @@ def state_of(
     ----------
     name : str
         For example "s1_kc".
-    value, half : float
-        Its value and half of its 95 % interval, not cut at the limits; NaN or infinite where the
-        data fix only a combination.
+    value : float
+        Its value.
+    ends : (float, float)
+        Of its 95 % interval, not cut at the limits; NaN or infinite where the data fix only a
+        combination.
     insight : Insight
         What the test can tell there.
     limits : (float, float)
         Its limits.
     """
-    size = float(insight.sizes[insight.names.index(name)])
+    size, short = float(insight.sizes[insight.names.index(name)]), split_name(name)[1]
+    half = 0.5 * (ends[1] - ends[0])
     half = half if math.isfinite(half) else math.nan
     verdict, why = uncertainty.state(value, half, size, *limits)
     if verdict == "not determined":
-        together = insight.combination(name, uncertainty.NOTHING / 1.96)
-        return verdict, together or (
-            why if math.isfinite(half) else "it leaves no trace in the curves"
-        )
-    short = split_name(name)[1]
-    if short in MAY_VANISH and abs(value) <= half and (value == 0.0 or value not in limits):
-        end = engineering(-abs(value) - half if short == "dsigma" else value + half, unit_of(name))
-        end = end.replace("Pa s", "Pa·s")
-        return "weak", f"it is not told from zero: its 95 % interval goes from 0 to {end}"
+        trace = why if math.isfinite(half) else "it leaves no trace in the curves"
+        return verdict, insight.combination(name, uncertainty.NOTHING / 1.96) or trace
+    at_bound = value in limits and value != 0.0
+    if short in MAY_VANISH and ends[0] <= 0.0 <= ends[1] and not at_bound:
+        reach = engineering(ends[0] if short == "dsigma" else ends[1], unit_of(name))
+        reach = reach.replace("Pa s", "Pa·s")
+        return "weak", f"it is not told from zero: its 95 % interval goes from 0 to {reach}"
     if verdict == "determined":
         return verdict, why
-    open_at = [limit for limit in limits if abs(value - limit) < half]
-    if open_at and "open" not in why:
-        why += f", open on one side: it reaches its limit {engineering(open_at[0], unit_of(name))}"
+    past = [ends[0] < limits[0], ends[1] > limits[1]]
+    if any(past) and "open" not in why:
+        limit, unit = limits[past.index(True)], unit_of(name)
+        told = engineering(limit, unit) if unit else f"{limit:g}"
+        why += f", open on one side: it reaches its limit {told}"
     together = insight.combination(name, uncertainty.WEAK / 1.96) or insight.companion(name)
     return verdict, f"{why}; {together}" if together else why
 
