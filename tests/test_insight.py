@@ -480,7 +480,7 @@ def test_the_pictures_show_every_parameter_and_curve() -> None:
 
 def test_report_and_plan_show_them_too() -> None:
     result = concluded()
-    page = render_report(result)
+    page = render_report(result, fit_png=b"\x89PNG" + bytes(20))
     assert page.count("data:image/png;base64,") == 4
     for words in ("Checklist", "What this test can tell", "Is the noise floor reached?"):
         assert words in page
@@ -490,3 +490,15 @@ def test_report_and_plan_show_them_too() -> None:
     problem = problem_of(test)
     plan = planning.make_plan(problem, values_of(problem, spring), "the truth")
     assert [len(half.axes) for half in plot_plan(plan).subfigs] == [2, 2]
+
+
+# ---------------------------------------------------------------- what the words leave out
+
+
+def test_what_was_never_reached_is_said_first() -> None:
+    slow = concluded(synthetic_impact(velocity=1.75, samples=201)[1])
+    start = "The test says nothing of s1_kc, s1_dsigma, s1_eps_c and s1_kh_minus, and least of the "
+    assert slow.insight.sentence().startswith(start + "rest of s1_")
+    warning = next(w for w in slow.warnings if w.startswith("Not determined"))
+    assert "s1_kc (branch c of spring 1 was never reached)" in warning
+    assert "s1_dsigma, s1_eps_c, s1_kh_minus (branch e of spring 1 was never reached)" in warning
