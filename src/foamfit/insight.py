@@ -28,6 +28,8 @@ Array = NDArray[np.float64]
 # Shares of a direction below which a parameter has no part in it, and of the largest below which
 # it is not named.
 PART, NAMED = 0.05, 0.3
+# Parameters of a joint change that are named at most.
+MOST = 3
 FLIGHT = "free flight"
 
 
@@ -284,8 +286,7 @@ class Insight:
         -------
         str
             If one combination of the parameters that can move together is fixed, that one as a
-            product of powers, good to first order; else the joint change that leaves the curves as
-            they are.
+            product of powers, good to first order; else those that make up for a change of it.
         """
         errors, vt = self._directions
         free = vt[errors > loose]
@@ -302,13 +303,21 @@ class Insight:
             powers = left[:, -1] * self.values[group] / self.sizes[group]
             if np.all(self.values[group] != 0.0):
                 return f"the data fix only {_product(names, powers)}"
-        change = left[:, 0] / left[np.argmax(np.abs(left[:, 0])), 0]
-        joint = ", ".join(
-            f"{other} by {part:+.2g}".replace("-", "−")
-            for other, part in zip(names, change, strict=True)
-            if abs(part) > PART
+        return self._made_up(name, free, errors[errors > loose])
+
+    def _made_up(self, name: str, free: Array, errors: Array) -> str:
+        """Say which parameters make up for one: how they go with it along the free directions."""
+        me = self.names.index(name)
+        change = (free[:, me] * np.minimum(errors, 1e6) ** 2) @ free
+        change = change / change[me]
+        change[me] = 0.0
+        order = np.argsort(-np.abs(change), kind="stable")
+        parts = [i for i in order if abs(change[i]) > NAMED * abs(change[order[0]])]
+        told = ", ".join(
+            f"{self.names[i]} ({change[i]:+.2g})".replace("-", "−") for i in parts[:MOST]
         )
-        return f"the curves stay as they are if {joint} change together (in natural sizes)"
+        more = f" and {len(parts) - MOST} more" if len(parts) > MOST else ""
+        return f"a change by one natural size is made up for by {told}{more}"
 
     def _group(self, free: Array, member: int) -> list[int]:
         """Parameters that can move together with one, itself included, along free directions."""

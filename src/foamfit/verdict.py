@@ -223,7 +223,7 @@ def state_of(
     at_bound = value in limits and value != 0.0
     if short in MAY_VANISH and ends[0] <= 0.0 <= ends[1] and not at_bound:
         reach = engineering(ends[0] if short == "dsigma" else ends[1], unit_of(name))
-        reach = reach.replace("Pa s", "Pa·s")
+        reach = reach.replace("Pa s", "Pa·s").replace("-", "−")
         return "weak", f"it is not told from zero: its 95 % interval goes from 0 to {reach}"
     if verdict == "determined":
         return verdict, why
