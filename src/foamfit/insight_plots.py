@@ -200,10 +200,11 @@ def _cells(ax: Axes, values: Array, colors: str, limits: tuple[float, float], fo
         if np.isfinite(value):
             shown = form.format(value).replace("-", "−").replace("0.", ".")
             dark = abs(value) > 0.6 * limits[1]
-            ax.text(
+            text = ax.text(
                 j, i, _short(shown), ha="center", va="center", fontsize=5.5,
                 color="white" if dark else "black",
             )  # fmt: skip
+            text.set_in_layout(False)  # inside its cell anyway; to measure each takes long
     style: dict[str, Any] = {"length": 0, "labelsize": 6.5}
     ax.tick_params(**style)
     for spine in ax.spines.values():

@@ -59,6 +59,7 @@ ENERGY = {  # of the audit: label and unit
     "momentum_change": ("change of momentum", "N·s"),
     "impulse_ratio": ("impulse over change of momentum", ""),
 }
+COARSE = 160  # dots per inch of what is only on the page, and should not take long
 ANSWERS = {True: ("yes", "ok"), False: ("no", "weak"), None: ("–", "fixed")}
 CITATION = (
     "Thevamaran, R., Fraternali, F., Daraio, C. (2014). Multiscale Mass-Spring Model for "
@@ -196,7 +197,7 @@ def _insight_figures(result: FitResult) -> list[tuple[str, float]]:
 
     matrix = None if result.correlation is None else result.correlation.matrix
     figures = (plot_information(result.insight, matrix), plot_sensitivities(result.insight))
-    return [_figure(image(figure, "png")) for figure in figures]
+    return [_figure(image(figure, "png", COARSE), COARSE) for figure in figures]
 
 
 def readable(name: str, p: ParameterEstimate) -> Readable:
@@ -308,6 +309,6 @@ def _wrap(start: str, text: str) -> list[str]:
     return textwrap.wrap(start + text, 100, subsequent_indent="  ")
 
 
-def _figure(png: bytes) -> tuple[str, float]:
+def _figure(png: bytes, dpi: int = DPI) -> tuple[str, float]:
     """Return a PNG in base64, and its width in inches (the width in pixels is in its header)."""
-    return base64.b64encode(png).decode("ascii"), int.from_bytes(png[16:20]) / DPI
+    return base64.b64encode(png).decode("ascii"), int.from_bytes(png[16:20]) / dpi
