@@ -165,6 +165,24 @@ def test_the_published_damping_is_answered_in_words() -> None:
     assert "gives 0.845, where the paper says 0.894" in " ".join(text.split())
 
 
+@pytest.mark.parametrize(
+    ("eta", "kc", "zeta"),
+    [
+        ("determined", "weak", "determined"),
+        ("weak", "determined", "weak"),
+        ("determined", "not determined", "not determined"),
+        ("fixed", "not determined", "fixed"),
+    ],
+)
+def test_the_damping_ratio_is_known_as_the_damping_is(eta: str, kc: str, zeta: str) -> None:
+    """ζ is η/√k_c: only a stiffness that is not known at all makes it worse than η."""
+    result = with_parameter(published_fit("foam-1/model-2"), "s1_kc", state=kc, why="kc's reason")
+    result = with_parameter(result, "s1_eta", state=eta, why="its reason", vary=eta != "fixed")
+    section = only(compare([result]))
+    assert (row(section, "η").state, row(section, "ζ").state) == (eta, zeta)
+    assert (row(section, "ζ").stderr is None) == (kc == "not determined")
+
+
 def test_other_springs_are_not_compared() -> None:
     result = published_fit("foam-1/model-3", off=1.0)
     comparison = compare([result], published="foam-1/model-1")

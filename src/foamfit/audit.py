@@ -57,8 +57,11 @@ class EnergyAudit:
 
     def warnings(self) -> list[str]:
         """Return one sentence for each balance that does not close."""
-        found = []
-        taken, ratio = self.absorbed_over_striker, self.impulse_ratio
+        return self.energy_warnings() + self.impulse_warnings()
+
+    def energy_warnings(self) -> list[str]:
+        """Return one sentence for each balance of energy that does not close."""
+        found, taken = [], self.absorbed_over_striker
         if taken is not None and taken > 1.05:
             found.append(
                 f"Check: the foam absorbs {taken:.2f} times the energy that the striker brings, "
@@ -71,12 +74,17 @@ class EnergyAudit:
             )
         if self.dissipated_fraction is not None and self.dissipated_fraction < -0.02:
             found.append("Check: the loop gives out more energy than it takes up.")
-        if ratio is not None and abs(ratio - 1) > 0.1:
-            found.append(
-                f"Check: the impulse of the force is {ratio:.2f} of the striker's change of "
-                "momentum; mass, the scale of the force and the motion do not agree."
-            )
         return found
+
+    def impulse_warnings(self) -> list[str]:
+        """Return a sentence if the impulse of the force is not the change of momentum."""
+        ratio = self.impulse_ratio
+        if ratio is None or abs(ratio - 1) <= 0.1:
+            return []
+        return [
+            f"Check: the impulse of the force is {ratio:.2f} of the striker's change of "
+            "momentum; mass, the scale of the force and the motion do not agree."
+        ]
 
     def sentences(self) -> list[str]:
         """Return what was found, what does not close, and what is missing."""

@@ -99,21 +99,84 @@ _SPECIMEN = click.option(
 )
 
 
+_DRIVE = click.option(
+    "--drive",
+    type=click.Choice(["impact", "stress", "displacement"]),
+    help="Default: impact if striker and time are known, else displacement.",
+)
+
+
 @main.command()
 @_TEST
 @_SPECIMEN
-def check(test: Path, specimen: Path | None) -> None:
+@click.option("--model", help="Also say what the test can tell of this model, before it is fitted.")
+@_DRIVE
+@click.option("--published", "published_set", metavar="NAME", help="Start from a published set.")
+@click.option(
+    "--params",
+    metavar="RESULT",
+    type=click.Path(path_type=Path),
+    help="Start from an earlier result. Default: a quick descent from the measured loop.",
+)
+@click.option(
+    "--plot", type=click.Path(path_type=Path), help="Draw what fixes what, PNG, PDF, SVG."
+)
+def check(
+    test: Path,
+    specimen: Path | None,
+    model: str | None,
+    drive: str | None,
+    published_set: str | None,
+    params: Path | None,
+    plot: Path | None,
+) -> None:
     """Say what the loader understood of TEST.csv: columns, contact, specimen, energy.
 
+    With --model also what the test can tell: the velocity that closes the loop, the standard errors
+    to expect, the channel worth measuring better. A TOML in the place of the CSV plans a test that
+    is not made yet, if --published or --params says what foam it will be.
+
     \b
-    Example:
+    Examples:
         foamfit check TEST.csv --specimen foam.toml
+        foamfit check TEST.csv --model bistable --plot what.png
+        foamfit check PLAN.toml --model bistable --published foam-1/model-1
     """
     from foamfit.audit import audit, describe
     from foamfit.reading import read_test
 
-    measurement = read_test(test, specimen)
-    click.echo(describe(measurement, audit(measurement)))
+    if model is None:
+        for option, value in (
+            ("--drive", drive),
+            ("--published", published_set),
+            ("--params", params),
+            ("--plot", plot),
+        ):
+            if value is not None:
+                raise InputError(f"{option} needs --model; give one, as --model bistable")
+    if plot is not None:
+        from foamfit.plots import figure_format
+
+        _check_file(plot)
+        figure_format(plot)
+    if published_set is not None and params is not None:
+        raise InputError("--published and --params exclude each other; give one of them")
+    planned = model is not None and test.suffix.lower() == ".toml"
+    if not planned:
+        measurement = read_test(test, specimen)
+        click.echo(describe(measurement, audit(measurement)))
+    if model is None:
+        return
+    from foamfit.planning import describe_plan, plan_test
+
+    plan = plan_test(test, specimen, model, drive, published_set=published_set, result=params)
+    click.echo("" if planned else "\n", nl=False)
+    click.echo(describe_plan(plan))
+    if plot is not None:
+        from foamfit.insight_plots import plot_plan
+
+        plot_plan(plan, plot)
+        click.echo(f"\ndrawn in {plot}")
 
 
 def _fixes(
@@ -160,11 +223,7 @@ def _hold_and_vary(
 @_TEST
 @_SPECIMEN
 @click.option("--model", default="bistable", show_default=True, help="Springs from the base up.")
-@click.option(
-    "--drive",
-    type=click.Choice(["impact", "stress", "displacement"]),
-    help="Default: impact if striker and time are known, else displacement.",
-)
+@_DRIVE
 @click.option(
     "--out",
     type=click.Path(path_type=Path),

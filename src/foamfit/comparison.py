@@ -453,8 +453,12 @@ def _damping_rows(side: _Side, other: _Side, nothing: str) -> Iterator[Row]:
         lambda *at: _total(*at[:-1]) / (2.0 * (inertia * at[-1]) ** 0.5),
     )
     if ratio is not None:
-        ratio = replace(ratio, state="fixed" if value.state == "fixed" else ratio.state)
+        # ζ is η over a root: it is known as well as η is, unless k_c is not known at all.
+        if ratio.state != "not determined" or value.state == "fixed":
+            ratio = replace(ratio, state=value.state, why=value.why)
         published = None if item.damping_ratio is None else _Value(item.damping_ratio, None, "", "")
+        lost = ratio.state == "not determined" != value.state
+        remark = f"not determined: {ratio.why}" if lost and not remark else remark
         yield _row(0, "ζ", "", ratio, published, remark)
 
 

@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.errors import InputError, SimulationError
+from foamfit.insight import unreached
 from foamfit.measurement import Measurement
 from foamfit.model import Model, split_name
 from foamfit.problem import Problem, make_problem
 from foamfit.result import FitResult
 from foamfit.search import SearchRecord, SearchStoppedError, Tracker, salvage, search
-from foamfit.verdict import conclude, unreached
+from foamfit.verdict import conclude
 
 Array = NDArray[np.float64]
 

@@ -263,7 +263,7 @@ def plot_comparison(comparison: Comparison, path: str | Path | None = None) -> F
     return figure
 
 
-def image(figure: Figure, form: Literal["png", "pdf", "svg"]) -> bytes:
+def image(figure: Figure, form: Literal["png", "pdf", "svg"], dpi: int = DPI) -> bytes:
     """Return the figure as the bytes of a file (PDF with embedded TrueType fonts).
 
     Parameters
@@ -272,6 +272,8 @@ def image(figure: Figure, form: Literal["png", "pdf", "svg"]) -> bytes:
         What to render.
     form : {"png", "pdf", "svg"}
         The format.
+    dpi : int
+        Of a PNG.
     """
     import matplotlib
 
@@ -281,7 +283,7 @@ def image(figure: Figure, form: Literal["png", "pdf", "svg"]) -> bytes:
     with matplotlib.rc_context(STYLE), warnings.catch_warnings():
         # A test may be named in letters that the font lacks: the figure is good without them.
         warnings.filterwarnings("ignore", message="Glyph .* missing")
-        figure.savefig(buffer, format=form, dpi=DPI, metadata=metadata)
+        figure.savefig(buffer, format=form, dpi=dpi, metadata=metadata)
     return buffer.getvalue()
 
 
@@ -603,6 +605,13 @@ def figure_format(path: str | Path) -> Literal["png", "pdf", "svg"]:
     if form is None:
         raise InputError(f"a figure is saved as .png, .pdf or .svg, not {Path(path).name!r}")
     return form
+
+
+def save(figure: Figure, path: str | Path | None) -> Figure:
+    """Save a figure, if there is a path, in the format of its suffix; returns the figure."""
+    if path is not None:
+        _save(figure, Path(path))
+    return figure
 
 
 def _save(figure: Figure, path: Path) -> None:

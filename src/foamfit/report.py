@@ -59,6 +59,8 @@ ENERGY = {  # of the audit: label and unit
     "momentum_change": ("change of momentum", "N·s"),
     "impulse_ratio": ("impulse over change of momentum", ""),
 }
+COARSE = 160  # dots per inch of what is only on the page, and should not take long
+ANSWERS = {True: ("yes", "ok"), False: ("no", "weak"), None: ("–", "fixed")}
 CITATION = (
     "Thevamaran, R., Fraternali, F., Daraio, C. (2014). Multiscale Mass-Spring Model for "
     "High-Rate Compression of Vertically Aligned Carbon Nanotube Foams. "
@@ -130,6 +132,8 @@ def render_report(result: FitResult, *, fit_png: bytes | None = None) -> str:
         drive_meaning=DRIVES.get(result.drive, ""),
         branches=BRANCHES,
         fit_figure=_figure(fit_png or image(plot_fit(result), "png")),
+        answers=ANSWERS,
+        insight_figures=_insight_figures(result),
         residual_figure=_figure(image(plot_residuals(result), "png")),
         citation=CITATION,
     )
@@ -161,12 +165,39 @@ def summary_text(result: FitResult) -> str:
     lines += _wrap("", "misfit (RMS over range): " + (", ".join(misfits) or "no curve to compare"))
     lines += ["", *_aligned([row for row in rows if row.state != "fixed"])]
     lines += _wrap("", "fixed: " + ", ".join(fixed)) if fixed else []
+    lines += list(_checks(result))
     lines += [""] if result.warnings or result.notes else []
     for note in result.notes:
         lines += _wrap("note: ", note)
     for warning in result.warnings:
         lines += _wrap("warning: ", warning)
     return "\n".join(lines)
+
+
+def _checks(result: FitResult) -> Iterator[str]:
+    """Give the checklist, and what the test tells least."""
+    if result.checklist:
+        yield ""
+    for check in result.checklist:
+        text = f"{check.question} {check.sentence}"
+        yield from textwrap.wrap(
+            f"{ANSWERS[check.answer][0]:<5}{text}", 100, subsequent_indent=" " * 7
+        )
+    sentence = "" if result.insight is None else result.insight.sentence()
+    if sentence:
+        yield ""
+        yield from _wrap("", sentence)
+
+
+def _insight_figures(result: FitResult) -> list[tuple[str, float]]:
+    """Give the figures of what the test can tell; none where it tells nothing."""
+    if result.insight is None:
+        return []
+    from foamfit.insight_plots import plot_information, plot_sensitivities
+
+    matrix = None if result.correlation is None else result.correlation.matrix
+    figures = (plot_information(result.insight, matrix), plot_sensitivities(result.insight))
+    return [_figure(image(figure, "png", COARSE), COARSE) for figure in figures]
 
 
 def readable(name: str, p: ParameterEstimate) -> Readable:
@@ -278,6 +309,6 @@ def _wrap(start: str, text: str) -> list[str]:
     return textwrap.wrap(start + text, 100, subsequent_indent="  ")
 
 
-def _figure(png: bytes) -> tuple[str, float]:
+def _figure(png: bytes, dpi: int = DPI) -> tuple[str, float]:
     """Return a PNG in base64, and its width in inches (the width in pixels is in its header)."""
-    return base64.b64encode(png).decode("ascii"), int.from_bytes(png[16:20]) / DPI
+    return base64.b64encode(png).decode("ascii"), int.from_bytes(png[16:20]) / dpi

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     import lmfit
 
     from foamfit.chain import Chain
+    from foamfit.checklist import Check
+    from foamfit.insight import Insight
     from foamfit.measurement import Measurement
     from foamfit.spring import BistableSpring
 
@@ -114,6 +116,8 @@ class FitResult:
     switches: tuple[Switch, ...]
     correlation: Correlation | None = None
     notes: tuple[str, ...] = ()
+    checklist: tuple[Check, ...] = ()
+    insight: Insight | None = None
 
     @property
     def bistable_springs(self) -> dict[str, BistableSpring]:
@@ -150,6 +154,10 @@ class FitResult:
                 "status": self.status,
                 "warnings": self.warnings,
                 "notes": self.notes,
+                "checklist": [
+                    {"question": c.question, "answer": c.answer, "sentence": c.sentence}
+                    for c in self.checklist
+                ],
                 "parameters": {name: asdict(p) for name, p in self.parameters.items()},
                 **({"correlation": vars(self.correlation)} if self.correlation else {}),
                 "derived": derived,

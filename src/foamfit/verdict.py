@@ -1,19 +1,21 @@
-"""What to say of the best point: estimates, states, statistics, warnings, and the result itself."""
+"""What to say of the best point: estimates, states, statistics, and the result itself."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from foamfit import kernels, uncertainty
-from foamfit.audit import EnergyAudit, audit
+from foamfit.audit import audit
+from foamfit.checklist import MAY_VANISH, Evidence, make_checklist, status_of, warnings_of
+from foamfit.conditioning import engineering
 from foamfit.errors import SimulationError
+from foamfit.insight import Insight, look, unreached, visited
 from foamfit.measurement import interior_channel
-from foamfit.model import BRANCHES, split_name, unit_of
+from foamfit.model import split_name, unit_of
 from foamfit.objective import Objective, Simulated
 from foamfit.problem import Problem
 from foamfit.result import Correlation, Curves, FitResult, ParameterEstimate, Switch
@@ -21,36 +23,41 @@ from foamfit.search import SearchRecord
 
 Array = NDArray[np.float64]
 
-# A curve was not fitted if it is off by more than this share of its own standard deviation; it is
-# fitted poorly if it is off by more than this share of its range.
-UNACCEPTABLE = 0.5
-POOR = 0.05
-
 
 def conclude(problem: Problem, values: Array, record: SearchRecord) -> FitResult:
     """Assemble the result at the best point."""
     objective, measurement = problem.objective, problem.measurement
     simulated = objective.simulate(values, everything=True)
     residual = objective.residual(values)
-    estimates, spread, correlation = _estimate(problem, values, residual)
-    misfit = objective.misfit(simulated)
+    estimates, spread, insight = _estimate(problem, values, residual)
+    correlation = None
+    if insight is not None and spread is not None:
+        correlation = Correlation(insight.names, spread.correlation)
     balance = audit(measurement)
+    evidence = Evidence(
+        problem=problem,
+        estimates=estimates,
+        visited=visited(problem, simulated),
+        residual=residual,
+        misfit=objective.misfit(simulated),
+        spread=spread,
+        record=record,
+        balance=balance,
+    )
+    checklist = make_checklist(evidence)
     n_vary = sum(1 for item in estimates.values() if item.vary and item.stderr is not None)
-    warnings = _warnings(problem, estimates, misfit, spread, record, balance)
-    missed = any(_missed(objective, misfit, name) for name in objective.counted)
-    status = "failed" if missed else ("warnings" if warnings else "ok")
     return FitResult(
         measurement=measurement,
         model=problem.model.name,
         drive=objective.drive,
         seed=record.seed,
-        status=status,
-        warnings=tuple(warnings),
+        status=status_of(checklist),
+        warnings=warnings_of(checklist),
         chain=problem.model.chain(values, measurement.specimen.height, measurement.specimen.area),
         params=problem.params,
         parameters=estimates,
-        visited=visited(problem, simulated),
-        misfit=misfit,
+        visited=evidence.visited,
+        misfit=evidence.misfit,
         weights=objective.weights,
         statistics=_statistics(residual, n_vary, spread, objective, record),
         energy=balance.as_dict() | {"sentences": balance.sentences()},
@@ -70,6 +77,8 @@ def conclude(problem: Problem, values: Array, record: SearchRecord) -> FitResult
         switches=_switches(problem, simulated),
         correlation=correlation,
         notes=_notes(problem, values, simulated),
+        checklist=checklist,
+        insight=insight,
     )
 
 
@@ -114,16 +123,18 @@ def _notes(problem: Problem, values: Array, simulated: Simulated) -> tuple[str, 
 
 def _estimate(
     problem: Problem, values: Array, residual: Array
-) -> tuple[dict[str, ParameterEstimate], uncertainty.Covariance | None, Correlation | None]:
+) -> tuple[dict[str, ParameterEstimate], uncertainty.Covariance | None, Insight | None]:
     """Value, uncertainty and state of every parameter; also put into lmfit's parameters."""
     params, objective = problem.params, problem.objective
     lost = unreached(problem, values)
     names = tuple(n for n in problem.model.names if params[n].vary and n not in lost)
-    spread = None
+    spread = insight = None
     if names:
-        sizes = problem.sizes(names, values)
         jacobian = problem.slopes(values, names)
+        sizes = problem.sizes(names, values)
         spread = uncertainty.covariance(jacobian, residual, objective.sizes, sizes)
+        noise = _left_over(problem, residual, spread)
+        insight = look(problem, values, names, jacobian, noise)
     out = {}
     for i, name in enumerate(problem.model.names):
         value, parameter = float(values[i]), params[name]
@@ -138,10 +149,23 @@ def _estimate(
             estimate = ParameterEstimate(value, None, None, unit_of(name), False, "fixed", why)
         else:
             assert spread is not None
-            estimate = _varied(problem, name, value, spread, names.index(name), sizes)
+            assert insight is not None
+            estimate = _varied(problem, name, value, spread, insight)
             parameter.stderr = estimate.stderr
         out[name] = estimate
-    return out, spread, None if spread is None else Correlation(names, spread.correlation)
+    return out, spread, insight
+
+
+def _left_over(
+    problem: Problem, residual: Array, spread: uncertainty.Covariance
+) -> dict[str, float]:
+    """One standard deviation of what is left of each curve, SI, its correlation counted."""
+    objective, out, at = problem.objective, {}, 0
+    for name, size, tau in zip(objective.counted, objective.sizes, spread.tau, strict=True):
+        rms = math.sqrt(float(np.mean(residual[at : at + size] ** 2)) * tau)
+        out[name] = max(rms, 1e-300) * objective.scale[name] / objective.weights[name] ** 0.5
+        at += size
+    return out
 
 
 def _varied(
@@ -149,20 +173,67 @@ def _varied(
     name: str,
     value: float,
     spread: uncertainty.Covariance,
-    column: int,
-    sizes: Array,
+    insight: Insight,
 ) -> ParameterEstimate:
     """Estimate of a parameter that was varied and whose branch was reached."""
     low, high = problem.params[name].min, problem.params[name].max
+    column = insight.names.index(name)
     stderr = float(spread.stderr[column])
-    half = uncertainty.half_width(stderr, spread.effective - len(sizes))
-    verdict, why = uncertainty.state(value, half, float(sizes[column]), low, high)
+    half = uncertainty.half_width(stderr, spread.effective - len(insight.names))
+    ends = (value - half, value + half)
+    verdict, why = state_of(name, value, ends, insight, (low, high))
     if verdict == "determined" and problem.objective.interior_mass:
         verdict, why = "weak", "the ringing of the interior mass leaves other valleys; " + why
     if verdict == "not determined":
         return ParameterEstimate(value, None, None, unit_of(name), True, verdict, why)
-    ci95 = (max(value - half, low), min(value + half, high))
+    ci95 = (max(ends[0], low), min(ends[1], high))
     return ParameterEstimate(value, stderr, ci95, unit_of(name), True, verdict, why)
+
+
+def state_of(
+    name: str,
+    value: float,
+    ends: tuple[float, float],
+    insight: Insight,
+    limits: tuple[float, float],
+) -> tuple[str, str]:
+    """State of a parameter that varies and whose branch is reached, and the reason in one sentence.
+
+    Parameters
+    ----------
+    name : str
+        For example "s1_kc".
+    value : float
+        Its value.
+    ends : (float, float)
+        Of its 95 % interval, not cut at the limits; NaN or infinite where the data fix only a
+        combination.
+    insight : Insight
+        What the test can tell there.
+    limits : (float, float)
+        Its limits.
+    """
+    size, short = float(insight.sizes[insight.names.index(name)]), split_name(name)[1]
+    half = 0.5 * (ends[1] - ends[0])
+    half = half if math.isfinite(half) else math.nan
+    verdict, why = uncertainty.state(value, half, size, *limits)
+    if verdict == "not determined":
+        trace = why if math.isfinite(half) else "it leaves no trace in the curves"
+        return verdict, insight.combination(name, uncertainty.NOTHING / 1.96) or trace
+    at_bound = value in limits and value != 0.0
+    if short in MAY_VANISH and ends[0] <= 0.0 <= ends[1] and not at_bound:
+        reach = engineering(ends[0] if short == "dsigma" else ends[1], unit_of(name))
+        reach = reach.replace("Pa s", "Pa·s").replace("-", "−")
+        return "weak", f"it is not told from zero: its 95 % interval goes from 0 to {reach}"
+    if verdict == "determined":
+        return verdict, why
+    past = [ends[0] < limits[0], ends[1] > limits[1]]
+    if any(past) and "open" not in why:
+        limit, unit = limits[past.index(True)], unit_of(name)
+        told = engineering(limit, unit) if unit else f"{limit:g}"
+        why += f", open on one side: it reaches its limit {told}"
+    together = insight.combination(name, uncertainty.WEAK / 1.96) or insight.companion(name)
+    return verdict, f"{why}; {together}" if together else why
 
 
 def _statistics(
@@ -195,13 +266,6 @@ def _statistics(
     }
 
 
-def _missed(objective: Objective, misfit: Mapping[str, float | None], name: str) -> bool:
-    """Whether a counted curve was not fitted at all."""
-    measured = objective.measured[name]
-    assert measured is not None
-    return (misfit[name] or 0.0) * float(np.ptp(measured)) > UNACCEPTABLE * float(np.std(measured))
-
-
 def _switches(problem: Problem, simulated: Simulated) -> tuple[Switch, ...]:
     """Place the switches of the fitted response on its curves."""
     measurement, motion = problem.measurement, simulated.motion
@@ -220,75 +284,3 @@ def _switches(problem: Problem, simulated: Simulated) -> tuple[Switch, ...]:
             )
         )
     return tuple(out)
-
-
-def _warnings(
-    problem: Problem,
-    estimates: Mapping[str, ParameterEstimate],
-    misfit: Mapping[str, float | None],
-    spread: uncertainty.Covariance | None,
-    record: SearchRecord,
-    balance: EnergyAudit,
-) -> list[str]:
-    """List what a reader must know before trusting the numbers, worst first."""
-    objective = problem.objective
-    out = []
-    if record.stopped is not None:
-        out.append(
-            f"The search was stopped by {record.stopped}; this is the best point until then."
-        )
-    for name in objective.counted:
-        off = misfit[name] or 0.0
-        if off > POOR:
-            word = "is not acceptable" if _missed(objective, misfit, name) else "is large"
-            out.append(f"The misfit of {name} is {off:.1%} of its range, which {word}.")
-    for verdict in ("not determined", "weak"):
-        names = [name for name, item in estimates.items() if item.state == verdict]
-        if names:
-            reasons = sorted({estimates[name].why for name in names if verdict != "weak"})
-            because = f": {'; '.join(reasons)}" if reasons else ""
-            out.append(f"{verdict.capitalize()}: {', '.join(names)}{because}.")
-    if objective.failures > 0.5 * max(objective.evaluations, 1):
-        out.append(
-            f"{objective.failures} of {objective.evaluations} trials could not be simulated; "
-            "the bounds may be wrong."
-        )
-    if record.agreeing == 1 and record.stopped is None:
-        out.append("Only one of the descents reached the best point; try more starts.")
-    if spread is not None and max(spread.tau) > 5.0:
-        out.append(
-            "The residuals are structured: they follow each other over "
-            f"{max(spread.tau):.0f} samples, and the intervals count that."
-        )
-    if objective.interior_mass and len(problem.model.kinds) > 1:
-        out.append(
-            "With interior masses the cost has a valley for every cycle of their ringing: trust no "
-            "parameter that other seeds, or the fit without them, do not confirm."
-        )
-    out.extend(balance.warnings())
-    return out
-
-
-def visited(problem: Problem, simulated: Simulated) -> dict[str, tuple[str, ...]]:
-    """Branches that each spring went through, in the order of the first visit."""
-    seen = {
-        i: ["a" if kind == "bistable" else "line"] for i, kind in enumerate(problem.model.kinds)
-    }
-    for _, spring, _, entered, _ in simulated.motion.switches:
-        name = kernels.BRANCH_NAMES[int(entered)]
-        if name not in seen[int(spring)]:
-            seen[int(spring)].append(name)
-    return {f"s{i + 1}": tuple(names) for i, names in seen.items()}
-
-
-def unreached(problem: Problem, values: Array) -> dict[str, str]:
-    """Parameters whose branch was never reached, and that branch."""
-    seen = visited(problem, problem.objective.simulate(values, everything=True))
-    out = {}
-    for name in problem.model.names:
-        spring, short = split_name(name)
-        branch = BRANCHES.get(short)
-        bistable = branch and problem.model.kinds[spring] == "bistable"
-        if branch and bistable and branch not in seen[f"s{spring + 1}"]:
-            out[name] = branch
-    return out

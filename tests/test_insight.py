@@ -1,0 +1,491 @@
+"""What a test can tell, against closed forms, energy, an independent integration and refits."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from scipy.optimize import least_squares
+
+import foamfit as ff
+from conftest import AREA, EXPERIMENTS, HEIGHT, synthetic_impact, synthetic_loop
+from foamfit import planning
+from foamfit.chain import Chain, Impact
+from foamfit.checklist import Check, status_of
+from foamfit.cli import main
+from foamfit.insight import FLIGHT, Insight, Section
+from foamfit.insight_plots import plot_information, plot_plan, plot_sensitivities
+from foamfit.measurement import Measurement, Noise, Specimen, Striker
+from foamfit.problem import Problem, make_params, make_problem
+from foamfit.report import render_report, summary_text
+from foamfit.search import SearchRecord
+from foamfit.verdict import conclude
+from reference import reference_impact
+
+STRIKER = Striker(mass=7e-3, velocity=1.75)
+SLOW = EXPERIMENTS / "foam-1" / "model-1-1.75mps-reconstruction.csv"
+AGREED = ((1.0, 5), (4.0, 2))
+
+
+def problem_of(
+    measurement: Measurement, model: str = "bistable", *, damped: bool = False, **given: Any
+) -> Problem:
+    """A problem whose dampers are held at zero unless `damped`."""
+    drive = given.pop("drive", None)
+    params = make_params(measurement, model, drive)
+    if not damped:
+        for name in params:
+            if name.endswith("eta"):
+                params[name].set(value=0.0, vary=False)
+    for name, changed in given.items():
+        params[name].set(**changed)
+    return make_problem(measurement, model, drive, params, None, interior_mass=False)
+
+
+def values_of(problem: Problem, *springs: ff.BistableSpring, **given: float) -> np.ndarray:
+    values = problem.vector()
+    for i, spring in enumerate(springs, start=1):
+        for short in ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus", "eta"):
+            values[problem.model.index[f"s{i}_{short}"]] = getattr(spring, short)
+    for name, value in given.items():
+        values[problem.model.index[name]] = value
+    return problem.tied()(values)
+
+
+def insight_of(scaled: np.ndarray, values: np.ndarray | None = None) -> Insight:
+    """An insight with given sensitivities of one curve."""
+    n, k = scaled.shape
+    values = np.ones(k) if values is None else values
+    return Insight(
+        tuple("pqrst"[:k]), values, np.abs(values), ("stress_time",), np.arange(float(n)), False,
+        scaled, (Section("a", 0, n // 2), Section("d", n // 2, n)),
+    )  # fmt: skip
+
+
+# ---------------------------------------------------------------- the closing velocity
+
+
+@pytest.mark.parametrize("name", ["foam-1/model-1", "foam-1/model-2"])
+def test_the_closing_velocity_brings_the_energy_of_the_way_to_c1(name: str) -> None:
+    """An undamped striker comes to C1 if m v²/2 = A H ∫σ dε, branch a then d; model.md: 1.911."""
+    s = ff.published[name].bistable
+    rise = s.eps_hat_c - s.eps_a
+    work = s.k0 * (-s.eps_a - math.log1p(-s.eps_a)) + s.sigma_a * rise + 0.5 * s.kh_plus * rise**2
+    direct = math.sqrt(2.0 * AREA * HEIGHT * work / STRIKER.mass)
+    found = planning.closing_velocity(Chain([s], [HEIGHT], AREA), STRIKER, 1)
+    assert found == pytest.approx(direct, rel=3e-5)
+    assert found == pytest.approx(1.911, abs=6e-4)
+
+
+def test_the_closing_velocity_of_a_chain_by_independent_integration() -> None:
+    item = ff.published["foam-1/model-3"]
+    chain = Chain(item.chain.springs, item.chain.heights, item.chain.area, [0.0, 0.0])
+    found = planning.closing_velocity(chain, STRIKER, 2)
+    assert found == pytest.approx(1.923, abs=6e-4)
+    time = np.linspace(0.0, 1.2e-3, 7)
+    for factor, closed in ((0.999, False), (1.001, True)):
+        run = reference_impact(chain, Impact(STRIKER.mass, factor * found), time, rtol=1e-9)
+        assert any(branch == "c" for _, _, branch in run.switches) == closed
+
+
+def test_dampers_raise_the_closing_velocity_and_a_wall_has_none() -> None:
+    spring = ff.published["foam-1/model-1"].bistable
+    damped = Chain([spring], [HEIGHT], AREA, site_damping=200.0)
+    assert planning.closing_velocity(damped, STRIKER, 1) > 1.95
+    stiff = Chain([replace(spring, k0=1e14, kc=1e15, kh_plus=1e14)], [HEIGHT], AREA)
+    assert planning.closing_velocity(stiff, STRIKER, 1) is None
+
+
+# ---------------------------------------------------------------- expected errors
+
+
+def test_the_errors_to_expect_are_the_scatter_of_refits() -> None:
+    """60 seeded refits of synthetic impacts; the ratio scatters by 1/√120 = 9 % itself."""
+    spring, test = synthetic_impact(noise=0.01, samples=201)
+    problem = problem_of(test)
+    values = values_of(problem, spring)
+    noise = {"stress_time": test.noise.stress, "displacement_time": test.noise.displacement}
+    outlook = planning.expect(problem, values, noise)
+    names = outlook.insight.names
+    places = [problem.model.index[name] for name in names]
+    sizes = problem.sizes(names, values)
+    clean = problem.objective.residual(values)  # simulated minus the noisy curves
+    slopes = problem.slopes(values, names)
+    rng = np.random.default_rng(7)
+    found = []
+    for _ in range(60):
+        draw = rng.standard_normal(problem.objective.n_data)
+
+        def residual(x: np.ndarray, draw: np.ndarray = draw) -> np.ndarray:
+            moved = values.copy()
+            moved[places] = x * sizes
+            return problem.objective.residual(moved) - clean + draw
+
+        fit = least_squares(residual, values[places] / sizes, jac=lambda _: slopes * sizes)
+        found.append(fit.x * sizes)
+    expected = [outlook.expected[name].stderr for name in names]
+    ratios = np.std(found, axis=0, ddof=1) / expected
+    assert np.all((ratios > 0.72) & (ratios < 1.32)), dict(zip(names, ratios, strict=True))
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.12)
+
+
+def test_half_the_noise_of_the_only_channel_halves_all_errors() -> None:
+    rng = np.random.default_rng(1)
+    insight = insight_of(rng.standard_normal((80, 3)))
+    assert planning.worth(insight)["stress_time"] == pytest.approx(dict.fromkeys("pqr", 0.5))
+
+
+def test_the_worth_of_a_channel_is_that_of_a_test_with_less_noise() -> None:
+    spring, test = synthetic_impact()
+    problem = problem_of(test)
+    values = values_of(problem, spring)
+    noise = {"stress_time": 4e4, "displacement_time": 4e-6}
+    now = planning.expect(problem, values, noise)
+    quiet = planning.expect(problem, values, noise | {"displacement_time": 2e-6})
+    for name, ratio in planning.worth(now.insight)["displacement_time"].items():
+        assert 0.5 <= ratio <= 1.0
+        direct = quiet.expected[name].stderr / now.expected[name].stderr
+        assert ratio == pytest.approx(direct, rel=1e-6)
+
+
+# ---------------------------------------------------------------- directions in words
+
+
+def test_two_springs_in_series_show_only_their_compliance() -> None:
+    """C = h/k_1 + (H-h)/k_2 is all that a slow loop sees; its logarithmic slopes are the powers."""
+    k, h = (8e6, 3e6), 0.3 * HEIGHT
+    compliance = h / k[0] + (HEIGHT - h) / k[1]
+    strain = np.concatenate([np.linspace(0, 0.3, 150), np.linspace(0.3, 0.0, 150)[1:]])
+    rng = np.random.default_rng(2)
+    test = Measurement(
+        name="synthetic springs", path=None, data_sha256="", time=None,
+        stress=strain * HEIGHT / compliance + 2e3 * rng.standard_normal(strain.size),
+        displacement=strain * HEIGHT, specimen=Specimen(HEIGHT, AREA), noise=Noise(2e3),
+        motion="measured",
+    )  # fmt: skip
+    problem = problem_of(test, "linear+linear")
+    values = values_of(problem, s1_k0=k[0], s2_k0=k[1], s1_height=h)
+    result = conclude(problem, values, SearchRecord(0, 1, 0.0, AGREED))
+    slopes = {
+        "s1_k0": -(h / k[0]) / compliance,
+        "s2_k0": -((HEIGHT - h) / k[1]) / compliance,
+        "s1_height": h * (1 / k[0] - 1 / k[1]) / compliance,
+    }
+    power = {name: abs(s / slopes["s2_k0"]) for name, s in slopes.items()}
+    wanted = f"s2_k0·s1_height^{power['s1_height']:.2g}·s1_k0^{power['s1_k0']:.2g}"
+    for name in slopes:
+        item = result.parameters[name]
+        assert (item.state, item.stderr, item.ci95) == ("not determined", None, None)
+        assert item.why == f"the data fix only {wanted}"
+    said = next(w for w in result.warnings if w.startswith("Not determined"))
+    assert all(name in said for name in slopes)
+    assert said.count(wanted) == 1 or all(f"{n} (" in said for n in slopes)
+
+
+X = np.linspace(0.0, 1.0, 60)
+
+
+@pytest.mark.parametrize(
+    ("columns", "values", "said"),
+    [
+        ((X, X, 1 - X), (1.0, 1.0, 1.0), "the data fix only p·q"),
+        ((X, -X, 1 - X), (1.0, 1.0, 1.0), "the data fix only p/q"),
+        ((2 * X, -X, 1 - X), (1.0, 1.0, 1.0), "the data fix only p/q^0.5"),
+        ((2 * X, -X, 1 - X), (1.0, -3.0, 1.0), "the data fix only p·q^0.5"),
+        ((X, X**2, X + 2 * X**2), (1.0, 1.0, 1.0), "made up for by q (+2), r (−1)"),
+        ((0 * X, 0 * X, 1 - X), (1.0, 1.0, 1.0), ""),
+    ],
+)
+def test_a_combination_is_named_with_its_powers(
+    columns: tuple[np.ndarray, ...], values: tuple[float, ...], said: str
+) -> None:
+    told = insight_of(100 * np.column_stack(columns), np.array(values)).combination("p", 1.0)
+    assert told == said or ("made up" in said and said in told)
+
+
+def test_the_weakest_direction_is_told_in_words() -> None:
+    alike = insight_of(np.column_stack([X, X * (1 + 1e-3 * X), 50 * (1 - X)]))
+    error, parts = alike.weakest()
+    assert parts == pytest.approx({"p": -1.0, "q": 1.0}, rel=2e-3) or parts == pytest.approx(
+        {"p": 1.0, "q": -1.0}, rel=2e-3
+    )
+    assert error == pytest.approx(alike.stderr[0] * math.sqrt(2), rel=2e-3)
+    assert "together" in alike.sentence()
+    alone = insight_of(np.column_stack([30 * X, 1 - X]))
+    assert alone.sentence().startswith("The test says least about q, which has a standard error")
+    nothing = insight_of(np.column_stack([X, 0 * X]))
+    assert "q, which cannot be told at all" in nothing.sentence()
+    assert np.isinf(nothing.stderr[1])
+
+
+def test_the_shares_of_the_information_add_up_and_lie_where_the_branch_is() -> None:
+    spring, test = synthetic_impact()
+    problem = problem_of(test, drive="displacement")
+    result = conclude(problem, values_of(problem, spring), SearchRecord(0, 1, 0.0, AGREED))
+    parts, shares = result.insight.shares()
+    assert np.sum(shares, axis=1) == pytest.approx(np.ones(len(result.insight.names)))
+    where = {
+        name: {branch: float(shares[i, j]) for j, (_, branch) in enumerate(parts)}
+        for i, name in enumerate(result.insight.names)
+    }
+    # Along a known motion a slope is told by its own branch alone.
+    assert where["s1_kh_minus"]["e"] > 0.99
+    assert where["s1_kh_plus"]["d"] > 0.99
+    assert where["s1_kc"]["c"] > 0.99
+    assert where["s1_k0"]["a"] > 0.99
+
+
+def test_the_sections_are_those_of_the_branches_in_time() -> None:
+    spring, test = synthetic_impact()
+    problem = problem_of(test)
+    result = conclude(problem, values_of(problem, spring), SearchRecord(0, 1, 0.0, AGREED))
+    cuts = result.insight.sections
+    assert [cut.branches for cut in cuts] == ["a", "d", "c", "e", FLIGHT]
+    assert cuts[0].start == 0
+    assert cuts[-1].stop == test.time.size
+    assert all(one.stop == other.start for one, other in pairwise(cuts))
+    for cut, switch in zip(cuts[1:], result.switches, strict=False):
+        assert test.time[cut.start - 1] < switch.time <= test.time[cut.start]
+    free = np.array(result.insight.along("s1_kc", "stress_time"))
+    assert not free[: cuts[2].start].any()  # k_c leaves no trace before branch c
+
+
+# ---------------------------------------------------------------- the checklist
+
+
+def concluded(
+    measurement: Measurement | None = None, record: dict[str, Any] | None = None, **given: Any
+) -> Any:
+    """What is said at the true parameters of a synthetic impact."""
+    spring, test = synthetic_impact(samples=201)
+    problem = problem_of(test if measurement is None else measurement, **given)
+    values = values_of(problem, spring)
+    return conclude(
+        problem, values, SearchRecord(0, 8, 0.0, **({"costs": AGREED} | (record or {})))
+    )
+
+
+def answers(result: Any) -> dict[str, bool | None]:
+    return {check.key: check.answer for check in result.checklist}
+
+
+def test_a_good_fit_passes_every_question() -> None:
+    result = concluded()
+    assert set(answers(result).values()) == {True}
+    assert (result.status, result.warnings) == ("ok", ())
+    assert summary_text(result).count("\nyes  ") == len(result.checklist)
+
+
+def _wave(test: Measurement) -> Measurement:
+    swing = 2.0 * test.noise.stress * np.sin(np.linspace(0, 12, test.time.size))
+    return replace(test, stress=test.stress + swing)
+
+
+SPOILT = {
+    "ended": {"record": {"stopped": "the time limit"}},
+    "agree": {"record": {"costs": ((1.0, 1), (2.0, 6))}},
+    "followed": {"change": lambda t: replace(t, stress=t.stress[::-1].copy())},
+    "floor": {"change": lambda t: replace(t, noise=Noise(t.noise.stress / 2, None))},
+    "structure": {"change": _wave},
+    "visited": {"change": lambda _: synthetic_impact(velocity=1.75, samples=201)[1]},
+    "determined": {"change": lambda _: synthetic_impact(velocity=1.75, samples=201)[1]},
+    "bounds": {"s1_kh_minus": {"min": ff.published["foam-1/model-1"].bistable.kh_minus}},
+    "energy": {"change": lambda t: replace(t, striker=Striker(6e-3, 2.0)), "drive": "displacement"},
+    "impulse": {"change": lambda t: replace(t, striker=Striker(8e-3, 2.0))},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("key", SPOILT)
+def test_each_question_is_answered_no_by_what_deserves_it(key: str) -> None:
+    given = dict(SPOILT[key])
+    change = given.pop("change", None)
+    test = synthetic_impact(samples=201)[1]
+    result = concluded(None if change is None else change(test), **given)
+    assert answers(result)[key] is False
+    assert result.status == ("failed" if key == "followed" else "warnings")
+    assert result.warnings
+    told = result.to_json_dict()["checklist"]
+    assert all(set(item) == {"question", "answer", "sentence"} for item in told)
+    assert sum(item["answer"] is False for item in told) >= 1
+
+
+def test_trials_that_fail_and_masses_that_ring_are_asked_after() -> None:
+    spring, test = synthetic_impact(samples=201)
+    problem = problem_of(test)
+    problem.objective.evaluations, problem.objective.failures = 10, 90
+    result = conclude(problem, values_of(problem, spring), SearchRecord(0, 8, 0.0, AGREED))
+    assert answers(result)["simulated"] is False
+    item = ff.published["foam-1/model-3"]
+    heavy = replace(test, specimen=Specimen(HEIGHT, AREA, 5.56e-6, item.chain.heights))
+    params = make_params(heavy, "linear+bistable")
+    problem = make_problem(heavy, "linear+bistable", None, params, None, interior_mass=True)
+    values, _ = planning.published_values(problem, "foam-1/model-3")
+    result = conclude(problem, values, SearchRecord(0, 8, 0.0, AGREED))
+    assert answers(result)["ringing"] is False
+    assert "determined" not in {p.state for p in result.parameters.values()}
+
+
+def test_what_the_test_does_not_say_is_neither_yes_nor_no() -> None:
+    spring, test = synthetic_loop()
+    problem = problem_of(test, drive="displacement")
+    result = conclude(problem, values_of(problem, spring), SearchRecord(0, 8, 0.0, AGREED))
+    assert answers(result)["energy"] is None
+    assert answers(result)["impulse"] is None
+    assert answers(result)["floor"] is True  # the noise is estimated here
+    assert result.status == "ok"
+
+
+def test_the_status_follows_from_the_answers() -> None:
+    def made(*told: tuple[bool | None, bool]) -> list[Check]:
+        return [Check("key", "question?", answer, "", (), fatal) for answer, fatal in told]
+
+    assert status_of(made((True, False), (None, False))) == "ok"
+    assert status_of(made((True, True), (False, False))) == "warnings"
+    assert status_of(made((False, False), (False, True))) == "failed"
+
+
+def test_a_damper_that_may_be_none_is_not_called_determined() -> None:
+    spring, test = synthetic_impact(eta=8.0)
+    problem = problem_of(test, damped=True)
+    result = conclude(problem, values_of(problem, spring), SearchRecord(0, 8, 0.0, AGREED))
+    item = result.parameters["s1_eta"]
+    assert item.ci95[0] == 0.0
+    assert item.state == "weak"
+    assert item.why.startswith("it is not told from zero: its 95 % interval goes from 0 to ")
+    # Its limit is known well, which is nothing to be warned of, but it is said.
+    assert result.status == "ok"
+    told = next(check for check in result.checklist if check.key == "determined")
+    assert told.sentence == "7 of 8 are; small, and not told from zero: s1_eta."
+    spring, test = synthetic_impact(eta=60.0)
+    problem = problem_of(test, damped=True)
+    result = conclude(problem, values_of(problem, spring), SearchRecord(0, 8, 0.0, AGREED))
+    assert result.parameters["s1_eta"].state == "determined"
+
+
+# ---------------------------------------------------------------- check --model
+
+
+def said(*args: object) -> str:
+    result = CliRunner().invoke(main, [str(arg) for arg in args])
+    assert result.exit_code == 0, result.output
+    return " ".join(result.stdout.split())
+
+
+def test_check_answers_for_a_test_that_is_there(tmp_path: Path) -> None:
+    picture = tmp_path / "what.png"
+    text = said(
+        "check", SLOW, "--model", "bistable", "--published", "foam-1/model-1", "--plot", picture
+    )
+    assert "At 1.75 m/s spring 1 turns back on branch d; from 1.911 m/s on its loop closes." in text
+    assert "The channel worth measuring better is stress-time." in text
+    assert "s1_kc: not determined, branch c of spring 1 is not reached." in text
+    assert "s1_kc MPa 82.50 not determined 82.50 ± " in text
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_check_calls_a_guess_a_guess() -> None:
+    text = said("check", SLOW, "--model", "bistable")
+    assert "the best of 4 quick descents" in text
+    assert "is a guess: this test does not tell s1_kc, s1_dsigma, s1_eps_c, s1_kh_minus" in text
+
+
+def test_check_answers_for_a_test_that_is_only_planned(tmp_path: Path) -> None:
+    plan = tmp_path / "plan.toml"
+    plan.write_text(
+        'name = "next week"\n[specimen]\nheight = "1.19 mm"\ndiameter = "5 mm"\n'
+        '[striker]\nmass = "7 g"\nvelocity = "2.1 m/s"\n[noise]\nstress = "20 kPa"\n'
+    )
+    text = said("check", plan, "--model", "bistable", "--published", "foam-1/model-1")
+    assert "the loop of spring 1 closes, as it does from 1.911 m/s on." in text
+    assert "stress-time 20 kPa (stated)" in text
+
+
+def test_a_slow_test_is_told_by_its_strain() -> None:
+    text = said("check", SLOW, "--model", "bistable", "--drive", "displacement",
+                "--published", "foam-1/model-1")  # fmt: skip
+    assert "from an overall strain of 0.346 (3.839 MPa) on its loop closes" in text
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (["--plot", "x.png"], "--plot needs --model"),
+        (["--drive", "impact"], "--drive needs --model"),
+        (["--model", "bistable", "--published", "foam-9"], "no published set 'foam-9'"),
+        (["--model", "bistable", "--published", "foam-2"], "foam-2 is a linear+bistable"),
+        (["--model", "bistable", "--params", "nowhere"], "nowhere is not a result folder"),
+        (["--model", "bistable", "--plot", "x.doc"], "x.doc"),
+        (["--model", "rubber"], "rubber"),
+    ],
+)
+def test_check_refuses_in_one_line(
+    args: list[str], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(main, ["check", str(SLOW), *args])
+    assert result.exit_code == 1
+    assert words in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_plan_says_what_it_needs(tmp_path: Path) -> None:
+    plan = tmp_path / "plan.toml"
+    plan.write_text('[specimen]\nheight = "1.19 mm"\ndiameter = "5 mm"\n')
+    for args, words in (
+        ([], "--published or --params"),
+        (["--published", "foam-1/model-1"], "[striker] mass is missing"),
+    ):
+        result = CliRunner().invoke(main, ["check", str(plan), "--model", "bistable", *args])
+        assert result.exit_code == 1
+        assert words in result.stderr
+
+
+# ---------------------------------------------------------------- pictures and report
+
+
+def test_the_pictures_show_every_parameter_and_curve() -> None:
+    result = concluded()
+    names, curves = result.insight.names, result.insight.curves
+    for panel, curve in zip(plot_sensitivities(result.insight).axes, curves, strict=True):
+        traces = [line.get_ydata() for line in panel.lines if len(line.get_xdata()) > 2]
+        assert len(traces) == len(names)
+        for i, (name, trace) in enumerate(zip(names, traces, strict=True)):
+            shown, true = i - np.asarray(trace), result.insight.along(name, curve)
+            assert np.corrcoef(shown, true)[0, 1] > 0.999
+    left, right = plot_information(result.insight, result.correlation.matrix).axes
+    assert [label.get_text() for label in left.get_yticklabels()] == list(names)
+    diagonal = [text for text in right.texts if text.get_text() == "1"]
+    assert len(diagonal) >= len(names)
+
+
+def test_report_and_plan_show_them_too() -> None:
+    result = concluded()
+    page = render_report(result, fit_png=b"\x89PNG" + bytes(20))
+    assert page.count("data:image/png;base64,") == 4
+    for words in ("Checklist", "What this test can tell", "Is the noise floor reached?"):
+        assert words in page
+    assert result.insight.sentence() in page
+    assert result.insight.sentence() in " ".join(summary_text(result).split())
+    spring, test = synthetic_impact()
+    problem = problem_of(test)
+    plan = planning.make_plan(problem, values_of(problem, spring), "the truth")
+    assert [len(half.axes) for half in plot_plan(plan).subfigs] == [2, 2]
+
+
+# ---------------------------------------------------------------- what the words leave out
+
+
+def test_what_was_never_reached_is_said_first() -> None:
+    slow = concluded(synthetic_impact(velocity=1.75, samples=201)[1])
+    start = "The test says nothing of s1_kc, s1_dsigma, s1_eps_c and s1_kh_minus, and least of the "
+    assert slow.insight.sentence().startswith(start + "rest of s1_")
+    warning = next(w for w in slow.warnings if w.startswith("Not determined"))
+    assert "s1_kc (branch c of spring 1 was never reached)" in warning
+    assert "s1_dsigma, s1_eps_c, s1_kh_minus (branch e of spring 1 was never reached)" in warning
