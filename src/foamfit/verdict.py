@@ -5,16 +5,27 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from foamfit import kernels, uncertainty
-from foamfit.audit import EnergyAudit, audit
-from foamfit.errors import SimulationError
+from foamfit.audit import EnergyAudit, audit, noise_sentences
+from foamfit.conditioning import engineering
+from foamfit.errors import InputError, SimulationError
 from foamfit.measurement import interior_channel
 from foamfit.model import BRANCHES, split_name, unit_of
-from foamfit.objective import Objective, Simulated
+from foamfit.objective import (
+    LOSSES,
+    MODEL_ERROR,
+    Objective,
+    Simulated,
+    check_time_shift,
+    influence,
+    soften,
+)
 from foamfit.problem import Problem
 from foamfit.result import Correlation, Curves, FitResult, ParameterEstimate, Switch
 from foamfit.search import SearchRecord
@@ -31,12 +42,15 @@ def conclude(problem: Problem, values: Array, record: SearchRecord) -> FitResult
     """Assemble the result at the best point."""
     objective, measurement = problem.objective, problem.measurement
     simulated = objective.simulate(values, everything=True)
-    residual = objective.residual(values)
+    springs = values[: len(problem.model.names)]
+    residual = objective.differences(values)
     estimates, spread, correlation = _estimate(problem, values, residual)
     misfit = objective.misfit(simulated)
     balance = audit(measurement)
     n_vary = sum(1 for item in estimates.values() if item.vary and item.stderr is not None)
     warnings = _warnings(problem, estimates, misfit, spread, record, balance)
+    late = None if objective.time_shift else shift_hint(problem, values, residual, estimates)
+    warnings += [late] if late else []
     missed = any(_missed(objective, misfit, name) for name in objective.counted)
     status = "failed" if missed else ("warnings" if warnings else "ok")
     return FitResult(
@@ -46,7 +60,7 @@ def conclude(problem: Problem, values: Array, record: SearchRecord) -> FitResult
         seed=record.seed,
         status=status,
         warnings=tuple(warnings),
-        chain=problem.model.chain(values, measurement.specimen.height, measurement.specimen.area),
+        chain=problem.model.chain(springs, measurement.specimen.height, measurement.specimen.area),
         params=problem.params,
         parameters=estimates,
         visited=visited(problem, simulated),
@@ -69,8 +83,136 @@ def conclude(problem: Problem, values: Array, record: SearchRecord) -> FitResult
         ),
         switches=_switches(problem, simulated),
         correlation=correlation,
-        notes=_notes(problem, values, simulated),
+        notes=(*_notes(problem, values, simulated), *_noise_notes(objective)),
+        stopped=record.stopped,
+        loss=objective.loss,
+        noise=_noise(objective, residual),
     )
+
+
+def _noise(objective: Objective, residual: Array) -> dict[str, dict[str, Any]]:
+    """Noise of each counted curve, how it is known, its scale, and the residuals over it."""
+    found = {}
+    ends = np.cumsum(objective.sizes)
+    for name, end, size in zip(objective.counted, ends, objective.sizes, strict=True):
+        level, scale = objective.noise(name), objective.scale[name]
+        part = residual[end - size : end] * scale / objective.weights[name] ** 0.5
+        rms = float(np.sqrt(np.mean(part**2)))
+        found[name] = {
+            "sigma": level.sigma,
+            "given": level.given,
+            "how": level.how,
+            "time": level.time,
+            "scale": scale,
+            "residual_over_noise": rms / level.sigma if level.sigma > 0.0 else None,
+        }
+    return found
+
+
+def _noise_notes(objective: Objective) -> list[str]:
+    """What the noise is, what the residuals are counted in, and which samples are left out."""
+    measurement = objective.measurement
+    told = [f"Noise of {sentence}" for sentence in noise_sentences(measurement)]
+    floored = [
+        name for name in objective.counted if objective.scale[name] > objective.noise(name).sigma
+    ]
+    if floored:
+        told.append(
+            f"{', '.join(floored)}: residuals count in units of {MODEL_ERROR:.1%} of the range, "
+            "which is more than the estimated noise, so that no channel outweighs another by an "
+            "error of the model; reduced χ² is in these units."
+        )
+    else:
+        told.append("Residuals count in units of the noise: at its floor the reduced χ² is 1.")
+    for channel, outliers in measurement.outliers.items():
+        told.append(f"{outliers.at.size} outliers of the {channel} are not fitted.")
+    if objective.loss != "linear":
+        told.append(
+            f"The loss is {objective.loss}: residuals past {LOSSES[objective.loss]:g} of their "
+            "units count less than their squares; χ² is that of the loss."
+        )
+    return told
+
+
+def shift_hint(
+    problem: Problem,
+    values: Array,
+    residual: Array,
+    estimates: Mapping[str, ParameterEstimate],
+) -> str | None:
+    """Say by how much the motion channel is late, where the test plainly shows it.
+
+    In the residuals: one linear step of all determined parameters and the shift together, told
+    where the shift is more than four standard errors and a quarter of a sample, and takes a fifth
+    of χ². Where a large shift has spoilt the fit, in the balance of the striker's motion.
+    """
+    try:
+        check_time_shift(problem.measurement, problem.objective.drive)
+    except InputError:
+        return None
+    late = _shift_of_residuals(problem, values, residual, estimates)
+    late = _shift_of_motion(problem) if late is None else late
+    if late is None:
+        return None
+    word = "late" if late > 0.0 else "early"
+    return (
+        f"The motion channel seems to be {word} by {engineering(abs(late), 's')} against the force; "
+        "fit the shift by --time-shift (time_shift=True)."
+    )
+
+
+def _shift_of_residuals(
+    problem: Problem,
+    values: Array,
+    residual: Array,
+    estimates: Mapping[str, ParameterEstimate],
+) -> float | None:
+    """Time by which the motion is late (s), if one linear step plainly finds it."""
+    assert problem.measurement.time is not None
+    step = float(np.median(np.diff(problem.measurement.time)))
+    shifted = replace(problem.objective, time_shift=True, loss="linear")
+    sides = [shifted.differences(np.append(values, side * step)) for side in (-0.5, 0.5)]
+    names = tuple(name for name, item in estimates.items() if item.stderr is not None)
+    plain = replace(problem, objective=replace(problem.objective, loss="linear"))
+    slope = (sides[1] - sides[0]) / step
+    jacobian = np.column_stack([plain.slopes(values, names), slope]) if names else slope[:, None]
+    sizes = np.append(plain.sizes(names, values), step)
+    move = np.linalg.lstsq(jacobian * sizes, -residual, rcond=1e-10)[0]
+    left = residual + jacobian @ (sizes * move)
+    spread = uncertainty.covariance(jacobian, left, shifted.sizes, sizes)
+    late, error = float(move[-1] * step), float(spread.stderr[-1])
+    gained = float(left @ left) < 0.8 * float(residual @ residual)
+    return late if gained and abs(late) > max(4.0 * error, 0.25 * step) else None
+
+
+def _shift_of_motion(problem: Problem) -> float | None:
+    """Time by which the motion is late (s), if the striker's balance of motion plainly shows it.
+
+    m w'' = -F: the force, integrated twice, must give the motion, but for its scale and for where
+    its zero lies. Told where a shift of a sample or more takes half of what is left, down to the
+    noise, or nine tenths.
+    """
+    test, striker = problem.measurement, problem.measurement.striker
+    time, stress, motion = test.time, test.stress, test.displacement
+    if problem.objective.drive != "impact" or time is None or stress is None or motion is None:
+        return None
+    assert striker is not None
+    assert striker.velocity is not None
+    dt = np.diff(time, prepend=min(time[0], 0.0))
+    slowed = np.cumsum(dt * (stress - 0.5 * np.diff(stress, prepend=0.0)))
+    braked = np.cumsum(dt * (slowed - 0.5 * np.diff(slowed, prepend=0.0)))
+    shifts = np.linspace(-0.1, 0.1, 401) * float(time[-1])
+    left = []
+    for late in shifts:
+        when = time - late
+        columns = np.column_stack([np.interp(when, time, braked), np.ones(time.size)])
+        free = motion - striker.velocity * when
+        left.append(float(np.linalg.lstsq(columns, free, rcond=None)[1].sum()))
+    best, none = int(np.argmin(left)), left[shifts.size // 2]
+    floor = 4.0 * problem.objective.noise("displacement_time").sigma ** 2 * time.size
+    plain = 0 < best < shifts.size - 1 and left[best] < (0.5 if left[best] < floor else 0.1) * none
+    step = float(np.median(np.diff(time)))
+    return float(shifts[best]) if plain and abs(shifts[best]) > step else None
 
 
 def _notes(problem: Problem, values: Array, simulated: Simulated) -> tuple[str, ...]:
@@ -90,9 +232,7 @@ def _notes(problem: Problem, values: Array, simulated: Simulated) -> tuple[str, 
     left_out = "The interior masses are left out"
     if specimen.mass is None:
         return (f"{left_out}; with [specimen] mass foamfit could say what they would change.",)
-    heavy = Objective(
-        problem.measurement, problem.model, "impact", objective.weights, interior_mass=True
-    )
+    heavy = replace(objective, interior_mass=True)
     try:
         other = heavy.simulate(values)
     except SimulationError as error:
@@ -118,14 +258,20 @@ def _estimate(
     """Value, uncertainty and state of every parameter; also put into lmfit's parameters."""
     params, objective = problem.params, problem.objective
     lost = unreached(problem, values)
-    names = tuple(n for n in problem.model.names if params[n].vary and n not in lost)
+    names = tuple(n for n in problem.names if params[n].vary and n not in lost)
     spread = None
     if names:
         sizes = problem.sizes(names, values)
-        jacobian = problem.slopes(values, names)
-        spread = uncertainty.covariance(jacobian, residual, objective.sizes, sizes)
+        plain = replace(problem, objective=replace(objective, loss="linear"))
+        spread = uncertainty.covariance(
+            plain.slopes(values, names),
+            pseudo_residual(residual, objective),
+            objective.sizes,
+            sizes,
+            tuple(objective.noise(name).time for name in objective.counted),
+        )
     out = {}
-    for i, name in enumerate(problem.model.names):
+    for i, name in enumerate(problem.names):
         value, parameter = float(values[i]), params[name]
         parameter.stderr = None
         if name in lost and parameter.vary:
@@ -142,6 +288,19 @@ def _estimate(
             parameter.stderr = estimate.stderr
         out[name] = estimate
     return out, spread, None if spread is None else Correlation(names, spread.correlation)
+
+
+def pseudo_residual(residual: Array, objective: Objective) -> Array:
+    """Residuals whose least squares have the covariance of the loss: ψ(r) over the mean of ψ'(r).
+
+    With them (JᵀJ)⁻¹ mean(ψ²)/mean(ψ')² is the covariance of an M-estimate (Huber 1981, Robust
+    Statistics, section 7.6), for each curve apart. Under the linear loss they are the residuals.
+    """
+    parts = []
+    for part in uncertainty.parts(objective.sizes):
+        psi, slope = influence(residual[part], objective.loss)
+        parts.append(psi / max(float(slope.mean()), 0.05))
+    return np.concatenate(parts)
 
 
 def _varied(
@@ -174,13 +333,15 @@ def _statistics(
 ) -> dict[str, float | int | None]:
     """Statistics as lmfit defines them (chi-square, AIC, BIC), and what the search cost."""
     n = residual.size
-    chisqr = float(residual @ residual)
+    cost = soften(residual, objective.loss)
+    chisqr = float(cost @ cost)
     log_likelihood = n * math.log(max(chisqr, 1e-300) / n)
     aic = log_likelihood + 2 * n_vary
     room = n - n_vary - 1
     return {
         "n_data": n,
         "n_effective": None if spread is None else spread.effective,
+        "n_left_out": sum(objective.measured_size(name) for name in objective.counted) - n,
         "n_vary": n_vary,
         "chisqr": chisqr,
         "redchi": chisqr / max(n - n_vary, 1),
