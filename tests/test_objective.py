@@ -12,6 +12,7 @@ from conftest import synthetic_impact, synthetic_loop
 from foamfit.measurement import Noise, Striker
 from foamfit.model import Model
 from foamfit.objective import (
+    MODEL_ERROR,
     PENALTY,
     Objective,
     check_drive,
@@ -42,15 +43,26 @@ def test_residuals_in_units_of_stated_noise_have_unit_variance():
     assert np.std(residual) == pytest.approx(1.0, abs=0.1)
 
 
-def test_without_noise_the_scale_is_the_range():
+def test_estimated_noise_is_the_scale_as_long_as_it_is_not_tiny():
     spring, measurement = synthetic_impact()
-    plain = replace(measurement, noise=Noise())
-    residual = objective(plain).residual(values_of(spring))
+    plain = objective(replace(measurement, noise=Noise()))
+    assert plain.scale["stress_time"] == pytest.approx(measurement.noise.stress, rel=0.15)
+    assert plain.scale["displacement_time"] == pytest.approx(
+        measurement.noise.displacement, rel=0.15
+    )
+    assert np.std(plain.residual(values_of(spring))) == pytest.approx(1.0, abs=0.15)
+
+
+def test_tiny_noise_counts_as_a_share_of_the_range():
+    spring, measurement = synthetic_impact(noise=0.0)
+    plain = objective(measurement)
+    off = plain.residual(values_of(spring)[:] * np.r_[1.01, np.ones(8)])
     n = measurement.time.size
-    simulated = objective(plain).simulate(values_of(spring))
-    expected = (simulated.stress_time - plain.stress) / np.ptp(plain.stress)
-    np.testing.assert_allclose(residual[:n], expected, rtol=1e-14)
-    assert residual.size == 2 * n
+    simulated = plain.simulate(values_of(spring) * np.r_[1.01, np.ones(8)])
+    unit = MODEL_ERROR * np.ptp(measurement.stress)
+    expected = (simulated.stress_time - measurement.stress) / unit
+    np.testing.assert_allclose(off[:n], expected, rtol=1e-14)
+    assert off.size == 2 * n
 
 
 def test_a_weight_multiplies_squares():
@@ -74,10 +86,12 @@ def test_failures_cost_a_finite_penalty_and_are_counted():
     plain = objective(replace(measurement, noise=Noise()))
     bad = values_of(spring)
     bad[2] = 1.0  # dsigma > 0
-    assert np.all(plain.residual(bad) == PENALTY)
+    assert np.all(plain.residual(bad) == plain.penalty)
+    for name in plain.counted:  # ten ranges of the curve that reaches farthest in its units
+        assert plain.penalty >= PENALTY * np.ptp(plain.measured[name]) / plain.scale[name]
     assert (plain.evaluations, plain.failures) == (1, 1)
     worst = plain.residual(values_of(spring))
-    assert np.max(np.abs(worst)) < PENALTY
+    assert np.max(np.abs(worst)) < plain.penalty
 
 
 def test_the_stress_strain_misfit_runs_along_the_measured_displacement():
@@ -97,7 +111,7 @@ def test_the_jacobian_agrees_with_the_law_in_closed_form():
     one = objective(measurement, "displacement")
     values = values_of(spring)
     steps = 1e-6 * np.abs(values)
-    column = one.jacobian(values, steps, np.array([0]))[:, 0] * np.ptp(measurement.stress)
+    column = one.jacobian(values, steps, np.array([0]))[:, 0] * one.scale["stress_strain"]
     strain = measurement.displacement / measurement.specimen.height
     up = np.arange(strain.size) < 200
     on_a = up & (strain < 0.13)
@@ -150,13 +164,14 @@ def test_a_mass_inside_counts_in_every_drive(drive, counted):
     one = Objective(measurement, TWO, drive, default_weights(measurement, drive, 2))
     assert one.counted == counted
     off = one.residual(values)[-one.sizes[-1] :]  # measured 3 um too far, everywhere
-    expected = -3e-6 / np.ptp(measurement.interior[1])
+    expected = -3e-6 / one.scale["displacement_1_time"]
     if drive == "stress":  # it is smoothed
         assert np.median(off) == pytest.approx(expected, rel=0.1)
     else:
         np.testing.assert_allclose(off, expected, rtol=1e-3)
     misfit = one.misfit(one.simulate(values))
-    assert misfit["displacement_1_time"] == pytest.approx(np.sqrt(np.mean(off**2)), rel=1e-12)
+    in_ranges = off * one.scale["displacement_1_time"] / np.ptp(measurement.interior[1])
+    assert misfit["displacement_1_time"] == pytest.approx(np.sqrt(np.mean(in_ranges**2)), rel=1e-12)
 
 
 def test_stated_noise_is_the_scale_of_a_mass_inside_too():

@@ -7,6 +7,7 @@ Each step is a function that returns a new `Record` and a sentence for each thin
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,7 +50,7 @@ class Record:
 
     def rows(self, which: slice | NDArray[np.bool_]) -> Record:
         """Keep some rows of every channel."""
-        channels = {f.name: getattr(self, f.name) for f in fields(self)}
+        channels: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
         inside = {node: values[which] for node, values in channels.pop("interior").items()}
         excess = {name: values[which] for name, values in channels.pop("excess").items()}
         kept = {k: v[which] for k, v in channels.items() if v is not None}
@@ -357,11 +358,9 @@ def _outlier_note(record: Record, name: str, at: NDArray[np.intp], values: Array
         place = engineering(float(record.clock[i]), "s") if record.time is not None else str(i + 1)
         told.append(f"{engineering(float(values[i]), unit)} at {where} {place}")
     rest = f" and {len(at) - len(told)} more" if len(at) > len(told) else ""
-    count = "1 sample of the {} is an outlier" if len(at) == 1 else f"{len(at)} samples of the {{}} are outliers"
-    return (
-        f"Check: {count.format(name)} among its neighbours and not fitted: "
-        f"{', '.join(told)}{rest}."
-    )
+    one = f"1 sample of the {name} is an outlier"
+    count = one if len(at) == 1 else f"{len(at)} samples of the {name} are outliers"
+    return f"Check: {count} among its neighbours and not fitted: {', '.join(told)}{rest}."
 
 
 def _outliers(whole: Record, record: Record, block: int) -> dict[str, Outliers]:
@@ -394,9 +393,7 @@ def noise_of_held(record: Record) -> dict[str, NoiseLevel]:
     return levels
 
 
-def noise_at_rest(
-    first: Record, start: Start, record: Record, block: int
-) -> dict[str, NoiseLevel]:
+def noise_at_rest(first: Record, start: Start, record: Record, block: int) -> dict[str, NoiseLevel]:
     """Estimate the noise of each channel from the samples before contact, about their line.
 
     They are taken where there are twenty, and where what the signal itself shows during contact

@@ -152,9 +152,10 @@ def find_outliers(values: Array) -> NDArray[np.bool_]:
     """Isolated samples that no smooth signal with this noise can hold: spikes and gaps.
 
     First the jumps into and out of gaps of up to five samples are looked for (dropped to zero,
-    saturated): ten times the median jump nearby, to and fro. Then each sample is predicted by the cubic through its eight neighbours: it is an outlier if it is off by
-    four standard deviations of that prediction, as seen over the whole record, while the
-    neighbours agree among themselves; where the signal bends, they do not either.
+    saturated): ten times the median jump nearby, to and fro. Then each sample is predicted by the
+    cubic through its eight neighbours: it is an outlier if it is off by four standard deviations of
+    that prediction, as seen over the whole record, while the neighbours agree among themselves and
+    the lines from either side do not lead to it. Where the signal bends they do one or the other.
 
     Parameters
     ----------

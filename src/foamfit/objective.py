@@ -36,8 +36,9 @@ PENALTY = 10.0
 # measured foam closer than 1 % of its range: noise far below that must not let one channel outweigh
 # the other by what is an error of the model in both.
 MODEL_ERROR = 0.005
-# Losses, and the residual (in units of the scale) past which each gives way: those of 95 % efficiency
-# under normal noise for Huber's and Cauchy's (Holland & Welsch 1977, Commun. Stat. A6, 813).
+# Losses, and the residual (in units of the scale) past which each gives way: those of 95 %
+# efficiency under normal noise for Huber's and Cauchy's (Holland & Welsch 1977, Commun. Stat. A6,
+# 813).
 LOSSES = {"linear": np.inf, "soft_l1": 1.345, "huber": 1.345, "cauchy": 2.385}
 # A trial that needs more steps than this is too stiff to be worth waiting for.
 MAX_STEPS = 20_000
@@ -280,7 +281,9 @@ class Objective:
         if self.time_shift:
             check_time_shift(self.measurement, self.drive)
         if self.loss not in LOSSES:
-            raise InputError(f"loss '{self.loss}' is unknown; it must be one of {', '.join(LOSSES)}")
+            raise InputError(
+                f"loss '{self.loss}' is unknown; it must be one of {', '.join(LOSSES)}"
+            )
         self.measurement = with_noise(self.measurement)
         self.interior = interior_curves(self.measurement, len(self.model.kinds))
         self.curves = (*CURVES, *self.interior)

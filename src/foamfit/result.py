@@ -296,9 +296,7 @@ def _parameter_rows(parameters: Mapping[str, ParameterEstimate]) -> Iterator[lis
         yield [name, *numbers, p.unit, p.state, p.why]
 
 
-def _curve_rows(
-    curves: Curves, outliers: Mapping[str, Outliers]
-) -> Iterator[Iterable[object]]:
+def _curve_rows(curves: Curves, outliers: Mapping[str, Outliers]) -> Iterator[Iterable[object]]:
     columns: dict[str, Array | None] = {
         "time (s)": curves.time,
         "measured stress (Pa)": curves.measured_stress,

@@ -156,8 +156,8 @@ def shift_hint(
         return None
     word = "late" if late > 0.0 else "early"
     return (
-        f"The motion channel seems to be {word} by {engineering(abs(late), 's')} against the force; "
-        "fit the shift by --time-shift (time_shift=True)."
+        f"The motion channel seems to be {word} by {engineering(abs(late), 's')} against the "
+        "force; fit the shift by --time-shift (time_shift=True)."
     )
 
 
