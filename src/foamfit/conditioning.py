@@ -53,8 +53,8 @@ class Record:
         channels: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
         inside = {node: values[which] for node, values in channels.pop("interior").items()}
         excess = {name: values[which] for name, values in channels.pop("excess").items()}
-        kept = {k: v[which] for k, v in channels.items() if v is not None}
-        return replace(self, **kept, interior=inside, excess=excess)
+        kept: dict[str, Any] = {k: v[which] for k, v in channels.items() if v is not None}
+        return replace(self, **(kept | {"interior": inside, "excess": excess}))
 
     def channel(self, name: str) -> Array | None:
         """Return a channel by its name; "displacement_1" is the mass inside above spring 1."""
@@ -358,9 +358,11 @@ def _outlier_note(record: Record, name: str, at: NDArray[np.intp], values: Array
         place = engineering(float(record.clock[i]), "s") if record.time is not None else str(i + 1)
         told.append(f"{engineering(float(values[i]), unit)} at {where} {place}")
     rest = f" and {len(at) - len(told)} more" if len(at) > len(told) else ""
-    one = f"1 sample of the {name} is an outlier"
-    count = one if len(at) == 1 else f"{len(at)} samples of the {name} are outliers"
-    return f"Check: {count} among its neighbours and not fitted: {', '.join(told)}{rest}."
+    if len(at) == 1:
+        count = f"1 sample of the {name} is an outlier, a spike or gap; it is"
+    else:
+        count = f"{len(at)} samples of the {name} are outliers, spikes or gaps; they are"
+    return f"Check: {count} not fitted: {', '.join(told)}{rest}."
 
 
 def _outliers(whole: Record, record: Record, block: int) -> dict[str, Outliers]:

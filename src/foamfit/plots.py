@@ -590,7 +590,7 @@ def _head(figure: Figure, result: FitResult) -> None:
     if word and word not in name.lower():
         title += f" · {word}"
     if result.stopped:
-        title += f" · stopped by {result.stopped}, not finished"
+        title += f" · stopped by {result.stopped}"
     title = textwrap.fill(title, int(12 * figure.get_figwidth()))
     # A name may hold a dollar sign: it is no formula.
     figure.suptitle(title, x=0.012, ha="left", fontsize=8.5, weight="bold", parse_math=False)
