@@ -270,6 +270,24 @@ def test_a_shift_without_two_channels_in_time_is_refused(changed, missing):
     assert "time shift" in str(caught.value)
 
 
+def test_the_command_fits_a_shift_and_refuses_it_without_time(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    test = fabricated_csv(tmp_path)
+    call = ["fit", str(test), "--starts", "4", "--json", "--time-shift", "--loss", "huber"]
+    out = CliRunner().invoke(main, call)
+    assert out.exit_code == 0
+    content = json.loads(out.stdout)
+    assert content["parameters"]["time_shift"]["unit"] == "s"
+    assert content["loss"] == "huber"
+    rows = [line.split(",")[1:] for line in test.read_text().splitlines()[:200]]
+    (tmp_path / "slow.csv").write_text("\n".join(",".join(row) for row in rows))
+    (tmp_path / "slow.toml").write_text('[specimen]\nheight = "1.19 mm"\ndiameter = "5 mm"\n')
+    out = CliRunner().invoke(main, ["fit", "slow.csv", "--time-shift"])
+    assert out.exit_code == 1
+    assert "it has no time" in out.stderr
+    assert len(out.stderr.splitlines()) == 1
+
+
 # ---------------------------------------------------------------------------------------- stopped
 
 

@@ -66,7 +66,8 @@ class Record:
         """Put other values into a channel."""
         node = interior_node(name)
         if node is None:
-            return replace(self, **{name: values})
+            change: dict[str, Any] = {name: values}
+            return replace(self, **change)
         return replace(self, interior=self.interior | {node: values})
 
     @property

@@ -43,9 +43,8 @@ _MOST = 0.02  # of the samples: if more stand out, they are no exceptions
 @cache
 def _residual_filter(width: int) -> tuple[Array, Array]:
     """Weights of "sample minus local cubic", and their autocorrelation from lag 0 on."""
-    from scipy.signal import savgol_coeffs
-
-    weights = -savgol_coeffs(width, 3)
+    cubic = np.vander(np.linspace(-1.0, 1.0, width), 4)
+    weights = -(cubic @ np.linalg.pinv(cubic))[width // 2]
     weights[width // 2] += 1.0
     return weights, np.correlate(weights, weights, mode="full")[width - 1 :]
 

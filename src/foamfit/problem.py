@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import lmfit
 import numpy as np
@@ -129,6 +129,12 @@ class Problem:
     def index(self) -> dict[str, int]:
         """Place of each parameter in the flat vector."""
         return {name: i for i, name in enumerate(self.names)}
+
+    def linear(self) -> Problem:
+        """The same problem without a soft loss, for derivatives of the plain residuals."""
+        if self.objective.loss == "linear":
+            return self
+        return replace(self, objective=replace(self.objective, loss="linear"))
 
     def vector(self, params: lmfit.Parameters | None = None) -> Array:
         """Flat vector of these parameters, or of the problem's own."""

@@ -173,7 +173,7 @@ def _shift_of_residuals(
     shifted = replace(problem.objective, time_shift=True, loss="linear")
     sides = [shifted.differences(np.append(values, side * step)) for side in (-0.5, 0.5)]
     names = tuple(name for name, item in estimates.items() if item.stderr is not None)
-    plain = replace(problem, objective=replace(problem.objective, loss="linear"))
+    plain = problem.linear()
     slope = (sides[1] - sides[0]) / step
     jacobian = np.column_stack([plain.slopes(values, names), slope]) if names else slope[:, None]
     sizes = np.append(plain.sizes(names, values), step)
@@ -262,9 +262,8 @@ def _estimate(
     spread = None
     if names:
         sizes = problem.sizes(names, values)
-        plain = replace(problem, objective=replace(objective, loss="linear"))
         spread = uncertainty.covariance(
-            plain.slopes(values, names),
+            problem.linear().slopes(values, names),
             pseudo_residual(residual, objective),
             objective.sizes,
             sizes,
