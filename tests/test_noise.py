@@ -155,7 +155,7 @@ def test_clean_records_have_next_to_no_outliers():
             assert not find_outliers(signal(channel, n)).any()  # kinks alone
             for level in (0.0005, 0.003, 0.01, 0.03):
                 for phi in (0.0, 0.5, 0.9):
-                    for _ in range(4):
+                    for _ in range(3):
                         noisy = signal(channel, n) + level * slow_noise(rng, n, phi)
                         flagged += int(find_outliers(noisy).sum())
                         samples += n

@@ -126,6 +126,11 @@ def _noise_notes(objective: Objective) -> list[str]:
         told.append("Residuals count in units of the noise: at its floor the reduced χ² is 1.")
     for channel, outliers in measurement.outliers.items():
         told.append(f"{outliers.at.size} outliers of the {channel} are not fitted.")
+    if objective.time_shift and objective.drive != "impact":
+        told.append(
+            "time_shift: a foam whose stress relaxes leads its strain, and looks just as if the "
+            "motion were late."
+        )
     if objective.loss != "linear":
         told.append(
             f"The loss is {objective.loss}: residuals past {LOSSES[objective.loss]:g} of their "
