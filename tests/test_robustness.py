@@ -176,7 +176,7 @@ def test_a_file_with_spikes_and_gaps_gives_the_parameters_of_the_spring(tmp_path
     read = ff.read_test(path)
     assert read.outliers["stress"].at.size == 5
     assert read.outliers["displacement"].at.size == 1
-    said = [note for note in read.notes if "outlier" in note]
+    said = [note for note in read.notes if "spikes or gaps" in note]
     assert any(note.startswith("Check: 5 samples of the stress") for note in said)
     assert any(note.startswith("Check: 1 sample of the displacement") for note in said)
     result = ff.fit(read, starts=8)

@@ -167,7 +167,8 @@ def condition(
     window = window or Window()
     impact = striker is not None and record.time is not None
     record = done(cut_to_window(record, window))
-    record = done(bridge_outliers(record))
+    record = bridge_outliers(record)
+    spoilt = {name: int(np.count_nonzero(excess)) for name, excess in record.excess.items()}
     check_signs(record)
     held = noise_of_held(record)
     record = done(fill_staircase(record))
@@ -193,6 +194,9 @@ def condition(
     noise = noise_at_rest(resting, start, record, block) if resting is not None else {}
     noise |= {name: _averaged(level, block) for name, level in held.items()}
     outliers = _outliers(whole, record, block)
+    notes += [
+        _outlier_note(name, count, outliers.get(name), record) for name, count in spoilt.items()
+    ]
     return Conditioned(record, motion, tuple(notes), outliers, noise, start.by)
 
 
@@ -332,38 +336,36 @@ def cut_to_window(record: Record, window: Window) -> tuple[Record, list[str]]:
     return record, [note]
 
 
-def bridge_outliers(record: Record) -> tuple[Record, list[str]]:
+def bridge_outliers(record: Record) -> Record:
     """Put a straight line in the place of spikes and short gaps; `excess` keeps what was there."""
     from foamfit.noise import bridged, find_outliers
 
-    notes = []
     for name in record.measured:
         values = record.channel(name)
         assert values is not None
         wrong = find_outliers(values)
-        if not wrong.any():
-            continue
-        line = bridged(values, wrong, record.clock)
-        excess = record.excess | {name: np.where(wrong, values - line, 0.0)}
-        record = replace(record.changed(name, line), excess=excess)
-        notes.append(_outlier_note(record, name, np.flatnonzero(wrong), values))
-    return record, notes
+        if wrong.any():
+            line = bridged(values, wrong, record.clock)
+            excess = record.excess | {name: np.where(wrong, values - line, 0.0)}
+            record = replace(record.changed(name, line), excess=excess)
+    return record
 
 
-def _outlier_note(record: Record, name: str, at: NDArray[np.intp], values: Array) -> str:
-    """Name a channel's outliers: how many, where by the file's clock, and what stands there."""
+def _outlier_note(name: str, count: int, found: Outliers | None, record: Record) -> str:
+    """Name a channel's outliers: how many, and where those of the part that is used are."""
+    some = f"{count} samples" if count > 1 else "1 sample"
+    note = f"Check: {some} of the {name} stood out as spikes or gaps and"
+    if found is None:
+        return f"{note} were bridged, none of them in the part that is used."
     unit = {"stress": "Pa", "velocity": "m/s", "acceleration": "m/s²"}.get(name, "m")
-    where = "row" if record.time is None else "time"
     told = []
-    for i in at[:4]:
-        place = engineering(float(record.clock[i]), "s") if record.time is not None else str(i + 1)
-        told.append(f"{engineering(float(values[i]), unit)} at {where} {place}")
-    rest = f" and {len(at) - len(told)} more" if len(at) > len(told) else ""
-    if len(at) == 1:
-        count = f"1 sample of the {name} is an outlier, a spike or gap; it is"
-    else:
-        count = f"{len(at)} samples of the {name} are outliers, spikes or gaps; they are"
-    return f"Check: {count} not fitted: {', '.join(told)}{rest}."
+    for at, value in list(zip(found.at, found.values, strict=True))[:4]:
+        place = f"sample {at:.0f}" if record.time is None else engineering(float(at), "s")
+        told.append(f"{engineering(float(value), unit)} at {place}")
+    used = found.at.size
+    rest = f" and {used - len(told)} more" if used > len(told) else ""
+    part = "" if used == count else f", {used} of them in the part that is used"
+    return f"{note} are not fitted{part}: {', '.join(told)}{rest}."
 
 
 def _outliers(whole: Record, record: Record, block: int) -> dict[str, Outliers]:
@@ -421,8 +423,14 @@ def noise_at_rest(first: Record, start: Start, record: Record, block: int) -> di
         time = (1 + phi) / (1 - phi) if 2 / np.sqrt(before) < phi < 1 else 1.0
         how = f"estimated from {before} samples before contact"
         level = _averaged(NoiseLevel(sigma, False, how, time), block)
-        if 0.5 < level.sigma / max(residual_noise(signal)[0], 1e-300) < 4.0:
+        during, phi = residual_noise(signal)
+        if 0.5 < level.sigma / max(during, 1e-300) < 4.0:
             levels[name] = level
+        elif during > 0.0:
+            how = f"estimated from what local cubics leave of {len(signal)} samples"
+            word = "quieter" if level.sigma < during else "less quiet"
+            how = f"{how}, the {before} before contact being {word}"
+            levels[name] = NoiseLevel(during, False, how, (1.0 + phi) / (1.0 - phi))
     return levels
 
 
