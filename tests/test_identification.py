@@ -112,6 +112,7 @@ def test_the_best_point_survives_ctrl_c(monkeypatch):
     monkeypatch.setattr(search, "descend", interrupted)
     result = ff.fit(measurement)
     assert "Ctrl-C" in result.warnings[0]
+    assert result.stopped == "Ctrl-C"
     assert result.misfit["stress_time"] < 0.05
 
 

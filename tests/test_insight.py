@@ -55,7 +55,7 @@ def values_of(problem: Problem, *springs: ff.BistableSpring, **given: float) -> 
             values[problem.model.index[f"s{i}_{short}"]] = getattr(spring, short)
     for name, value in given.items():
         values[problem.model.index[name]] = value
-    return problem.tied()(values)
+    return problem.space().complete(values)
 
 
 def insight_of(scaled: np.ndarray, values: np.ndarray | None = None) -> Insight:

@@ -9,9 +9,10 @@ import pytest
 
 import foamfit as ff
 from conftest import synthetic_impact, synthetic_loop
-from foamfit.measurement import Noise, Striker
+from foamfit.measurement import Noise, Outliers, Striker
 from foamfit.model import Model
 from foamfit.objective import (
+    MODEL_ERROR,
     PENALTY,
     Objective,
     check_drive,
@@ -42,15 +43,26 @@ def test_residuals_in_units_of_stated_noise_have_unit_variance():
     assert np.std(residual) == pytest.approx(1.0, abs=0.1)
 
 
-def test_without_noise_the_scale_is_the_range():
+def test_estimated_noise_is_the_scale_as_long_as_it_is_not_tiny():
     spring, measurement = synthetic_impact()
-    plain = replace(measurement, noise=Noise())
-    residual = objective(plain).residual(values_of(spring))
+    plain = objective(replace(measurement, noise=Noise()))
+    assert plain.scale["stress_time"] == pytest.approx(measurement.noise.stress, rel=0.15)
+    assert plain.scale["displacement_time"] == pytest.approx(
+        measurement.noise.displacement, rel=0.15
+    )
+    assert np.std(plain.residual(values_of(spring))) == pytest.approx(1.0, abs=0.15)
+
+
+def test_tiny_noise_counts_as_a_share_of_the_range():
+    spring, measurement = synthetic_impact(noise=0.0)
+    plain = objective(measurement)
+    off = plain.residual(values_of(spring)[:] * np.r_[1.01, np.ones(8)])
     n = measurement.time.size
-    simulated = objective(plain).simulate(values_of(spring))
-    expected = (simulated.stress_time - plain.stress) / np.ptp(plain.stress)
-    np.testing.assert_allclose(residual[:n], expected, rtol=1e-14)
-    assert residual.size == 2 * n
+    simulated = plain.simulate(values_of(spring) * np.r_[1.01, np.ones(8)])
+    unit = MODEL_ERROR * np.ptp(measurement.stress)
+    expected = (simulated.stress_time - measurement.stress) / unit
+    np.testing.assert_allclose(off[:n], expected, rtol=1e-14)
+    assert off.size == 2 * n
 
 
 def test_a_weight_multiplies_squares():
@@ -74,10 +86,12 @@ def test_failures_cost_a_finite_penalty_and_are_counted():
     plain = objective(replace(measurement, noise=Noise()))
     bad = values_of(spring)
     bad[2] = 1.0  # dsigma > 0
-    assert np.all(plain.residual(bad) == PENALTY)
+    assert np.all(plain.residual(bad) == plain.penalty)
+    for name in plain.counted:  # ten ranges of the curve that reaches farthest in its units
+        assert plain.penalty >= PENALTY * np.ptp(plain.measured[name]) / plain.scale[name]
     assert (plain.evaluations, plain.failures) == (1, 1)
     worst = plain.residual(values_of(spring))
-    assert np.max(np.abs(worst)) < PENALTY
+    assert np.max(np.abs(worst)) < plain.penalty
 
 
 def test_the_stress_strain_misfit_runs_along_the_measured_displacement():
@@ -96,8 +110,7 @@ def test_the_jacobian_agrees_with_the_law_in_closed_form():
     spring, measurement = synthetic_loop()
     one = objective(measurement, "displacement")
     values = values_of(spring)
-    steps = 1e-6 * np.abs(values)
-    column = one.jacobian(values, steps, np.array([0]))[:, 0] * np.ptp(measurement.stress)
+    column = one.jacobian(values, np.array([0]), np.array([1.0]))[:, 0] * one.scale["stress_strain"]
     strain = measurement.displacement / measurement.specimen.height
     up = np.arange(strain.size) < 200
     on_a = up & (strain < 0.13)
@@ -106,6 +119,59 @@ def test_the_jacobian_agrees_with_the_law_in_closed_form():
         column[on_a], strain[on_a] / (1 - strain[on_a]), rtol=1e-6, atol=1e-9
     )
     np.testing.assert_allclose(column[on_d], 0.14 / 0.86, rtol=1e-6)
+
+
+def differences_of(one: Objective, values: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Central differences of the residual over steps of all parameters."""
+    columns = []
+    for i, step in enumerate(steps):
+        sides = []
+        for side in (step, -step):
+            moved = values.copy()
+            moved[i] += side
+            sides.append(one.residual(moved))
+        columns.append((sides[0] - sides[1]) / (2.0 * step))
+    return np.column_stack(columns)
+
+
+@pytest.mark.parametrize("late", [0.0, 7.3e-6])
+@pytest.mark.parametrize("contact", ["file", "stress", "motion"])
+@pytest.mark.parametrize("loss", ["linear", "soft_l1", "cauchy"])
+def test_the_jacobian_is_that_of_the_residual(late, contact, loss):
+    """Softened by the loss, without the outliers, and shifted: as central differences say."""
+    spring, test = synthetic_impact(eta=20.0, samples=151)
+    wrong = np.zeros(151, bool)
+    wrong[[20, 21, 70]] = True
+    spikes = Outliers(wrong, test.time[wrong], test.stress[wrong])
+    test = replace(test, contact=contact, outliers={"stress": spikes})
+    weights = {"stress_time": 1.0, "displacement_time": 2.0, "stress_strain": 0.5}
+    one = Objective(
+        test, BISTABLE, "impact", weights, rtol=1e-11, time_shift=True, loss=loss
+    )  # fmt: skip
+    assert one.n_data == 3 * 151 - 2 * 3
+    values = np.append(values_of(spring), late)
+    values[:8] *= 1.0 + 0.02 * np.array([1, -1, 1, -1, 1, -1, 1, -1])
+    values[8] = 10.0
+    sample = test.time[1] - test.time[0]
+    steps = np.append(1e-6 * np.abs(values[:9]), 0.5 * sample)
+    found = one.jacobian(values, np.arange(10), steps)
+    wanted = differences_of(one, values, steps)
+    for i, size in enumerate(np.append(steps[:9] * 1e6, sample)):
+        # a sample beside a kink of the strain's rate may see it on one side only
+        off = np.abs(found[:, i] - wanted[:, i]) * size
+        tolerance = 1e-4 if i < 9 else (1e-9 if loss == "linear" else 0.2)
+        assert np.sort(off)[-5] < tolerance * np.max(np.abs(wanted[:, i]) * size)
+
+
+def test_a_shift_that_is_not_wanted_gives_no_column():
+    spring, test = synthetic_impact(samples=101)
+    plain = objective(test)
+    shifted = replace(plain, time_shift=True)
+    values = values_of(spring)
+    places, steps = np.array([0, 5, 3]), np.ones(3)
+    one = plain.jacobian(values, places, steps)
+    two = shifted.jacobian(np.append(values, 0.0), places, steps)
+    np.testing.assert_array_equal(one, two)
 
 
 def followed_chain(drive, noise=None):
@@ -150,13 +216,14 @@ def test_a_mass_inside_counts_in_every_drive(drive, counted):
     one = Objective(measurement, TWO, drive, default_weights(measurement, drive, 2))
     assert one.counted == counted
     off = one.residual(values)[-one.sizes[-1] :]  # measured 3 um too far, everywhere
-    expected = -3e-6 / np.ptp(measurement.interior[1])
+    expected = -3e-6 / one.scale["displacement_1_time"]
     if drive == "stress":  # it is smoothed
         assert np.median(off) == pytest.approx(expected, rel=0.1)
     else:
         np.testing.assert_allclose(off, expected, rtol=1e-3)
     misfit = one.misfit(one.simulate(values))
-    assert misfit["displacement_1_time"] == pytest.approx(np.sqrt(np.mean(off**2)), rel=1e-12)
+    in_ranges = off * one.scale["displacement_1_time"] / np.ptp(measurement.interior[1])
+    assert misfit["displacement_1_time"] == pytest.approx(np.sqrt(np.mean(in_ranges**2)), rel=1e-12)
 
 
 def test_stated_noise_is_the_scale_of_a_mass_inside_too():

@@ -20,6 +20,7 @@ KEYS = {
     "schema", "foamfit", "test", "data_sha256", "model", "drive", "seed", "status", "warnings",
     "notes", "checklist",
     "parameters", "derived", "visited", "misfit", "weights", "statistics", "energy", "runtime_s",
+    "stopped", "loss", "noise", "outliers",
 }  # fmt: skip
 
 

@@ -253,12 +253,23 @@ def describe(measurement: Measurement, audit: EnergyAudit) -> str:
     lines += [("specimen", _specimen(test)), ("striker", _striker(test))]
     lines += [("samples", _sampling(test))]
     lines += _peaks(test)
-    noise = [(n, getattr(test.noise, n), u) for n, u in (("stress", "Pa"), ("displacement", "m"))]
-    if any(value for _, value, _ in noise):
-        told = (f"{name} {engineering(value, unit)}" for name, value, unit in noise if value)
-        lines.append(("noise", ", ".join(told) + " (one standard deviation)"))
+    lines += _labelled("noise", noise_sentences(test))
     lines += _labelled("done", test.notes) + _labelled("energy", audit.sentences())
     return "\n".join(f"{label:<10}{_wrap(text)}" for label, text in lines)
+
+
+def noise_sentences(measurement: Measurement) -> list[str]:
+    """Say of each channel what its noise is, one standard deviation, and how it is known."""
+    told = []
+    for channel, values in measurement.channels().items():
+        level = measurement.noise.of(channel)
+        if level is not None:
+            sigma = engineering(level.sigma, "Pa" if channel == "stress" else "m")
+            share = level.sigma / (float(np.ptp(values)) or 1.0)
+            slow = f", each follows the others for {level.time:.1f} samples"
+            slow = slow if level.time > 1.0 else ""
+            told.append(f"{channel} {sigma} ({share:.2g} of its range), {level.how}{slow}.")
+    return told
 
 
 def _wrap(text: str) -> str:

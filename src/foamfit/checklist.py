@@ -10,8 +10,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from foamfit.insight import curve_noise
+from foamfit.clocks import shift_hint
+from foamfit.conditioning import engineering
+from foamfit.errors import InputError
 from foamfit.model import split_name
+from foamfit.objective import check_time_shift
 from foamfit.uncertainty import WEAK
 
 if TYPE_CHECKING:
@@ -80,7 +83,7 @@ class Evidence:
 
     @property
     def values(self) -> NDArray[np.float64]:
-        """The best point, SI, in the order of the model's names."""
+        """The best point, SI, in the order of the problem's names."""
         return np.array([item.value for item in self.estimates.values()])
 
 
@@ -101,7 +104,7 @@ def make_checklist(evidence: Evidence) -> tuple[Check, ...]:
     """Put all questions, what matters most first."""
     questions: tuple[Callable[[Evidence], Check], ...] = (
         _ended, _followed, _floor, _determined, _visited, _bounds, _agree, _structure, _ringing,
-        _simulated, _energy, _impulse,
+        _simulated, _energy, _impulse, _clocks,
     )  # fmt: skip
     return tuple(question(evidence) for question in questions)
 
@@ -179,12 +182,12 @@ def _floor(e: Evidence) -> Check:
     """Residuals against the noise of each curve, with the scatter that a chi-square has itself."""
     objective, question = e.problem.objective, "Is the noise floor reached?"
     told, warnings, at = [], [], 0
-    for i, (name, (noise, stated)) in enumerate(curve_noise(objective).items()):
-        size = objective.sizes[i]
+    for i, (name, size) in enumerate(zip(objective.counted, objective.sizes, strict=True)):
+        noise, stated = objective.noise(name).sigma, objective.noise(name).given
         rms = float(np.sqrt(np.mean(e.residual[at : at + size] ** 2)))
         rms *= objective.scale[name] / objective.weights[name] ** 0.5
         at += size
-        if noise <= 1e-9 * objective.scale[name]:  # a range, where nothing is stated
+        if noise <= 1e-9 * objective.scale[name]:  # there is none to be seen
             continue
         tau = 1.0 if e.spread is None else e.spread.tau[i]
         most = (STATED if stated else ESTIMATED) + 3.0 * math.sqrt(tau / (2.0 * size))
@@ -322,6 +325,26 @@ def _impulse(e: Evidence) -> Check:
         return Check("impulse", question, None, "The test does not say enough to tell.")
     found = f"The impulse of the force is {ratio:.2f} of the striker's change of momentum."
     return Check("impulse", question, not warnings, found, warnings)
+
+
+def _clocks(e: Evidence) -> Check:
+    question, objective = "Do the clocks of force and motion agree?", e.problem.objective
+    if objective.time_shift:
+        late = engineering(e.estimates["time_shift"].value, "s").replace("-", "−")
+        return Check("clocks", question, True, f"Their shift is fitted: {late}.")
+    try:
+        check_time_shift(e.problem.measurement, objective.drive)
+    except InputError:
+        return Check("clocks", question, None, "Not both channels were measured in time.")
+    found = shift_hint(e.problem, e.values, e.residual, e.estimates)
+    if found is None:
+        return Check("clocks", question, True, "A shift would explain nothing that is left.")
+    told = f"{'late' if found > 0.0 else 'early'} by {engineering(abs(found), 's')}"
+    warning = (
+        f"The motion channel seems to be {told} against the force; fit the shift by --time-shift "
+        "(time_shift=True)."
+    )
+    return Check("clocks", question, False, f"The motion seems {told}.", (warning,))
 
 
 def _spoken(name: str) -> str:

@@ -245,6 +245,14 @@ def _hold_and_vary(
 @click.option("--fix", multiple=True, metavar="NAME=VALUE", callback=_fixes, help="Hold one (SI).")
 @click.option("--vary", multiple=True, metavar="NAME", help="Vary one that is held by default.")
 @click.option("--interior-mass", is_flag=True, help="Put the specimen's mass between the springs.")
+@click.option("--time-shift", is_flag=True, help="Fit how late the motion is against the force.")
+@click.option(
+    "--loss",
+    type=click.Choice(["linear", "soft_l1", "huber", "cauchy"]),
+    default="linear",
+    show_default=True,
+    help="All but linear give way to large residuals.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print fit.json on stdout, nothing else.")
 @click.option("--quiet", is_flag=True, help="Print nothing but warnings of failure.")
 def fit(
@@ -259,6 +267,8 @@ def fit(
     fix: dict[str, float],
     vary: tuple[str, ...],
     interior_mass: bool,
+    time_shift: bool,
+    loss: str,
     as_json: bool,
     quiet: bool,
 ) -> int:
@@ -282,9 +292,12 @@ def fit(
     folder = Path("fits", test.stem, model) if out is None else out
     check_target(folder)
     from foamfit import identification
+    from foamfit.objective import check_time_shift, choose_drive
     from foamfit.problem import make_params
 
-    params = make_params(measurement, model, drive)
+    if time_shift:
+        check_time_shift(measurement, drive or choose_drive(measurement))
+    params = make_params(measurement, model, drive, time_shift=time_shift)
     _hold_and_vary(params, model, fix, vary)
     with _progress(quiet or as_json) as progress:
         result = identification.fit(
@@ -296,6 +309,8 @@ def fit(
             max_time=max_time,
             params=params,
             interior_mass=interior_mass,
+            time_shift=time_shift,
+            loss=loss,
             progress=progress,
         )
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # from here on Ctrl-C could only lose the result

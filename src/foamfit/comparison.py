@@ -144,6 +144,7 @@ class _Side:
     correlation: Mapping[tuple[str, str], float]
     drive: str = ""
     status: str = ""
+    stopped: str | None = None
     test: str = ""
     sha: str = ""
     source: PublishedSet | None = None
@@ -235,6 +236,7 @@ def _side(result: Result) -> _Side:
             correlation=_correlation(content.get("correlation")),
             drive=drive,
             status=content["status"],
+            stopped=content.get("stopped"),
             test=test,
             sha=content.get("data_sha256", ""),
         )
@@ -363,6 +365,12 @@ def _section(side: _Side, other: _Side) -> Section:
     nothing = _incomparable(side, other)
     rows = [*_spring_rows(side, other, nothing), *_damping_rows(side, other, nothing)]
     remarks = [nothing[0].upper() + nothing[1:] + "."] if nothing else []
+    remarks += [
+        f"{one.label} was stopped by {one.stopped}: its numbers are the best until then, not the "
+        "end of a fit."
+        for one in (side, other)
+        if one.stopped
+    ]
     if not nothing:
         if other.source is not None and side.drive != "stress":
             remarks.append(PAPER_DRIVE.format(drive=side.drive))
@@ -382,9 +390,13 @@ def _section(side: _Side, other: _Side) -> Section:
         if any(not one.correlation for one in fits) and any("/" in row.name for row in rows):
             remarks.append(INDEPENDENT)
     return Section(
-        side.test, "+".join(side.kinds), side.drive, side.status, other.label,
+        side.test, "+".join(side.kinds), side.drive, _status(side), other.label,
         tuple(rows), tuple(remarks),
     )  # fmt: skip
+
+
+def _status(side: _Side) -> str:
+    return f"{side.status}, stopped by {side.stopped}" if side.stopped else side.status
 
 
 def _incomparable(side: _Side, other: _Side) -> str:

@@ -7,12 +7,21 @@ Each step is a function that returns a new `Record` and a sentence for each thin
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.errors import InputError
-from foamfit.measurement import Array, Specimen, Striker, interior_channel
+from foamfit.measurement import (
+    Array,
+    NoiseLevel,
+    Outliers,
+    Specimen,
+    Striker,
+    interior_channel,
+    interior_node,
+)
 
 _MIN_ROWS = 10
 _MIN_REST = 20
@@ -26,7 +35,9 @@ class Record:
 
     Time in s, stress in Pa, displacement of the top in m, velocity of the top in m/s and its
     deceleration in m/s² (like the stress that causes it, it is positive in compression). `interior`
-    holds the displacement of masses inside in m, 1 for the one above spring 1.
+    holds the displacement of masses inside in m, 1 for the one above spring 1. `excess` is what the
+    file has beyond the straight line that bridges an outlier, 0 elsewhere, for each channel that
+    has outliers.
     """
 
     time: Array | None
@@ -35,13 +46,36 @@ class Record:
     velocity: Array | None = None
     acceleration: Array | None = None
     interior: dict[int, Array] = field(default_factory=dict)
+    excess: dict[str, Array] = field(default_factory=dict)
 
     def rows(self, which: slice | NDArray[np.bool_]) -> Record:
         """Keep some rows of every channel."""
-        channels = {f.name: getattr(self, f.name) for f in fields(self)}
+        channels: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
         inside = {node: values[which] for node, values in channels.pop("interior").items()}
-        kept = {k: v[which] for k, v in channels.items() if v is not None}
-        return replace(self, **kept, interior=inside)
+        excess = {name: values[which] for name, values in channels.pop("excess").items()}
+        kept: dict[str, Any] = {k: v[which] for k, v in channels.items() if v is not None}
+        return replace(self, **(kept | {"interior": inside, "excess": excess}))
+
+    def channel(self, name: str) -> Array | None:
+        """Return a channel by its name; "displacement_1" is the mass inside above spring 1."""
+        node = interior_node(name)
+        values: Array | None = getattr(self, name) if node is None else self.interior.get(node)
+        return values
+
+    def changed(self, name: str, values: Array) -> Record:
+        """Put other values into a channel."""
+        node = interior_node(name)
+        if node is None:
+            change: dict[str, Any] = {name: values}
+            return replace(self, **change)
+        return replace(self, interior=self.interior | {node: values})
+
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """Names of the channels that are there."""
+        names = ("stress", "displacement", "velocity", "acceleration")
+        there = [name for name in names if getattr(self, name) is not None]
+        return (*there, *map(interior_channel, self.interior))
 
     def __len__(self) -> int:
         """Count the samples."""
@@ -64,11 +98,18 @@ class Window:
 
 @dataclass(frozen=True, eq=False)
 class Conditioned:
-    """A conditioned record, where its displacement came from, and what was done."""
+    """A conditioned record, where its displacement came from, and what was done.
+
+    `noise` is what the samples before contact, or those where a held channel is fresh, say of it;
+    `contact` is the channel that set time zero: "stress", "motion", or "file" for the file's own.
+    """
 
     record: Record
     motion: str
     notes: tuple[str, ...]
+    outliers: dict[str, Outliers]
+    noise: dict[str, NoiseLevel]
+    contact: str
 
 
 @dataclass(frozen=True)
@@ -83,6 +124,13 @@ class Start:
     zero: float
     free: bool
     how: str
+
+    @property
+    def by(self) -> str:
+        """The channel that set time zero: "stress", "motion", or "file" for the file's own."""
+        if self.time is None:
+            return "file"
+        return "motion" if "displacement" in self.how else "stress"
 
 
 def condition(
@@ -119,12 +167,16 @@ def condition(
     window = window or Window()
     impact = striker is not None and record.time is not None
     record = done(cut_to_window(record, window))
+    record = bridge_outliers(record)
+    spoilt = {name: int(np.count_nonzero(excess)) for name, excess in record.excess.items()}
     check_signs(record)
+    held = noise_of_held(record)
     record = done(fill_staircase(record))
     if impact and window.cycle != 1:
         raise InputError("[window] cycle is for slow tests; for an impact give start and end.")
     first = record if impact else select_cycle(record, 1)[0]
     start = find_start(first, impact)
+    resting = first if impact or start.free else None
     record = done(zero_interior(record, first, start))
     record = done(remove_offset(record, start, impact))
     if not impact:
@@ -137,8 +189,15 @@ def condition(
         record, motion = integrate_motion(record, specimen, striker or Striker())
         notes.append(f"The file has no displacement: the motion is {motion}.")
     notes += checks(record, specimen, striker if impact else None, motion)
-    record = done(thin(record))
-    return Conditioned(record, motion, tuple(notes))
+    whole, record = record, done(thin(record))
+    block = -(-len(whole) // len(record))
+    noise = noise_at_rest(resting, start, record, block) if resting is not None else {}
+    noise |= {name: _averaged(level, block) for name, level in held.items()}
+    outliers = _outliers(whole, record, block)
+    notes += [
+        _outlier_note(name, count, outliers.get(name), record) for name, count in spoilt.items()
+    ]
+    return Conditioned(record, motion, tuple(notes), outliers, noise, start.by)
 
 
 def engineering(value: float, unit: str) -> str:
@@ -275,6 +334,113 @@ def cut_to_window(record: Record, window: Window) -> tuple[Record, list[str]]:
             name = interior_channel(node)
             raise InputError(f"{name} is constant within [window]; it must vary.")
     return record, [note]
+
+
+def bridge_outliers(record: Record) -> Record:
+    """Put a straight line in the place of spikes and short gaps; `excess` keeps what was there."""
+    from foamfit.noise import bridged, find_outliers
+
+    for name in record.measured:
+        values = record.channel(name)
+        assert values is not None
+        wrong = find_outliers(values)
+        if wrong.any():
+            line = bridged(values, wrong, record.clock)
+            excess = record.excess | {name: np.where(wrong, values - line, 0.0)}
+            record = replace(record.changed(name, line), excess=excess)
+    return record
+
+
+def _outlier_note(name: str, count: int, found: Outliers | None, record: Record) -> str:
+    """Name a channel's outliers: how many, and where those of the part that is used are."""
+    some = f"{count} samples" if count > 1 else "1 sample"
+    note = f"Check: {some} of the {name} stood out as spikes or gaps and"
+    if found is None:
+        return f"{note} were bridged, none of them in the part that is used."
+    unit = {"stress": "Pa", "velocity": "m/s", "acceleration": "m/s²"}.get(name, "m")
+    told = []
+    for at, value in list(zip(found.at, found.values, strict=True))[:4]:
+        place = f"sample {at:.0f}" if record.time is None else engineering(float(at), "s")
+        told.append(f"{engineering(float(value), unit)} at {place}")
+    used = found.at.size
+    rest = f" and {used - len(told)} more" if used > len(told) else ""
+    part = "" if used == count else f", {used} of them in the part that is used"
+    return f"{note} are not fitted{part}: {', '.join(told)}{rest}."
+
+
+def _outliers(whole: Record, record: Record, block: int) -> dict[str, Outliers]:
+    """Outliers of a record that was thinned: a block of them is left out, one in a block is not."""
+    found = {}
+    for name, excess in whole.excess.items():
+        values, wrong = whole.channel(name), excess != 0.0
+        if values is None or not wrong.any():
+            continue
+        share = np.add.reduceat(wrong.astype(float), np.arange(0, len(whole), block)) / block
+        at = np.flatnonzero(wrong)
+        found[name] = Outliers(share > 0.5, whole.clock[at], values[at] + excess[at])
+    return found
+
+
+def noise_of_held(record: Record) -> dict[str, NoiseLevel]:
+    """Estimate the noise of the channels that are held, from the samples where they are fresh."""
+    from foamfit.noise import is_staircase, residual_noise
+
+    levels = {}
+    for name in record.measured:
+        values = record.channel(name)
+        if not name.startswith("displacement") or values is None or not is_staircase(values):
+            continue
+        fresh = values[np.append(0, np.flatnonzero(np.diff(values) != 0) + 1)]
+        if len(fresh) >= _MIN_ROWS:
+            how = f"estimated from what local cubics leave of {len(fresh)} fresh samples"
+            step = len(values) / len(fresh)
+            levels[name] = NoiseLevel(residual_noise(fresh)[0], False, how, step)
+    return levels
+
+
+def noise_at_rest(first: Record, start: Start, record: Record, block: int) -> dict[str, NoiseLevel]:
+    """Estimate the noise of each channel from the samples before contact, about their line.
+
+    They are taken where there are twenty, and where what the signal itself shows during contact
+    does not contradict: a sensor may be quieter at rest, and a motion may start before the stress.
+    """
+    from foamfit.noise import residual_noise
+
+    before = 0 if start.time is None else int(np.searchsorted(first.clock, start.time)) - 2
+    levels: dict[str, NoiseLevel] = {}
+    if before < _MIN_REST:
+        return levels
+    for name in ("stress", "displacement", *map(interior_channel, first.interior)):
+        rest, signal = first.channel(name), record.channel(name)
+        if rest is None or signal is None:
+            continue
+        x = np.arange(before, dtype=np.float64)
+        off = rest[:before] - np.polyval(np.polyfit(x, rest[:before], 1), x)
+        sigma = float(np.sqrt(off @ off / (before - 2)))
+        if sigma == 0.0:
+            continue
+        phi = float(off[1:] @ off[:-1] / (off @ off))
+        time = (1 + phi) / (1 - phi) if 2 / np.sqrt(before) < phi < 1 else 1.0
+        how = f"estimated from {before} samples before contact"
+        level = _averaged(NoiseLevel(sigma, False, how, time), block)
+        during, phi = residual_noise(signal)
+        if 0.5 < level.sigma / max(during, 1e-300) < 4.0:
+            levels[name] = level
+        elif during > 0.0:
+            how = f"estimated from what local cubics leave of {len(signal)} samples"
+            word = "quieter" if level.sigma < during else "less quiet"
+            how = f"{how}, the {before} before contact being {word}"
+            levels[name] = NoiseLevel(during, False, how, (1.0 + phi) / (1.0 - phi))
+    return levels
+
+
+def _averaged(level: NoiseLevel, block: int) -> NoiseLevel:
+    """Noise of the means of blocks of samples."""
+    if block == 1:
+        return level
+    sigma = level.sigma * np.sqrt(min(level.time / block, 1.0))
+    how = f"{level.how}, averaged in blocks of {block}"
+    return replace(level, sigma=float(sigma), how=how, time=max(level.time / block, 1.0))
 
 
 def fill_staircase(record: Record) -> tuple[Record, list[str]]:

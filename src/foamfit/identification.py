@@ -38,6 +38,8 @@ def fit(
     params: lmfit.Parameters | None = None,
     weights: Mapping[str, float] | None = None,
     interior_mass: bool = False,
+    time_shift: bool = False,
+    loss: str = "linear",
     progress: Callable[[float, str], None] | None = None,
 ) -> FitResult:
     """Identify the parameters of a chain of springs from a test.
@@ -64,6 +66,12 @@ def fit(
     interior_mass : bool
         Whether the specimen's mass sits between the springs of a chain, in equal parts; by default
         it is left out, and the result's notes say what it would change.
+    time_shift : bool
+        Whether the time by which the motion channel is late against the force is fitted too, as
+        the parameter time_shift (s).
+    loss : str
+        "linear" (least squares), or one that gives way to large residuals: "soft_l1", "huber",
+        "cauchy"; see `foamfit.objective.soften`.
     progress : callable, optional
         Told the fraction done and what is going on.
 
@@ -84,7 +92,10 @@ def fit(
         raise InputError(f"starts = {starts} is not admissible; it must be at least 1")
     if max_time is not None and not max_time > 0:
         raise InputError(f"max_time = {max_time:g} s is not admissible; it must be positive")
-    problem = make_problem(measurement, model, drive, params, weights, interior_mass)
+    problem = make_problem(
+        measurement, model, drive, params, weights, interior_mass,
+        time_shift=time_shift, loss=loss,
+    )  # fmt: skip
     starts = STARTS * len(problem.model.kinds) if starts is None else starts
     deadline = None if max_time is None else time.monotonic() + max_time
     tracker = Tracker(problem.objective, deadline)
@@ -147,7 +158,7 @@ def _refine(problem: Problem, tracker: Tracker) -> None:
     params = problem.params.copy()
     for name in lost:
         params[name].vary = False
-    names = tuple(name for name in problem.model.names if params[name].vary)
+    names = tuple(name for name in problem.names if params[name].vary)
     if not names:
         return
     _move_inside(params, names)

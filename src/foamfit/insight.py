@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit import kernels
-from foamfit.conditioning import noise_level
 from foamfit.model import BRANCHES, split_name
 
 if TYPE_CHECKING:
-    from foamfit.objective import Objective, Simulated
+    from foamfit.objective import Simulated
     from foamfit.problem import Problem
 
 Array = NDArray[np.float64]
@@ -95,29 +94,6 @@ def sections(problem: Problem, simulated: Simulated) -> tuple[Section, ...]:
         for (start, name), stop in zip(cuts, ends, strict=True)
         if stop > start
     )
-
-
-# ---------------------------------------------------------------- noise
-
-
-def curve_noise(objective: Objective) -> dict[str, tuple[float, bool]]:
-    """One standard deviation of each counted curve, SI, and whether the test states it.
-
-    Where it does not, the differences of neighbouring samples tell (`conditioning.noise_level`):
-    they see white noise only.
-    """
-    noise, out = objective.measurement.noise, {}
-    for name in objective.counted:
-        given = noise.displacement if name.startswith("displacement") else noise.stress
-        measured = objective.measured[name]
-        assert measured is not None
-        out[name] = (given or noise_level(measured), bool(given))
-    return out
-
-
-def counted_samples(objective: Objective, curve: str) -> NDArray[np.intp]:
-    """Samples of a curve that stand in the residual, in their order."""
-    return np.arange(objective.sizes[objective.counted.index(curve)])
 
 
 # ---------------------------------------------------------------- sensitivities
@@ -368,7 +344,7 @@ def look(
     n, at = objective.time.size, 0
     scaled = np.zeros((len(objective.counted) * n, len(names)))
     for c, curve in enumerate(objective.counted):
-        kept = counted_samples(objective, curve)
+        kept = objective.kept(curve)
         weighed = objective.weights[curve] ** 0.5 / objective.scale[curve]
         rows = slopes[at : at + kept.size] * problem.sizes(names, values)
         scaled[c * n + kept] = rows / (weighed * noise[curve])
@@ -377,7 +353,7 @@ def look(
     lost = unreached(problem, values)
     return Insight(
         names=names,
-        values=np.array([values[problem.model.index[name]] for name in names]),
+        values=np.array([values[problem.index[name]] for name in names]),
         sizes=problem.sizes(names, values),
         curves=objective.counted,
         clock=objective.time,

@@ -8,6 +8,7 @@ spring is on is its whole memory: a and d belong to the paper's flag a, c and e 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -23,10 +24,11 @@ Branches = NDArray[np.int64]
 compiled = njit(cache=True, error_model="numpy")
 # For what only other loops call: without the bridge to Python, which takes long to compile; without
 # counting who holds an array, which takes long to run; and with the body put where it is called.
-BRIDGELESS = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+BRIDGELESS: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 maker = njit(error_model="numpy", **BRIDGELESS)
-inner = njit(error_model="numpy", _nrt=False, **BRIDGELESS)
-inlined = njit(error_model="numpy", _nrt=False, forceinline=True, **BRIDGELESS)
+LEAN: dict[str, Any] = {"_nrt": False, **BRIDGELESS}
+inner = njit(error_model="numpy", **LEAN)
+inlined = njit(error_model="numpy", forceinline=True, **LEAN)
 
 # Columns of a row.
 KIND, K0, KC, EPS_A, EPS_C, KH_PLUS, KH_MINUS, ETA = range(8)

@@ -54,11 +54,69 @@ class Striker:
 
 
 @dataclass(frozen=True)
+class NoiseLevel:
+    """The noise of one channel.
+
+    Attributes
+    ----------
+    sigma : float
+        One standard deviation, Pa or m.
+    given : bool
+        Whether the test states it; else it is estimated from the data.
+    how : str
+        "given", or how it was estimated: "estimated from 40 samples before contact".
+    time : float
+        Its autocorrelation time, in samples (1: white).
+    """
+
+    sigma: float
+    given: bool
+    how: str
+    time: float = 1.0
+
+
+@dataclass(frozen=True)
 class Noise:
-    """One standard deviation of the noise of a channel: stress in Pa, displacement in m."""
+    """The noise of the channels, each one standard deviation.
+
+    Attributes
+    ----------
+    stress, displacement : float or None
+        As the TOML states them, Pa and m; the second holds for masses inside too.
+    estimated : dict of str to NoiseLevel
+        Of the channels of which the TOML says nothing ("stress", "displacement",
+        "displacement_1", …), as they were estimated from the data.
+    """
 
     stress: float | None = None
     displacement: float | None = None
+    estimated: dict[str, NoiseLevel] = field(default_factory=dict)
+
+    def of(self, channel: str) -> NoiseLevel | None:
+        """Return the noise of a channel, stated or else estimated; None where neither is known."""
+        given = self.displacement if channel.startswith("displacement") else self.stress
+        if given is not None:
+            return NoiseLevel(given, True, "given")
+        return self.estimated.get(channel)
+
+
+@dataclass(frozen=True, eq=False)
+class Outliers:
+    """Samples of a channel that are plainly wrong: spikes and short gaps.
+
+    Attributes
+    ----------
+    left_out : (n,) array of bool
+        Samples of the test that are not fitted; the channel holds a straight line there.
+    at : (k,) array
+        Where the file has them: time in s, or the sample where the test has no time.
+    values : (k,) array
+        What the file has there, Pa or m.
+    """
+
+    left_out: NDArray[np.bool_]
+    at: Array
+    values: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,12 +139,19 @@ class Measurement:
         Displacement of the top, m.
     interior : dict of int to (n,) array
         Displacement of the masses inside that a camera followed, m: 1 is the one above spring 1.
-    specimen, striker, noise
+    specimen, striker
         What the TOML says; `striker` is None where nothing of it is known.
+    noise : Noise
+        What the TOML says of it, and what was estimated of the rest.
     motion : str or None
         Where the displacement came from: "measured", "integrated from force", …
     notes : tuple of str
         Each thing that the loader did to the data or could not do, one sentence each.
+    outliers : dict of str to Outliers
+        Of the channels that have some.
+    contact : str
+        What set time zero: "stress" (then the displacement is zero there too), "motion", or "file"
+        for the file's own.
     """
 
     name: str
@@ -101,3 +166,11 @@ class Measurement:
     motion: str | None = None
     notes: tuple[str, ...] = ()
     interior: dict[int, Array] = field(default_factory=dict)
+    outliers: dict[str, Outliers] = field(default_factory=dict)
+    contact: str = "file"
+
+    def channels(self) -> dict[str, Array]:
+        """Stress, displacement and displacements of masses inside, as far as they are there."""
+        found = {"stress": self.stress, "displacement": self.displacement}
+        found |= {interior_channel(node): values for node, values in self.interior.items()}
+        return {name: values for name, values in found.items() if values is not None}

@@ -33,6 +33,7 @@ UNITS = {
     "kh_minus": "Pa",
     "eta": "Pa s",
     "height": "m",
+    "time_shift": "s",
 }
 
 # The branches of which a test must have reached one for the parameter to leave a trace in it.
@@ -158,9 +159,9 @@ class Model:
 
 
 def split_name(name: str) -> tuple[int, str]:
-    """Split "s2_kh_plus" into (1, "kh_plus"); "site_eta" gives (-1, "eta")."""
-    if name == "site_eta":
-        return -1, "eta"
+    """Split "s2_kh_plus" into (1, "kh_plus"); (-1, "eta") for "site_eta", (-1, "time_shift")."""
+    if name in ("site_eta", "time_shift"):
+        return -1, name.removeprefix("site_")
     prefix, short = name.split("_", 1)
     return int(prefix[1:]) - 1, short
 

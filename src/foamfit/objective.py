@@ -17,8 +17,9 @@ from scipy.signal import savgol_filter
 from foamfit import kernels
 from foamfit.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.errors import InputError, SimulationError
-from foamfit.measurement import Measurement, interior_channel
+from foamfit.measurement import Measurement, NoiseLevel, interior_channel
 from foamfit.model import Model
+from foamfit.noise import with_noise
 from foamfit.simulation import Motion, Plan
 from foamfit.simulation import plan as make_plan
 from foamfit.spring import LinearSpring
@@ -31,6 +32,14 @@ DRIVES = ("impact", "stress", "displacement")
 # What a residual is, in units of the curve's scale, where a simulation failed.
 PENALTY = 10.0
 NOWHERE = np.empty(0, np.int64)
+# Share of a channel's range that estimated noise counts for at least. The law has not followed a
+# measured foam closer than 1 % of its range: noise far below that must not let one channel outweigh
+# the other by what is an error of the model in both.
+MODEL_ERROR = 0.005
+# Losses, and the residual (in units of the scale) past which each gives way: those of 95 %
+# efficiency under normal noise for Huber's and Cauchy's (Holland & Welsch 1977, Commun. Stat. A6,
+# 813).
+LOSSES = {"linear": np.inf, "soft_l1": 1.345, "huber": 1.345, "cauchy": 2.385}
 # A trial that needs more steps than this is too stiff to be worth waiting for.
 MAX_STEPS = 20_000
 
@@ -146,6 +155,66 @@ def driving_stress(stress: Array, model: Model) -> Array:
     return np.maximum(smooth, 0.0) if "unilateral" in model.kinds else smooth
 
 
+def check_time_shift(measurement: Measurement, drive: str) -> None:
+    """Refuse a time shift where the test has no two channels in time.
+
+    Raises
+    ------
+    InputError
+        Saying what is missing.
+    """
+    missing = None
+    if measurement.time is None:
+        missing = "it has no time"
+    elif measurement.displacement is None or measurement.motion == "integrated from force":
+        missing = "its motion is not measured apart from the force"
+    if missing:
+        raise InputError(
+            f"{measurement.name}: a time shift between force and motion cannot be fitted in the "
+            f"{drive} drive, {missing}; both channels must be measured in time"
+        )
+
+
+def soften(residual: Array, loss: str) -> Array:
+    """Residuals whose squares sum to the loss: sign(r) c √ρ((r/c)²), shape (n,).
+
+    A search that lowers a sum of squares so lowers Σ c² ρ((r/c)²); ρ(z) is z (linear),
+    2 (√(1+z) - 1) (soft_l1), z up to 1 and 2√z - 1 beyond (huber), ln(1+z) (cauchy), as in
+    `scipy.optimize.least_squares`, and c is in `LOSSES`.
+    """
+    if loss == "linear":
+        return residual
+    width = LOSSES[loss]
+    z = (residual / width) ** 2
+    if loss == "soft_l1":
+        rho = 2.0 * z / (np.sqrt(1.0 + z) + 1.0)
+    elif loss == "huber":
+        rho = np.where(z <= 1.0, z, 2.0 * np.sqrt(z) - 1.0)
+    else:
+        rho = np.log1p(z)
+    return np.asarray(np.sign(residual) * width * np.sqrt(rho))
+
+
+def influence(residual: Array, loss: str) -> tuple[Array, Array]:
+    """Influence ψ(r) = r ρ'(z) of residuals under a loss, and its slope ψ'(r), shapes (n,)."""
+    if loss == "linear":
+        return residual, np.ones_like(residual)
+    z = (residual / LOSSES[loss]) ** 2
+    if loss == "soft_l1":
+        return residual / np.sqrt(1.0 + z), (1.0 + z) ** -1.5
+    if loss == "huber":
+        inside = z <= 1.0
+        return residual / np.sqrt(np.maximum(z, 1.0)), inside.astype(float)
+    return residual / (1.0 + z), (1.0 - z) / (1.0 + z) ** 2
+
+
+def softness(residual: Array, loss: str) -> Array:
+    """Derivative of `soften` by the residual, (n,): ψ over the softened residual, 1 at zero."""
+    soft = soften(residual, loss)
+    near = np.abs(soft) < 1e-8
+    return np.where(near, 1.0, influence(residual, loss)[0] / np.where(near, 1.0, soft))
+
+
 @dataclass(frozen=True, eq=False)
 class Simulated:
     """The curves of one set of parameters; None where the drive prescribes or the test lacks them.
@@ -189,6 +258,11 @@ class Objective:
         Tolerance of the simulation.
     interior_mass : bool
         Whether the specimen's mass sits between the springs, in equal parts, as in the paper.
+    time_shift : bool
+        Whether the flat vector of parameters ends, after those of the model, with how late the
+        motion channel is, s.
+    loss : str
+        One of `LOSSES`.
 
     Attributes
     ----------
@@ -206,12 +280,21 @@ class Objective:
     weights: dict[str, float]
     rtol: float = 1e-6
     interior_mass: bool = False
+    time_shift: bool = False
+    loss: str = "linear"
     evaluations: int = field(default=0, init=False)
     failures: int = field(default=0, init=False)
 
     def __post_init__(self) -> None:
         """Make the scenes ready and fix the scale of each curve."""
         check_drive(self.measurement, self.drive)
+        if self.time_shift:
+            check_time_shift(self.measurement, self.drive)
+        if self.loss not in LOSSES:
+            raise InputError(
+                f"loss '{self.loss}' is unknown; it must be one of {', '.join(LOSSES)}"
+            )
+        self.measurement = with_noise(self.measurement)
         self.interior = interior_curves(self.measurement, len(self.model.kinds))
         self.curves = (*CURVES, *self.interior)
         self._check_weights()
@@ -237,7 +320,8 @@ class Objective:
                 f"{self.drive} drive has a weight above zero"
             )
         self.scale = {name: self._scale(name) for name in self.curves}
-        self.sizes = tuple(self._curve(name).size for name in self.counted)
+        self._kept = {name: self._fitted(name) for name in self.curves}
+        self.sizes = tuple(self._curve(name)[self._kept[name]].size for name in self.counted)
         self.n_data = sum(self.sizes)
         # Worse per sample than any curve that stays within ten ranges.
         self.penalty = max(
@@ -319,14 +403,37 @@ class Objective:
         assert curve is not None
         return curve
 
+    @property
+    def nuisance(self) -> tuple[str, ...]:
+        """Names of the parameters that the objective adds to those of the model."""
+        return ("time_shift",) if self.time_shift else ()
+
+    def channel(self, name: str) -> str:
+        """Channel of the test that a curve is compared with."""
+        return name.removesuffix("_time") if name.startswith("displacement") else "stress"
+
+    def measured_size(self, name: str) -> int:
+        """Samples of a curve, outliers and all."""
+        return self._curve(name).size
+
+    def noise(self, name: str) -> NoiseLevel:
+        """Noise of a curve, stated or estimated."""
+        level = self.measurement.noise.of(self.channel(name))
+        assert level is not None  # completed by with_noise
+        return level
+
     def _scale(self, name: str) -> float:
-        """One standard deviation of a curve if the test states it, else the curve's range."""
-        noise = self.measurement.noise
-        given = noise.displacement if name.startswith("displacement") else noise.stress
+        """One standard deviation of a curve's noise; an estimated one not below MODEL_ERROR."""
         curve = self.measured[name]
-        if given is not None or curve is None:
-            return given or 1.0
-        return float(np.ptp(curve))
+        if curve is None:
+            return 1.0
+        level = self.noise(name)
+        return level.sigma if level.given else max(level.sigma, MODEL_ERROR * float(np.ptp(curve)))
+
+    def _fitted(self, name: str) -> slice | NDArray[np.bool_]:
+        """Samples of a curve that count: all but the outliers of its channel."""
+        outliers = self.measurement.outliers.get(self.channel(name))
+        return slice(None) if outliers is None else ~outliers.left_out
 
     # ------------------------------------------------------------------ simulation and residual
 
@@ -342,6 +449,14 @@ class Objective:
         SimulationError
             If the parameters are not admissible or the scene has no finite answer.
         """
+        count = len(self.model.names)
+        springs = self._springs(values[:count], everything, places[places < count])
+        if not self.time_shift:
+            return springs
+        return self._shifted(springs, float(values[count]), places == count)
+
+    def _springs(self, values: Array, everything: bool, places: NDArray[np.int64]) -> Simulated:
+        """Simulate the parameters of the model, on one clock; see `simulate`."""
         height = self.measurement.specimen.height
         rows = self.model.rows(values)
         heights = np.ascontiguousarray(self.model.heights(values, height))
@@ -378,12 +493,73 @@ class Objective:
             slopes=slopes,
         )
 
+    def _shifted(self, curves: Simulated, late: float, by_shift: NDArray[np.bool_]) -> Simulated:
+        """Curves as channels show them of which the motion is late by so many seconds.
+
+        Slopes are shifted with their curves. Where `by_shift` (n_places,) marks one by the shift
+        itself, that is a difference over one sample: no simulation is in it.
+        """
+        there = {name: curve for name in self.curves if (curve := curves.curve(name)) is not None}
+        slopes: dict[str, Array] | None = None
+        if curves.slopes is not None:
+            step = float(np.median(np.diff(self.time)))
+            slopes = {}
+            for name in there.keys() & curves.slopes.keys():
+                out = np.empty((by_shift.size, self.time.size))
+                rows = [self._shift(name, row, late, 0.0) for row in curves.slopes[name]]
+                out[~by_shift] = np.reshape(rows, (-1, self.time.size))
+                sides = [self._shift(name, there[name], late + side * step) for side in (-0.5, 0.5)]
+                out[by_shift] = (sides[1] - sides[0]) / step
+                slopes[name] = out
+        if late != 0.0:
+            there = {name: self._shift(name, curve, late) for name, curve in there.items()}
+        return replace(
+            curves,
+            stress_time=there.get("stress_time"),
+            displacement_time=there.get("displacement_time"),
+            stress_strain=there.get("stress_strain"),
+            interior={name: there[name] for name in curves.interior},
+            slopes=slopes,
+        )
+
+    def _shift(self, name: str, curve: Array, late: float, speed: float | None = None) -> Array:
+        """One curve, or its derivative, seen by channels of which the motion is late (s).
+
+        Where the clock is that of the force, the motion is seen later; where it is that of the
+        motion (time zero is read off it, or it drives), the force is seen earlier. Before contact
+        the striker comes at its velocity, or at `speed` (m/s), and nothing bears stress; a
+        displacement that was set to zero where the stress starts is so here.
+        """
+        impact, contact = self.drive == "impact", self.measurement.contact
+        by_motion = self.drive == "displacement" or (impact and contact == "motion")
+        if not name.startswith("displacement"):
+            if not by_motion and name != "stress_strain":
+                return curve
+            when = self.time + late
+            earlier = np.interp(when, self.time, curve)
+            return np.where(when < 0.0, 0.0, earlier) if late < 0.0 else earlier
+        if by_motion:
+            return curve
+        before: float | None = None
+        if impact:
+            assert self.measurement.striker is not None  # checked by check_drive
+            before = self.measurement.striker.velocity if speed is None else speed
+        moved = _later(self.time, curve, late, before)
+        if impact and contact == "stress":
+            moved = moved - _later(self.time, curve, late, before, at=0.0)
+        return moved
+
     def residual(self, values: Array) -> Array:
         """Weighted residuals of all counted curves, shape (n_data,), dimensionless.
 
-        Simulated minus measured over the curve's scale, times the root of its weight. Parameters
-        that cannot be simulated cost a finite penalty and are counted in `failures`.
+        Simulated minus measured over the curve's scale, times the root of its weight, softened by
+        the loss; outliers are left out. Parameters that cannot be simulated cost a finite penalty
+        and are counted in `failures`.
         """
+        return soften(self.differences(values), self.loss)
+
+    def differences(self, values: Array) -> Array:
+        """Residuals before the loss gives way to large ones, shape (n_data,)."""
         self.evaluations += 1
         try:
             curves = self.simulate(values)
@@ -398,7 +574,8 @@ class Objective:
         for name in self.counted:
             simulated = curves.curve(name)
             assert simulated is not None  # a curve is counted only if the drive leaves it free
-            parts.append((simulated - self._curve(name)) * self._factor(name))
+            difference = simulated - self._curve(name)
+            parts.append(difference[self._kept[name]] * self._factor(name))
         # A stress near the pole of branch c is as bad as none.
         return np.asarray(np.clip(np.concatenate(parts), -self.penalty, self.penalty))
 
@@ -420,10 +597,13 @@ class Objective:
             return np.zeros((self.n_data, places.size))
         if curves.slopes is None:
             return self._differences(values, places, steps)
-        parts = [curves.slopes[name] * self._factor(name) for name in self.counted]
+        parts = [
+            curves.slopes[name][:, self._kept[name]] * self._factor(name) for name in self.counted
+        ]
         slopes = np.concatenate(parts, axis=1).T
-        slopes[np.abs(self._compare(curves)) >= self.penalty] = 0.0
-        return slopes
+        residual = self._compare(curves)
+        slopes[np.abs(residual) >= self.penalty] = 0.0
+        return slopes if self.loss == "linear" else slopes * softness(residual, self.loss)[:, None]
 
     def jacobian_along(self, values: Array, moves: Array, steps: Array) -> Array:
         """Derivative of the residual along moves (n_values, m) of the parameters, (n_data, m).
@@ -457,14 +637,37 @@ class Objective:
             columns[:, column] = (high - low) / (up - down) if up != down else 0.0
         return columns
 
+    def kept(self, name: str) -> NDArray[np.intp]:
+        """Samples of a curve that stand in the residual, in their order: all but outliers."""
+        return np.arange(self.measured_size(name))[self._kept[name]]
+
     def misfit(self, curves: Simulated) -> dict[str, float | None]:
-        """RMS of simulated minus measured over the measured range, per curve; None if not there."""
+        """RMS of simulated minus measured over the measured range, per curve; None if not there.
+
+        Outliers are left out.
+        """
         out: dict[str, float | None] = {}
         for name in self.curves:
             measured, simulated = self.measured[name], curves.curve(name)
             if measured is None or simulated is None:
                 out[name] = None
             else:
-                miss = np.sqrt(np.mean((simulated - measured) ** 2))
+                kept = self._kept[name]
+                miss = np.sqrt(np.mean((simulated - measured)[kept] ** 2))
                 out[name] = float(miss / np.ptp(measured))
         return out
+
+
+def _later(
+    time: Array, curve: Array, late: float, before: float | None, *, at: float | None = None
+) -> Array:
+    """Motion (m) seen `late` seconds later, at the samples or at one time; straight past its ends.
+
+    `before` is the velocity (m/s) ahead of the first sample, by default that of its first step.
+    """
+    when = (time if at is None else np.array([at])) - late
+    first = (curve[1] - curve[0]) / (time[1] - time[0]) if before is None else before
+    last = (curve[-1] - curve[-2]) / (time[-1] - time[-2])
+    inside = np.interp(when, time, curve)
+    ahead, after = np.minimum(when - time[0], 0.0), np.maximum(when - time[-1], 0.0)
+    return np.asarray(inside + first * ahead + last * after)

@@ -2,7 +2,7 @@
 
 At start values of the parameters: the velocity that closes the loop of each spring, the standard
 errors to expect, and which channel is worth measuring better. All errors suppose that the model
-follows the foam down to a white noise; what the model leaves unexplained makes them larger.
+follows the foam down to the noise; what the model leaves unexplained makes them larger.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from foamfit.chain import Chain, Impact
 from foamfit.checklist import ESTIMATED
 from foamfit.conditioning import engineering
 from foamfit.errors import InputError, SimulationError
-from foamfit.insight import Insight, curve_noise, look, unreached, visited
+from foamfit.insight import Insight, look, unreached, visited
 from foamfit.literature import published
-from foamfit.measurement import Measurement, Noise, Striker
+from foamfit.measurement import Measurement, Noise, NoiseLevel, Striker
 from foamfit.model import Model, split_name, unit_of
 from foamfit.problem import Problem, make_problem
 from foamfit.result import ParameterEstimate, load_result
@@ -87,8 +87,8 @@ class Plan:
         to 30 times the planned one does. Empty in other drives than the impact.
     beyond : Outlook or None
         The same experiment 5 % faster than what closes all loops, where it now leaves one open.
-    noise : dict of str to (float, bool)
-        See `insight.curve_noise`.
+    noise : dict of str to NoiseLevel
+        Of each counted curve.
     """
 
     problem: Problem
@@ -97,7 +97,7 @@ class Plan:
     outlook: Outlook
     closing: dict[str, float | None]
     beyond: Outlook | None
-    noise: dict[str, tuple[float, bool]]
+    noise: dict[str, NoiseLevel]
 
 
 def make_plan(problem: Problem, values: Array, source: str) -> Plan:
@@ -112,8 +112,8 @@ def make_plan(problem: Problem, values: Array, source: str) -> Plan:
     source : str
         Where they come from, for the reader.
     """
-    noise = curve_noise(problem.objective)
-    sd = {name: value for name, (value, _) in noise.items()}
+    noise = {name: problem.objective.noise(name) for name in problem.objective.counted}
+    sd = {name: level.sigma * level.time**0.5 for name, level in noise.items()}
     outlook = expect(problem, values, sd)
     closing: dict[str, float | None] = {}
     beyond = None
@@ -178,7 +178,7 @@ def published_values(problem: Problem, name: str) -> tuple[Array, str]:
             new = 0.0 if short == "eta" else getattr(item.chain.springs[spring], short)
         if problem.params[full].vary or short == "eta":
             values[problem.model.index[full]] = new
-    return problem.tied()(values), f"published {name}, without its numerical damping"
+    return problem.space().complete(values), f"published {name}, without its numerical damping"
 
 
 def result_values(problem: Problem, folder: Path) -> tuple[Array, str]:
@@ -191,14 +191,14 @@ def result_values(problem: Problem, folder: Path) -> tuple[Array, str]:
     """
     content = load_result(folder)
     given = content.get("parameters", {})
-    missing = [name for name in problem.model.names if name not in given]
+    missing = [name for name in problem.names if name not in given]
     if missing:
         raise InputError(
             f"{folder} has no {missing[0]}; it is a {content.get('model')}, not a "
             f"{problem.model.name}"
         )
-    values = np.array([float(given[name]["value"]) for name in problem.model.names])
-    return problem.tied()(values), f"the result in {folder}"
+    values = np.array([float(given[name]["value"]) for name in problem.names])
+    return problem.space().complete(values), f"the result in {folder}"
 
 
 # ---------------------------------------------------------------- a test that is not made yet
@@ -256,7 +256,7 @@ def simulated_test(like: Measurement, chain: Chain, striker: Striker) -> Measure
     inside = {node: response.displacement[node - 1] for node in like.interior}
     return replace(
         like, time=time, stress=stress, displacement=motion, interior=inside, striker=striker,
-        noise=noise,
+        noise=noise, outliers={}, contact="file",
     )  # fmt: skip
 
 
@@ -368,13 +368,13 @@ def expect(problem: Problem, values: Array, noise: Mapping[str, float]) -> Outlo
         One standard deviation of each counted curve, SI.
     """
     lost, params = unreached(problem, values), problem.params
-    names = tuple(n for n in problem.model.names if params[n].vary and n not in lost)
+    names = tuple(n for n in problem.names if params[n].vary and n not in lost)
     insight = None
     if names:
         insight = look(problem, values, names, problem.slopes(values, names), noise)
     expected = {}
     for name in problem.free():
-        value, unit = float(values[problem.model.index[name]]), unit_of(name)
+        value, unit = float(values[problem.index[name]]), unit_of(name)
         if name in lost or insight is None:
             why = f"branch {lost[name]} of spring {split_name(name)[0] + 1} is not reached"
             expected[name] = ParameterEstimate(value, None, None, unit, True, "not determined", why)
@@ -417,8 +417,9 @@ def describe_plan(plan: Plan) -> str:
     out = [("model", f"{plan.problem.model.name}, {plan.problem.objective.drive} drive")]
     out.append(("start", f"{plan.source}; all that follows holds there"))
     told = (
-        f"{_spoken(name)} {engineering(sd, _unit(name))} ({'stated' if given else 'estimated'})"
-        for name, (sd, given) in plan.noise.items()
+        f"{_spoken(name)} {engineering(level.sigma, _unit(name))} "
+        f"({'stated' if level.given else 'estimated'})"
+        for name, level in plan.noise.items()
     )
     out.append(("noise", ", ".join(told)))
     out += [("", text) for text in _unexplained(plan)]
@@ -434,8 +435,9 @@ def describe_plan(plan: Plan) -> str:
 def _unexplained(plan: Plan) -> Iterator[str]:
     """Warn where the start values leave more than the noise: then the errors are too small."""
     objective, at = plan.problem.objective, 0
-    residual = objective.residual(plan.values)
-    for (name, (noise, _)), size in zip(plan.noise.items(), objective.sizes, strict=True):
+    residual = objective.differences(plan.values)
+    for (name, level), size in zip(plan.noise.items(), objective.sizes, strict=True):
+        noise = level.sigma
         rms = float(np.sqrt(np.mean(residual[at : at + size] ** 2)))
         rms *= objective.scale[name] / objective.weights[name] ** 0.5
         at += size

@@ -114,6 +114,7 @@ def plot_fit(result: FitResult, path: str | Path | None = None) -> Figure:
         figure = Figure(figsize=(width, 2.75), layout="constrained")
         for ax, panel in zip(_row(figure, len(panels)), panels, strict=True):
             _draw(ax, panel)
+            _mark_outliers(ax, panel, result)
             _mark_switches(ax, panel, result)
             if panel.key == "stress_strain":
                 _name_branches(ax, panel, result)
@@ -487,6 +488,30 @@ def _evenly(x: Array, y: Array, n: int) -> NDArray[np.intp]:
     return there[np.unique(np.searchsorted(along, np.linspace(0.0, along[-1], n)))]
 
 
+def _mark_outliers(ax: Axes, panel: _Panel, result: FitResult) -> None:
+    """Cross what the file has at samples that are not fitted, at the edge if it is beyond."""
+    test = result.measurement
+    fx, _, fy, _ = panel.scale()
+    own = "displacement" if panel.key == "displacement_time" else "stress"
+    for channel, found in test.outliers.items():
+        if not channel.startswith(own) or (panel.key != "stress_strain" and test.time is None):
+            continue
+        x = found.at
+        if panel.key == "stress_strain":
+            motion = test.displacement
+            if motion is None:
+                continue
+            clock = np.arange(motion.size) if test.time is None else test.time
+            x = np.interp(found.at, clock, motion) / test.specimen.height
+        low, high = ax.get_ylim()  # fixed: a wild sample must not shrink the curves
+        y = np.clip(found.values / fy, low, high)
+        ax.plot(
+            x / fx, y, "x", ms=4.0, mew=1.0, color="black", zorder=6, clip_on=False,
+            label="outlier, not fitted",
+        )  # fmt: skip
+        ax.set_ylim(low, high)
+
+
 def _mark_switches(ax: Axes, panel: _Panel, result: FitResult) -> None:
     from matplotlib.patheffects import withStroke
 
@@ -566,6 +591,8 @@ def _head(figure: Figure, result: FitResult) -> None:
     word = origin_word(result)
     if word and word not in name.lower():
         title += f" · {word}"
+    if result.stopped:
+        title += f" · stopped by {result.stopped}"
     title = textwrap.fill(title, int(12 * figure.get_figwidth()))
     # A name may hold a dollar sign: it is no formula.
     figure.suptitle(title, x=0.012, ha="left", fontsize=8.5, weight="bold", parse_math=False)

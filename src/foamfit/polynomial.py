@@ -5,10 +5,10 @@ from __future__ import annotations
 
 from numba import njit
 
-from foamfit.kernels import BRIDGELESS, Array, inner
+from foamfit.kernels import LEAN, Array, inner
 
 # A product and a sum in one rounding: faster, and no less exact.
-_fused = njit(error_model="numpy", fastmath={"contract"}, _nrt=False, **BRIDGELESS)
+_fused = njit(error_model="numpy", fastmath={"contract"}, **LEAN)
 
 
 @_fused

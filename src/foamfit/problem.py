@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import lmfit
 import numpy as np
@@ -13,13 +13,17 @@ from foamfit.errors import InputError
 from foamfit.measurement import Measurement
 from foamfit.model import Model, split_name
 from foamfit.objective import Objective, check_interior, choose_drive, default_weights
-from foamfit.space import Scales, Space
+from foamfit.space import LARGEST_SHIFT, Scales, Space
 
 Array = NDArray[np.float64]
 
 
 def make_params(
-    measurement: Measurement, model: str | Model = "bistable", drive: str | None = None
+    measurement: Measurement,
+    model: str | Model = "bistable",
+    drive: str | None = None,
+    *,
+    time_shift: bool = False,
 ) -> lmfit.Parameters:
     """Parameters of a model for a test, with bounds from its scales; change them, then `fit`.
 
@@ -35,6 +39,8 @@ def make_params(
         For example "linear+bistable".
     drive : str, optional
         "impact", "stress" or "displacement"; see `foamfit.objective.choose_drive`.
+    time_shift : bool
+        Whether the time by which the motion channel is late is a parameter too.
 
     Returns
     -------
@@ -65,6 +71,9 @@ def make_params(
         vary = short != "eta" or (drive == "impact" and (spring >= 0) == (count == 1))
         params.add(name, value=value, min=low, max=high, vary=vary)
     _add_heights(params, measurement, model)
+    if time_shift:
+        most = LARGEST_SHIFT * scales.duration
+        params.add("time_shift", value=0.0, min=-most, max=most)
     for name in model.names:
         if name.endswith("_dsigma"):
             own = name.removesuffix("dsigma")
@@ -111,28 +120,44 @@ class Problem:
     params: lmfit.Parameters
     scales: Scales
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all parameters in the order of the flat vector: the model's, the nuisance."""
+        return (*self.model.names, *self.objective.nuisance)
+
+    @property
+    def index(self) -> dict[str, int]:
+        """Place of each parameter in the flat vector."""
+        return {name: i for i, name in enumerate(self.names)}
+
+    def linear(self) -> Problem:
+        """The same problem without a soft loss, for derivatives of the plain residuals."""
+        if self.objective.loss == "linear":
+            return self
+        return replace(self, objective=replace(self.objective, loss="linear"))
+
     def vector(self, params: lmfit.Parameters | None = None) -> Array:
         """Flat vector of these parameters, or of the problem's own."""
         values = (self.params if params is None else params).valuesdict()
-        return np.array([values[name] for name in self.model.names])
+        return np.array([values[name] for name in self.names])
 
     def put(self, values: Array) -> None:
         """Write a flat vector into the parameters that vary."""
-        for name, value in zip(self.model.names, values, strict=True):
+        for name, value in zip(self.names, values, strict=True):
             if self.params[name].expr is None:
                 self.params[name].value = float(value)
         self.params.update_constraints()
 
     def free(self) -> tuple[str, ...]:
         """Names of the parameters that vary."""
-        return tuple(name for name in self.model.names if self.params[name].vary)
+        return tuple(name for name in self.names if self.params[name].vary)
 
     def tied(self) -> Callable[[Array], Array] | None:
         """Completion of a vector by the expressions among the parameters; None if there is none."""
-        tied = [name for name in self.model.names if self.params[name].expr is not None]
+        tied = [name for name in self.names if self.params[name].expr is not None]
         if not tied:
             return None
-        places = [self.model.index[name] for name in tied]
+        places = [self.index[name] for name in tied]
         rest = _rest_of_height(self.measurement, self.model)
         if [self.params[name].expr for name in tied] == [rest]:
             return self._last_height
@@ -140,7 +165,7 @@ class Problem:
 
         def complete(values: Array) -> Array:
             for name in self.free():
-                scratch[name].value = values[self.model.index[name]]
+                scratch[name].value = values[self.index[name]]
             scratch.update_constraints()
             for name, place in zip(tied, places, strict=True):
                 values[place] = scratch[name].value
@@ -151,7 +176,9 @@ class Problem:
     def _last_height(self, values: Array) -> Array:
         """Complete the heights to that of the specimen; the expression itself, but fast."""
         count = len(self.model.kinds)
-        values[-2] = self.measurement.specimen.height - values[-1 - count : -2].sum()
+        first = self.model.index["s1_height"]
+        others = values[first : first + count - 1]
+        values[first + count - 1] = self.measurement.specimen.height - others.sum()
         return values
 
     def space(self) -> Space:
@@ -161,14 +188,14 @@ class Problem:
             scales=self.scales,
             values=self.vector(),
             free=self.free(),
-            low=np.array([self.params[name].min for name in self.model.names]),
-            high=np.array([self.params[name].max for name in self.model.names]),
+            low=np.array([self.params[name].min for name in self.names]),
+            high=np.array([self.params[name].max for name in self.names]),
             tied=self.tied(),
         )
 
     def sizes(self, names: tuple[str, ...], values: Array) -> Array:
         """Natural sizes of some parameters at a point."""
-        at = dict(zip(self.model.names, map(float, values), strict=True))
+        at = dict(zip(self.names, map(float, values), strict=True))
         return np.array([self.scales.of_parameter(name, at) for name in names])
 
     def slopes(self, values: Array, names: tuple[str, ...]) -> Array:
@@ -177,7 +204,7 @@ class Problem:
         Exact but for scenes with implicit steps; see `Objective.jacobian`. Parameters that hang on
         these by expressions move with them.
         """
-        places = np.array([self.model.index[name] for name in names])
+        places = np.array([self.index[name] for name in names])
         steps = 1e-5 * self.sizes(names, values)
         moves = np.zeros((values.size, places.size))
         moves[places, np.arange(places.size)] = 1.0
@@ -198,6 +225,7 @@ def _check_held(params: lmfit.Parameters) -> None:
             "kh_plus": ("zero or positive", value >= 0.0),
             "kh_minus": ("zero or positive", value >= 0.0),
             "eta": ("zero or positive", value >= 0.0),
+            "time_shift": ("finite", bool(np.isfinite(value))),
         }.get(short, ("positive", value > 0.0))
         if not fine:
             raise InputError(f"{name} = {value:g} is not admissible: it must be {wanted}")
@@ -210,6 +238,9 @@ def make_problem(
     params: lmfit.Parameters | None,
     weights: Mapping[str, float] | None,
     interior_mass: bool,
+    *,
+    time_shift: bool = False,
+    loss: str = "linear",
 ) -> Problem:
     """Make a problem ready; see `foamfit.fit` for the arguments.
 
@@ -223,13 +254,17 @@ def make_problem(
     count = len(model.kinds)
     check_interior(measurement, count)
     chosen = default_weights(measurement, drive, count) if weights is None else dict(weights)
-    objective = Objective(measurement, model, drive, chosen, interior_mass=interior_mass)
-    wanted = make_params(measurement, model, drive)
+    objective = Objective(
+        measurement, model, drive, chosen,
+        interior_mass=interior_mass, time_shift=time_shift, loss=loss,
+    )  # fmt: skip
+    measurement = objective.measurement  # with the noise of each channel
+    wanted = make_params(measurement, model, drive, time_shift=time_shift)
     for name in params or ():
         if name not in wanted:
             raise InputError(
                 f"parameter '{name}' is not one of the model {model.name}; "
-                f"its parameters are {', '.join(model.names)}"
+                f"its parameters are {', '.join(wanted)}"
             )
     for name in params or ():
         wanted[name] = params[name]  # type: ignore[index]

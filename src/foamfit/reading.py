@@ -15,7 +15,7 @@ import io
 import math
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ import numpy as np
 from foamfit.conditioning import Record, condition
 from foamfit.errors import InputError
 from foamfit.measurement import Array, Measurement, Striker, interior_channel, interior_node
+from foamfit.noise import with_noise
 from foamfit.settings import Column, Settings, read_settings
 from foamfit.units import factor, is_unit
 
@@ -539,7 +540,7 @@ def read_test(path: str | Path, specimen: str | Path | None = None) -> Measureme
         )
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    return Measurement(
+    measurement = Measurement(
         name=settings.name,
         path=path,
         data_sha256=hashlib.sha256(raw).hexdigest(),
@@ -548,8 +549,11 @@ def read_test(path: str | Path, specimen: str | Path | None = None) -> Measureme
         displacement=conditioned.record.displacement,
         specimen=settings.specimen,
         striker=settings.striker,
-        noise=settings.noise,
+        noise=replace(settings.noise, estimated=conditioned.noise),
         motion=conditioned.motion,
         notes=(*notes, *conditioned.notes),
         interior=conditioned.record.interior,
+        outliers=conditioned.outliers,
+        contact=conditioned.contact,
     )
+    return with_noise(measurement)

@@ -40,13 +40,13 @@ POINTS = (  # attribute of the spring, symbol and its index, meaning, unit
 SYMBOLS = {
     "k0": ("k", "0"), "kc": ("k", "c"), "dsigma": ("Δσ", ""), "eps_a": ("ε", "a"),
     "eps_c": ("ε", "c"), "kh_plus": ("k", "h+"), "kh_minus": ("k", "h−"), "eta": ("η", ""),
-    "height": ("h", ""), "site_eta": ("η", "site"),
+    "height": ("h", ""), "site_eta": ("η", "site"), "time_shift": ("Δt", ""),
 }  # fmt: skip
 STATISTICS = {
     "n_data": "data points", "n_effective": "effective samples", "n_vary": "parameters varied",
     "chisqr": "χ²", "redchi": "reduced χ²", "aic": "AIC", "aicc": "AICc", "bic": "BIC",
     "n_failed": "trials that could not be simulated", "n_descents": "valleys searched",
-    "n_agreeing": "descents that agree",
+    "n_agreeing": "descents that agree", "n_left_out": "outliers left out",
 }  # fmt: skip
 ENERGY = {  # of the audit: label and unit
     "striker_energy": ("striker's energy", "J/m³"),
@@ -154,6 +154,7 @@ def summary_text(result: FitResult) -> str:
     """
     m = result.measurement
     head = f"{m.name}: {result.model}, {result.drive} drive, seed {result.seed}: {result.status}"
+    head += f" (stopped by {result.stopped}, not finished)" if result.stopped else ""
     misfits = [
         f"{name} {100 * misfit:.2g} %"
         for key, name in _curves(result).items()

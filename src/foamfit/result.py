@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from foamfit.chain import Chain
     from foamfit.checklist import Check
     from foamfit.insight import Insight
-    from foamfit.measurement import Measurement
+    from foamfit.measurement import Measurement, Outliers
     from foamfit.spring import BistableSpring
 
 SCHEMA = 1
@@ -118,6 +118,9 @@ class FitResult:
     notes: tuple[str, ...] = ()
     checklist: tuple[Check, ...] = ()
     insight: Insight | None = None
+    stopped: str | None = None  # what ended the search early: "the time limit", "Ctrl-C"
+    loss: str = "linear"
+    noise: dict[str, dict[str, Any]] = field(default_factory=dict)  # of each counted curve
 
     @property
     def bistable_springs(self) -> dict[str, BistableSpring]:
@@ -152,6 +155,8 @@ class FitResult:
                 "drive": self.drive,
                 "seed": self.seed,
                 "status": self.status,
+                "stopped": self.stopped,
+                "loss": self.loss,
                 "warnings": self.warnings,
                 "notes": self.notes,
                 "checklist": [
@@ -165,6 +170,11 @@ class FitResult:
                 "misfit": self.misfit,
                 "weights": self.weights,
                 "statistics": self.statistics,
+                "noise": self.noise,
+                "outliers": {
+                    channel: {"at": found.at, "values": found.values}
+                    for channel, found in self.measurement.outliers.items()
+                },
                 "energy": self.energy,
                 "runtime_s": self.runtime_s,
             }
@@ -273,7 +283,7 @@ def _write(result: FitResult, folder: Path) -> None:
     text = json.dumps(result.to_json_dict(), indent=2, ensure_ascii=False, allow_nan=False)
     (folder / "fit.json").write_text(text + "\n", encoding="utf-8")
     _write_table(folder / "parameters.csv", _parameter_rows(result.parameters))
-    _write_table(folder / "curves.csv", _curve_rows(result.curves))
+    _write_table(folder / "curves.csv", _curve_rows(result.curves, result.measurement.outliers))
     figure = plot_fit(result)
     png = image(figure, "png")
     (folder / "fit.png").write_bytes(png)
@@ -294,8 +304,8 @@ def _parameter_rows(parameters: Mapping[str, ParameterEstimate]) -> Iterator[lis
         yield [name, *numbers, p.unit, p.state, p.why]
 
 
-def _curve_rows(curves: Curves) -> Iterator[Iterable[object]]:
-    columns = {
+def _curve_rows(curves: Curves, outliers: Mapping[str, Outliers]) -> Iterator[Iterable[object]]:
+    columns: dict[str, Array | None] = {
         "time (s)": curves.time,
         "measured stress (Pa)": curves.measured_stress,
         "fitted stress (Pa)": curves.stress,
@@ -306,6 +316,8 @@ def _curve_rows(curves: Curves) -> Iterator[Iterable[object]]:
     for node, (measured, fitted) in curves.interior.items():
         columns[f"measured {interior_channel(node)} (m)"] = measured
         columns[f"fitted {interior_channel(node)} (m)"] = fitted
+    for channel, found in outliers.items():
+        columns[f"outliers of {channel} left out"] = found.left_out.astype(int)
     there = {name: column for name, column in columns.items() if column is not None}
     yield there.keys()
     # Python floats are written with as many digits as they have, numpy's with their type's name.

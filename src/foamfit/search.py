@@ -115,6 +115,7 @@ def smooth_loop(measurement: Measurement) -> Measurement:
         displacement=motion[keep],
         stress=stress[keep],
         time=None if time is None else time[keep],
+        outliers={},  # bridged, and smoothed over
     )
 
 
@@ -246,6 +247,8 @@ def box_starts(space: Space, rng: np.random.Generator, count: int) -> list[Array
             high[j] = 4.0
         elif short == "eta":
             high[j] = 0.3
+        elif short == "time_shift":
+            low[j], high[j] = -0.3, 0.3
         elif short in ("k0", "kc"):
             low[j], high[j] = np.log(0.3), np.log(300.0)
     return list(low + (high - low) * qmc.LatinHypercube(low.size, rng=rng).random(count))
@@ -422,9 +425,11 @@ def _search_loop(
     """
     objective = tracker.objective
     loop = smooth_loop(objective.measurement)
-    inner = Tracker(
-        Objective(loop, objective.model, "displacement", {"stress_strain": 1.0}), tracker.deadline
-    )
+    along = Objective(
+        loop, objective.model, "displacement", {"stress_strain": 1.0},
+        time_shift=objective.time_shift, loss=objective.loss,
+    )  # fmt: skip
+    inner = Tracker(along, tracker.deadline)
     try:
         ranked = rank(inner, space, points + curve_starts(space, loop, rng))
         points = [point for _, point in ranked]
@@ -448,7 +453,7 @@ def _scan_ringing(tracker: Tracker, space: Space, start: Array) -> list[tuple[fl
     massless chain fixes all that does not ring, for each stiffness of a linear spring in turn.
     """
     ringing = tracker.objective
-    quiet = Objective(ringing.measurement, ringing.model, ringing.drive, ringing.weights)
+    quiet = replace(ringing, interior_mass=False)
     massless = Tracker(quiet, tracker.deadline)
     _, start = descend(massless, space, start, 40)
     out: list[tuple[float, Array]] = []

@@ -205,7 +205,7 @@ def make_tangents(count: int, groups: int, order: int, directions: Branches) -> 
 
 
 @inner
-def springs_of(ends: Branches, g: int) -> tuple[int, int]:
+def springs_of(ends: Branches, g: int) -> tuple[np.int64, np.int64]:
     """First spring of a group, and one past its last."""
     return ends[g - 1] if g > 0 else np.int64(0), ends[g]
 
@@ -682,10 +682,10 @@ def equilibrium_tangents(
                 longer = -heights[i] * known / slope[i] if slope[i] > 0.0 else 0.0
             common, gap = 0.0, 0.0
             if moved and flat < 0:
-                common = -longer / soft[count]
+                common = float(-longer / soft[count])
             elif moved:  # a flat branch takes up all that the others leave
                 common = known if i == flat else 0.0
-                gap = -longer - common * soft[count]
+                gap = float(-longer - common * soft[count])
             out_s[p, j] = common
             for node in range(count):
                 own = longer if 0 <= i <= node else 0.0

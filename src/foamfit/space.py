@@ -1,7 +1,7 @@
 """The coordinates of the search: a box in which every point is an admissible chain.
 
 Logarithms of the stiffnesses and of ε_a, the drop Δσ/σ_a, the place of ε_c between ε_a and one,
-slopes and damping over the scales of the test.
+slopes and damping over the scales of the test, a time shift over the largest one.
 """
 
 from __future__ import annotations
@@ -64,11 +64,18 @@ class Scales:
         """Damping that would carry the whole stress, Pa·s."""
         return self.stress / self.rate if self.rate > 0.0 else 1.0
 
+    @property
+    def duration(self) -> float:
+        """Time under load, s; 1 where time is unknown."""
+        return 2.0 * self.strain / self.rate if self.rate > 0.0 else 1.0
+
     def of_parameter(self, name: str, values: dict[str, float]) -> float:
         """Natural size of a parameter, in its unit: what a change by 100 % means."""
         spring, short = split_name(name)
         if short == "eta":
             return max(abs(values[name]), 0.1 * self.eta)
+        if short == "time_shift":
+            return 0.01 * self.duration
         if short in ("kh_plus", "kh_minus"):
             return max(abs(values[name]), 0.1 * self.slope)
         if short == "dsigma":
@@ -89,7 +96,10 @@ BOX = {
     "kh_minus": (0.0, 50.0),
     "eta": (0.0, 10.0),
     "height": (0.02, 0.98),
+    "time_shift": (-1.0, 1.0),
 }
+# Largest time shift between force and motion, over the time under load.
+LARGEST_SHIFT = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +137,8 @@ class Space:
         for name in sorted(self.free, key=lambda name: list(BOX).index(split_name(name)[1])):
             spring, short = split_name(name)
             first = self.model.index[f"s{spring + 1}_k0"] if spring >= 0 else -1
-            out.append((self.model.index[name], short, first))
+            place = self.model.index.get(name, len(self.model.names))  # the nuisance stands last
+            out.append((place, short, first))
         return out
 
     @cached_property
@@ -139,6 +150,8 @@ class Space:
     def _unit(self, short: str) -> float:
         if short == "height":
             return self.scales.height
+        if short == "time_shift":
+            return LARGEST_SHIFT * self.scales.duration
         return self.scales.eta if short == "eta" else self.scales.slope
 
     def encode(self, values: Array) -> Array:

@@ -83,7 +83,11 @@ class Covariance:
 
 
 def covariance(
-    jacobian: Array, residual: Array, sizes: tuple[int, ...], sizes_of: Array
+    jacobian: Array,
+    residual: Array,
+    sizes: tuple[int, ...],
+    sizes_of: Array,
+    noise_times: tuple[float, ...] = (),
 ) -> Covariance:
     """Covariance (JᵀJ)⁻¹ Jᵀ S J (JᵀJ)⁻¹ with S the noise of each curve, counted effectively.
 
@@ -97,15 +101,19 @@ def covariance(
         Samples of each curve, in their order.
     sizes_of : (k,) array
         Natural size of each parameter, so that directions can be compared.
+    noise_times : tuple of float, optional
+        Autocorrelation time of the noise of each curve, where it is known: τ is at least that,
+        because a fit takes up some of what is slow in it.
     """
     n, k = jacobian.shape
     scaled = jacobian * sizes_of
     noise = np.empty(n)
     tau: list[float] = []
     effective = 0.0
-    for part in _parts(sizes):
+    known = noise_times or (1.0,) * len(sizes)
+    for part, least in zip(parts(sizes), known, strict=True):
         length = part.stop - part.start
-        time = autocorrelation_time(residual[part])
+        time = max(autocorrelation_time(residual[part]), min(least, length / 10.0))
         dof = max(length - k * length / n, 1.0)
         noise[part] = float(residual[part] @ residual[part]) / dof * time
         tau.append(time)
@@ -120,7 +128,8 @@ def covariance(
     return Covariance(matrix * np.outer(sizes_of, sizes_of), effective, tuple(tau))
 
 
-def _parts(sizes: tuple[int, ...]) -> list[slice]:
+def parts(sizes: tuple[int, ...]) -> list[slice]:
+    """Slices of the curves in a residual, of which they have so many samples each."""
     ends = np.cumsum(sizes)
     return [slice(int(end - size), int(end)) for size, end in zip(sizes, ends, strict=True)]
 

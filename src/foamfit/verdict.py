@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from foamfit import kernels, uncertainty
-from foamfit.audit import audit
+from foamfit.audit import audit, noise_sentences
 from foamfit.checklist import MAY_VANISH, Evidence, make_checklist, status_of, warnings_of
 from foamfit.conditioning import engineering
 from foamfit.errors import SimulationError
 from foamfit.insight import Insight, look, unreached, visited
 from foamfit.measurement import interior_channel
 from foamfit.model import split_name, unit_of
-from foamfit.objective import Objective, Simulated
+from foamfit.objective import LOSSES, MODEL_ERROR, Objective, Simulated, influence, soften
 from foamfit.problem import Problem
 from foamfit.result import Correlation, Curves, FitResult, ParameterEstimate, Switch
 from foamfit.search import SearchRecord
@@ -28,7 +30,8 @@ def conclude(problem: Problem, values: Array, record: SearchRecord) -> FitResult
     """Assemble the result at the best point."""
     objective, measurement = problem.objective, problem.measurement
     simulated = objective.simulate(values, everything=True)
-    residual = objective.residual(values)
+    springs = values[: len(problem.model.names)]
+    residual = objective.differences(values)
     estimates, spread, insight = _estimate(problem, values, residual)
     correlation = None
     if insight is not None and spread is not None:
@@ -53,7 +56,7 @@ def conclude(problem: Problem, values: Array, record: SearchRecord) -> FitResult
         seed=record.seed,
         status=status_of(checklist),
         warnings=warnings_of(checklist),
-        chain=problem.model.chain(values, measurement.specimen.height, measurement.specimen.area),
+        chain=problem.model.chain(springs, measurement.specimen.height, measurement.specimen.area),
         params=problem.params,
         parameters=estimates,
         visited=evidence.visited,
@@ -76,10 +79,62 @@ def conclude(problem: Problem, values: Array, record: SearchRecord) -> FitResult
         ),
         switches=_switches(problem, simulated),
         correlation=correlation,
-        notes=_notes(problem, values, simulated),
+        notes=(*_notes(problem, values, simulated), *_noise_notes(objective)),
         checklist=checklist,
         insight=insight,
+        stopped=record.stopped,
+        loss=objective.loss,
+        noise=_noise(objective, residual),
     )
+
+
+def _noise(objective: Objective, residual: Array) -> dict[str, dict[str, Any]]:
+    """Noise of each counted curve, how it is known, its scale, and the residuals over it."""
+    found = {}
+    ends = np.cumsum(objective.sizes)
+    for name, end, size in zip(objective.counted, ends, objective.sizes, strict=True):
+        level, scale = objective.noise(name), objective.scale[name]
+        part = residual[end - size : end] * scale / objective.weights[name] ** 0.5
+        rms = float(np.sqrt(np.mean(part**2)))
+        found[name] = {
+            "sigma": level.sigma,
+            "given": level.given,
+            "how": level.how,
+            "time": level.time,
+            "scale": scale,
+            "residual_over_noise": rms / level.sigma if level.sigma > 0.0 else None,
+        }
+    return found
+
+
+def _noise_notes(objective: Objective) -> list[str]:
+    """What the noise is, what the residuals are counted in, and which samples are left out."""
+    measurement = objective.measurement
+    told = [f"Noise of {sentence}" for sentence in noise_sentences(measurement)]
+    floored = [
+        name for name in objective.counted if objective.scale[name] > objective.noise(name).sigma
+    ]
+    if floored:
+        told.append(
+            f"{', '.join(floored)}: residuals count in units of {MODEL_ERROR:.1%} of the range, "
+            "which is more than the estimated noise, so that no channel outweighs another by an "
+            "error of the model; reduced χ² is in these units."
+        )
+    else:
+        told.append("Residuals count in units of the noise: at its floor the reduced χ² is 1.")
+    for channel, outliers in measurement.outliers.items():
+        told.append(f"{outliers.at.size} outliers of the {channel} are not fitted.")
+    if objective.time_shift and objective.drive != "impact":
+        told.append(
+            "time_shift: a foam whose stress relaxes leads its strain, and looks just as if the "
+            "motion were late."
+        )
+    if objective.loss != "linear":
+        told.append(
+            f"The loss is {objective.loss}: residuals past {LOSSES[objective.loss]:g} of their "
+            "units count less than their squares; χ² is that of the loss."
+        )
+    return told
 
 
 def _notes(problem: Problem, values: Array, simulated: Simulated) -> tuple[str, ...]:
@@ -99,9 +154,7 @@ def _notes(problem: Problem, values: Array, simulated: Simulated) -> tuple[str, 
     left_out = "The interior masses are left out"
     if specimen.mass is None:
         return (f"{left_out}; with [specimen] mass foamfit could say what they would change.",)
-    heavy = Objective(
-        problem.measurement, problem.model, "impact", objective.weights, interior_mass=True
-    )
+    heavy = replace(objective, interior_mass=True)
     try:
         other = heavy.simulate(values)
     except SimulationError as error:
@@ -127,16 +180,17 @@ def _estimate(
     """Value, uncertainty and state of every parameter; also put into lmfit's parameters."""
     params, objective = problem.params, problem.objective
     lost = unreached(problem, values)
-    names = tuple(n for n in problem.model.names if params[n].vary and n not in lost)
+    names = tuple(n for n in problem.names if params[n].vary and n not in lost)
     spread = insight = None
     if names:
-        jacobian = problem.slopes(values, names)
+        jacobian = problem.linear().slopes(values, names)
         sizes = problem.sizes(names, values)
-        spread = uncertainty.covariance(jacobian, residual, objective.sizes, sizes)
-        noise = _left_over(problem, residual, spread)
-        insight = look(problem, values, names, jacobian, noise)
+        left = pseudo_residual(residual, objective)
+        times = tuple(objective.noise(name).time for name in objective.counted)
+        spread = uncertainty.covariance(jacobian, left, objective.sizes, sizes, times)
+        insight = look(problem, values, names, jacobian, _left_over(problem, left, spread))
     out = {}
-    for i, name in enumerate(problem.model.names):
+    for i, name in enumerate(problem.names):
         value, parameter = float(values[i]), params[name]
         parameter.stderr = None
         if name in lost and parameter.vary:
@@ -166,6 +220,19 @@ def _left_over(
         out[name] = max(rms, 1e-300) * objective.scale[name] / objective.weights[name] ** 0.5
         at += size
     return out
+
+
+def pseudo_residual(residual: Array, objective: Objective) -> Array:
+    """Residuals whose least squares have the covariance of the loss: ψ(r) over the mean of ψ'(r).
+
+    With them (JᵀJ)⁻¹ mean(ψ²)/mean(ψ')² is the covariance of an M-estimate (Huber 1981, Robust
+    Statistics, section 7.6), for each curve apart. Under the linear loss they are the residuals.
+    """
+    parts = []
+    for part in uncertainty.parts(objective.sizes):
+        psi, slope = influence(residual[part], objective.loss)
+        parts.append(psi / max(float(slope.mean()), 0.05))
+    return np.concatenate(parts)
 
 
 def _varied(
@@ -245,13 +312,15 @@ def _statistics(
 ) -> dict[str, float | int | None]:
     """Statistics as lmfit defines them (chi-square, AIC, BIC), and what the search cost."""
     n = residual.size
-    chisqr = float(residual @ residual)
+    cost = soften(residual, objective.loss)
+    chisqr = float(cost @ cost)
     log_likelihood = n * math.log(max(chisqr, 1e-300) / n)
     aic = log_likelihood + 2 * n_vary
     room = n - n_vary - 1
     return {
         "n_data": n,
         "n_effective": None if spread is None else spread.effective,
+        "n_left_out": sum(objective.measured_size(name) for name in objective.counted) - n,
         "n_vary": n_vary,
         "chisqr": chisqr,
         "redchi": chisqr / max(n - n_vary, 1),

@@ -1,0 +1,228 @@
+"""Noise and outliers of a channel, against known noise and planted outliers."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+import foamfit as ff
+from conftest import DATA, HEIGHT, needs_data, synthetic_impact
+from fabricated import half_sine
+from foamfit.conditioning import Record, condition
+from foamfit.measurement import Noise, Specimen, Striker
+from foamfit.noise import find_outliers, quantum, residual_noise, with_noise
+
+SPECIMEN = Specimen(HEIGHT, 1.9635e-5)
+
+
+@functools.cache
+def signal(channel: str, n: int) -> np.ndarray:
+    """A channel without noise, over its range: kinks where springs switch, loading and rebound."""
+    if channel == "loop":
+        spring = ff.published["foam-1/model-1"].bistable
+        strain = 0.38 * (1 - np.abs(np.linspace(-1, 1, n)))
+        values = spring.stress(strain)
+    else:
+        _, test = synthetic_impact(noise=0.0, samples=n)
+        values = getattr(test, channel)
+    return values / np.ptp(values)
+
+
+def slow_noise(rng: np.random.Generator, n: int, phi: float) -> np.ndarray:
+    """First-order autoregressive noise of unit variance."""
+    white = np.sqrt(1 - phi**2) * rng.standard_normal(n + 400)
+    return lfilter([1.0], [1.0, -phi], white)[400:]
+
+
+CHANNELS = ("stress", "displacement", "loop")
+
+
+@pytest.mark.parametrize("channel", CHANNELS)
+@pytest.mark.parametrize("n", [300, 1000, 5000])
+def test_white_noise_is_estimated_to_fifteen_percent(channel, n):
+    rng = np.random.default_rng(n)
+    ratios = [
+        residual_noise(signal(channel, n) + level * rng.standard_normal(n))[0] / level
+        for level in (0.002, 0.01, 0.03)
+        for _ in range(20)
+    ]
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.05)
+    # Of 300 samples the estimate itself scatters by 6 %, of 5000 by 1.5 %.
+    assert np.mean(np.abs(np.array(ratios) - 1.0) < 0.15) >= (0.9 if n == 300 else 0.99)
+
+
+@pytest.mark.parametrize(("n", "phi", "off"), [(300, 0.5, 0.4), (1000, 0.8, 0.4), (5000, 0.9, 0.2)])
+def test_slow_noise_is_not_taken_for_signal(n, phi, off):
+    """Second differences would see 0.61, 0.34 and 0.25 of it."""
+    rng = np.random.default_rng(1)
+    found = np.array(
+        [
+            residual_noise(signal(channel, n) + 0.01 * slow_noise(rng, n, phi))
+            for channel in CHANNELS
+            for _ in range(8)
+        ]
+    )
+    ratios = found[:, 0] / 0.01
+    assert np.median(ratios) == pytest.approx(1.0, abs=0.15)
+    assert np.mean(np.abs(ratios - 1.0) < off) >= 0.8
+    assert np.median(found[:, 1]) == pytest.approx(phi, abs=0.1)
+
+
+def test_spikes_and_ringing_are_no_noise():
+    rng = np.random.default_rng(2)
+    n = 1000
+    values = signal("stress", n) + 0.01 * rng.standard_normal(n)
+    values[rng.choice(n, 10, replace=False)] += 0.3
+    assert residual_noise(values)[0] == pytest.approx(0.01, rel=0.15)
+    ringing = values + 0.1 * np.sin(2 * np.pi * np.arange(n) / 60)
+    assert residual_noise(ringing)[0] == pytest.approx(0.01, rel=0.15)
+
+
+@pytest.mark.parametrize("step", [0.002, 0.02])
+def test_a_digitiser_makes_noise_of_its_own(step):
+    values = np.round(signal("stress", 600) / step) * step
+    assert quantum(values) == pytest.approx(step)
+    assert step / np.sqrt(12) * (1 - 1e-9) <= residual_noise(values)[0] < step
+    assert quantum(signal("stress", 600)) == 0.0
+
+
+def test_noise_is_taken_from_the_samples_before_contact():
+    """Slow in time, so that the signal's own samples would show less of it."""
+    _, test = synthetic_impact(noise=0.0, samples=601)
+    rng = np.random.default_rng(3)
+    step = test.time[1]
+    time = np.concatenate([np.arange(-200, 0) * step, test.time])
+    stress = np.concatenate([np.zeros(200), test.stress]) + 40e3 * slow_noise(rng, 801, 0.4)
+    motion = np.concatenate([np.zeros(200), test.displacement])
+    motion += 3e-6 * rng.standard_normal(801)
+    done = condition(Record(time, stress, motion), SPECIMEN, striker=Striker(7e-3, 2.0))
+    level = done.noise["stress"]
+    assert "samples before contact" in level.how
+    assert level.sigma == pytest.approx(40e3, rel=0.15)
+    assert level.time == pytest.approx((1 + 0.4) / (1 - 0.4), rel=0.5)
+    assert done.noise["displacement"].sigma == pytest.approx(3e-6, rel=0.15)
+    assert not level.given
+
+
+def test_noise_of_a_held_channel_is_that_of_its_fresh_samples():
+    rng = np.random.default_rng(4)
+    n, hold = 1200, 5
+    fresh = 4e-4 * (1 - np.abs(np.linspace(-1, 1, n // hold))) + 1e-6 * rng.standard_normal(240)
+    held = np.repeat(fresh, hold)
+    done = condition(Record(np.arange(n) * 1e-3, 1e9 * held + 1e3, held), SPECIMEN)
+    level = done.noise["displacement"]
+    assert level.sigma == pytest.approx(1e-6, rel=0.2)
+    assert level.time == pytest.approx(hold, rel=0.05)
+    assert "fresh samples" in level.how
+
+
+def test_thinned_noise_is_that_of_the_means():
+    rng = np.random.default_rng(5)
+    n = 20_000
+    stress = 1e6 * signal("stress", n) + 1e4 * rng.standard_normal(n)
+    motion = 4e-4 * signal("displacement", n) + 1e-6 * rng.standard_normal(n)
+    time = np.linspace(0, 0.75e-3, n)
+    done = condition(Record(time, stress, motion), SPECIMEN, striker=Striker(7e-3, 2.0))
+    block = -(-n // len(done.record))
+    sigma, _ = residual_noise(done.record.stress)
+    assert block > 10
+    assert sigma == pytest.approx(1e4 / np.sqrt(block), rel=0.25)
+
+
+def test_stated_noise_is_kept_and_the_rest_is_completed():
+    _, test = synthetic_impact()
+    whole = with_noise(replace(test, noise=Noise(stress=2e4)))
+    assert whole.noise.of("stress").given
+    assert whole.noise.of("stress").sigma == 2e4
+    level = whole.noise.of("displacement")
+    assert not level.given
+    assert level.sigma == pytest.approx(test.noise.displacement, rel=0.15)
+    assert with_noise(whole) is whole
+
+
+# ------------------------------------------------------------------------------------- outliers
+
+
+def test_clean_records_have_next_to_no_outliers():
+    rng = np.random.default_rng(6)
+    flagged = samples = 0
+    for channel in CHANNELS:
+        for n in (150, 300, 600, 1500):
+            assert not find_outliers(signal(channel, n)).any()  # kinks alone
+            for level in (0.0005, 0.003, 0.01, 0.03):
+                for phi in (0.0, 0.5, 0.9):
+                    for _ in range(3):
+                        noisy = signal(channel, n) + level * slow_noise(rng, n, phi)
+                        flagged += int(find_outliers(noisy).sum())
+                        samples += n
+    assert flagged / samples < 1e-3
+
+
+@pytest.mark.parametrize(("size", "least"), [(5.0, 0.4), (7.0, 0.85), (10.0, 0.97), (20.0, 0.99)])
+def test_spikes_are_found(size, least):
+    rng = np.random.default_rng(7)
+    found = []
+    for _ in range(150):
+        channel, n = rng.choice(CHANNELS), int(rng.choice([300, 600, 1500]))
+        values = signal(channel, n) + 0.01 * rng.standard_normal(n)
+        at = int(rng.integers(8, n - 8))
+        values[at] += size * 0.01 * rng.choice([-1, 1])
+        found.append(find_outliers(values)[at])
+    assert np.mean(found) >= least
+
+
+@pytest.mark.parametrize("constant", [0.0, 1.5, -999.0])
+def test_dropped_samples_are_found(constant):
+    rng = np.random.default_rng(8)
+    found = []
+    for _ in range(100):
+        channel, n = rng.choice(CHANNELS), int(rng.choice([300, 600, 1500]))
+        values = signal(channel, n) + 0.01 * rng.standard_normal(n)
+        at, run = int(rng.integers(n // 4, n * 3 // 5)), int(rng.integers(1, 4))
+        if abs(values[at] - constant) < 0.3:
+            continue
+        values[at : at + run] = constant
+        found.append(find_outliers(values)[at : at + run].all())
+    assert np.mean(found) >= 0.95
+
+
+def test_too_many_outliers_are_no_exceptions():
+    rng = np.random.default_rng(9)
+    values = signal("stress", 600) + 0.003 * rng.standard_normal(600)
+    values[10::25] += 0.5
+    assert not find_outliers(values).any()
+
+
+@needs_data
+def test_measurements_of_others_have_next_to_no_outliers():
+    flagged = samples = 0
+    for path in sorted((DATA / "shoe-foam").glob("*_cycle*.csv")):
+        table = np.genfromtxt(path, delimiter=",", names=True)
+        for channel in ("displacement_m", "force_N"):
+            flagged += int(find_outliers(table[channel]).sum())
+            samples += table.size
+    assert samples > 20_000
+    assert flagged / samples < 1e-3
+
+
+def test_outliers_are_bridged_named_and_kept_for_the_eye():
+    time, strain, stress, _ = half_sine()
+    rng = np.random.default_rng(10)
+    spoilt = stress + 1e4 * rng.standard_normal(time.size)
+    clean = spoilt.copy()
+    spoilt[200] = 0.0
+    spoilt[[300, 301]] = 1e8
+    done = condition(Record(time, spoilt, strain * HEIGHT), SPECIMEN, striker=Striker(7e-3, 1.75))
+    found = done.outliers["stress"]
+    np.testing.assert_allclose(found.at, time[[200, 300, 301]], atol=1e-6)
+    np.testing.assert_allclose(found.values, [0.0, 1e8, 1e8], rtol=1e-6, atol=2e4)
+    assert found.left_out.sum() == 3
+    assert done.record.stress[~found.left_out].max() < 1.1 * clean.max()
+    (note,) = [note for note in done.notes if "spikes or gaps" in note]
+    assert note.startswith("Check: 3 samples of the stress")
+    assert "100 MPa" in note
+    assert set(done.outliers) == {"stress"}

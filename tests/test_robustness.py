@@ -1,0 +1,346 @@
+"""What a fit bears: outliers, heavy tails, a clock that is off, and being stopped."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from scipy.optimize import least_squares
+
+import fabricated
+import foamfit as ff
+import foamfit.plots
+import foamfit.report
+from conftest import AREA, HEIGHT, synthetic_impact, synthetic_loop
+from foamfit import uncertainty
+from foamfit.cli import main
+from foamfit.comparison import compare, comparison_text
+from foamfit.measurement import Measurement, Outliers
+from foamfit.model import Model
+from foamfit.objective import LOSSES, Objective, default_weights, influence, soften
+from foamfit.plots import plot_fit
+from foamfit.report import render_report, summary_text
+from foamfit.result import FitResult, load_result
+
+BISTABLE = Model.parse("bistable")
+NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
+
+
+def worst_deviation(result: ff.FitResult, spring: ff.BistableSpring) -> float:
+    """Largest deviation of the seven parameters from the truth, in standard errors."""
+    items = [result.parameters[f"s1_{name}"] for name in NAMES]
+    return max(
+        abs(item.value - true) / item.stderr for item, true in zip(items, spring.seven, strict=True)
+    )
+
+
+# ----------------------------------------------------------------------------------------- losses
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_a_loss_costs_what_scipy_says(loss):
+    residual = np.random.default_rng(0).standard_cauchy(200)
+    width = 1.0 if loss == "linear" else LOSSES[loss]
+    said = least_squares(lambda x: residual + x, [0.0], loss=loss, f_scale=width, max_nfev=1)
+    at = residual + said.x
+    assert np.sum(soften(at, loss) ** 2) == pytest.approx(2 * said.cost, rel=1e-12)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_the_influence_is_half_the_slope_of_the_loss(loss):
+    residual = np.linspace(-9.03, 9.01, 101)
+    h = 1e-5
+    up, down = (soften(residual + side, loss) ** 2 for side in (h, -h))
+    psi, slope = influence(residual, loss)
+    np.testing.assert_allclose(psi, (up - down) / (4 * h), rtol=1e-6, atol=1e-8)
+    bent = (influence(residual + h, loss)[0] - influence(residual - h, loss)[0]) / (2 * h)
+    np.testing.assert_allclose(slope, bent, rtol=1e-5, atol=1e-8)
+
+
+@pytest.mark.parametrize("loss", ["soft_l1", "huber", "cauchy"])
+def test_the_standard_error_of_a_soft_loss_is_honest(loss):
+    """Of the level of contaminated noise: the scatter of many fits against what each says."""
+    from foamfit.verdict import pseudo_residual
+
+    rng = np.random.default_rng(1)
+    _, test = synthetic_loop()
+    objective = Objective(
+        test, BISTABLE, "displacement", default_weights(test, "displacement"), loss=loss
+    )
+    n = objective.n_data
+    levels, said = [], []
+    for _ in range(200):
+        data = rng.standard_normal(n)
+        wild = rng.random(n) < 0.1
+        data[wild] *= 8.0
+        level = least_squares(lambda x, y=data: soften(x - y, loss), [0.0]).x[0]
+        jacobian, size = np.ones((n, 1)), np.ones(1)
+        pseudo = pseudo_residual(level - data, objective)
+        levels.append(level)
+        said.append(uncertainty.covariance(jacobian, pseudo, (n,), size).stderr[0])
+    assert np.mean(said) == pytest.approx(np.std(levels), rel=0.15)
+    assert np.std(levels) < 0.7 * np.sqrt((0.9 + 0.1 * 64) / n)  # least squares does worse
+
+
+@pytest.mark.parametrize("loss", ["soft_l1", "huber", "cauchy"])
+def test_a_soft_loss_bears_what_is_no_outlier_by_itself(loss):
+    """A twentieth of the samples in runs of ten are off: no neighbour gives them away."""
+    spring, test = synthetic_impact()
+    stress = test.stress.copy()
+    for at in (120, 260):
+        stress[at : at + 10] += 12 * test.noise.stress
+    spoilt = replace(test, stress=stress)
+    soft, hard = (ff.fit(spoilt, loss=how, starts=6) for how in (loss, "linear"))
+    assert worst_deviation(soft, spring) < 4.0
+    truth = np.array([*spring.seven])
+    off = [
+        np.abs([r.parameters[f"s1_{n}"].value for n in NAMES] - truth) / np.abs(truth)
+        for r in (soft, hard)
+    ]
+    assert off[0].max() < off[1].max()
+    assert soft.loss == soft.to_json_dict()["loss"] == loss
+    assert any(loss in note for note in soft.notes)
+
+
+def test_an_unknown_loss_is_refused():
+    with pytest.raises(ff.InputError, match="loss 'l2'"):
+        ff.fit(synthetic_loop()[1], loss="l2")
+
+
+# --------------------------------------------------------------------------------------- outliers
+
+
+def spoilt_impact() -> tuple[ff.BistableSpring, Measurement, np.ndarray]:
+    """An impact whose stress was wild at some samples, as the loader hands it on."""
+    spring, test = synthetic_impact()
+    at = np.array([57, 148, 149, 301])
+    left_out = np.isin(np.arange(test.time.size), at)
+    found = Outliers(left_out, test.time[at], np.full(4, 9e6))
+    return spring, replace(test, outliers={"stress": found}), at
+
+
+def test_what_stands_at_an_outlier_does_not_matter():
+    spring, test, at = spoilt_impact()
+    values = np.array([*spring.seven, 0.0, 0.0])
+    changed = replace(test, stress=np.where(test.outliers["stress"].left_out, 7e5, test.stress))
+    weights = default_weights(test, "impact")
+    one, other = (Objective(t, BISTABLE, "impact", weights) for t in (test, changed))
+    np.testing.assert_array_equal(one.residual(values), other.residual(values))
+    assert one.sizes == (401 - at.size, 401)
+    simulated = one.simulate(values)
+    assert one.misfit(simulated)["stress_time"] == pytest.approx(
+        other.misfit(simulated)["stress_time"], rel=1e-12
+    )
+
+
+def test_outliers_are_in_the_result_and_crossed_in_the_figure(tmp_path, monkeypatch):
+    for module in (foamfit.plots, foamfit.report):  # the folder needs no pictures here
+        monkeypatch.setattr(module, "image", lambda *_: b"\x89PNG" + bytes(20))
+    _, test, at = spoilt_impact()
+    result = ff.fit(test, starts=4)
+    content = result.to_json_dict()
+    assert content["statistics"]["n_left_out"] == at.size
+    assert content["outliers"]["stress"]["values"] == [9e6] * 4
+    assert any("4 outliers of the stress" in note for note in result.notes)
+    figure = plot_fit(result)
+    for ax, count in zip(figure.axes, (1, 0, 1), strict=True):
+        crosses = [line for line in ax.lines if line.get_label() == "outlier, not fitted"]
+        assert len(crosses) == count
+        for line in crosses:
+            assert line.get_xdata().size == at.size
+            assert max(line.get_ydata()) <= ax.get_ylim()[1]  # the curves keep their room
+    folder = result.save(tmp_path / "fit")
+    header, *rows = (folder / "curves.csv").read_text().splitlines()
+    column = header.split(",").index("outliers of stress left out")
+    assert [i for i, row in enumerate(rows) if row.split(",")[column] == "1"] == at.tolist()
+
+
+def test_a_file_with_spikes_and_gaps_gives_the_parameters_of_the_spring(tmp_path):
+    spring, test = synthetic_impact(samples=601)
+    stress, motion = test.stress.copy(), test.displacement.copy()
+    rng = np.random.default_rng(2)
+    spikes = rng.choice(np.arange(40, 400), 3, replace=False)
+    stress[spikes] += 15 * test.noise.stress
+    stress[[210, 211]] = 0.0
+    motion[333] = 0.0
+    path = tmp_path / "spoilt.csv"
+    table = np.column_stack([test.time, stress, motion])
+    np.savetxt(path, table, delimiter=",", header="time_s,stress_Pa,displacement_m", comments="")
+    path.with_suffix(".toml").write_text(
+        f'[specimen]\nheight = "{HEIGHT} m"\narea = "{AREA} m^2"\n'
+        '[striker]\nmass = "7 g"\nvelocity = "2 m/s"\n'
+    )
+    read = ff.read_test(path)
+    assert read.outliers["stress"].at.size == 5
+    assert read.outliers["displacement"].at.size == 1
+    said = [note for note in read.notes if "spikes or gaps" in note]
+    assert any(note.startswith("Check: 5 samples of the stress") for note in said)
+    assert any(note.startswith("Check: 1 sample of the displacement") for note in said)
+    result = ff.fit(read, starts=8)
+    assert worst_deviation(result, spring) < 4.0
+    assert result.noise["stress_time"]["given"] is False
+    assert result.noise["stress_time"]["residual_over_noise"] == pytest.approx(1.0, abs=0.15)
+    assert result.statistics["redchi"] == pytest.approx(1.0, abs=0.2)
+
+
+# ------------------------------------------------------------------------------------- time shift
+
+
+def shifted_impact(late: float, **changed: object) -> tuple[ff.BistableSpring, Measurement]:
+    """The impact of conftest, its motion written down `late` seconds too late."""
+    spring, test = synthetic_impact()
+    chain = ff.Chain([spring], [HEIGHT], AREA)
+    dense = np.linspace(0.0, 0.9e-3, 20_001)
+    motion = ff.simulate(chain, ff.Impact(7e-3, 2.0), dense).displacement[-1]
+    when = test.time - late
+    seen = np.where(when < 0.0, 2.0 * when, np.interp(when, dense, motion))
+    noise = test.noise.displacement * np.random.default_rng(3).standard_normal(when.size)
+    return spring, replace(test, displacement=seen + noise, **changed)
+
+
+@pytest.mark.parametrize("late", [15e-6, -10e-6])
+def test_a_shift_between_force_and_motion_is_warned_of_and_fitted(late):
+    spring, test = shifted_impact(late)
+    plain = ff.fit(test, starts=8)
+    word = "late" if late > 0 else "early"
+    (warning,) = [w for w in plain.warnings if "--time-shift" in w]
+    assert f"{word} by" in warning
+    result = ff.fit(test, time_shift=True, starts=8)
+    item = result.parameters["time_shift"]
+    assert item.unit == "s"
+    assert item.state == "determined"
+    assert abs(item.value - late) < max(3 * item.stderr, 0.05 * abs(late))
+    assert item.ci95[0] < item.value < item.ci95[1]
+    assert worst_deviation(result, spring) < 4.0
+    assert not [w for w in result.warnings if "--time-shift" in w]
+    assert result.params["time_shift"].value == item.value
+    assert "time_shift" in summary_text(result)
+
+
+def test_no_shift_is_warned_of_where_there_is_none():
+    result = ff.fit(synthetic_impact()[1], starts=4)
+    assert not [w for w in result.warnings if "--time-shift" in w]
+    shifted = ff.fit(synthetic_impact()[1], time_shift=True, starts=4).parameters["time_shift"]
+    assert abs(shifted.value) < 3 * shifted.stderr
+
+
+@pytest.mark.parametrize("contact", ["file", "stress", "motion"])
+def test_the_curves_of_a_shifted_test_are_those_that_it_shows(contact):
+    """Time zero is the file's, where the stress starts (the motion is zero), or the motion's."""
+    late = 12e-6
+    spring, test = synthetic_impact(noise=0.0)
+    motion = test.displacement
+    if contact == "motion":
+        test = replace(test, stress=np.interp(test.time + late, test.time, test.stress))
+    else:
+        motion = np.interp(test.time - late, test.time, motion)
+        motion[test.time < late] = 2.0 * (test.time[test.time < late] - late)
+        test = replace(test, displacement=motion + (2.0 * late if contact == "stress" else 0.0))
+    test = replace(test, contact=contact)
+    one = Objective(test, BISTABLE, "impact", default_weights(test, "impact"), time_shift=True)
+    curves = one.simulate(np.array([*spring.seven, 0.0, 0.0, late]))
+    inside = (test.time > 2 * late) & (test.time < test.time[-1] - 2 * late)
+    for simulated, measured in (
+        (curves.stress_time, test.stress),
+        (curves.displacement_time, test.displacement),
+    ):
+        off = np.abs(simulated - measured)[inside] / np.ptp(measured)
+        assert off.max() < 1e-9
+
+
+def test_a_slow_test_in_time_has_a_shift_too():
+    _, loop = synthetic_loop()
+    time = np.linspace(0.0, 4.0, loop.stress.size)
+    late = 0.05
+    seen = np.interp(time - late, time, loop.displacement)
+    result = ff.fit(replace(loop, time=time, displacement=seen), time_shift=True, starts=8)
+    item = result.parameters["time_shift"]
+    assert item.value == pytest.approx(late, abs=max(3 * item.stderr, 2e-3))
+    assert result.drive == "displacement"
+    assert any("relaxes" in note for note in result.notes)
+
+
+@pytest.mark.parametrize(
+    ("changed", "missing"),
+    [({"time": None, "striker": None}, "no time"), ({"motion": "integrated from force"}, "motion")],
+)
+def test_a_shift_without_two_channels_in_time_is_refused(changed, missing):
+    _, test = synthetic_impact()
+    with pytest.raises(ff.InputError, match=missing) as caught:
+        ff.fit(replace(test, **changed), time_shift=True)
+    assert "time shift" in str(caught.value)
+
+
+def test_the_command_fits_a_shift_and_refuses_it_without_time(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    test = fabricated_csv(tmp_path)
+    monkeypatch.setattr(FitResult, "save", lambda self, folder: folder)
+    call = ["fit", str(test), "--starts", "4", "--json", "--time-shift", "--loss", "huber"]
+    out = CliRunner().invoke(main, call)
+    assert out.exit_code == 0
+    content = json.loads(out.stdout)
+    assert content["parameters"]["time_shift"]["unit"] == "s"
+    assert content["loss"] == "huber"
+    rows = [line.split(",")[1:] for line in test.read_text().splitlines()[:200]]
+    (tmp_path / "slow.csv").write_text("\n".join(",".join(row) for row in rows))
+    (tmp_path / "slow.toml").write_text('[specimen]\nheight = "1.19 mm"\ndiameter = "5 mm"\n')
+    out = CliRunner().invoke(main, ["fit", "slow.csv", "--time-shift"])
+    assert out.exit_code == 1
+    assert "it has no time" in out.stderr
+    assert len(out.stderr.splitlines()) == 1
+
+
+# ---------------------------------------------------------------------------------------- stopped
+
+
+def test_a_stopped_fit_is_marked_everywhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    test = fabricated_csv(tmp_path)
+    out = CliRunner().invoke(main, ["fit", str(test), "--max-time", "0.02", "--out", "stopped"])
+    assert out.exit_code in (0, 2)
+    assert "stopped by the time limit" in out.stdout.splitlines()[0]
+    content = load_result(tmp_path / "stopped")
+    assert content["stopped"] == "the time limit"
+    assert content["status"] in ("warnings", "failed")
+    assert "stopped by the time limit" in content["warnings"][0]
+    head = (tmp_path / "stopped" / "report.html").read_text().split("</h1>")[1][:400]
+    assert "stopped by the time limit" in head
+    text = comparison_text(compare([tmp_path / "stopped"], "foam-1/model-1"))
+    assert "stopped by the time limit)" in text.splitlines()[0]
+    assert "not the end of a fit" in " ".join(text.split())
+
+
+def test_the_figure_of_a_stopped_fit_says_so():
+    stopped = fabricated.result(stopped="Ctrl-C")
+    assert "stopped by Ctrl-C" in plot_fit(stopped).get_suptitle().replace("\n", " ")
+    assert "stopped" not in plot_fit(fabricated.result()).get_suptitle()
+    assert "stopped by Ctrl-C" in render_report(stopped, fit_png=b"\x89PNG" + bytes(20))
+    assert json.loads(json.dumps(fabricated.result().to_json_dict()))["stopped"] is None
+
+
+def test_a_stopped_fit_is_never_ok(monkeypatch):
+    from foamfit import identification
+    from foamfit.search import SearchStoppedError
+
+    def stop(*_: object) -> None:
+        raise SearchStoppedError
+
+    monkeypatch.setattr(identification, "_refine", stop)
+    result = ff.fit(synthetic_impact()[1], starts=4)
+    assert result.stopped == "the time limit"
+    assert result.status == "warnings"
+
+
+def fabricated_csv(folder):
+    _, test = synthetic_impact()
+    path = folder / "foam-1-model-1.csv"
+    table = np.column_stack([test.time, test.stress, test.displacement])
+    np.savetxt(path, table, delimiter=",", header="time_s,stress_Pa,displacement_m", comments="")
+    path.with_suffix(".toml").write_text(
+        f'[specimen]\nheight = "{HEIGHT} m"\narea = "{AREA} m^2"\n'
+        '[striker]\nmass = "7 g"\nvelocity = "2 m/s"\n'
+    )
+    return path
