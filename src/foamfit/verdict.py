@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from foamfit import kernels, uncertainty
 from foamfit.audit import EnergyAudit, audit
 from foamfit.errors import SimulationError
+from foamfit.intervals import Intervals
 from foamfit.measurement import interior_channel
 from foamfit.model import BRANCHES, split_name, unit_of
 from foamfit.objective import Objective, Simulated
@@ -27,12 +28,15 @@ UNACCEPTABLE = 0.5
 POOR = 0.05
 
 
-def conclude(problem: Problem, values: Array, record: SearchRecord) -> FitResult:
-    """Assemble the result at the best point."""
+def conclude(
+    problem: Problem, values: Array, record: SearchRecord, intervals: Intervals | None = None
+) -> FitResult:
+    """Assemble the result at the best point, with other intervals than local ones if there are."""
     objective, measurement = problem.objective, problem.measurement
     simulated = objective.simulate(values, everything=True)
     residual = objective.residual(values)
-    estimates, spread, correlation = _estimate(problem, values, residual)
+    intervals = Intervals() if intervals is None else intervals
+    estimates, spread, correlation = _estimate(problem, values, residual, intervals)
     misfit = objective.misfit(simulated)
     balance = audit(measurement)
     n_vary = sum(1 for item in estimates.values() if item.vary and item.stderr is not None)
@@ -69,7 +73,8 @@ def conclude(problem: Problem, values: Array, record: SearchRecord) -> FitResult
         ),
         switches=_switches(problem, simulated),
         correlation=correlation,
-        notes=_notes(problem, values, simulated),
+        notes=(*_notes(problem, values, simulated), *intervals.notes),
+        intervals=intervals,
     )
 
 
@@ -113,7 +118,7 @@ def _notes(problem: Problem, values: Array, simulated: Simulated) -> tuple[str, 
 
 
 def _estimate(
-    problem: Problem, values: Array, residual: Array
+    problem: Problem, values: Array, residual: Array, intervals: Intervals
 ) -> tuple[dict[str, ParameterEstimate], uncertainty.Covariance | None, Correlation | None]:
     """Value, uncertainty and state of every parameter; also put into lmfit's parameters."""
     params, objective = problem.params, problem.objective
@@ -138,7 +143,7 @@ def _estimate(
             estimate = ParameterEstimate(value, None, None, unit_of(name), False, "fixed", why)
         else:
             assert spread is not None
-            estimate = _varied(problem, name, value, spread, names.index(name), sizes)
+            estimate = _varied(problem, name, value, spread, names.index(name), sizes, intervals)
             parameter.stderr = estimate.stderr
         out[name] = estimate
     return out, spread, None if spread is None else Correlation(names, spread.correlation)
@@ -151,18 +156,25 @@ def _varied(
     spread: uncertainty.Covariance,
     column: int,
     sizes: Array,
+    intervals: Intervals,
 ) -> ParameterEstimate:
     """Estimate of a parameter that was varied and whose branch was reached."""
     low, high = problem.params[name].min, problem.params[name].max
     stderr = float(spread.stderr[column])
-    half = uncertainty.half_width(stderr, spread.effective - len(sizes))
+    half = uncertainty.half_width(stderr, spread.freedom)
+    ends = intervals.ends.get(name, (value - half, value + half))
+    if name in intervals.ends:
+        half = 0.5 * (ends[1] - ends[0])
     verdict, why = uncertainty.state(value, half, float(sizes[column]), low, high)
     if verdict == "determined" and problem.objective.interior_mass:
         verdict, why = "weak", "the ringing of the interior mass leaves other valleys; " + why
     if verdict == "not determined":
         return ParameterEstimate(value, None, None, unit_of(name), True, verdict, why)
-    ci95 = (max(value - half, low), min(value + half, high))
-    return ParameterEstimate(value, stderr, ci95, unit_of(name), True, verdict, why)
+    if name in intervals.doubtful:
+        why += "; its interval is local, though the cost is no parabola there"
+    ci95 = (max(ends[0], low), min(ends[1], high))
+    method = intervals.methods.get(name, "local covariance")
+    return ParameterEstimate(value, stderr, ci95, unit_of(name), True, verdict, why, method)
 
 
 def _statistics(
