@@ -96,16 +96,21 @@ def run_test(group: Class, seed: int, intervals: str = "auto") -> list[dict[str,
     return rows
 
 
-def run(tests: int, intervals: str) -> pd.DataFrame:
-    """Fit all tests of all classes."""
-    rows: list[dict[str, object]] = []
-    for group in CLASSES:
-        began = time.perf_counter()
-        for seed in range(1, tests + 1):
-            rows += run_test(group, seed, intervals)
-        took = time.perf_counter() - began
-        print(f"{group.noise} {group.samples}: {took:.0f} s", file=sys.stderr, flush=True)
-    return pd.DataFrame(rows)
+def run(tests: int, intervals: str, raw: Path | None) -> pd.DataFrame:
+    """Fit all tests of all classes, but for those that `raw` holds already; it is kept up."""
+    rows = pd.read_csv(raw) if raw is not None and raw.exists() else pd.DataFrame()
+    done = set(map(tuple, rows[["noise", "samples", "test"]].to_numpy())) if len(rows) else set()
+    began = time.perf_counter()
+    for seed in range(1, tests + 1):
+        for group in CLASSES:
+            if (group.noise, group.samples, seed) not in done:
+                rows = pd.concat([rows, pd.DataFrame(run_test(group, seed, intervals))])
+        if raw is not None:
+            rows.to_csv(raw, index=False)
+        if seed % 10 == 0:
+            took = time.perf_counter() - began
+            print(f"{seed} tests per class: {took:.0f} s", file=sys.stderr, flush=True)
+    return rows[rows["test"] <= tests]
 
 
 def coverage(rows: pd.DataFrame) -> pd.DataFrame:
@@ -179,13 +184,11 @@ def main() -> None:
     parser.add_argument("--tests", type=int, default=200)
     parser.add_argument("--intervals", default="auto", choices=("auto", "local", "profile"))
     parser.add_argument("--out", type=Path, default=HERE)
-    parser.add_argument("--raw", type=Path, help="also write one row per test and parameter")
+    parser.add_argument("--raw", type=Path, help="one row per test and parameter; resumed")
     options = parser.parse_args()
     began = time.perf_counter()
     run_test(CLASSES[0], 0)  # compiles
-    rows = run(options.tests, options.intervals)
-    if options.raw:
-        rows.to_csv(options.raw, index=False)
+    rows = run(options.tests, options.intervals, options.raw)
     table = coverage(rows)
     suffix = "" if options.intervals == "auto" else f"_{options.intervals}"
     table.to_csv(options.out / f"recovery{suffix}.csv", index=False, float_format="%.4g")

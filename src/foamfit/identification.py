@@ -150,7 +150,14 @@ def _assess(
         if not names:
             break
         vicinity = Vicinity.of(problem, values, names)
-        found = assess(vicinity, choice, deadline=tracker.deadline, budget=budget, tell=tell)
+        found = assess(
+            vicinity,
+            choice,
+            valleys=tracker.ends,
+            deadline=tracker.deadline,
+            budget=budget,
+            tell=tell,
+        )
         if found.better is None:
             break
         before = tracker.best_cost

@@ -78,7 +78,12 @@ class Profile:
     complete: bool = True
 
 
-def profile(vicinity: Vicinity, name: str, tracker: Tracker | None = None) -> Profile:
+def profile(
+    vicinity: Vicinity,
+    name: str,
+    tracker: Tracker | None = None,
+    valleys: Sequence[Array] = (),
+) -> Profile:
     """Follow the least cost along a parameter to both sides, past the 95 % cut.
 
     The adjusted likelihood ratio: the rise of the cost over `Covariance.inflation`, which is χ²
@@ -93,6 +98,9 @@ def profile(vicinity: Vicinity, name: str, tracker: Tracker | None = None) -> Pr
         One of its names.
     tracker : Tracker, optional
         Counts, keeps the best point seen and ends the profile at its deadline.
+    valleys : sequence of (n,) arrays
+        Other points at which descents ended: the profile goes on beyond them where they are
+        within the cut, whatever barrier lies between.
 
     Returns
     -------
@@ -105,7 +113,7 @@ def profile(vicinity: Vicinity, name: str, tracker: Tracker | None = None) -> Pr
     for sign in (-1.0, 1.0):
         sides.append(_Side(vicinity, name, Refit(vicinity, tracker), sign))
         try:
-            sides[-1].follow()
+            sides[-1].follow(valleys)
         except (SearchStoppedError, KeyboardInterrupt):
             complete = False
             break
@@ -144,8 +152,29 @@ class _Side:
         """Root of the rise, straight along a parabola."""
         return math.sqrt(max(self.rise(place), 0.0))
 
-    def follow(self) -> None:
+    def follow(self, valleys: Sequence[Array]) -> None:
         """Go outward until well beyond the cut, then place the outermost crossing."""
+        self._outward()
+        for valley in sorted(valleys, key=lambda point: self.sign * float(point[self.place])):
+            value = float(valley[self.place])
+            if self.better or self.sign * (value - self.value(self.places[-1])) <= 0.0:
+                continue
+            residual = self.refit.residual(valley)
+            if residual is None:
+                continue
+            place = self.refit.run(self.refit.fresh(valley, residual), self._others)
+            if self.rise(place) < self.quantile**2:
+                self.places.append(place)
+                self._outward()
+        self._inward()
+
+    @property
+    def _others(self) -> NDArray[np.bool_]:
+        """All parameters but the one that is held."""
+        return np.asarray(np.arange(len(self.vicinity.names)) != self.column)
+
+    def _outward(self) -> None:
+        """Go on from the outermost place until well beyond the cut."""
         step = 0.5 * self.quantile * float(self.vicinity.spread.stderr[self.column])
         refused = 0
         for _ in range(OUTWARD):
@@ -163,6 +192,9 @@ class _Side:
                 break
             if self.root(place) - self.root(last) < 0.35 * self.quantile:
                 step *= 1.6
+
+    def _inward(self) -> None:
+        """Place the outermost crossing of the cut."""
         for _ in range(INWARD):
             inner, outer = self._bracket()
             if outer is None or self.better:
@@ -186,7 +218,7 @@ class _Side:
 
         The others follow as the slopes there promise; where that cannot be simulated they stay.
         """
-        free = np.arange(len(self.vicinity.names)) != self.column
+        free = self._others
         shift = np.zeros(free.size)
         shift[self.column] = (value - self.value(near)) / self.vicinity.sizes[self.column]
         ahead = replace(near, residual=near.residual + near.slopes @ shift)
@@ -209,10 +241,10 @@ class _Side:
 
     @property
     def bound(self) -> float:
-        """Where the root of the rise crosses that of the cut, by a straight line."""
+        """Where the root of the rise crosses that of the cut, on a straight line; else the limit."""
         inner, outer = self._bracket()
         if outer is None:
-            return self.value(inner)
+            return self.limit
         share = (self.quantile - self.root(inner)) / (self.root(outer) - self.root(inner))
         return self.value(inner) + share * (self.value(outer) - self.value(inner))
 
@@ -552,6 +584,7 @@ def assess(
     vicinity: Vicinity,
     choice: Choice,
     *,
+    valleys: Sequence[Array] = (),
     deadline: float | None = None,
     budget: float = math.inf,
     tell: Callable[[str], None] = lambda told: None,
@@ -564,6 +597,8 @@ def assess(
         The best point.
     choice : Choice
         The method.
+    valleys : sequence of (n,) arrays
+        Points at which the descents of the search ended.
     deadline : float, optional
         `time.monotonic` at which it ends with what was done.
     budget : float
@@ -581,15 +616,32 @@ def assess(
     known = [name for name in vicinity.names if vicinity.knows(name)]
     if choice.method == "profile":
         tell(_cost_told(vicinity, "profile likelihood", REFITS * len(known)))
-        return _by_profiles(vicinity, known, tracker, math.inf)
+        return _by_profiles(vicinity, known, valleys, tracker, math.inf)
     far = np.abs(departures(vicinity)).max(axis=1, initial=0.0)
+    far[_elsewhere(vicinity, valleys, tracker)] = np.inf
     order = sorted(known, key=lambda name: -far[vicinity.names.index(name)])
     bent = [name for name in order if far[vicinity.names.index(name)] > BENT]
-    return _by_profiles(vicinity, bent, tracker, budget)
+    return _by_profiles(vicinity, bent, valleys, tracker, budget)
+
+
+def _elsewhere(vicinity: Vicinity, valleys: Sequence[Array], tracker: Tracker) -> NDArray[np.bool_]:
+    """Parameters that another valley within the cut puts outside of their local interval, (k,)."""
+    places = [vicinity.problem.model.index[name] for name in vicinity.names]
+    out = np.zeros(len(places), dtype=bool)
+    for valley in valleys:
+        residual = tracker.consider(valley)
+        rise = (float(residual @ residual) - vicinity.cost) / vicinity.spread.inflation
+        apart = np.abs(valley - vicinity.values)[places] / vicinity.spread.stderr
+        out |= (rise < vicinity.quantile**2) & (apart > vicinity.quantile)
+    return out
 
 
 def _by_profiles(
-    vicinity: Vicinity, names: Sequence[str], tracker: Tracker, budget: float
+    vicinity: Vicinity,
+    names: Sequence[str],
+    valleys: Sequence[Array],
+    tracker: Tracker,
+    budget: float,
 ) -> Intervals:
     """Profiles of some parameters, until they are done, a better point is met or all ends."""
     objective = tracker.objective
@@ -599,7 +651,7 @@ def _by_profiles(
     for name in names:
         if objective.evaluations >= allowed:
             break
-        profiles.append(profile(vicinity, name, tracker))
+        profiles.append(profile(vicinity, name, tracker, valleys))
         lowest = profiles[-1].rises.argmin()
         if profiles[-1].rises[lowest] < -BETTER * profiles[-1].cut:
             better = profiles[-1].points[lowest]

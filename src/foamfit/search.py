@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -67,12 +67,16 @@ class SearchRecord:
 
 @dataclass(eq=False)
 class Tracker:
-    """Counts and times the evaluations of an objective and keeps the best point ever seen."""
+    """Counts and times the evaluations of an objective and keeps the best point ever seen.
+
+    `ends` holds the parameters at which the descents on the drive's curves ended.
+    """
 
     objective: Objective
     deadline: float | None = None
     best_values: Array | None = None
     best_cost: float = np.inf
+    ends: list[Array] = field(default_factory=list)
 
     def residual(self, values: Array) -> Array:
         """Residual of the objective; raises SearchStoppedError once the time is up."""
@@ -402,7 +406,9 @@ def search(
     out = []
     for i, point in enumerate(points):
         progress(0.7 + 0.25 * i / len(points), "curves")
-        out.append((descend(tracker, space, point, 60)[0], counts.get(id(point), 1)))
+        cost, end = descend(tracker, space, point, 60)
+        tracker.ends.append(space.decode(end))
+        out.append((cost, counts.get(id(point), 1)))
     return sorted(out)
 
 

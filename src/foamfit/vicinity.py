@@ -16,6 +16,8 @@ Array = NDArray[np.float64]
 
 # How often a refit gets new slopes before it is taken as it is.
 RENEWALS = 2
+# Largest drop of the stress from A1 to C2 over the stress at A1.
+LAST_DROP = 0.999
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +134,11 @@ class Refit:
         bounds = np.array([best.limits(name) for name in best.names])
         self.low, self.high = bounds.T
         self.tied = best.problem.tied()
+        index = best.problem.model.index
+        self.drops = [
+            ([index[own + "k0"], index[own + "eps_a"]], index[own + "dsigma"])
+            for own in (name.removesuffix("dsigma") for name in best.names if "_dsigma" in name)
+        ]
         # Of the cost: less than this is no gain.
         self.enough = 1e-3 * best.quantile**2 * float(np.nanmin(best.spread.inflation))
 
@@ -157,6 +164,9 @@ class Refit:
         point = place.point.copy()
         there = point[self.places] + step * self.vicinity.sizes
         point[self.places] = np.clip(there, self.low, self.high)
+        for sigma_a, drop in self.drops:  # no spring's stress at C2 falls below zero
+            k0, eps_a = point[sigma_a]
+            point[drop] = max(point[drop], -LAST_DROP * k0 * eps_a / (1.0 - eps_a))
         return self.tied(point)
 
     def step(self, place: Place, free: NDArray[np.bool_], damping: float) -> tuple[Array, float]:
