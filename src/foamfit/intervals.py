@@ -241,7 +241,7 @@ class _Side:
 
     @property
     def bound(self) -> float:
-        """Where the root of the rise crosses that of the cut, on a straight line; else the limit."""
+        """Where the root of the rise crosses that of the cut; where it never does, the limit."""
         inner, outer = self._bracket()
         if outer is None:
             return self.limit
@@ -328,31 +328,34 @@ def block_length(process: NoiseProcess, n: int) -> int:
     return int(min(max(round(length), 1), max(n // 4, 1)))
 
 
-def resample(
-    residual: Array,
-    processes: Sequence[NoiseProcess],
-    sizes: Sequence[int],
-    rng: np.random.Generator,
-) -> Array:
-    """Noise made of blocks of the residuals of each curve, (n_data,).
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """Circular blocks of the residuals of one curve (Politis & Romano 1992).
 
-    Circular blocks with random starts (Politis & Romano 1992). Residuals are smaller than the noise
-    was, and blocks break correlation at their ends: both are made up for by a factor for each
-    curve, such that sums over the curve vary as those of its noise.
-    """  # fmt: skip
-    out, at = [], 0
-    for process, n in zip(processes, sizes, strict=True):
-        own = residual[at : at + n] - residual[at : at + n].mean()
-        at += n
-        length = block_length(process, n)
-        starts = rng.integers(0, n, -(-n // length))
-        drawn = own[(starts[:, None] + np.arange(length)) % n].ravel()[:n]
-        lags = process.autocovariance(length)
-        within = lags[0] + 2.0 * float((1.0 - np.arange(1, length) / length) @ lags[1:])
-        power = float(own @ own) / n
-        share = within / (process.tau * lags[0])
-        out.append(drawn * math.sqrt(process.variance / max(power, 1e-300) / min(share, 1.0)))
-    return np.concatenate(out)
+    Residuals are smaller than the noise was, and blocks break correlation at their ends: both are
+    made up for by a factor, such that sums over the curve vary as those of its noise.
+    """
+
+    residual: Array
+    length: int
+
+    @classmethod
+    def of(cls, residual: Array, process: NoiseProcess) -> Blocks:
+        """Blocks of a residual whose noise is known."""
+        length = block_length(process, residual.size)
+        centred = residual - residual.mean()
+        lags = process.autocovariance(length) / process.variance
+        within = 1.0 + 2.0 * float((1.0 - np.arange(1, length) / length) @ lags[1:])
+        power = max(float(centred @ centred) / centred.size, 1e-300)
+        factor = process.variance / power * max(process.tau / within, 1.0)
+        return cls(centred * math.sqrt(factor), length)
+
+    def draw(self, rng: np.random.Generator) -> Array:
+        """As many samples as the residual has, from blocks with random starts."""
+        n = self.residual.size
+        starts = rng.integers(0, n, -(-n // self.length))
+        drawn = (starts[:, None] + np.arange(self.length)) % n
+        return np.asarray(self.residual[drawn.ravel()[:n]])
 
 
 def bootstrap(vicinity: Vicinity, draws: int, seed: int, tracker: Tracker | None = None) -> Array:
@@ -380,10 +383,13 @@ def bootstrap(vicinity: Vicinity, draws: int, seed: int, tracker: Tracker | None
     tracker = Tracker(objective) if tracker is None else tracker
     rng = np.random.default_rng([seed, 1])
     free = np.ones(len(vicinity.names), dtype=bool)
+    ends = np.cumsum(objective.sizes)[:-1]
+    parts = zip(np.split(vicinity.residual, ends), vicinity.spread.noise, strict=True)
+    blocks = [Blocks.of(part, process) for part, process in parts]
     out: list[Array] = []
     try:
         for _ in range(draws):
-            noise = resample(vicinity.residual, vicinity.spread.noise, objective.sizes, rng)
+            noise = np.concatenate([block.draw(rng) for block in blocks])
             refit = Refit(vicinity, tracker, vicinity.residual - noise)
             out.append(refit.run(refit.start(), free).point[refit.places])
     except (SearchStoppedError, KeyboardInterrupt):

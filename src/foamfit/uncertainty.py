@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,7 +49,7 @@ class NoiseProcess:
         lags = np.fft.irfft(transfer)[:n]
         return np.asarray(lags * (self.variance / lags[0]))
 
-    @property
+    @cached_property
     def tau(self) -> float:
         """Autocorrelation time 1 + 2 Σ ρ_k, at least one, in samples."""
         if not self.coefficients.size:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,7 +65,7 @@ class Vicinity:
         """Sum of squares of the residual."""
         return float(self.residual @ self.residual)
 
-    @property
+    @cached_property
     def quantile(self) -> float:
         """Student's t of the 95 % interval."""
         return uncertainty.half_width(1.0, self.spread.freedom)
