@@ -131,7 +131,7 @@ def noise_processes(residual: Array, jacobian: Array, sizes: tuple[int, ...]) ->
         scores = [n * math.log(max(white, 1e-300)) + len(f) * math.log(n) for f, white in fits]
         order = int(np.argmin(scores))
         sums[-1] = sums[-1][: order + 1]
-        processes.append(NoiseProcess(fits[order][0], float(sums[-1][0] / n)))
+        processes.append(NoiseProcess(_damped(fits[order][0], n), float(sums[-1][0] / n)))
     if not basis.shape[1]:
         return processes
     for _ in range(CORRECTIONS):
@@ -161,7 +161,16 @@ def _corrected(
     lags *= min(1.0, 4.0 * seen[0] / n / lags[0]) if lags[0] > 0.0 else 1.0
     if lags[0] <= 0.0:
         return process
-    return NoiseProcess(_levinson(lags)[-1][0], float(lags[0]))
+    return NoiseProcess(_damped(_levinson(lags)[-1][0], n), float(lags[0]))
+
+
+def _damped(coefficients: Array, n: int) -> Array:
+    """Coefficients of an autoregression none of whose waves lives longer than a quarter of n."""
+    if not coefficients.size:
+        return coefficients
+    radius = float(np.max(np.abs(np.roots(np.append(1.0, -coefficients)))))
+    share = min(1.0, (1.0 - 4.0 / n) / max(radius, 1e-300))
+    return np.asarray(coefficients * share ** np.arange(1, coefficients.size + 1))
 
 
 def _basis(jacobian: Array) -> Array:
@@ -248,13 +257,15 @@ def covariance(
     """
     scaled = jacobian * sizes_of
     noise = noise_processes(residual, scaled, sizes)
-    images = [
-        process.times(scaled[part]) for process, part in zip(noise, _parts(sizes), strict=True)
-    ]
-    _, singular, vt = np.linalg.svd(scaled, full_matrices=False)
+    left, singular, vt = np.linalg.svd(scaled, full_matrices=False)
     seen = singular > SINGULAR * max(float(singular[0]), 1e-300)
-    inverse = (vt[seen].T / singular[seen] ** 2) @ vt[seen]
-    matrix = inverse @ (scaled.T @ np.concatenate(images)) @ inverse
+    left, root = left[:, seen], vt[seen].T / singular[seen]
+    inner = np.zeros((len(root.T), len(root.T)))
+    for process, part in zip(noise, _parts(sizes), strict=True):
+        inner += left[part].T @ process.times(left[part])
+    power, axes = np.linalg.eigh(0.5 * (inner + inner.T))
+    spread = root @ axes * np.sqrt(np.maximum(power, 1e-12 * power[-1]))  # no variance is negative
+    matrix, inverse = spread @ spread.T, root @ root.T
     lost = np.any(np.abs(vt[~seen]) > 1e-3, axis=0)
     matrix[lost, :] = np.nan
     matrix[:, lost] = np.nan
