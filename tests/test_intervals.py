@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 from scipy.stats import binom
@@ -20,6 +21,7 @@ from scipy.stats import binom
 import foamfit as ff
 from conftest import EXPERIMENTS, synthetic_impact
 from foamfit import intervals
+from foamfit.cli import main
 from foamfit.errors import InputError
 from foamfit.intervals import Choice, assess, block_length, bootstrap, departures, mcmc, profile
 from foamfit.plots import plot_profiles
@@ -343,9 +345,9 @@ def test_says_in_one_sentence_that_emcee_is_missing(monkeypatch):
 
 
 def test_the_result_says_what_made_each_interval(tmp_path: Path):
-    _, measurement = synthetic_impact(samples=301)
+    _, measurement = synthetic_impact(samples=201)
     told: list[str] = []
-    result = ff.fit(measurement, starts=4, intervals="profile", tell=told.append)
+    result = ff.fit(measurement, starts=3, intervals="profile", tell=told.append)
     assert "refits" in told[0]
     assert " s" in told[0]
     varied = [p for p in result.parameters.values() if p.ci95 is not None]
@@ -365,11 +367,26 @@ def test_the_result_says_what_made_each_interval(tmp_path: Path):
 
 
 def test_local_intervals_are_told_apart():
-    _, measurement = synthetic_impact(samples=301)
-    result = ff.fit(measurement, starts=4, intervals="local")
+    _, measurement = synthetic_impact(samples=201)
+    result = ff.fit(measurement, starts=3, intervals="local")
     methods = {p.ci95_method for p in result.parameters.values() if p.ci95 is not None}
     assert methods == {"local covariance"}
     assert result.intervals.profiles == ()
+
+
+def test_the_command_makes_intervals_one_way_and_tells_the_cost(tmp_path: Path):
+    test = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
+    call = ["fit", str(test), "--starts", "2", "--out", str(tmp_path / "out")]
+    refused = CliRunner().invoke(main, [*call, "--profile", "--bootstrap", "50"])
+    assert refused.exit_code == 1
+    assert "--profile and --bootstrap exclude each other" in refused.stderr
+    assert not (tmp_path / "out").exists()
+    done = CliRunner().invoke(main, [*call, "--bootstrap", "40", "--json"])
+    assert done.exit_code == 0
+    assert "block bootstrap: 40 refits, about" in done.stderr
+    content = json.loads(done.stdout)
+    assert content["parameters"]["s1_kc"]["ci95_method"] == "block bootstrap"
+    assert any("40 of 40 refits" in note for note in content["notes"])
 
 
 # ---------------------------------------------------------------- coverage

@@ -30,7 +30,7 @@ STARTS = 16
 DRAWS = {"bootstrap": 500, "mcmc": 2000}
 # Evaluations that the default spends on profiles, over those of the search; and how often it goes
 # on from a better point that a profile has met.
-PROFILE_SHARE, IMPROVEMENTS = 1.0, 3
+PROFILE_SHARE, IMPROVEMENTS = 0.5, 3
 
 
 def fit(
