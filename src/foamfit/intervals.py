@@ -133,7 +133,7 @@ class _Side:
         """Begin at the best point."""
         best = self.vicinity
         self.column = best.names.index(self.name)
-        self.place = best.problem.model.index[self.name]
+        self.place = best.index[self.name]
         self.unit = float(best.spread.inflation[self.column])
         self.quantile = best.quantile
         self.places = [self.refit.start()]
@@ -296,7 +296,7 @@ def departures(vicinity: Vicinity) -> Array:
         here = least(vicinity.residual)
         stderr = float(vicinity.spread.stderr[i])
         reach = vicinity.quantile * stderr
-        value = vicinity.values[vicinity.problem.model.index[name]]
+        value = vicinity.values[vicinity.index[name]]
         low, high = vicinity.limits(name)
         for side, room in enumerate((value - low, high - value)):
             if not room > 0.05 * reach:
@@ -632,7 +632,7 @@ def assess(
 
 def _elsewhere(vicinity: Vicinity, valleys: Sequence[Array], tracker: Tracker) -> NDArray[np.bool_]:
     """Parameters that another valley within the cut puts outside of their local interval, (k,)."""
-    places = [vicinity.problem.model.index[name] for name in vicinity.names]
+    places = [vicinity.index[name] for name in vicinity.names]
     out = np.zeros(len(places), dtype=bool)
     for valley in valleys:
         residual = tracker.consider(valley)

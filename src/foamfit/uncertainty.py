@@ -120,9 +120,9 @@ def noise_processes(residual: Array, jacobian: Array, sizes: tuple[int, ...]) ->
         Samples of each curve.
     """
     basis = _basis(jacobian)
-    parts = _parts(sizes)
+    curves = parts(sizes)
     sums, processes = [], []
-    for part in parts:
+    for part in curves:
         own = residual[part][:, None]
         n = len(own)
         highest = min(MOST_ORDERS, n // 10)
@@ -136,14 +136,14 @@ def noise_processes(residual: Array, jacobian: Array, sizes: tuple[int, ...]) ->
         return processes
     for _ in range(CORRECTIONS):
         images = [
-            process.times(basis[part]) for process, part in zip(processes, parts, strict=True)
+            process.times(basis[part]) for process, part in zip(processes, curves, strict=True)
         ]
         middle = np.zeros((basis.shape[1], basis.shape[1]))
-        for image, part in zip(images, parts, strict=True):
+        for image, part in zip(images, curves, strict=True):
             middle += basis[part].T @ image
         processes = [
             _corrected(process, seen, basis[part], image, middle)
-            for process, seen, part, image in zip(processes, sums, parts, images, strict=True)
+            for process, seen, part, image in zip(processes, sums, curves, images, strict=True)
         ]
     return processes
 
@@ -261,7 +261,7 @@ def covariance(
     seen = singular > SINGULAR * max(float(singular[0]), 1e-300)
     left, root = left[:, seen], vt[seen].T / singular[seen]
     inner = np.zeros((len(root.T), len(root.T)))
-    for process, part in zip(noise, _parts(sizes), strict=True):
+    for process, part in zip(noise, parts(sizes), strict=True):
         inner += left[part].T @ process.times(left[part])
     power, axes = np.linalg.eigh(0.5 * (inner + inner.T))
     spread = root @ axes * np.sqrt(np.maximum(power, 1e-12 * power[-1]))  # no variance is negative
@@ -278,7 +278,8 @@ def covariance(
     )
 
 
-def _parts(sizes: tuple[int, ...]) -> list[slice]:
+def parts(sizes: tuple[int, ...]) -> list[slice]:
+    """Slices of the curves in a residual, of which they have so many samples each."""
     ends = np.cumsum(sizes)
     return [slice(int(end - size), int(end)) for size, end in zip(sizes, ends, strict=True)]
 

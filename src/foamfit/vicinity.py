@@ -65,6 +65,11 @@ class Vicinity:
         """Sum of squares of the residual."""
         return float(self.residual @ self.residual)
 
+    @property
+    def index(self) -> dict[str, int]:
+        """Place of each parameter in `values`."""
+        return self.problem.model.index
+
     @cached_property
     def quantile(self) -> float:
         """Student's t of the 95 % interval."""
@@ -131,11 +136,11 @@ class Refit:
     def __post_init__(self) -> None:
         """Lay out the scaled parameters."""
         best = self.vicinity
-        self.places = np.array([best.problem.model.index[name] for name in best.names])
+        self.places = np.array([best.index[name] for name in best.names])
         bounds = np.array([best.limits(name) for name in best.names])
         self.low, self.high = bounds.T
         self.tied = best.problem.tied()
-        index = best.problem.model.index
+        index = best.index
         self.drops = [
             ([index[own + "k0"], index[own + "eps_a"]], index[own + "dsigma"])
             for own in (name.removesuffix("dsigma") for name in best.names if "_dsigma" in name)
