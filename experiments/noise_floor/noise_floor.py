@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import platform
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,16 @@ NOISE = 0.01
 HEIGHT, AREA, MASS = 1.2e-3, 1.9635e-5, 7e-3
 
 
-def random_case(rng: np.random.Generator) -> tuple[ff.BistableSpring, Measurement]:
+def white(rng: np.random.Generator, samples: int) -> np.ndarray:
+    """White noise of unit variance."""
+    return rng.standard_normal(samples)
+
+
+def random_case(
+    rng: np.random.Generator,
+    samples: int = 501,
+    noise: Callable[[np.random.Generator, int], np.ndarray] = white,
+) -> tuple[ff.BistableSpring, Measurement]:
     """A random spring and its synthetic impact, struck hard enough to use branch c."""
     k0 = 10 ** rng.uniform(6, 7.5)
     eps_a = rng.uniform(0.05, 0.35)
@@ -60,10 +70,10 @@ def random_case(rng: np.random.Generator) -> tuple[ff.BistableSpring, Measuremen
     drive = ff.Impact(MASS, velocity)
     long = ff.simulate(chain, drive, np.linspace(0, 20 * HEIGHT / velocity, 4001))
     end = long.contact_end or long.time[-1]
-    time_ = np.linspace(0, 1.05 * end, 501)
+    time_ = np.linspace(0, 1.05 * end, samples)
     response = ff.simulate(chain, drive, time_)
     stress, motion = response.base_stress, response.displacement[-1]
-    noisy = [x + NOISE * np.ptp(x) * rng.standard_normal(x.size) for x in (stress, motion)]
+    noisy = [x + NOISE * np.ptp(x) * noise(rng, x.size) for x in (stress, motion)]
     measurement = Measurement(
         name="synthetic impact",
         path=None,

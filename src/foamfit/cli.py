@@ -253,6 +253,11 @@ def _hold_and_vary(
     show_default=True,
     help="All but linear give way to large residuals.",
 )
+@click.option("--profile", is_flag=True, help="95 % intervals by profile likelihood.")
+@click.option(
+    "--bootstrap", type=int, metavar="N", help="95 % intervals by N refits to resampled blocks."
+)
+@click.option("--mcmc", type=int, metavar="N", help="95 % intervals by N steps of emcee.")
 @click.option("--json", "as_json", is_flag=True, help="Print fit.json on stdout, nothing else.")
 @click.option("--quiet", is_flag=True, help="Print nothing but warnings of failure.")
 def fit(
@@ -269,6 +274,9 @@ def fit(
     interior_mass: bool,
     time_shift: bool,
     loss: str,
+    profile: bool,
+    bootstrap: int | None,
+    mcmc: int | None,
     as_json: bool,
     quiet: bool,
 ) -> int:
@@ -287,6 +295,7 @@ def fit(
     from foamfit.reading import read_test
     from foamfit.result import check_target
 
+    intervals, draws = _intervals(profile, bootstrap, mcmc)
     model = Model.parse(model).name
     measurement = read_test(test, specimen)
     folder = Path("fits", test.stem, model) if out is None else out
@@ -311,7 +320,10 @@ def fit(
             interior_mass=interior_mass,
             time_shift=time_shift,
             loss=loss,
+            intervals=intervals,
+            draws=draws,
             progress=progress,
+            tell=None if quiet else lambda told: click.echo(f"foamfit: {told}", err=True),
         )
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # from here on Ctrl-C could only lose the result
     result.save(folder)
@@ -328,6 +340,23 @@ def fit(
         click.echo(f"foamfit: no acceptable fit was found; see {folder}", err=True)
         return NOT_ACCEPTABLE
     return 0
+
+
+def _intervals(profile: bool, bootstrap: int | None, mcmc: int | None) -> tuple[str, int | None]:
+    """Return the method of the intervals and its draws."""
+    chosen: list[tuple[str, int | None]] = [
+        (name, draws)
+        for name, draws, given in (
+            ("profile", None, profile),
+            ("bootstrap", bootstrap, bootstrap is not None),
+            ("mcmc", mcmc, mcmc is not None),
+        )
+        if given
+    ]
+    if len(chosen) > 1:
+        names = " and ".join(f"--{name}" for name, _ in chosen)
+        raise InputError(f"{names} exclude each other; choose one way to make the intervals")
+    return chosen[0] if chosen else ("auto", None)
 
 
 @contextmanager

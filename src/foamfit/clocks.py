@@ -47,7 +47,7 @@ def _shift_of_residuals(
     shifted = replace(problem.objective, time_shift=True, loss="linear")
     sides = [shifted.differences(np.append(values, side * step)) for side in (-0.5, 0.5)]
     names = tuple(name for name, item in estimates.items() if item.stderr is not None)
-    plain = problem.linear()
+    plain = problem.linear
     slope = (sides[1] - sides[0]) / step
     jacobian = np.column_stack([plain.slopes(values, names), slope]) if names else slope[:, None]
     sizes = np.append(plain.sizes(names, values), step)

@@ -14,17 +14,24 @@ from numpy.typing import NDArray
 
 from foamfit.errors import InputError, SimulationError
 from foamfit.insight import unreached
+from foamfit.intervals import Choice, Intervals, assess
 from foamfit.measurement import Measurement
 from foamfit.model import Model, split_name
 from foamfit.problem import Problem, make_problem
 from foamfit.result import FitResult
 from foamfit.search import SearchRecord, SearchStoppedError, Tracker, salvage, search
 from foamfit.verdict import conclude
+from foamfit.vicinity import Vicinity
 
 Array = NDArray[np.float64]
 
 # Descents of the search for each spring.
 STARTS = 16
+# Refits of the bootstrap and steps of the Markov chain.
+DRAWS = {"bootstrap": 500, "mcmc": 2000}
+# Evaluations that the default spends on profiles, over those of the search; and how often it goes
+# on from a better point that a profile has met.
+PROFILE_SHARE, IMPROVEMENTS = 0.5, 3
 
 
 def fit(
@@ -40,7 +47,10 @@ def fit(
     interior_mass: bool = False,
     time_shift: bool = False,
     loss: str = "linear",
+    intervals: str = "auto",
+    draws: int | None = None,
     progress: Callable[[float, str], None] | None = None,
+    tell: Callable[[str], None] | None = None,
 ) -> FitResult:
     """Identify the parameters of a chain of springs from a test.
 
@@ -72,8 +82,15 @@ def fit(
     loss : str
         "linear" (least squares), or one that gives way to large residuals: "soft_l1", "huber",
         "cauchy"; see `foamfit.objective.soften`.
+    intervals : str
+        What makes the 95 % intervals: "auto" (local covariance, and profiles of the parameters
+        along which the cost is no parabola), "local", "profile", "bootstrap" or "mcmc".
+    draws : int, optional
+        Refits of the bootstrap (by default 500) or steps of the Markov chain (2000).
     progress : callable, optional
         Told the fraction done and what is going on.
+    tell : callable, optional
+        Told what the intervals will cost before it is paid.
 
     Returns
     -------
@@ -92,6 +109,7 @@ def fit(
         raise InputError(f"starts = {starts} is not admissible; it must be at least 1")
     if max_time is not None and not max_time > 0:
         raise InputError(f"max_time = {max_time:g} s is not admissible; it must be positive")
+    choice = Choice(intervals, DRAWS.get(intervals, 0) if draws is None else draws, seed)
     problem = make_problem(
         measurement, model, drive, params, weights, interior_mass,
         time_shift=time_shift, loss=loss,
@@ -107,16 +125,62 @@ def fit(
             "that were tried could be simulated; check the drive, the heights and the bounds"
         )
     try:
-        return _finish(problem, tracker.best_values, record)
+        if record.stopped is None:
+            found, record = _assess(problem, tracker, record, choice, tell or (lambda _: None))
+        else:
+            found = Intervals()
+        return _finish(problem, tracker.best_values, record, found)
     except KeyboardInterrupt:  # what was found is not given up for a late Ctrl-C
-        return _finish(problem, tracker.best_values, replace(record, stopped="Ctrl-C"))
+        record = replace(record, stopped="Ctrl-C")
+        return _finish(problem, tracker.best_values, record, Intervals())
 
 
-def _finish(problem: Problem, values: Array, record: SearchRecord) -> FitResult:
+def _finish(
+    problem: Problem, values: Array, record: SearchRecord, intervals: Intervals
+) -> FitResult:
     """Order the springs, write the point into the parameters, and say what is to be said of it."""
     values = _ordered(problem, values)
     problem.put(values)
-    return conclude(problem, values, record)
+    return conclude(problem, values, record, intervals)
+
+
+def _assess(
+    problem: Problem,
+    tracker: Tracker,
+    record: SearchRecord,
+    choice: Choice,
+    tell: Callable[[str], None],
+) -> tuple[Intervals, SearchRecord]:
+    """Make the intervals; where these meet a better point, go on from there."""
+    assert tracker.best_values is not None
+    budget = PROFILE_SHARE * problem.objective.evaluations
+    found = Intervals()
+    for _ in range(IMPROVEMENTS + 1):
+        values = _ordered(problem, tracker.best_values)
+        lost = unreached(problem, values)
+        names = tuple(name for name in problem.free() if name not in lost)
+        if not names:
+            break
+        vicinity = Vicinity.of(problem, values, names)
+        found = assess(
+            vicinity,
+            choice,
+            valleys=tracker.ends,
+            deadline=tracker.deadline,
+            budget=budget,
+            tell=tell,
+        )
+        if found.better is None:
+            break
+        before = tracker.best_cost
+        tracker.consider(found.better)
+        try:
+            _refine(problem, tracker)
+        except SearchStoppedError:
+            break
+        if tracker.best_cost < before / 1.02:  # a valley that no descent of the search has found
+            record = replace(record, costs=((tracker.best_cost, 1), *record.costs))
+    return (found if found.better is None else Intervals()), record
 
 
 def _identify(

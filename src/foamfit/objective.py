@@ -549,14 +549,15 @@ class Objective:
             moved = moved - _later(self.time, curve, late, before, at=0.0)
         return moved
 
-    def residual(self, values: Array) -> Array:
+    def residual(self, values: Array, shift: Array | float = 0.0) -> Array:
         """Weighted residuals of all counted curves, shape (n_data,), dimensionless.
 
         Simulated minus measured over the curve's scale, times the root of its weight, softened by
         the loss; outliers are left out. Parameters that cannot be simulated cost a finite penalty
-        and are counted in `failures`.
+        and are counted in `failures`. `shift` (n_data,) is taken off before the loss: data that
+        differ by so much from those that were measured.
         """
-        return soften(self.differences(values), self.loss)
+        return soften(self.differences(values) - shift, self.loss)
 
     def differences(self, values: Array) -> Array:
         """Residuals before the loss gives way to large ones, shape (n_data,)."""

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from foamfit.comparison import Comparison, Row, Section
-    from foamfit.result import FitResult
+    from foamfit.intervals import Profile
+    from foamfit.result import FitResult, ParameterEstimate
     from foamfit.simulation import Response
 
 Array = NDArray[np.float64]
@@ -160,6 +161,64 @@ def plot_residuals(result: FitResult, path: str | Path | None = None) -> Figure:
     if path is not None:
         _save(figure, Path(path))
     return figure
+
+
+def plot_profiles(result: FitResult, path: str | Path | None = None) -> Figure:
+    """Draw the profile of each parameter that was followed, with its 95 % cut and its interval.
+
+    Parameters
+    ----------
+    result : FitResult
+        The fit; a profile that was stopped is drawn as far as it came.
+    path : str or Path, optional
+        Where to save the figure; the suffix gives the format.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        7 in wide, four panels a row; dashed is the parabola of the local covariance.
+    """
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    profiles = result.intervals.profiles if result.intervals is not None else ()
+    rows = max(-(-len(profiles) // 4), 1)
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(7.0, 0.35 + 1.55 * rows), layout="constrained")
+        axes = figure.subplots(rows, 4, squeeze=False, sharey=True).ravel()
+        for ax, profile in zip(axes, profiles, strict=False):
+            _draw_profile(ax, profile, result.parameters[profile.name])
+        for ax in axes[max(len(profiles), 1) :]:
+            ax.set_axis_off()
+        if profiles:
+            for ax in axes[: len(profiles) : 4]:
+                ax.set_ylabel("rise of χ²")
+        else:
+            _say_nothing_there(axes[0])
+    if path is not None:
+        _save(figure, Path(path))
+    return figure
+
+
+def _draw_profile(ax: Axes, profile: Profile, estimate: ParameterEstimate) -> None:
+    """One profile, its cut, its interval, and the parabola of the standard error."""
+    factor, unit = readable_unit(_size(profile.values), estimate.unit)
+    top = 2.0 * profile.cut
+    x = profile.values / factor
+    ax.axhline(profile.cut, color=GREY, lw=0.6, ls=(0, (2, 2)))
+    ax.axvspan(*(end / factor for end in profile.ci95), color="0.92", lw=0)
+    fine = np.linspace(x.min(), x.max(), 200)
+    if estimate.stderr:
+        parabola = ((fine * factor - estimate.value) / estimate.stderr) ** 2
+        ax.plot(fine, np.where(parabola <= top, parabola, np.nan), color=GREY, lw=0.8, ls="--")
+    root = np.sign(profile.values - estimate.value) * np.sqrt(np.maximum(profile.rises, 0.0))
+    ax.plot(fine, np.interp(fine, x, root) ** 2, color=BLUE, lw=1.1)
+    ax.plot(x, profile.rises, "o", color=BLUE, ms=2.2)
+    ax.plot(estimate.value / factor, 0.0, "o", color=VERMILION, ms=3.5)
+    ax.set_ylim(-0.04 * top, top)
+    ax.locator_params(axis="x", nbins=4)
+    name = f"{profile.name} ({unit})" if unit else profile.name
+    ax.set_xlabel(name if profile.complete else f"{name}, stopped", labelpad=1)
 
 
 def plot_response(response: Response, path: str | Path | None = None) -> Figure:

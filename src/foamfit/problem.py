@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import lmfit
 import numpy as np
@@ -130,6 +131,7 @@ class Problem:
         """Place of each parameter in the flat vector."""
         return {name: i for i, name in enumerate(self.names)}
 
+    @cached_property
     def linear(self) -> Problem:
         """The same problem without a soft loss, for derivatives of the plain residuals."""
         if self.objective.loss == "linear":

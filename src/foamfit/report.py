@@ -12,7 +12,15 @@ from typing import TYPE_CHECKING, Any
 
 from foamfit.conditioning import engineering
 from foamfit.measurement import interior_channel
-from foamfit.plots import DPI, image, origin_word, plot_fit, plot_residuals, readable_unit
+from foamfit.plots import (
+    DPI,
+    image,
+    origin_word,
+    plot_fit,
+    plot_profiles,
+    plot_residuals,
+    readable_unit,
+)
 
 if TYPE_CHECKING:
     from foamfit.result import FitResult, ParameterEstimate
@@ -80,6 +88,7 @@ class Readable:
     unit: str
     state: str
     why: str
+    method: str = ""
 
     @property
     def with_error(self) -> str:
@@ -114,6 +123,7 @@ def render_report(result: FitResult, *, fit_png: bytes | None = None) -> str:
     environment.filters["number"] = number
     plain = result.to_json_dict()
     energy = plain["energy"]
+    profiled = result.intervals is not None and result.intervals.profiles
     return environment.get_template("report.html").render(
         result=result,
         version=version("foamfit"),
@@ -135,6 +145,7 @@ def render_report(result: FitResult, *, fit_png: bytes | None = None) -> str:
         answers=ANSWERS,
         insight_figures=_insight_figures(result),
         residual_figure=_figure(image(plot_residuals(result), "png")),
+        profile_figure=_figure(image(plot_profiles(result), "png")) if profiled else None,
         citation=CITATION,
     )
 
@@ -221,7 +232,9 @@ def readable(name: str, p: ParameterEstimate) -> Readable:
         if p.ci95 is not None:
             interval = " to ".join(_fixed(bound / factor, places) for bound in p.ci95)
     unit = {"": "–", "1": "–", "-": "–", "Pa s": "Pa·s", "Pa*s": "Pa·s"}.get(unit, unit)
-    return Readable(name, _symbol(name), shown, stderr, interval, unit, p.state, p.why)
+    return Readable(name, _symbol(name), shown, stderr, interval, unit, p.state, p.why,
+        p.ci95_method or "",
+    )  # fmt: skip
 
 
 def number(value: Any) -> str:

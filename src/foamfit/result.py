@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from foamfit.chain import Chain
     from foamfit.checklist import Check
     from foamfit.insight import Insight
+    from foamfit.intervals import Intervals
     from foamfit.measurement import Measurement, Outliers
     from foamfit.spring import BistableSpring
 
@@ -42,7 +43,8 @@ class ParameterEstimate:
 
     `stderr` and `ci95` are None where the test does not determine it; `state` is "determined",
     "weak", "not determined" or "fixed" (fixed by the user or the model), and `why` says so in a
-    sentence.
+    sentence. `ci95_method` names what made the interval: "local covariance", "profile likelihood",
+    "block bootstrap" or "MCMC".
     """
 
     value: float
@@ -52,6 +54,7 @@ class ParameterEstimate:
     vary: bool
     state: str
     why: str
+    ci95_method: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +124,7 @@ class FitResult:
     stopped: str | None = None  # what ended the search early: "the time limit", "Ctrl-C"
     loss: str = "linear"
     noise: dict[str, dict[str, Any]] = field(default_factory=dict)  # of each counted curve
+    intervals: Intervals | None = None
 
     @property
     def bistable_springs(self) -> dict[str, BistableSpring]:
@@ -193,7 +197,7 @@ class FitResult:
         -------
         Path
             The folder, with ``fit.json``, ``parameters.csv``, ``curves.csv``, ``fit.png``,
-            ``fit.pdf`` and ``report.html``.
+            ``fit.pdf`` and ``report.html``; with profiles also ``profiles.csv``.
 
         Raises
         ------
@@ -284,6 +288,8 @@ def _write(result: FitResult, folder: Path) -> None:
     (folder / "fit.json").write_text(text + "\n", encoding="utf-8")
     _write_table(folder / "parameters.csv", _parameter_rows(result.parameters))
     _write_table(folder / "curves.csv", _curve_rows(result.curves, result.measurement.outliers))
+    if result.intervals is not None and result.intervals.profiles:
+        _write_table(folder / "profiles.csv", _profile_rows(result.intervals))
     figure = plot_fit(result)
     png = image(figure, "png")
     (folder / "fit.png").write_bytes(png)
@@ -297,11 +303,20 @@ def _write_table(path: Path, rows: Iterable[Iterable[object]]) -> None:
 
 
 def _parameter_rows(parameters: Mapping[str, ParameterEstimate]) -> Iterator[list[object]]:
-    yield ["name", "value", "stderr", "ci95_low", "ci95_high", "unit", "state", "why"]
+    yield [
+        "name", "value", "stderr", "ci95_low", "ci95_high", "unit", "state", "why", "ci95_method"
+    ]  # fmt: skip
     for name, p in parameters.items():
         low, high = p.ci95 or (None, None)
         numbers = (_plain(number) for number in (p.value, p.stderr, low, high))
-        yield [name, *numbers, p.unit, p.state, p.why]
+        yield [name, *numbers, p.unit, p.state, p.why, p.ci95_method]
+
+
+def _profile_rows(intervals: Intervals) -> Iterator[Iterable[object]]:
+    yield ["name", "value", "chi2", "chi2 of the 95 % cut", "complete"]
+    for profile in intervals.profiles:
+        for value, rise in zip(profile.values.tolist(), profile.rises.tolist(), strict=True):
+            yield [profile.name, value, rise, profile.cut, profile.complete]
 
 
 def _curve_rows(curves: Curves, outliers: Mapping[str, Outliers]) -> Iterator[Iterable[object]]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -67,16 +67,20 @@ class SearchRecord:
 
 @dataclass(eq=False)
 class Tracker:
-    """Counts and times the evaluations of an objective and keeps the best point ever seen."""
+    """Counts and times the evaluations of an objective and keeps the best point ever seen.
+
+    `ends` holds the parameters at which the descents on the drive's curves ended.
+    """
 
     objective: Objective
     deadline: float | None = None
     best_values: Array | None = None
     best_cost: float = np.inf
+    ends: list[Array] = field(default_factory=list)
 
-    def residual(self, values: Array) -> Array:
+    def residual(self, values: Array, shift: Array | float = 0.0) -> Array:
         """Residual of the objective; raises SearchStoppedError once the time is up."""
-        residual = self.consider(values)
+        residual = self.consider(values, shift)
         if self.deadline is not None and time.monotonic() > self.deadline:
             raise SearchStoppedError
         return residual
@@ -87,11 +91,13 @@ class Tracker:
         moves = space.slopes(point, values)
         return self.objective.jacobian_along(values, moves, np.full(point.size, 1e-5))
 
-    def consider(self, values: Array) -> Array:
-        """Residual of the objective, whatever the time."""
+    def consider(self, values: Array, shift: Array | float = 0.0) -> Array:
+        """Residual of the objective, whatever the time; with a shift, that of other data."""
         failures = self.objective.failures
-        residual = self.objective.residual(values)
+        residual = self.objective.residual(values, shift)
         cost = float(residual @ residual)
+        if np.any(shift):
+            return residual
         if cost < self.best_cost and self.objective.failures == failures:
             self.best_cost, self.best_values = cost, values.copy()
         return residual
@@ -399,7 +405,9 @@ def search(
     out = []
     for i, point in enumerate(points):
         progress(0.7 + 0.25 * i / len(points), "curves")
-        out.append((descend(tracker, space, point, 60)[0], counts.get(id(point), 1)))
+        cost, end = descend(tracker, space, point, 60)
+        tracker.ends.append(space.decode(end))
+        out.append((cost, counts.get(id(point), 1)))
     return sorted(out)
 
 

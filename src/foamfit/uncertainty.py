@@ -1,14 +1,16 @@
 """How sure the identified parameters are: covariance, intervals, and which are determined at all.
 
 Measured noise is seldom white: oversampled curves repeat themselves, and what the model cannot
-follow shows as slow waves in the residuals. The covariance therefore counts only the effective
-number of samples, n/τ, with τ the autocorrelation time of the residuals of each curve.
+follow shows as slow waves in the residuals. The covariance therefore takes the noise of each curve
+as an autoregressive process that is read off its residuals, corrected for what the fit took out of
+them; n/τ is the effective number of samples, τ the autocorrelation time.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,35 +23,176 @@ Array = NDArray[np.float64]
 WEAK, NOTHING = 0.5, 3.0
 # Two directions closer than this cannot be told apart.
 SINGULAR = 1e-12
+# Of the autoregressive noise: most orders, largest reflection coefficient, rounds of correction.
+MOST_ORDERS, LARGEST, CORRECTIONS = 10, 0.995, 4
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseProcess:
+    """Autoregressive noise of one curve: x_t = Σ φ_j x_(t-j) + white.
+
+    Attributes
+    ----------
+    coefficients : (p,) array
+        φ_1 … φ_p; none for white noise.
+    variance : float
+        Of the process itself, not of the white noise that drives it.
+    """
+
+    coefficients: Array
+    variance: float
+
+    def autocovariance(self, n: int) -> Array:
+        """Autocovariance at the lags 0 … n-1."""
+        size = 4 * max(n, 256)
+        transfer = np.abs(np.fft.rfft(np.append(1.0, -self.coefficients), size)) ** -2
+        lags = np.fft.irfft(transfer)[:n]
+        return np.asarray(lags * (self.variance / lags[0]))
+
+    @cached_property
+    def tau(self) -> float:
+        """Autocorrelation time 1 + 2 Σ ρ_k, at least one, in samples."""
+        if not self.coefficients.size:
+            return 1.0
+        white = self._white_share()
+        return max(white / (1.0 - float(self.coefficients.sum())) ** 2, 1.0)
+
+    def _white_share(self) -> float:
+        """Variance of the driving white noise over that of the process."""
+        size = 1 << 14
+        transfer = np.abs(np.fft.rfft(np.append(1.0, -self.coefficients), size)) ** -2
+        return float(1.0 / np.fft.irfft(transfer)[0])
+
+    def times(self, columns: Array) -> Array:
+        """Covariance matrix of n samples times the columns of an (n, k) array."""
+        if not self.coefficients.size:
+            return self.variance * columns
+        n = len(columns)
+        lags = self.autocovariance(n)
+        around = np.fft.rfft(np.concatenate([lags, [0.0], lags[:0:-1]]))
+        spectrum = np.fft.rfft(columns, 2 * n, axis=0) * around[:, None]
+        product: Array = np.fft.irfft(spectrum, axis=0)[:n]
+        return product
+
+
+def _levinson(lags: Array) -> list[tuple[Array, float]]:
+    """Autoregressions of order 0, 1, … from autocovariances, with their white variance."""
+    fits = [(np.empty(0), float(lags[0]))]
+    for order in range(1, lags.size):
+        phi, white = fits[-1]
+        if white <= 0.0:
+            break
+        reflection = (lags[order] - phi @ lags[order - 1 : 0 : -1]) / white
+        reflection = float(np.clip(reflection, -LARGEST, LARGEST))
+        phi = np.append(phi - reflection * phi[::-1], reflection)
+        fits.append((phi, white * (1.0 - reflection**2)))
+    return fits
+
+
+def _lag_sums(one: Array, other: Array, order: int) -> Array:
+    """Σ_t (one_t ⊗ other_(t+k), symmetric in k) for k = 0 … order, (order+1, columns, columns)."""
+    n = len(one)
+    sums = [one[: n - k].T @ other[k:] + one[k:].T @ other[: n - k] for k in range(order + 1)]
+    return 0.5 * np.array(sums)
+
+
+def noise_process(residual: Array, jacobian: Array | None = None) -> NoiseProcess:
+    """Noise of one curve alone; see `noise_processes`."""
+    none = np.empty((residual.size, 0))
+    return noise_processes(residual, none if jacobian is None else jacobian, (residual.size,))[0]
+
+
+def noise_processes(residual: Array, jacobian: Array, sizes: tuple[int, ...]) -> list[NoiseProcess]:
+    """Noise of each curve as an autoregressive process, from the residuals of a fit.
+
+    The order is that of the least Bayesian information criterion. A fit takes what its parameters
+    can follow out of the noise, mostly at low frequencies: residuals look less correlated and
+    smaller than the noise was. With the hat matrix H = QQᵀ of the fit, residuals (I-H)e have the
+    expected lag sums tr S_k (I-H)Σ(I-H); the autocovariances are corrected by what Σ itself loses.
+
+    Parameters
+    ----------
+    residual : (n,) array
+        All curves after each other, each in the order of time.
+    jacobian : (n, k) array
+        Derivative of the residual, in any scaling of its columns.
+    sizes : tuple of int
+        Samples of each curve.
+    """
+    basis = _basis(jacobian)
+    curves = parts(sizes)
+    sums, processes = [], []
+    for part in curves:
+        own = residual[part][:, None]
+        n = len(own)
+        highest = min(MOST_ORDERS, n // 10)
+        sums.append(_lag_sums(own, own, highest)[:, 0, 0])
+        fits = _levinson(sums[-1] / n)
+        scores = [n * math.log(max(white, 1e-300)) + len(f) * math.log(n) for f, white in fits]
+        order = int(np.argmin(scores))
+        sums[-1] = sums[-1][: order + 1]
+        processes.append(NoiseProcess(_damped(fits[order][0], n), float(sums[-1][0] / n)))
+    if not basis.shape[1]:
+        return processes
+    for _ in range(CORRECTIONS):
+        images = [
+            process.times(basis[part]) for process, part in zip(processes, curves, strict=True)
+        ]
+        middle = np.zeros((basis.shape[1], basis.shape[1]))
+        for image, part in zip(images, curves, strict=True):
+            middle += basis[part].T @ image
+        processes = [
+            _corrected(process, seen, basis[part], image, middle)
+            for process, seen, part, image in zip(processes, sums, curves, images, strict=True)
+        ]
+    return processes
+
+
+def _corrected(
+    process: NoiseProcess, seen: Array, basis: Array, image: Array, middle: Array
+) -> NoiseProcess:
+    """Process whose lag sums, less what the fit took of them, are those seen in the residual."""
+    n, order = len(basis), seen.size - 1
+    once = np.trace(_lag_sums(basis, image, order), axis1=1, axis2=2)
+    twice = np.einsum("kij,ji->k", _lag_sums(basis, basis, order), middle)
+    taken = 2.0 * once - twice
+    lags = (seen + taken) / (n - np.arange(order + 1))
+    # A fit that took most of a curve's noise leaves nothing to correct it by.
+    lags *= min(1.0, 4.0 * seen[0] / n / lags[0]) if lags[0] > 0.0 else 1.0
+    if lags[0] <= 0.0:
+        return process
+    return NoiseProcess(_damped(_levinson(lags)[-1][0], n), float(lags[0]))
+
+
+def _damped(coefficients: Array, n: int) -> Array:
+    """Coefficients of an autoregression none of whose waves lives longer than a quarter of n."""
+    if not coefficients.size:
+        return coefficients
+    radius = float(np.max(np.abs(np.roots(np.append(1.0, -coefficients)))))
+    share = min(1.0, (1.0 - 4.0 / n) / max(radius, 1e-300))
+    return np.asarray(coefficients * share ** np.arange(1, coefficients.size + 1))
+
+
+def _basis(jacobian: Array) -> Array:
+    """Orthonormal basis of the columns of a Jacobian."""
+    if not jacobian.shape[1]:
+        return jacobian
+    scale = np.linalg.norm(jacobian, axis=0)
+    left, singular, _ = np.linalg.svd(jacobian / np.where(scale > 0, scale, 1), full_matrices=False)
+    return left[:, singular > 1e-10 * max(float(singular[0]), 1e-300)]
 
 
 def autocorrelation_time(residual: Array) -> float:
-    """Integrated autocorrelation time τ >= 1 of a residual, in samples.
-
-    τ = 1 + 2 Σ ρ_k, summed until the first pair of autocorrelations whose sum is not positive
-    (initial positive sequence, Geyer 1992, Stat. Sci. 7, 473). White noise has τ = 1.
+    """Autocorrelation time τ = 1 + 2 Σ ρ_k >= 1 of a residual, in samples; white noise has τ = 1.
 
     Parameters
     ----------
     residual : (n,) array
         In the order of time.
     """
-    n = residual.size
-    centred = residual - residual.mean()
-    power = float(centred @ centred)
-    if n < 8 or power == 0.0:
+    if residual.size < 8 or not residual.any():
         return 1.0
-    spectrum = np.fft.rfft(centred, 2 * n)
-    rho = np.fft.irfft(np.abs(spectrum) ** 2)[: n // 2] / power
-    total = 0.0
-    for pair in range(rho.size // 2):
-        both = rho[2 * pair] + rho[2 * pair + 1]
-        if both <= 0.0:
-            break
-        total += both
-    tau = max(2.0 * total - 1.0, 1.0)
-    # Within the scatter of white noise, τ is one.
-    return float(tau) if abs(rho[1]) > 2.0 / np.sqrt(n) else 1.0
+    return noise_process(residual).tau
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,15 +203,29 @@ class Covariance:
     ----------
     matrix : (k, k) array
         Covariance, SI; NaN rows and columns where the test says nothing.
+    inflation : (k,) array
+        Variance of each parameter over that of a residual of white noise of unit variance: what a
+        rise of the sum of squares along a parameter's profile must be divided by to be a χ².
     effective : float
         Effective number of samples.
-    tau : tuple of float
-        Autocorrelation time of each curve, samples.
+    noise : tuple of NoiseProcess
+        Noise of each curve, in units of the residual.
     """
 
     matrix: Array
+    inflation: Array
     effective: float
-    tau: tuple[float, ...]
+    noise: tuple[NoiseProcess, ...]
+
+    @property
+    def tau(self) -> tuple[float, ...]:
+        """Autocorrelation time of each curve, samples."""
+        return tuple(process.tau for process in self.noise)
+
+    @property
+    def freedom(self) -> float:
+        """Degrees of freedom: effective samples that are left after the parameters."""
+        return max(self.effective - len(self.matrix), 1.0)
 
     @property
     def stderr(self) -> Array:
@@ -83,13 +240,9 @@ class Covariance:
 
 
 def covariance(
-    jacobian: Array,
-    residual: Array,
-    sizes: tuple[int, ...],
-    sizes_of: Array,
-    noise_times: tuple[float, ...] = (),
+    jacobian: Array, residual: Array, sizes: tuple[int, ...], sizes_of: Array
 ) -> Covariance:
-    """Covariance (JᵀJ)⁻¹ Jᵀ S J (JᵀJ)⁻¹ with S the noise of each curve, counted effectively.
+    """Covariance (JᵀJ)⁻¹ JᵀΣJ (JᵀJ)⁻¹ with Σ the noise of each curve (`noise_processes`).
 
     Parameters
     ----------
@@ -101,31 +254,28 @@ def covariance(
         Samples of each curve, in their order.
     sizes_of : (k,) array
         Natural size of each parameter, so that directions can be compared.
-    noise_times : tuple of float, optional
-        Autocorrelation time of the noise of each curve, where it is known: τ is at least that,
-        because a fit takes up some of what is slow in it.
     """
-    n, k = jacobian.shape
     scaled = jacobian * sizes_of
-    noise = np.empty(n)
-    tau: list[float] = []
-    effective = 0.0
-    known = noise_times or (1.0,) * len(sizes)
-    for part, least in zip(parts(sizes), known, strict=True):
-        length = part.stop - part.start
-        time = max(autocorrelation_time(residual[part]), min(least, length / 10.0))
-        dof = max(length - k * length / n, 1.0)
-        noise[part] = float(residual[part] @ residual[part]) / dof * time
-        tau.append(time)
-        effective += length / time
-    _, singular, vt = np.linalg.svd(scaled, full_matrices=False)
+    noise = noise_processes(residual, scaled, sizes)
+    left, singular, vt = np.linalg.svd(scaled, full_matrices=False)
     seen = singular > SINGULAR * max(float(singular[0]), 1e-300)
-    inverse = (vt[seen].T / singular[seen] ** 2) @ vt[seen]
-    matrix = inverse @ (scaled.T * noise) @ scaled @ inverse
+    left, root = left[:, seen], vt[seen].T / singular[seen]
+    inner = np.zeros((len(root.T), len(root.T)))
+    for process, part in zip(noise, parts(sizes), strict=True):
+        inner += left[part].T @ process.times(left[part])
+    power, axes = np.linalg.eigh(0.5 * (inner + inner.T))
+    spread = root @ axes * np.sqrt(np.maximum(power, 1e-12 * power[-1]))  # no variance is negative
+    matrix, inverse = spread @ spread.T, root @ root.T
     lost = np.any(np.abs(vt[~seen]) > 1e-3, axis=0)
     matrix[lost, :] = np.nan
     matrix[:, lost] = np.nan
-    return Covariance(matrix * np.outer(sizes_of, sizes_of), effective, tuple(tau))
+    effective = sum(n / process.tau for n, process in zip(sizes, noise, strict=True))
+    return Covariance(
+        matrix * np.outer(sizes_of, sizes_of),
+        np.diag(matrix) / np.diag(inverse),
+        float(effective),
+        tuple(noise),
+    )
 
 
 def parts(sizes: tuple[int, ...]) -> list[slice]:

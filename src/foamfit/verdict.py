@@ -16,23 +16,28 @@ from foamfit.checklist import MAY_VANISH, Evidence, make_checklist, status_of, w
 from foamfit.conditioning import engineering
 from foamfit.errors import SimulationError
 from foamfit.insight import Insight, look, unreached, visited
+from foamfit.intervals import Intervals
 from foamfit.measurement import interior_channel
 from foamfit.model import split_name, unit_of
-from foamfit.objective import LOSSES, MODEL_ERROR, Objective, Simulated, influence, soften
+from foamfit.objective import LOSSES, MODEL_ERROR, Objective, Simulated, soften
 from foamfit.problem import Problem
 from foamfit.result import Correlation, Curves, FitResult, ParameterEstimate, Switch
 from foamfit.search import SearchRecord
+from foamfit.vicinity import Vicinity
 
 Array = NDArray[np.float64]
 
 
-def conclude(problem: Problem, values: Array, record: SearchRecord) -> FitResult:
-    """Assemble the result at the best point."""
+def conclude(
+    problem: Problem, values: Array, record: SearchRecord, intervals: Intervals | None = None
+) -> FitResult:
+    """Assemble the result at the best point, with other intervals than local ones if there are."""
     objective, measurement = problem.objective, problem.measurement
     simulated = objective.simulate(values, everything=True)
     springs = values[: len(problem.model.names)]
     residual = objective.differences(values)
-    estimates, spread, insight = _estimate(problem, values, residual)
+    intervals = Intervals() if intervals is None else intervals
+    estimates, spread, insight = _estimate(problem, values, intervals)
     correlation = None
     if insight is not None and spread is not None:
         correlation = Correlation(insight.names, spread.correlation)
@@ -79,12 +84,13 @@ def conclude(problem: Problem, values: Array, record: SearchRecord) -> FitResult
         ),
         switches=_switches(problem, simulated),
         correlation=correlation,
-        notes=(*_notes(problem, values, simulated), *_noise_notes(objective)),
+        notes=(*_notes(problem, values, simulated), *_noise_notes(objective), *intervals.notes),
         checklist=checklist,
         insight=insight,
         stopped=record.stopped,
         loss=objective.loss,
         noise=_noise(objective, residual),
+        intervals=intervals,
     )
 
 
@@ -175,20 +181,17 @@ def _notes(problem: Problem, values: Array, simulated: Simulated) -> tuple[str, 
 
 
 def _estimate(
-    problem: Problem, values: Array, residual: Array
+    problem: Problem, values: Array, intervals: Intervals
 ) -> tuple[dict[str, ParameterEstimate], uncertainty.Covariance | None, Insight | None]:
     """Value, uncertainty and state of every parameter; also put into lmfit's parameters."""
-    params, objective = problem.params, problem.objective
+    params = problem.params
     lost = unreached(problem, values)
     names = tuple(n for n in problem.names if params[n].vary and n not in lost)
     spread = insight = None
     if names:
-        jacobian = problem.linear().slopes(values, names)
-        sizes = problem.sizes(names, values)
-        left = pseudo_residual(residual, objective)
-        times = tuple(objective.noise(name).time for name in objective.counted)
-        spread = uncertainty.covariance(jacobian, left, objective.sizes, sizes, times)
-        insight = look(problem, values, names, jacobian, _left_over(problem, left, spread))
+        around = Vicinity.of(problem, values, names)
+        spread = around.spread
+        insight = look(problem, values, names, around.jacobian, _left_over(around))
     out = {}
     for i, name in enumerate(problem.names):
         value, parameter = float(values[i]), params[name]
@@ -204,35 +207,19 @@ def _estimate(
         else:
             assert spread is not None
             assert insight is not None
-            estimate = _varied(problem, name, value, spread, insight)
+            estimate = _varied(problem, name, value, spread, insight, intervals)
             parameter.stderr = estimate.stderr
         out[name] = estimate
     return out, spread, insight
 
 
-def _left_over(
-    problem: Problem, residual: Array, spread: uncertainty.Covariance
-) -> dict[str, float]:
+def _left_over(around: Vicinity) -> dict[str, float]:
     """One standard deviation of what is left of each curve, SI, its correlation counted."""
-    objective, out, at = problem.objective, {}, 0
-    for name, size, tau in zip(objective.counted, objective.sizes, spread.tau, strict=True):
-        rms = math.sqrt(float(np.mean(residual[at : at + size] ** 2)) * tau)
-        out[name] = max(rms, 1e-300) * objective.scale[name] / objective.weights[name] ** 0.5
-        at += size
+    objective, out = around.problem.objective, {}
+    for name, process in zip(objective.counted, around.spread.noise, strict=True):
+        spread = math.sqrt(max(process.variance * process.tau, 1e-300))
+        out[name] = spread * objective.scale[name] / objective.weights[name] ** 0.5
     return out
-
-
-def pseudo_residual(residual: Array, objective: Objective) -> Array:
-    """Residuals whose least squares have the covariance of the loss: ψ(r) over the mean of ψ'(r).
-
-    With them (JᵀJ)⁻¹ mean(ψ²)/mean(ψ')² is the covariance of an M-estimate (Huber 1981, Robust
-    Statistics, section 7.6), for each curve apart. Under the linear loss they are the residuals.
-    """
-    parts = []
-    for part in uncertainty.parts(objective.sizes):
-        psi, slope = influence(residual[part], objective.loss)
-        parts.append(psi / max(float(slope.mean()), 0.05))
-    return np.concatenate(parts)
 
 
 def _varied(
@@ -241,20 +228,24 @@ def _varied(
     value: float,
     spread: uncertainty.Covariance,
     insight: Insight,
+    intervals: Intervals,
 ) -> ParameterEstimate:
     """Estimate of a parameter that was varied and whose branch was reached."""
     low, high = problem.params[name].min, problem.params[name].max
     column = insight.names.index(name)
     stderr = float(spread.stderr[column])
-    half = uncertainty.half_width(stderr, spread.effective - len(insight.names))
-    ends = (value - half, value + half)
+    half = uncertainty.half_width(stderr, spread.freedom)
+    ends = intervals.ends.get(name, (value - half, value + half))
     verdict, why = state_of(name, value, ends, insight, (low, high))
     if verdict == "determined" and problem.objective.interior_mass:
         verdict, why = "weak", "the ringing of the interior mass leaves other valleys; " + why
     if verdict == "not determined":
         return ParameterEstimate(value, None, None, unit_of(name), True, verdict, why)
+    if name in intervals.doubtful:
+        why += "; its interval is local, though the cost is no parabola there"
     ci95 = (max(ends[0], low), min(ends[1], high))
-    return ParameterEstimate(value, stderr, ci95, unit_of(name), True, verdict, why)
+    method = intervals.methods.get(name, "local covariance")
+    return ParameterEstimate(value, stderr, ci95, unit_of(name), True, verdict, why, method)
 
 
 def state_of(
@@ -294,7 +285,7 @@ def state_of(
         return "weak", f"it is not told from zero: its 95 % interval goes from 0 to {reach}"
     if verdict == "determined":
         return verdict, why
-    past = [ends[0] < limits[0], ends[1] > limits[1]]
+    past = [ends[0] <= limits[0], ends[1] >= limits[1]]
     if any(past) and "open" not in why:
         limit, unit = limits[past.index(True)], unit_of(name)
         told = engineering(limit, unit) if unit else f"{limit:g}"

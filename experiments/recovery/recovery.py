@@ -1,0 +1,208 @@
+"""Do the 95 % intervals hold? Coverage of the true parameters on synthetic impacts.
+
+Random bistable springs (with and without dashpot) are struck fast enough to close their loop, as in
+experiments/noise_floor; 1 % noise on stress and displacement, white or autoregressive of first
+order (autocorrelation time 8 samples), 300, 1000 or 5000 samples per curve. The noise is not told
+to the fit. Each test is fitted from the curves alone with the defaults of `foamfit.fit` (full
+search, no knowledge of the truth), and every 95 % interval of a parameter that is not called "not
+determined" either holds the truth or does not.
+
+    python experiments/recovery/recovery.py                  # 200 tests for each of six classes
+    python experiments/recovery/recovery.py --tests 40
+    python experiments/recovery/recovery.py --intervals local
+"""
+
+from __future__ import annotations
+
+import argparse
+import platform
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from scipy.signal import lfilter
+from scipy.stats import binomtest
+
+import foamfit as ff
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parent / "noise_floor"))
+from noise_floor import random_case  # noqa: E402
+
+TAU = 8.0
+PARAMETERS = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus", "eta")
+SYMBOLS = {
+    "k0": r"$k_0$", "kc": r"$k_c$", "dsigma": r"$\Delta\sigma$", "eps_a": r"$\varepsilon_a$",
+    "eps_c": r"$\varepsilon_c$", "kh_plus": r"$k_{h+}$", "kh_minus": r"$k_{h-}$", "eta": r"$\eta$",
+    "all": "all",
+}  # fmt: skip
+COLOURS = {300: "#56B4E9", 1000: "#0072B2", 5000: "#D55E00"}
+
+
+@dataclass(frozen=True)
+class Class:
+    """A class of tests: autocorrelation time of its noise and samples per curve."""
+
+    tau: float
+    samples: int
+
+    @property
+    def noise(self) -> str:
+        """What the noise is called."""
+        return "white" if self.tau == 1.0 else "correlated"
+
+    def draw(self, rng: np.random.Generator, samples: int) -> np.ndarray:
+        """Noise of unit variance."""
+        rho = (self.tau - 1.0) / (self.tau + 1.0)
+        white = rng.standard_normal(samples + 500)
+        return lfilter([np.sqrt(1.0 - rho**2)], [1.0, -rho], white)[500:]
+
+
+CLASSES = tuple(Class(tau, samples) for tau in (1.0, TAU) for samples in (300, 1000, 5000))
+
+
+def run_test(group: Class, seed: int, intervals: str = "auto") -> list[dict[str, object]]:
+    """Fit one synthetic test; a row for each parameter."""
+    rng = np.random.default_rng([seed, group.samples, int(group.tau)])
+    spring, measurement = random_case(rng, group.samples, group.draw)
+    began = time.perf_counter()
+    result = ff.fit(measurement, seed=0, intervals=intervals)
+    seconds = time.perf_counter() - began
+    rows = []
+    for name in PARAMETERS:
+        estimate, truth = result.parameters[f"s1_{name}"], getattr(spring, name)
+        low, high = estimate.ci95 or (np.nan, np.nan)
+        rows.append(
+            {
+                "noise": group.noise,
+                "samples": group.samples,
+                "test": seed,
+                "parameter": name,
+                "truth": truth,
+                "value": estimate.value,
+                "low": low,
+                "high": high,
+                "state": estimate.state,
+                "method": estimate.ci95_method,
+                "holds": bool(low <= truth <= high),
+                "seconds": seconds,
+            }
+        )
+    return rows
+
+
+def run(tests: int, intervals: str, raw: Path | None) -> pd.DataFrame:
+    """Fit all tests of all classes, but for those that `raw` holds already; it is kept up."""
+    rows = pd.read_csv(raw) if raw is not None and raw.exists() else pd.DataFrame()
+    done = set(map(tuple, rows[["noise", "samples", "test"]].to_numpy())) if len(rows) else set()
+    began = time.perf_counter()
+    for seed in range(1, tests + 1):
+        for group in CLASSES:
+            if (group.noise, group.samples, seed) not in done:
+                rows = pd.concat([rows, pd.DataFrame(run_test(group, seed, intervals))])
+        if raw is not None:
+            rows.to_csv(raw, index=False)
+        if seed % 10 == 0:
+            took = time.perf_counter() - began
+            print(f"{seed} tests per class: {took:.0f} s", file=sys.stderr, flush=True)
+    return rows[rows["test"] <= tests]
+
+
+def coverage(rows: pd.DataFrame) -> pd.DataFrame:
+    """Coverage of each parameter and class with its binomial 95 % interval, and typical widths."""
+    given = rows[rows["low"].notna()].copy()
+    scale = given["truth"].abs().where(given["truth"] != 0.0)
+    given["width"] = (given["high"] - given["low"]) / 2.0 / scale
+    out = []
+    for (noise, samples), group in given.groupby(["noise", "samples"], sort=False):
+        total = len(rows[(rows["noise"] == noise) & (rows["samples"] == samples)])
+        for name in (*PARAMETERS, "all"):
+            own = group if name == "all" else group[group["parameter"] == name]
+            count, held = len(own), int(own["holds"].sum())
+            error = binomtest(held, count).proportion_ci(method="wilson")
+            out.append(
+                {
+                    "noise": noise,
+                    "samples": samples,
+                    "parameter": name,
+                    "tests": total // (1 if name == "all" else len(PARAMETERS)),
+                    "intervals": count,
+                    "coverage": held / count,
+                    "error low": error.low,
+                    "error high": error.high,
+                    "half width over truth, median": own["width"].median(),
+                    "profiled": (own["method"] == "profile likelihood").mean(),
+                }
+            )
+    return pd.DataFrame(out)
+
+
+def picture(table: pd.DataFrame, path: Path, tests: int) -> None:
+    """Coverage and interval width per parameter and class."""
+    figure = Figure(figsize=(7.2, 4.8), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(2, 2, sharex="col", sharey="row")
+    figure.suptitle(f"{tests} synthetic impacts per class, 1 % noise, full search", fontsize=10)
+    names = (*PARAMETERS, "all")
+    for column, (noise, title) in enumerate(
+        (("white", "white noise"), ("correlated", f"correlated noise, τ = {TAU:g} samples"))
+    ):
+        above, below = axes[0, column], axes[1, column]
+        above.axhspan(92, 98, color="0.92", linewidth=0)
+        above.axhline(95, color="0.6", linewidth=0.8)
+        above.set_title(title, fontsize=9)
+        for shift, (samples, colour) in zip((-0.22, 0.0, 0.22), COLOURS.items(), strict=True):
+            own = table[(table["noise"] == noise) & (table["samples"] == samples)]
+            own = own.set_index("parameter").loc[list(names)]
+            x = np.arange(len(names)) + shift
+            percent = 100.0 * own["coverage"]
+            error = [percent - 100.0 * own["error low"], 100.0 * own["error high"] - percent]
+            above.errorbar(
+                x, percent, error, fmt="o", color=colour, markersize=3, linewidth=0.9,
+                label=f"{samples} samples per curve" if column == 0 else None,
+            )  # fmt: skip
+            below.plot(x[:-1], 100.0 * own["half width over truth, median"][:-1], "o",
+                       color=colour, markersize=3)  # fmt: skip
+        below.set_yscale("log")
+        below.set_xticks(range(len(names)), [SYMBOLS[name] for name in names])
+    axes[0, 0].set_ylabel("truth inside the 95 % interval (%)", fontsize=8)
+    axes[1, 0].set_ylabel("median half width (% of truth)", fontsize=8)
+    for panel in axes.flat:
+        panel.tick_params(labelsize=8)
+        panel.spines[["top", "right"]].set_visible(False)
+    figure.legend(frameon=False, fontsize=8, loc="outside lower center", ncols=3)
+    figure.savefig(path, dpi=200)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--tests", type=int, default=200)
+    parser.add_argument("--intervals", default="auto", choices=("auto", "local", "profile"))
+    parser.add_argument("--out", type=Path, default=HERE)
+    parser.add_argument("--raw", type=Path, help="one row per test and parameter; resumed")
+    options = parser.parse_args()
+    began = time.perf_counter()
+    run_test(CLASSES[0], 0)  # compiles
+    rows = run(options.tests, options.intervals, options.raw)
+    table = coverage(rows)
+    suffix = "" if options.intervals == "auto" else f"_{options.intervals}"
+    table.to_csv(options.out / f"recovery{suffix}.csv", index=False, float_format="%.4g")
+    picture(table, options.out / f"recovery{suffix}.png", options.tests)
+    wide = table.pivot_table(
+        index=["noise", "samples"], columns="parameter", values="coverage", sort=False
+    )
+    print((100.0 * wide).round(1).to_string())
+    print(
+        f"{options.tests} tests per class in {(time.perf_counter() - began) / 60:.1f} minutes, "
+        f"median {rows['seconds'].median():.2f} s per fit "
+        f"(foamfit {ff.__version__}, Python {platform.python_version()}, {platform.machine()})"
+    )
+
+
+if __name__ == "__main__":
+    main()

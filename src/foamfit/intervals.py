@@ -1,0 +1,742 @@
+"""Intervals that hold: profiles of the cost, bootstrap, Markov chains.
+
+The local covariance of `foamfit.uncertainty` takes the cost for a parabola. Where branches a and d
+are about equally stiff it is none: it is flat along ε_a, with several shallow valleys. Here the
+cost itself is asked. A profile is the least cost with one parameter held; a rise of the cost is
+compared with what the noise would make of it, correlated as it is (`Covariance.inflation`), so
+that on a parabola profile and local interval are the same.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foamfit.errors import InputError
+from foamfit.search import SearchStoppedError, Tracker
+from foamfit.uncertainty import NoiseProcess
+from foamfit.vicinity import Place, Refit, Vicinity, m_estimate
+
+Array = NDArray[np.float64]
+
+# A profile is followed until its χ² is this many times that of the 95 % cut: small barriers
+# between shallow valleys are crossed.
+BEYOND = 2.0
+# Refits of one side of a profile: to get beyond the cut, and to place it.
+OUTWARD, INWARD = 14, 6
+# The cut is placed to this share of the root of its χ².
+PLACED = 0.02
+# The least share of the cut by which a profile below the best point tells of a better valley.
+BETTER = 0.01
+# The default profiles a parameter if the root of the cost departs from a straight line by this
+# share at the end of its local interval.
+BENT = 0.15
+METHODS = ("auto", "local", "profile", "bootstrap", "mcmc")
+# Refits of an average profile, for the announcement; draws that percentiles need.
+REFITS, ENOUGH_DRAWS = 9, 40
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """Least cost along one parameter.
+
+    Attributes
+    ----------
+    name : str
+        The parameter.
+    values : (m,) array
+        Where it was held, ascending, SI; the best point is among them.
+    rises : (m,) array
+        Rise of the cost there as a χ² of one degree of freedom.
+    points : (m, n) array
+        All parameters of the model at each.
+    cut : float
+        χ² of the 95 % interval.
+    ci95 : (float, float)
+        Outermost crossings of the cut; a limit of the parameter where there is none.
+    open_low, open_high : bool
+        Whether the cost does not reach the cut on that side.
+    complete : bool
+        Whether it was followed to its end on both sides.
+    """
+
+    name: str
+    values: Array
+    rises: Array
+    points: Array
+    cut: float
+    ci95: tuple[float, float]
+    open_low: bool
+    open_high: bool
+    complete: bool = True
+
+
+def profile(
+    vicinity: Vicinity,
+    name: str,
+    tracker: Tracker | None = None,
+    valleys: Sequence[Array] = (),
+) -> Profile:
+    """Follow the least cost along a parameter to both sides, past the 95 % cut.
+
+    The adjusted likelihood ratio: the rise of the cost over `Covariance.inflation`, which is χ²
+    with one degree of freedom also where the noise is correlated (Chandler & Bate 2007,
+    Biometrika 94, 167).
+
+    Parameters
+    ----------
+    vicinity : Vicinity
+        The best point.
+    name : str
+        One of its names.
+    tracker : Tracker, optional
+        Counts, keeps the best point seen and ends the profile at its deadline.
+    valleys : sequence of (n,) arrays
+        Other points at which descents ended: the profile goes on beyond them where they are
+        within the cut, whatever barrier lies between.
+
+    Returns
+    -------
+    Profile
+        Incomplete if the deadline or Ctrl-C ended it: `ci95` is then that of what was done.
+    """
+    tracker = Tracker(vicinity.problem.objective) if tracker is None else tracker
+    sides: list[_Side] = []
+    complete = True
+    for sign in (-1.0, 1.0):
+        sides.append(_Side(vicinity, name, Refit(vicinity, tracker), sign))
+        try:
+            sides[-1].follow(valleys)
+        except (SearchStoppedError, KeyboardInterrupt):
+            complete = False
+            break
+    return _assemble(vicinity, name, sides, complete)
+
+
+@dataclass(eq=False)
+class _Side:
+    """One side of a profile: down (-1) or up (+1)."""
+
+    vicinity: Vicinity
+    name: str
+    refit: Refit
+    sign: float
+
+    def __post_init__(self) -> None:
+        """Begin at the best point."""
+        best = self.vicinity
+        self.column = best.names.index(self.name)
+        self.place = best.index[self.name]
+        self.unit = float(best.spread.inflation[self.column])
+        self.quantile = best.quantile
+        self.places = [self.refit.start()]
+        low, high = best.limits(self.name)
+        self.limit = low if self.sign < 0 else high
+
+    def value(self, place: Place) -> float:
+        """Where the parameter was held."""
+        return float(place.point[self.place])
+
+    def rise(self, place: Place) -> float:
+        """Rise of the cost as a χ²."""
+        return (place.cost - self.vicinity.cost) / self.unit
+
+    def root(self, place: Place) -> float:
+        """Root of the rise, straight along a parabola."""
+        return math.sqrt(max(self.rise(place), 0.0))
+
+    def follow(self, valleys: Sequence[Array]) -> None:
+        """Go outward until well beyond the cut, then place the outermost crossing."""
+        self._outward()
+        for valley in sorted(valleys, key=lambda point: self.sign * float(point[self.place])):
+            value = float(valley[self.place])
+            if self.better or self.sign * (value - self.value(self.places[-1])) <= 0.0:
+                continue
+            residual = self.refit.residual(valley)
+            if residual is None:
+                continue
+            place = self.refit.run(self.refit.fresh(valley, residual), self._others)
+            if self.rise(place) < self.quantile**2:
+                self.places.append(place)
+                self._outward()
+        self._inward()
+
+    @property
+    def _others(self) -> NDArray[np.bool_]:
+        """All parameters but the one that is held."""
+        return np.asarray(np.arange(len(self.vicinity.names)) != self.column)
+
+    def _outward(self) -> None:
+        """Go on from the outermost place until well beyond the cut."""
+        step = 0.5 * self.quantile * float(self.vicinity.spread.stderr[self.column])
+        refused = 0
+        for _ in range(OUTWARD):
+            last = self.places[-1]
+            if self.value(last) == self.limit or refused > 3:
+                break
+            value = self.value(last) + self.sign * step
+            value = max(value, self.limit) if self.sign < 0 else min(value, self.limit)
+            place = self._hold(value, last)
+            if place is None:
+                step, refused = 0.3 * step, refused + 1
+                continue
+            self.places.append(place)
+            if self.rise(place) >= BEYOND * self.quantile**2 or self.better:
+                break
+            if self.root(place) - self.root(last) < 0.35 * self.quantile:
+                step *= 1.6
+
+    def _inward(self) -> None:
+        """Place the outermost crossing of the cut."""
+        for _ in range(INWARD):
+            inner, outer = self._bracket()
+            if outer is None or self.better:
+                break
+            miss = min(abs(self.root(p) - self.quantile) for p in (inner, outer))
+            if miss <= PLACED * self.quantile:
+                break
+            place = self._hold(self.bound, inner)
+            if place is None:
+                break
+            self.places.append(place)
+            self.places.sort(key=lambda p: self.sign * self.value(p))
+
+    @property
+    def better(self) -> bool:
+        """Whether a better point than the best was met."""
+        return min(map(self.rise, self.places)) < -BETTER * self.quantile**2
+
+    def _hold(self, value: float, near: Place) -> Place | None:
+        """Refit with the parameter held, starting from a place near by; None if nothing is found.
+
+        The others follow as the slopes there promise; where that cannot be simulated they stay.
+        """
+        free = self._others
+        shift = np.zeros(free.size)
+        shift[self.column] = (value - self.value(near)) / self.vicinity.sizes[self.column]
+        ahead = replace(near, residual=near.residual + near.slopes @ shift)
+        follow, _ = self.refit.step(ahead, free, 1e-9)
+        for step in (shift + follow, shift):
+            point = self.refit.moved(near, step)
+            point[self.place] = value
+            residual = self.refit.residual(point)
+            if residual is not None:
+                taken = (point - near.point)[self.refit.places] / self.vicinity.sizes
+                surprise = residual - near.residual - near.slopes @ taken
+                slopes = near.slopes + np.outer(surprise, taken / (taken @ taken))
+                return self.refit.run(Place(point, residual, slopes), free)
+        return None
+
+    def _bracket(self) -> tuple[Place, Place | None]:
+        """The outermost place below the cut, and the next one."""
+        last = max(i for i, place in enumerate(self.places) if self.root(place) < self.quantile)
+        return self.places[last], self.places[last + 1] if last + 1 < len(self.places) else None
+
+    @property
+    def bound(self) -> float:
+        """Where the root of the rise crosses that of the cut; where it never does, the limit."""
+        inner, outer = self._bracket()
+        if outer is None:
+            return self.limit
+        share = (self.quantile - self.root(inner)) / (self.root(outer) - self.root(inner))
+        return self.value(inner) + share * (self.value(outer) - self.value(inner))
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the cost never reached the cut."""
+        return self._bracket()[1] is None
+
+
+def _assemble(vicinity: Vicinity, name: str, sides: list[_Side], complete: bool) -> Profile:
+    """Put the sides of a profile together; a side that was not begun ends at the best point."""
+    low = sides[0]
+    high = sides[1] if len(sides) > 1 else None
+    places = low.places[::-1] + (high.places[1:] if high else [])
+    return Profile(
+        name=name,
+        values=np.array([low.value(place) for place in places]),
+        rises=np.array([low.rise(place) for place in places]),
+        points=np.array([place.point for place in places]),
+        cut=vicinity.quantile**2,
+        ci95=(low.bound, high.bound if high else low.value(low.places[0])),
+        open_low=low.is_open,
+        open_high=high.is_open if high else True,
+        complete=complete,
+    )
+
+
+def departures(vicinity: Vicinity) -> Array:
+    """How far the cost is from a parabola at either end of each local interval, (k, 2).
+
+    One evaluation each: the parameter is put at the end of its interval (nearer if nothing can be
+    simulated there), the others follow their correlation, and what they could still gain is read
+    off the local slopes. Given is the root of the rise over what a parabola has, less one; zero
+    where a limit leaves no room, infinite where nothing can be simulated.
+    """
+    refit = Refit(vicinity, Tracker(vicinity.problem.objective))
+    start = refit.start()
+    normal = start.slopes.T @ start.slopes
+    out = np.zeros((len(vicinity.names), 2))
+    for i, name in enumerate(vicinity.names):
+        others = np.arange(len(vicinity.names)) != i
+        inverse = np.linalg.pinv(normal[np.ix_(others, others)], rcond=1e-10, hermitian=True)
+        own = start.slopes[:, others]
+
+        def least(residual: Array, own: Array = own, inverse: Any = inverse) -> float:
+            slope = own.T @ residual
+            return float(residual @ residual - slope @ inverse @ slope)
+
+        here = least(start.residual)
+        stderr = float(vicinity.spread.stderr[i])
+        reach = vicinity.quantile * stderr
+        value = vicinity.values[vicinity.index[name]]
+        low, high = vicinity.limits(name)
+        for side, room in enumerate((value - low, high - value)):
+            if not room > 0.05 * reach:
+                continue
+            out[i, side] = np.inf
+            for share in (1.0, 0.5, 0.25):
+                shift = min(share * reach, room)
+                along = vicinity.along(name) * (-shift if side == 0 else shift) / vicinity.sizes
+                residual = refit.residual(refit.moved(start, along))
+                if residual is not None:
+                    rise = (least(residual) - here) / vicinity.spread.inflation[i]
+                    out[i, side] = math.sqrt(max(rise, 0.0)) * stderr / shift - 1.0
+                    break
+    return out
+
+
+# ---------------------------------------------------------------- bootstrap
+
+
+def block_length(process: NoiseProcess, n: int) -> int:
+    """Length of the blocks of a bootstrap of n samples of a noise.
+
+    The one that makes the error of a variance least if the noise is autoregressive of first order
+    with the same autocorrelation time (Politis & White 2004, Econometric Reviews 23, 53):
+    (3/8 n ((τ²-1)/τ)²)^(1/3), one for white noise.
+    """
+    tau = process.tau
+    length = (0.375 * n * ((tau * tau - 1.0) / tau) ** 2) ** (1.0 / 3.0)
+    return int(min(max(round(length), 1), max(n // 4, 1)))
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """Circular blocks of the residuals of one curve (Politis & Romano 1992).
+
+    Residuals are smaller than the noise was, and blocks break correlation at their ends: both are
+    made up for by a factor, such that sums over the curve vary as those of its noise.
+    """
+
+    residual: Array
+    length: int
+
+    @classmethod
+    def of(cls, residual: Array, process: NoiseProcess, like: Array | None = None) -> Blocks:
+        """Blocks of a residual whose noise is known; `like` is what it was read off, if not it."""
+        length = block_length(process, residual.size)
+        centred = residual - residual.mean()
+        lags = process.autocovariance(length) / process.variance
+        within = 1.0 + 2.0 * float((1.0 - np.arange(1, length) / length) @ lags[1:])
+        power = max(float(np.var(residual if like is None else like)), 1e-300)
+        factor = process.variance / power * max(process.tau / within, 1.0)
+        return cls(centred * math.sqrt(factor), length)
+
+    def draw(self, rng: np.random.Generator) -> Array:
+        """As many samples as the residual has, from blocks with random starts."""
+        n = self.residual.size
+        starts = rng.integers(0, n, -(-n // self.length))
+        drawn = (starts[:, None] + np.arange(self.length)) % n
+        return np.asarray(self.residual[drawn.ravel()[:n]])
+
+
+def bootstrap(vicinity: Vicinity, draws: int, seed: int, tracker: Tracker | None = None) -> Array:
+    """Refits to data remade from the fitted curves and blocks of the residuals.
+
+    Each refit descends from the best point; other valleys of the cost are not searched.
+
+    Parameters
+    ----------
+    vicinity : Vicinity
+        The best point.
+    draws : int
+        How many.
+    seed : int
+        Same seed, same numbers.
+    tracker : Tracker, optional
+        Ends it at its deadline.
+
+    Returns
+    -------
+    (m, k) array
+        Refitted parameters, SI; m < draws if the deadline or Ctrl-C ended it.
+    """
+    objective = vicinity.problem.objective
+    tracker = Tracker(objective) if tracker is None else tracker
+    rng = np.random.default_rng([seed, 1])
+    free = np.ones(len(vicinity.names), dtype=bool)
+    ends = np.cumsum(objective.sizes)[:-1]
+    _, pseudo = m_estimate(vicinity.residual, objective.sizes, objective.loss)
+    pairs = zip(np.split(vicinity.residual, ends), np.split(pseudo, ends), strict=True)
+    blocks = [
+        Blocks.of(part, process, like)
+        for (part, like), process in zip(pairs, vicinity.spread.noise, strict=True)
+    ]
+    out: list[Array] = []
+    try:
+        for _ in range(draws):
+            noise = np.concatenate([block.draw(rng) for block in blocks])
+            refit = Refit(vicinity, tracker, vicinity.residual - noise)
+            out.append(refit.run(refit.start(), free).point[refit.places])
+    except (SearchStoppedError, KeyboardInterrupt):
+        pass
+    return np.array(out).reshape(-1, len(vicinity.names))
+
+
+# ---------------------------------------------------------------- Markov chain
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """A Markov chain of the parameters.
+
+    Attributes
+    ----------
+    samples : (m, k) array
+        Draws after the burn-in, all walkers, SI.
+    steps, burn_in : int
+        Steps of each walker, and how many of the first were left out.
+    walkers : int
+        Number of walkers.
+    autocorrelation : float
+        Integrated autocorrelation time of the slowest parameter, steps.
+    """
+
+    samples: Array
+    steps: int
+    burn_in: int
+    walkers: int
+    autocorrelation: float
+
+    @property
+    def converged(self) -> bool:
+        """Whether the chain is longer than fifty autocorrelation times, as emcee asks for."""
+        return self.steps - self.burn_in >= 50.0 * self.autocorrelation
+
+    def sentence(self) -> str:
+        """What the autocorrelation says of the chain."""
+        length = self.steps - self.burn_in
+        word = "enough" if self.converged else "too short to trust: wanted are 50"
+        return (
+            f"Markov chain of {self.walkers} walkers and {self.steps} steps, the first "
+            f"{self.burn_in} left out: {length / self.autocorrelation:.0f} autocorrelation times "
+            f"of the slowest parameter, which is {word}."
+        )
+
+
+def check_emcee() -> None:
+    """Raise InputError if emcee is not there."""
+    if importlib.util.find_spec("emcee") is None:
+        raise InputError(
+            'Markov chains need emcee, which is not installed; pip install "foamfit[mcmc]"'
+        )
+
+
+def walkers(vicinity: Vicinity) -> int:
+    """Number of walkers of a chain."""
+    return 2 * len(vicinity.names) + 4
+
+
+def mcmc(vicinity: Vicinity, steps: int, seed: int, tracker: Tracker | None = None) -> Chain:
+    """Sample the posterior by emcee's affine-invariant ensemble (Foreman-Mackey et al. 2013).
+
+    Flat priors within the limits; the likelihood counts n/τ samples of each curve: its sum of
+    squares over the variance of its noise is divided by τ.
+
+    Parameters
+    ----------
+    vicinity : Vicinity
+        The best point, about which the walkers begin.
+    steps : int
+        Of each walker; the first fifth is left out.
+    seed : int
+        Same seed, same numbers.
+    tracker : Tracker, optional
+        Ends it at its deadline.
+
+    Raises
+    ------
+    InputError
+        If emcee is not installed.
+    """
+    check_emcee()
+    import emcee
+
+    tracker = Tracker(vicinity.problem.objective) if tracker is None else tracker
+    refit = Refit(vicinity, tracker)
+    start = refit.start()
+    weights = np.concatenate(
+        [
+            np.full(n, 1.0 / (process.variance * process.tau))
+            for n, process in zip(
+                vicinity.problem.objective.sizes, vicinity.spread.noise, strict=True
+            )
+        ]
+    )
+
+    def log_probability(scaled: Array) -> float:
+        point = start.point.copy()
+        point[refit.places] = scaled * vicinity.sizes
+        inside = np.all((point[refit.places] >= refit.low) & (point[refit.places] <= refit.high))
+        residual = refit.residual(refit.complete(point)) if inside else None
+        return -0.5 * float(weights @ residual**2) if residual is not None else -np.inf
+
+    rng = np.random.default_rng([seed, 2])
+    count, k = walkers(vicinity), len(vicinity.names)
+    scale = vicinity.spread.matrix / np.outer(vicinity.sizes, vicinity.sizes)
+    at = start.point[refit.places]
+    begin: list[Array] = []
+    while len(begin) < count:
+        drawn = rng.multivariate_normal(at / vicinity.sizes, 0.25 * scale)
+        drawn = np.clip(drawn, refit.low / vicinity.sizes, refit.high / vicinity.sizes)
+        if np.isfinite(log_probability(drawn)):
+            begin.append(drawn)
+    sampler = emcee.EnsembleSampler(count, k, log_probability)
+    sampler.random_state = np.random.RandomState(seed).get_state()
+    done = 0
+    try:
+        for _ in sampler.sample(np.array(begin), iterations=steps, skip_initial_state_check=True):
+            done += 1
+    except (SearchStoppedError, KeyboardInterrupt):
+        pass
+    burn_in = done // 5
+    chain = sampler.get_chain()[burn_in:done] if done else np.empty((0, count, k))
+    times = emcee.autocorr.integrated_time(chain, tol=0, quiet=True) if done > 10 else [np.inf]
+    slowest = float(np.max(np.nan_to_num(times, nan=np.inf)))
+    return Chain(chain.reshape(-1, k) * vicinity.sizes, done, burn_in, count, slowest)
+
+
+# ---------------------------------------------------------------- the intervals of a fit
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Which intervals are wanted.
+
+    Attributes
+    ----------
+    method : str
+        "auto" (profiles of those parameters along which the cost is no parabola, local covariance
+        for the others), "local", "profile", "bootstrap" or "mcmc".
+    draws : int
+        Refits of the bootstrap, or steps of the Markov chain.
+    seed : int
+        Source of all chance.
+    """
+
+    method: str = "auto"
+    draws: int = 0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse what is unknown or cannot be done."""
+        if self.method not in METHODS:
+            raise InputError(
+                f"intervals '{self.method}' is unknown; it must be one of {', '.join(METHODS)}"
+            )
+        least = {"bootstrap": 40, "mcmc": 100}.get(self.method, 0)
+        if self.draws < least:
+            raise InputError(
+                f"{self.draws} draws are too few for intervals by {self.method}; "
+                f"it must be at least {least}"
+            )
+        if self.method == "mcmc":
+            check_emcee()
+
+
+@dataclass(frozen=True, eq=False)
+class Intervals:
+    """The 95 % intervals of a fit, and how they were made.
+
+    Attributes
+    ----------
+    ends : dict of str to (float, float)
+        Ends of the intervals that are not those of the local covariance.
+    methods : dict of str to str
+        How each of these was made.
+    profiles : tuple of Profile
+        All profiles that were followed, whole or not.
+    doubtful : tuple of str
+        Parameters along which the cost is no parabola and whose interval is local all the same.
+    notes : tuple of str
+        One sentence each.
+    better : (n,) array or None
+        A point with a lower cost that was met: it should be gone on from.
+    """
+
+    ends: dict[str, tuple[float, float]] = field(default_factory=dict)
+    methods: dict[str, str] = field(default_factory=dict)
+    profiles: tuple[Profile, ...] = ()
+    doubtful: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    better: Array | None = None
+
+
+def assess(
+    vicinity: Vicinity,
+    choice: Choice,
+    *,
+    valleys: Sequence[Array] = (),
+    deadline: float | None = None,
+    budget: float = math.inf,
+    tell: Callable[[str], None] = lambda told: None,
+) -> Intervals:
+    """Make the intervals that were chosen.
+
+    Parameters
+    ----------
+    vicinity : Vicinity
+        The best point.
+    choice : Choice
+        The method.
+    valleys : sequence of (n,) arrays
+        Points at which the descents of the search ended.
+    deadline : float, optional
+        `time.monotonic` at which it ends with what was done.
+    budget : float
+        Evaluations after which "auto" begins no further profile.
+    tell : callable
+        Told what it will cost before it is paid.
+    """
+    tracker = Tracker(vicinity.problem.objective, deadline, best_cost=vicinity.cost)
+    if choice.method == "local":
+        return Intervals()
+    if choice.method == "bootstrap":
+        return _by_bootstrap(vicinity, choice, tracker, tell)
+    if choice.method == "mcmc":
+        return _by_mcmc(vicinity, choice, tracker, tell)
+    known = [name for name in vicinity.names if vicinity.knows(name)]
+    if choice.method == "profile":
+        tell(_cost_told(vicinity, "profile likelihood", REFITS * len(known)))
+        return _by_profiles(vicinity, known, valleys, tracker, math.inf)
+    far = np.abs(departures(vicinity)).max(axis=1, initial=0.0)
+    far[_elsewhere(vicinity, valleys, tracker)] = np.inf
+    order = sorted(known, key=lambda name: -far[vicinity.names.index(name)])
+    bent = [name for name in order if far[vicinity.names.index(name)] > BENT]
+    return _by_profiles(vicinity, bent, valleys, tracker, budget)
+
+
+def _elsewhere(vicinity: Vicinity, valleys: Sequence[Array], tracker: Tracker) -> NDArray[np.bool_]:
+    """Parameters that another valley within the cut puts outside of their local interval, (k,)."""
+    places = [vicinity.index[name] for name in vicinity.names]
+    out = np.zeros(len(places), dtype=bool)
+    for valley in valleys:
+        residual = tracker.consider(valley)
+        rise = (float(residual @ residual) - vicinity.cost) / vicinity.spread.inflation
+        apart = np.abs(valley - vicinity.values)[places] / vicinity.spread.stderr
+        out |= (rise < vicinity.quantile**2) & (apart > vicinity.quantile)
+    return out
+
+
+def _by_profiles(
+    vicinity: Vicinity,
+    names: Sequence[str],
+    valleys: Sequence[Array],
+    tracker: Tracker,
+    budget: float,
+) -> Intervals:
+    """Profiles of some parameters, until they are done, a better point is met or all ends."""
+    objective = tracker.objective
+    allowed = objective.evaluations + budget
+    profiles: list[Profile] = []
+    better = None
+    for name in names:
+        if objective.evaluations >= allowed:
+            break
+        profiles.append(profile(vicinity, name, tracker, valleys))
+        lowest = profiles[-1].rises.argmin()
+        if profiles[-1].rises[lowest] < -BETTER * profiles[-1].cut:
+            better = profiles[-1].points[lowest]
+            break
+        if not profiles[-1].complete:
+            break
+    whole = {p.name: p for p in profiles if p.complete}
+    left = tuple(name for name in names if name not in whole)
+    notes: tuple[str, ...] = ()
+    if profiles and not profiles[-1].complete:
+        notes = (
+            f"The profiles were stopped: {len(whole)} of {len(names)} were done, and "
+            f"the intervals of {', '.join(left)} are local.",
+        )
+    return Intervals(
+        ends={name: p.ci95 for name, p in whole.items()},
+        methods=dict.fromkeys(whole, "profile likelihood"),
+        profiles=tuple(profiles),
+        doubtful=left,
+        notes=notes,
+        better=better,
+    )
+
+
+def _by_bootstrap(
+    vicinity: Vicinity, choice: Choice, tracker: Tracker, tell: Callable[[str], None]
+) -> Intervals:
+    tell(_cost_told(vicinity, "block bootstrap", choice.draws))
+    drawn = bootstrap(vicinity, choice.draws, choice.seed, tracker)
+    sizes = vicinity.problem.objective.sizes
+    lengths = [block_length(p, n) for p, n in zip(vicinity.spread.noise, sizes, strict=True)]
+    note = (
+        f"Block bootstrap: {len(drawn)} of {choice.draws} refits, blocks of "
+        f"{' and '.join(map(str, lengths))} samples."
+    )
+    if len(drawn) < ENOUGH_DRAWS:
+        return Intervals(notes=(note + " These are too few, so the intervals are local.",))
+    return _percentiles(vicinity, drawn, "block bootstrap", note)
+
+
+def _by_mcmc(
+    vicinity: Vicinity, choice: Choice, tracker: Tracker, tell: Callable[[str], None]
+) -> Intervals:
+    count = (choice.draws + 1) * walkers(vicinity)
+    seconds = count * _seconds(vicinity)[0]
+    tell(f"Markov chain: {count} simulations, about {seconds:.2g} s")
+    chain = mcmc(vicinity, choice.draws, choice.seed, tracker)
+    if len(chain.samples) < ENOUGH_DRAWS:
+        return Intervals(notes=(chain.sentence() + " The intervals are local.",))
+    return _percentiles(vicinity, chain.samples, "MCMC", chain.sentence())
+
+
+def _percentiles(vicinity: Vicinity, drawn: Array, method: str, note: str) -> Intervals:
+    """Intervals between the 2.5th and the 97.5th percentile of what was drawn."""
+    low, high = np.percentile(drawn, [2.5, 97.5], axis=0)
+    ends = {
+        name: (float(low[i]), float(high[i]))
+        for i, name in enumerate(vicinity.names)
+        if vicinity.knows(name)
+    }
+    return Intervals(ends=ends, methods=dict.fromkeys(ends, method), notes=(note,))
+
+
+def _seconds(vicinity: Vicinity) -> tuple[float, float]:
+    """Seconds of one evaluation of the residual and of its slopes."""
+    problem = vicinity.problem
+    began = time.perf_counter()
+    for _ in range(3):
+        problem.objective.residual(vicinity.values)
+    middle = time.perf_counter()
+    problem.slopes(vicinity.values, vicinity.names)
+    return (middle - began) / 3.0, time.perf_counter() - middle
+
+
+def _cost_told(vicinity: Vicinity, what: str, refits: int) -> str:
+    """Announcement of so many refits."""
+    evaluation, slopes = _seconds(vicinity)
+    return f"{what}: {refits} refits, about {refits * (6.0 * evaluation + 0.6 * slopes):.2g} s"
