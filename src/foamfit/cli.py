@@ -159,7 +159,12 @@ def _hold_and_vary(
 @main.command()
 @_TEST
 @_SPECIMEN
-@click.option("--model", default="bistable", show_default=True, help="Springs from the base up.")
+@click.option(
+    "--model",
+    default="bistable",
+    show_default=True,
+    help="Springs from the base up; auto takes the simplest that holds.",
+)
 @click.option(
     "--drive",
     type=click.Choice(["impact", "stress", "displacement"]),
@@ -211,6 +216,7 @@ def fit(
     \b
     Examples:
         foamfit fit TEST.csv
+        foamfit fit TEST.csv --model auto
         foamfit fit TEST.csv --drive displacement --out results/today
         foamfit fit TEST.csv --model linear+bistable --fix s1_k0=60e6
     """
@@ -218,15 +224,20 @@ def fit(
     from foamfit.reading import read_test
     from foamfit.result import check_target
 
-    model = Model.parse(model).name
+    auto = model.strip() == "auto"
+    model = "auto" if auto else Model.parse(model).name
+    if auto and (fix or vary):
+        raise InputError("--fix and --vary belong to one model; name it instead of --model auto")
     measurement = read_test(test, specimen)
     folder = Path("fits", test.stem, model) if out is None else out
     check_target(folder)
     from foamfit import identification
     from foamfit.problem import make_params
 
-    params = make_params(measurement, model, drive)
-    _hold_and_vary(params, model, fix, vary)
+    params = None
+    if not auto:
+        params = make_params(measurement, model, drive)
+        _hold_and_vary(params, model, fix, vary)
     with _progress(quiet or as_json) as progress:
         result = identification.fit(
             measurement,

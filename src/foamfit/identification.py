@@ -46,7 +46,8 @@ def fit(
     measurement : Measurement
         The test; see `foamfit.read_test`.
     model : str
-        Springs from the base up, joined by "+".
+        Springs from the base up, joined by "+"; "auto" takes the simplest that holds, see
+        `foamfit.ladder.climb`.
     drive : str, optional
         "impact", "stress" or "displacement"; by default what the test allows, in this order:
         impact, displacement.
@@ -83,6 +84,21 @@ def fit(
         raise InputError(f"starts = {starts} is not admissible; it must be at least 1")
     if max_time is not None and not max_time > 0:
         raise InputError(f"max_time = {max_time:g} s is not admissible; it must be positive")
+    if model == "auto":
+        from foamfit.ladder import climb  # which fits its rungs by this function
+
+        if params is not None:
+            raise InputError("params belong to one model; name it instead of 'auto'")
+        return climb(
+            measurement,
+            drive=drive,
+            seed=seed,
+            starts=starts,
+            max_time=max_time,
+            weights=weights,
+            interior_mass=interior_mass,
+            progress=progress,
+        )
     problem = make_problem(measurement, model, drive, params, weights, interior_mass)
     starts = STARTS * len(problem.model.kinds) if starts is None else starts
     deadline = None if max_time is None else time.monotonic() + max_time

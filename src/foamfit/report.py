@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import math
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
@@ -15,6 +15,7 @@ from foamfit.measurement import interior_channel
 from foamfit.plots import DPI, image, origin_word, plot_fit, plot_residuals, readable_unit
 
 if TYPE_CHECKING:
+    from foamfit.ladder import Ladder
     from foamfit.result import FitResult, ParameterEstimate
 
 CURVES = {
@@ -59,6 +60,10 @@ ENERGY = {  # of the audit: label and unit
     "momentum_change": ("change of momentum", "N·s"),
     "impulse_ratio": ("impulse over change of momentum", ""),
 }
+LADDER = (
+    "model", "damping", "misfit, %", "χ²", "varied", "rank", "n_eff", "AICc", "BIC", "runs p",
+    "n.d.", "weak", "s",
+)  # fmt: skip
 CITATION = (
     "Thevamaran, R., Fraternali, F., Daraio, C. (2014). Multiscale Mass-Spring Model for "
     "High-Rate Compression of Vertically Aligned Carbon Nanotube Foams. "
@@ -129,6 +134,9 @@ def render_report(result: FitResult, *, fit_png: bytes | None = None) -> str:
         energy=dict(_energies(energy)),
         drive_meaning=DRIVES.get(result.drive, ""),
         branches=BRANCHES,
+        ladder=result.ladder,
+        ladder_header=LADDER,
+        ladder_rows=[] if result.ladder is None else ladder_cells(result.ladder),
         fit_figure=_figure(fit_png or image(plot_fit(result), "png")),
         residual_figure=_figure(image(plot_residuals(result), "png")),
         citation=CITATION,
@@ -159,6 +167,7 @@ def summary_text(result: FitResult) -> str:
     fixed = [f"{row.name} {row.value} {row.unit}" for row in rows if row.state == "fixed"]
     lines = _wrap("", head)
     lines += _wrap("", "misfit (RMS over range): " + (", ".join(misfits) or "no curve to compare"))
+    lines += [] if result.ladder is None else ["", *_ladder_lines(result.ladder)]
     lines += ["", *_aligned([row for row in rows if row.state != "fixed"])]
     lines += _wrap("", "fixed: " + ", ".join(fixed)) if fixed else []
     lines += [""] if result.warnings or result.notes else []
@@ -264,9 +273,52 @@ def _visited(result: FitResult) -> dict[str, tuple[str, ...] | None]:
     return {name: result.visited.get(name, ()) if name in bistable else None for name in names}
 
 
+def ladder_cells(ladder: Ladder) -> list[tuple[str, ...]]:
+    """Return the rungs of a ladder as text, in the columns of `LADDER`.
+
+    The misfits are those of the curves in time where there are any, else that of stress-strain.
+    """
+    cells = []
+    for rung in ladder.rungs:
+        timed = [name for name in rung.misfit if name != "stress_strain"]
+        shown = [off for name in timed if (off := rung.misfit[name]) is not None]
+        shown = shown or [off for off in rung.misfit.values() if off is not None]
+        misfits = " ".join(f"{100 * off:.2g}" for off in shown)
+        measures = [_tenth(value) for value in (rung.n_eff, rung.aicc, rung.bic)]
+        cells.append(
+            (
+                rung.model, rung.damping, misfits, f"{rung.chisqr:.4g}", str(rung.n_vary),
+                str(rung.rank), *measures, f"{rung.runs_p:.2g}".replace("-", "−"),
+                str(len(rung.not_determined)), str(len(rung.weak)), f"{rung.seconds:.1f}",
+            )
+        )  # fmt: skip
+    return cells
+
+
+def _tenth(value: float) -> str:
+    return f"{value:.1f}".replace("-", "−") if math.isfinite(value) else "–"
+
+
+def _ladder_lines(ladder: Ladder) -> list[str]:
+    """Return the table of a ladder, why each rung was chosen or not, and what it all says."""
+    marks = ["", *("→" if rung.chosen else "" for rung in ladder.rungs)]
+    table = _columns([LADDER, *ladder_cells(ladder)])
+    lines = [f"{mark:<2}{line}" for mark, line in zip(marks, table, strict=True)]
+    for rung in ladder.rungs:
+        lines += _wrap("", f"{rung.name}: {rung.why}")
+    for reason in ladder.skipped:
+        lines += _wrap("not tried: ", reason)
+    said = [sentence for sentence in ladder.sentences if sentence not in ladder.cautions]
+    return [*lines, "", *(line for sentence in said for line in _wrap("", sentence))]
+
+
 def _aligned(rows: list[Readable]) -> list[str]:
     header = ("parameter", "value ± stderr", "unit", "95 % interval", "state")
-    table = [header] + [(r.name, r.with_error, r.unit, r.interval, r.state) for r in rows]
+    return _columns([header] + [(r.name, r.with_error, r.unit, r.interval, r.state) for r in rows])
+
+
+def _columns(table: Sequence[tuple[str, ...]]) -> list[str]:
+    header = table[0]
     widths = [max(len(row[i]) for row in table) for i in range(len(header))]
     return [
         "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()

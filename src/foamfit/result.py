@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     import lmfit
 
     from foamfit.chain import Chain
+    from foamfit.ladder import Ladder
     from foamfit.measurement import Measurement
     from foamfit.spring import BistableSpring
 
@@ -114,6 +115,8 @@ class FitResult:
     switches: tuple[Switch, ...]
     correlation: Correlation | None = None
     notes: tuple[str, ...] = ()
+    stopped: str | None = None
+    ladder: Ladder | None = None
 
     @property
     def bistable_springs(self) -> dict[str, BistableSpring]:
@@ -159,6 +162,7 @@ class FitResult:
                 "statistics": self.statistics,
                 "energy": self.energy,
                 "runtime_s": self.runtime_s,
+                **({"ladder": self.ladder.as_dict()} if self.ladder else {}),
             }
         )
         return content
@@ -175,7 +179,7 @@ class FitResult:
         -------
         Path
             The folder, with ``fit.json``, ``parameters.csv``, ``curves.csv``, ``fit.png``,
-            ``fit.pdf`` and ``report.html``.
+            ``fit.pdf`` and ``report.html``, and ``ladder.csv`` of a ladder.
 
         Raises
         ------
@@ -266,6 +270,8 @@ def _write(result: FitResult, folder: Path) -> None:
     (folder / "fit.json").write_text(text + "\n", encoding="utf-8")
     _write_table(folder / "parameters.csv", _parameter_rows(result.parameters))
     _write_table(folder / "curves.csv", _curve_rows(result.curves))
+    if result.ladder is not None:
+        _write_table(folder / "ladder.csv", result.ladder.rows())
     figure = plot_fit(result)
     png = image(figure, "png")
     (folder / "fit.png").write_bytes(png)

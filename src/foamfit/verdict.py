@@ -70,6 +70,7 @@ def conclude(problem: Problem, values: Array, record: SearchRecord) -> FitResult
         switches=_switches(problem, simulated),
         correlation=correlation,
         notes=_notes(problem, values, simulated),
+        stopped=record.stopped,
     )
 
 
