@@ -39,8 +39,8 @@ from foamfit.structure import BENT, find_structure, runs_test
 
 Progress = Callable[[float, str], None]
 
-# From the simplest up. More springs have more parameters (23 and more) than a loop has features, and
-# take minutes.
+# From the simplest up. More springs have more parameters (23 and more) than a loop has features,
+# and take minutes.
 LADDER = ("bistable", "linear+bistable", "bistable+bistable", "linear+bistable+bistable")
 # Steps up the ladder in a row without evidence after which it ends.
 PATIENCE = 2
