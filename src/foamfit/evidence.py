@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from foamfit import kernels
 from foamfit.problem import Problem
 from foamfit.result import FitResult
-from foamfit.structure import branch_places, runs_test
+from foamfit.structure import branch_places, neighbours_test, runs_test
 from foamfit.uncertainty import NOTHING, autocorrelation_time
 
 Array = NDArray[np.float64]
 
-# Residuals are structureless where the runs test does not reject it at this level.
+# Residuals are structureless where neither test of their order rejects it at this level.
 LEVEL = 0.05
 # By how much AICc and BIC must both fall for a richer model to be preferred: "strong" evidence of
 # Kass & Raftery (1995), J. Am. Stat. Assoc. 90, 773.
@@ -103,9 +103,14 @@ class Tried:
         return min(1.0, len(self.sizes) * min(runs_test(part) for part in self.curves))
 
     @property
+    def neighbours_p(self) -> float:
+        """p-value of the neighbours tests of all curves together (Bonferroni)."""
+        return min(1.0, len(self.sizes) * min(neighbours_test(part) for part in self.curves))
+
+    @property
     def structureless(self) -> bool:
         """Whether nothing but noise is left."""
-        return self.chisqr <= self.floor or self.runs_p >= LEVEL
+        return self.chisqr <= self.floor or min(self.runs_p, self.neighbours_p) >= LEVEL
 
     def states(self, state: str) -> tuple[str, ...]:
         """Names of the parameters in a state."""

@@ -70,6 +70,8 @@ class Rung:
         Infinite where there are too few effective samples for so many parameters.
     runs_p : float
         p-value of the runs test: the chance that noise without structure has as few runs.
+    neighbours_p : float
+        p-value of the neighbours test: the same by size, where the runs test goes by sign.
     not_determined, weak : tuple of str
         Names of the parameters in these states.
     seconds : float
@@ -92,6 +94,7 @@ class Rung:
     aicc: float
     bic: float
     runs_p: float
+    neighbours_p: float
     not_determined: tuple[str, ...]
     weak: tuple[str, ...]
     seconds: float
@@ -413,6 +416,7 @@ def _rung(one: Tried, found: Evidence, chosen: bool, why: str) -> Rung:
         aicc=found.aicc,
         bic=found.bic,
         runs_p=one.runs_p,
+        neighbours_p=one.neighbours_p,
         not_determined=one.states("not determined"),
         weak=one.states("weak"),
         seconds=one.seconds,

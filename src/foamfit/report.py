@@ -62,7 +62,7 @@ ENERGY = {  # of the audit: label and unit
 }
 LADDER = (
     "model", "damping", "misfit, %", "χ²", "varied", "rank", "n_eff", "AICc", "BIC", "runs p",
-    "n.d.", "weak", "s",
+    "lag p", "n.d.", "weak", "s",
 )  # fmt: skip
 CITATION = (
     "Thevamaran, R., Fraternali, F., Daraio, C. (2014). Multiscale Mass-Spring Model for "
@@ -288,11 +288,15 @@ def ladder_cells(ladder: Ladder) -> list[tuple[str, ...]]:
         cells.append(
             (
                 rung.model, rung.damping, misfits, f"{rung.chisqr:.4g}", str(rung.n_vary),
-                str(rung.rank), *measures, f"{rung.runs_p:.2g}".replace("-", "−"),
+                str(rung.rank), *measures, _p(rung.runs_p), _p(rung.neighbours_p),
                 str(len(rung.not_determined)), str(len(rung.weak)), f"{rung.seconds:.1f}",
             )
         )  # fmt: skip
     return cells
+
+
+def _p(value: float) -> str:
+    return "<1e−6" if value < 1e-6 else f"{value:.1g}".replace("-", "−")
 
 
 def _tenth(value: float) -> str:
