@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import csv
 import itertools
+import json
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 import foamfit as ff
-from foamfit import evidence
+from conftest import synthetic_impact, synthetic_loop
+from foamfit import evidence, identification, ladder
+from foamfit.cli import main
 from foamfit.measurement import Measurement, Specimen, Striker
+from foamfit.report import render_report, summary_text
 from foamfit.structure import branch_places, find_structure, neighbours_test, runs_test
 
 HEIGHT, AREA = 1.2e-3, 1.9635e-5
@@ -144,7 +150,7 @@ def impact(springs, heights, site=0.0, velocity=2.0, noise=0.005, seed=0):
     chain = ff.Chain(springs, heights, AREA, site_damping=site)
     drive = ff.Impact(7e-3, velocity)
     long = ff.simulate(chain, drive, np.linspace(0, 20 * HEIGHT / velocity, 4001))
-    time = np.linspace(0, 1.05 * long.contact_end, 301)
+    time = np.linspace(0, 1.05 * long.contact_end, 201)
     run = ff.simulate(chain, drive, time)
     rng = np.random.default_rng(seed)
     curves = [
@@ -184,9 +190,257 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_a_clear_structure_is_found(name):
     springs, heights, site = CASES[name]
-    result = ff.fit(impact(springs, heights, site, velocity=2.6), model="auto", starts=12)
+    result = ff.fit(impact(springs, heights, site, velocity=2.6), model="auto", starts=6)
     assert result.ladder.chosen.name == name
     assert result.model == result.ladder.chosen.model
     assert result.misfit["stress_time"] == result.ladder.chosen.misfit["stress_time"]
     assert result.ladder.chosen.runs_p > 1e-3
     assert len([rung for rung in result.ladder.rungs if rung.chosen]) == 1
+
+
+def test_two_bistable_springs_are_told_from_fewer():
+    test = impact([SOFT, STIFF], HALVES, velocity=4.5)
+    result = ff.fit(test, model="auto", starts=6)
+    assert result.ladder.chosen.name == "bistable+bistable without damping"
+    below = result.ladder.rungs[:4]
+    assert all(rung.bic > result.ladder.chosen.bic + evidence.MARGIN for rung in below)
+    assert result.ladder.rungs[0].neighbours_p < 1e-6
+
+
+def test_a_linear_spring_in_series_adds_combinations_and_no_evidence():
+    """Along a given motion it only bends the branches of one bistable spring."""
+    _, loop = synthetic_loop()
+    one = ff.fit(loop, starts=4)
+    chain = ff.fit(loop, model="linear+bistable", starts=8)
+    both = []
+    for result in (one, chain):
+        problem = ladder.make_problem(loop, result.model, result.drive, result.params, None, False)
+        both.append(evidence.weigh(problem, result, "none", 0.0))
+    best, found = evidence.choose(both)
+    assert best == 0
+    varied = [sum(item.vary for item in result.parameters.values()) for result in (one, chain)]
+    assert varied == [7, 9]
+    assert found[0].rank == 7
+    assert found[1].rank < 9
+
+
+# ---------------------------------------------------------------- which rungs
+
+
+def test_only_models_that_the_test_allows_are_tried():
+    _, test = synthetic_impact()
+    assert ladder._models(test) == (list(ladder.LADDER), [])
+    given = replace(test, specimen=replace(test.specimen, heights=(0.6e-3, 0.59e-3)))
+    models, skipped = ladder._models(given)
+    assert models == ["bistable", "linear+bistable", "bistable+bistable"]
+    assert skipped == ["linear+bistable+bistable: [specimen] heights are those of 2 springs"]
+    followed = replace(test, interior={1: test.displacement * 0.4})
+    models, skipped = ladder._models(followed)
+    assert models == list(ladder.LADDER[1:])
+    assert "motion was measured" in skipped[0]
+    with pytest.raises(ff.InputError, match="no model of the ladder"):
+        ladder._models(replace(test, interior={5: test.displacement}))
+
+
+def test_a_drive_without_dampers_has_one_rung_for_each_model():
+    result = ff.fit(synthetic_loop()[1], model="auto", starts=4)
+    assert [(rung.model, rung.damping) for rung in result.ladder.rungs] == [("bistable", "none")]
+    assert result.ladder.ended == "the residuals are structureless"
+    assert result.status == "ok"
+
+
+# ---------------------------------------------------------------- interruption
+
+
+@pytest.fixture(scope="module")
+def wavy():
+    """A loop that no rung follows: a wave of 5 % lies on it."""
+    _, loop = synthetic_loop()
+    wave = 0.05 * np.ptp(loop.stress) * np.sin(np.linspace(0, 60, loop.stress.size))
+    return replace(loop, stress=loop.stress + wave, name="synthetic loop with a wave")
+
+
+def test_an_interrupted_ladder_keeps_what_is_done(wavy, monkeypatch):
+    calls = 0
+    original = identification.fit
+
+    def interrupted(*args, **options):
+        nonlocal calls
+        calls += 1
+        if calls == 2:
+            raise KeyboardInterrupt
+        return original(*args, **options)
+
+    monkeypatch.setattr(ladder.identification, "fit", interrupted)
+    result = ladder.climb(wavy, starts=2)
+    assert [rung.model for rung in result.ladder.rungs] == ["bistable"]
+    assert (result.stopped, result.ladder.stopped) == ("Ctrl-C", "Ctrl-C")
+    assert result.status == "warnings"
+    assert "stopped by Ctrl-C" in result.warnings[0]
+    calls = 1
+    with pytest.raises(KeyboardInterrupt):
+        ladder.climb(wavy, starts=2)
+
+
+def test_the_time_limit_is_shared_over_the_rungs(wavy, monkeypatch):
+    """A clock that gains a second with each look: what is left for a rung shrinks."""
+    now = itertools.count(0.0, 1.0)
+    monkeypatch.setattr(ladder.time, "monotonic", lambda: next(now))
+    given = []
+    original = identification.fit
+
+    def watched(*args, max_time, **options):
+        given.append(max_time)
+        return original(*args, max_time=None, **options)
+
+    monkeypatch.setattr(ladder.identification, "fit", watched)
+    result = ladder.climb(wavy, starts=2, max_time=2.5)
+    assert given == [1.5, 0.5]
+    assert len(result.ladder.rungs) == 2
+    assert result.stopped == "the time limit"
+
+
+def test_a_rung_that_the_time_limit_cut_says_so():
+    result = ff.fit(synthetic_impact()[1], model="auto", max_time=1e-6)
+    (rung,) = result.ladder.rungs
+    assert rung.stopped == result.ladder.stopped == "the time limit"
+    assert rung.chosen
+    assert "richer models were not tried" in result.warnings[0]
+
+
+def test_a_rung_that_cannot_be_simulated_is_left_out(wavy, monkeypatch):
+    original = identification.fit
+
+    def failing(*args, model, **options):
+        if model == "linear+bistable":
+            raise ff.SimulationError("none could be simulated")
+        return original(*args, model=model, **options)
+
+    monkeypatch.setattr(ladder.identification, "fit", failing)
+    monkeypatch.setattr(ladder, "LADDER", ladder.LADDER[:2])
+    result = ladder.climb(wavy, starts=2)
+    assert result.ladder.skipped == ("linear+bistable: none could be simulated",)
+    monkeypatch.setattr(ladder, "LADDER", ladder.LADDER[1:2])
+    with pytest.raises(ff.SimulationError, match="no rung could be tried"):
+        ladder.climb(wavy, starts=2)
+
+
+# ---------------------------------------------------------------- what is written
+
+
+@pytest.fixture(scope="module")
+def climbed(wavy):
+    """Two rungs, neither of which reaches the noise."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ladder, "LADDER", ladder.LADDER[:2])
+        return ff.fit(wavy, model="auto", starts=4)
+
+
+def test_what_remains_is_said(climbed):
+    warning = next(text for text in climbed.warnings if text.startswith("No rung reaches"))
+    assert "residuals of stress_strain hold a structure of" in warning
+    size = float(warning.split("structure of ")[1].split("%")[0])
+    assert size == pytest.approx(5 / np.sqrt(2), rel=0.25)  # what the springs follow of it is less
+    assert climbed.ladder.ended == "the top of the ladder was reached"
+
+
+def test_undetermined_parameters_of_the_chosen_model_are_named(climbed):
+    """A loop that never closes leaves branches c and e out of every rung."""
+    _, test = synthetic_impact(velocity=1.75)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ladder, "LADDER", ladder.LADDER[:1])
+        result = ff.fit(test, model="auto", starts=4)
+    (sentence,) = [text for text in result.ladder.cautions if "does not determine" in text]
+    assert "s1_kc" in sentence
+    assert "no rung of the ladder has all parameters determined" in sentence
+    assert sentence in result.warnings
+    assert result.ladder.chosen.rank <= 3 < result.ladder.chosen.n_vary
+    assert any("combinations" in text for text in result.ladder.sentences)
+    for name in result.ladder.chosen.not_determined:
+        assert result.parameters[name].state == "not determined"
+
+
+def test_the_folder_holds_the_ladder(climbed, tmp_path):
+    folder = climbed.save(tmp_path / "auto")
+    content = json.loads((folder / "fit.json").read_text())["ladder"]
+    with (folder / "ladder.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(content["rungs"]) == 2
+    for row, rung, original in zip(rows, content["rungs"], climbed.ladder.rungs, strict=True):
+        assert row["model"] == rung["model"] == original.model
+        assert float(row["bic"]) == rung["bic"] == original.bic
+        assert float(row["misfit_stress_strain"]) == original.misfit["stress_strain"]
+        assert row["chosen"] == str(rung["chosen"]) == str(original.chosen)
+        assert row["why"] == rung["why"] != ""
+        assert row["not_determined"].split() == rung["not_determined"]
+    assert "misfit_displacement_time" not in rows[0]
+    assert content["sentences"] == list(climbed.ladder.sentences)
+
+
+def test_the_report_and_the_summary_show_the_ladder(climbed):
+    page = render_report(climbed, fit_png=b"\x89PNG" + bytes(20))
+    text = summary_text(climbed)
+    assert "The simplest model that holds" in page
+    for rung in climbed.ladder.rungs:
+        assert rung.why in page
+        assert f"{rung.bic:.1f}".replace("-", "−") in page
+        assert f"{rung.bic:.0f}".replace("-", "−") in text
+        assert f" {rung.rank}/{rung.n_vary} " in text
+        assert f"{rung.name}: {rung.why}" in " ".join(text.split())
+    for sentence in climbed.ladder.sentences:
+        assert sentence.replace("<", "&lt;") in page
+        assert " ".join(text.split()).count(sentence) == 1
+    assert max(map(len, text.splitlines())) <= 100
+    named = ff.fit(synthetic_loop()[1], starts=2)
+    assert "The simplest model" not in render_report(named, fit_png=b"\x89PNG" + bytes(20))
+    assert "ladder" not in named.to_json_dict()
+
+
+def run(*args):
+    return CliRunner().invoke(main, [str(arg) for arg in args])
+
+
+@pytest.fixture
+def loop_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    _, loop = synthetic_loop()
+    rows = [f"{s:.6g},{d:.8g}" for s, d in zip(loop.stress, loop.displacement, strict=True)]
+    path = tmp_path / "loop.csv"
+    path.write_text("\n".join(["stress (Pa),displacement (m)", *rows]) + "\n")
+    path.with_suffix(".toml").write_text(
+        f'[specimen]\nheight = "{loop.specimen.height} m"\narea = "{loop.specimen.area} m^2"\n'
+    )
+    return path
+
+
+def test_the_command_writes_to_auto(loop_file, tmp_path):
+    done = run("fit", loop_file, "--model", "auto", "--starts", 4)
+    assert done.exit_code == 0, done.output
+    assert "bistable is the simplest that holds" in done.stdout
+    folder = tmp_path / "fits" / "loop" / "auto"
+    content = json.loads((folder / "fit.json").read_text())
+    assert content["model"] == "bistable"
+    assert [rung["chosen"] for rung in content["ladder"]["rungs"]] == [True]
+    assert (folder / "ladder.csv").is_file()
+
+
+def test_the_command_refuses_parameters_of_one_model(loop_file, tmp_path):
+    for option in (("--fix", "s1_eta=0"), ("--vary", "s1_eta")):
+        done = run("fit", loop_file, "--model", "auto", *option)
+        assert (done.exit_code, done.stdout) == (1, "")
+        assert "belong to one model" in done.stderr
+    assert not (tmp_path / "fits").exists()
+    with pytest.raises(ff.InputError, match="belong to one model"):
+        ff.fit(synthetic_loop()[1], model="auto", params=ff.make_params(synthetic_loop()[1]))
+
+
+def test_no_acceptable_rung_is_exit_code_two(loop_file, tmp_path):
+    rows = loop_file.read_text().splitlines()
+    noise = np.abs(np.random.default_rng(0).standard_normal(len(rows))) * 1e6
+    for i in range(1, len(rows)):
+        rows[i] = f"{noise[i]:.6g},{rows[i].split(',')[1]}"
+    loop_file.write_text("\n".join(rows) + "\n")
+    done = run("fit", loop_file, "--model", "auto", "--starts", 2)
+    assert done.exit_code == 2
+    assert "no acceptable fit" in done.stderr
+    assert (tmp_path / "fits" / "loop" / "auto" / "ladder.csv").is_file()

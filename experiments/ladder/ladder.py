@@ -318,8 +318,8 @@ def wrong_sentences(table: pd.DataFrame) -> str:
     for _, row in wrong.iterrows():
         lines.append(
             f"- {row['structure']} (case {row['case']}) for {row['chosen']}: the rungs below the "
-            f"true one miss by {row['misfit of simpler over noise']:.2f} times the noise; runs test "
-            f"p = {row['runs p']:.2g}, neighbours test p = {row['lag p']:.2g}, {row['ended']}"
+            f"true one miss by {row['misfit of simpler over noise']:.2f} times the noise; runs "
+            f"test p = {row['runs p']:.2g}, neighbours test p = {row['lag p']:.2g}, {row['ended']}"
         )
     return "\n".join(lines)
 

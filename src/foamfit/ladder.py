@@ -263,9 +263,9 @@ def climb(
 
 def _speaks(tried: Sequence[Tried], below: int) -> bool:
     """Whether AICc or BIC speaks strongly for one of the last rungs against all below them."""
-    found = choose(tried)[1]
     if not 0 < below < len(tried):
         return len(tried) > below
+    found = choose(tried)[1]
     return any(
         min(getattr(one, name) for one in found[below:])
         < min(getattr(one, name) for one in found[:below]) - MARGIN

@@ -61,7 +61,7 @@ ENERGY = {  # of the audit: label and unit
     "impulse_ratio": ("impulse over change of momentum", ""),
 }
 LADDER = (
-    "model", "damping", "misfit, %", "χ²", "varied", "rank", "n_eff", "AICc", "BIC", "runs p",
+    "model", "damping", "misfit %", "χ²", "vary", "rank", "n_eff", "AICc", "BIC", "runs p",
     "lag p", "n.d.", "weak", "s",
 )  # fmt: skip
 CITATION = (
@@ -295,6 +295,10 @@ def ladder_cells(ladder: Ladder) -> list[tuple[str, ...]]:
     return cells
 
 
+def _whole(value: float) -> str:
+    return f"{value:.0f}".replace("-", "−") if math.isfinite(value) else "–"
+
+
 def _p(value: float) -> str:
     return "<1e−6" if value < 1e-6 else f"{value:.1g}".replace("-", "−")
 
@@ -304,10 +308,26 @@ def _tenth(value: float) -> str:
 
 
 def _ladder_lines(ladder: Ladder) -> list[str]:
-    """Return the table of a ladder, why each rung was chosen or not, and what it all says."""
-    marks = ["", *("→" if rung.chosen else "" for rung in ladder.rungs)]
-    table = _columns([LADDER, *ladder_cells(ladder)])
-    lines = [f"{mark:<2}{line}" for mark, line in zip(marks, table, strict=True)]
+    """Return the table of a ladder, why each rung was chosen or not, and what it all says.
+
+    To fit the width, rank and parameters varied share a column (7/9), and so do parameters not
+    determined and weak (0/2); numbers have fewer digits than in the page.
+    """
+    header = (
+        "", "model", "damping", "misfit%", "χ²", "rank", "n_eff", "AICc", "BIC", "runs p", "lag p",
+        "n.d.", "s",
+    )  # fmt: skip
+    rows = []
+    for rung, cells in zip(ladder.rungs, ladder_cells(ladder), strict=True):
+        whole = [_whole(value) for value in (rung.n_eff, rung.aicc, rung.bic)]
+        rows.append(
+            (
+                "→" if rung.chosen else "", *cells[:3], f"{rung.chisqr:.3g}",
+                f"{cells[5]}/{cells[4]}", *whole, cells[9], cells[10],
+                f"{cells[11]}/{cells[12]}", cells[13],
+            )
+        )  # fmt: skip
+    lines = _columns([header, *rows], gap=" ")
     for rung in ladder.rungs:
         lines += _wrap("", f"{rung.name}: {rung.why}")
     for reason in ladder.skipped:
@@ -321,11 +341,11 @@ def _aligned(rows: list[Readable]) -> list[str]:
     return _columns([header] + [(r.name, r.with_error, r.unit, r.interval, r.state) for r in rows])
 
 
-def _columns(table: Sequence[tuple[str, ...]]) -> list[str]:
+def _columns(table: Sequence[tuple[str, ...]], gap: str = "  ") -> list[str]:
     header = table[0]
     widths = [max(len(row[i]) for row in table) for i in range(len(header))]
     return [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        gap.join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
         for row in table
     ]
 
