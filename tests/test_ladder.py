@@ -200,7 +200,7 @@ def test_a_clear_structure_is_found(name):
 
 def test_two_bistable_springs_are_told_from_fewer():
     test = impact([SOFT, STIFF], HALVES, velocity=4.5)
-    result = ff.fit(test, model="auto", starts=6)
+    result = ff.fit(test, model="auto", starts=12)
     assert result.ladder.chosen.name == "bistable+bistable without damping"
     below = result.ladder.rungs[:4]
     assert all(rung.bic > result.ladder.chosen.bic + evidence.MARGIN for rung in below)

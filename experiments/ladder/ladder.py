@@ -1,10 +1,9 @@
 """Does `--model auto` find the structure that made a test? And what does it say of real foam?
 
 Synthetic impacts on chains of known structure, 401 samples, white noise of 0.5-1 % of the range on
-stress and displacement; springs, heights and velocities are random. Twenty clear tests of each
-structure are climbed by `foamfit.fit(test, model="auto")` with its defaults, and so is every
-unclear one that was drawn on the way. A test is clear, by the simulation alone and before it is
-climbed, if
+stress and displacement; springs, heights and velocities are random. Twenty tests of each structure
+are climbed by `foamfit.fit(test, model="auto")` with its defaults. A test is clear, by the
+simulation alone and before it is climbed, if
 
 - every bistable spring goes through branches a, d, c and e;
 - with damping, dashpots dissipate at least 5 % of the striker's energy;
@@ -15,7 +14,7 @@ Where FOAMFIT_DATA names the measurements of others (see experiments/real_foams.
 climbs the first cycles of running-shoe foam; they stay where they lie.
 
     python experiments/ladder/ladder.py              # tables, picture and README
-    python experiments/ladder/ladder.py --clear 2
+    python experiments/ladder/ladder.py --tests 2
 """
 
 from __future__ import annotations
@@ -47,7 +46,6 @@ from real_foams import SHOE_FOAM  # noqa: E402
 
 HEIGHT, AREA, MASS, SAMPLES = 1.2e-3, 1.9635e-5, 7e-3, 401
 CLEAR_MISFIT, CLEAR_DAMPING = 0.5, 0.05
-MOST_DRAWS = 3  # times the number of clear tests wanted
 STRUCTURES = [
     ("bistable", False),
     ("bistable", True),
@@ -118,8 +116,9 @@ def random_test(
     velocity = float(np.sqrt(2 * quasi_static_work(springs, heights, top) / MASS))
     site = 0.0
     if damped:
-        eta = 10 ** rng.uniform(-1.5, -0.6) * top * HEIGHT / velocity
-        velocity *= 1.15
+        share = 10 ** rng.uniform(-1.5, -0.6)  # of the largest stress, at the first touch
+        eta = share * top * HEIGHT / velocity
+        velocity *= np.sqrt(1 + 4 * share)  # about what the dashpot takes
         if len(springs) == 1:
             springs = [replace(springs[0], eta=eta)]
         else:
@@ -176,17 +175,15 @@ def best_simpler_misfit(clean: Measurement, model: str, damped: bool) -> float:
     return least
 
 
-def study(wanted: int, seed: int) -> pd.DataFrame:
-    """Climb every test that is drawn; one row each."""
-    rows = []
-    for kind, (model, damped) in enumerate(STRUCTURES):
-        clear = drawn = case = 0
-        while clear < wanted and drawn < MOST_DRAWS * wanted:
-            case += 1
-            made = random_test(np.random.default_rng([seed, kind, case]), model, damped)
-            if made is None:
-                continue
-            drawn += 1
+def study(wanted: int, seed: int, path: Path) -> None:
+    """Climb so many tests of each structure; one row each, written as it is known."""
+    rows: list[dict[str, object]] = []
+    for case in range(1, wanted + 1):
+        for kind, (model, damped) in enumerate(STRUCTURES):
+            rng = np.random.default_rng([seed, kind, case])
+            made = None
+            while made is None:
+                made = random_test(rng, model, damped)
             clean, test, noise, dissipated, closed = made
             misfit = best_simpler_misfit(clean, model, damped)
             is_clear = (
@@ -194,7 +191,6 @@ def study(wanted: int, seed: int) -> pd.DataFrame:
                 and misfit >= CLEAR_MISFIT * noise
                 and (not damped or dissipated >= CLEAR_DAMPING)
             )
-            clear += is_clear
             began = time.perf_counter()
             result = ff.fit(test, model="auto")
             chosen = result.ladder.chosen
@@ -218,7 +214,7 @@ def study(wanted: int, seed: int) -> pd.DataFrame:
                 }
             )
             print(*list(rows[-1].values())[:-1], flush=True)
-    return pd.DataFrame(rows)
+            pd.DataFrame(rows).to_csv(path, index=False, float_format="%.4g")
 
 
 # ---------------------------------------------------------------- real foam
@@ -407,7 +403,7 @@ def write_page(folder: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--clear", type=int, default=20, help="clear tests of each structure")
+    parser.add_argument("--tests", type=int, default=20, help="tests of each structure")
     parser.add_argument("--seed", type=int, default=2014)
     parser.add_argument("--out", type=Path, default=HERE)
     parser.add_argument("--part", choices=["all", "structures", "foams", "page"], default="all")
@@ -415,7 +411,7 @@ def main() -> None:
     ff.fit(random_test(np.random.default_rng(0), "bistable", False)[1])  # compiles
     rows = options.out / "structures.csv"
     if options.part in ("all", "structures"):
-        study(options.clear, options.seed).to_csv(rows, index=False, float_format="%.4g")
+        study(options.tests, options.seed, rows)
     data = Path(os.environ.get("FOAMFIT_DATA", ""))
     if options.part in ("all", "foams") and (data / "shoe-foam").is_dir():
         foams = climb_foams(data)

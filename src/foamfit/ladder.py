@@ -1,9 +1,10 @@
 """The simplest model that holds: a climb from one spring to several, and the evidence for each.
 
-A ladder of models is fitted from the simplest up, each without and with damping. What is compared
-are AICc and BIC with the effective number of samples and the effective number of parameters, so
-that neither correlated residuals nor combinations that the curves do not fix count as evidence.
-The climb ends where the residuals are structureless, or where two steps in a row bring no evidence.
+A ladder of models is fitted from the simplest up, each without damping and then with it. What is
+compared are AICc and BIC with the effective number of samples and the effective number of
+parameters, so that neither correlated residuals nor combinations that the curves do not fix count
+as evidence. The climb ends where the residuals are structureless, or where two steps in a row bring
+no evidence.
 """
 
 from __future__ import annotations
@@ -291,7 +292,10 @@ class _Climb:
     def family(
         self, model: str, models: Sequence[str], tried: list[Tried], skipped: list[str]
     ) -> list[Tried]:
-        """Fit one model without and with damping; what is fitted is added to `tried` at once."""
+        """Fit one model without damping and, unless that is enough, with it.
+
+        What is fitted is added to `tried` at once.
+        """
         params = make_params(self.measurement, model, self.drive)
         dampings = ("without", "with") if _dampers(params) else ("none",)
         family: list[Tried] = []
@@ -311,8 +315,8 @@ class _Climb:
                 continue
             family.append(one)
             tried.append(one)
-            if one.result.stopped is not None:
-                self.stopped = one.result.stopped
+            self.stopped = one.result.stopped
+            if self.stopped is not None or one.structureless:
                 break
         return family
 
