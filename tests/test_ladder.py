@@ -140,6 +140,7 @@ def test_a_bent_structure_is_found_where_it_is():
     assert found.bent > 0.99
     rms = 0.1 * np.sqrt(4 / 45) * 0.5  # of x² - 1/3 along a quarter of the samples
     assert found.size == pytest.approx(rms, rel=0.05)
+    assert found.noise == pytest.approx(1e-3, rel=0.15)
 
 
 # ---------------------------------------------------------------- known structures

@@ -16,7 +16,6 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import lmfit
-import numpy as np
 
 from foamfit import identification
 from foamfit.errors import InputError, SimulationError
@@ -36,7 +35,7 @@ from foamfit.model import Model, split_name
 from foamfit.objective import choose_drive
 from foamfit.problem import make_params, make_problem
 from foamfit.result import FitResult
-from foamfit.structure import BENT, find_structure, runs_test
+from foamfit.structure import BENT, find_structure, neighbours_test, runs_test
 
 Progress = Callable[[float, str], None]
 
@@ -467,9 +466,10 @@ def _sentences(
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """What the comparison says, and what it warns of."""
     one, mine = tried[best], found[best]
+    taken = "is the simplest that holds" if one.structureless else "is what the evidence supports"
     said = [
-        f"Of {len(tried)} rungs {one.name} is the simplest that holds "
-        f"(runs test p {p_value(one.runs_p)}); the climb ended because {ended}."
+        f"Of {len(tried)} rungs {one.name} {taken} (runs test p {p_value(one.runs_p)}, neighbours "
+        f"test p {p_value(one.neighbours_p)}); the climb ended because {ended}."
     ]
     warned = []
     varied = sum(item.vary for item in one.result.parameters.values())
@@ -517,19 +517,19 @@ def _undetermined(
 def _remains(tried: Sequence[Tried], best: int) -> str:
     """Sentence on the structure that no rung takes off, as the chosen one leaves it."""
     one = tried[best]
-    tests = [runs_test(part) for part in one.curves]
-    which = int(np.argmin(tests))
+    which = least([min(runs_test(part), neighbours_test(part)) for part in one.curves])
     curve = one.counted[which]
     found = find_structure(one.curves[which], one.places)
-    size = found.size / one.spans[which]
+    size, noise = found.size / one.spans[which], found.noise / one.spans[which]
+    runs, near = (max(p) for p in zip(*((r.runs_p, r.neighbours_p) for r in tried), strict=True))
     told = (
-        f"No rung reaches the noise (runs test p {p_value(max(rung.runs_p for rung in tried))} at "
-        f"best): the residuals of {curve} hold a structure of {size:.2%} of the range, "
-        f"{found.share:.0%} of it on {found.place}"
+        f"No rung reaches the noise (at best runs test p {p_value(runs)}, neighbours test p "
+        f"{p_value(near)}): the residuals of {curve} hold a structure of {size:.2%} of the range "
+        f"over noise of {noise:.2%}, {found.share:.0%} of it on {found.place}"
     )
     if found.bent > BENT and found.straight:
         told += (
             f", where a parabola takes off {found.bent:.0%}: the curve is bent there where the law "
-            "is a straight line, and a law with a curved branch would be needed"
+            "is a straight line, and a law with a curved branch would be needed to follow it"
         )
     return f"{told}."

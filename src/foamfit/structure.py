@@ -69,6 +69,10 @@ class Structure:
     ----------
     size : float
         Root of the mean product of neighbouring residuals, in their unit: white noise adds nothing.
+    noise : float
+        One standard deviation of what is left of a residual over the mean of its neighbours, as
+        white noise would have it (its variance there is 3/2 of its own); by the median, which jumps
+        do not move.
     place : str
         Branches that the springs are on, and whether on loading or unloading.
     share : float
@@ -78,6 +82,7 @@ class Structure:
     """
 
     size: float
+    noise: float
     place: str
     share: float
     bent: float
@@ -99,11 +104,13 @@ def find_structure(residual: Array, places: NDArray[np.str_]) -> Structure:
         See `branch_places`.
     """
     product = residual[1:] * residual[:-1]
+    rough = residual[1:-1] - 0.5 * (residual[2:] + residual[:-2])
     sums = {str(place): float(product[places[1:] == place].sum()) for place in np.unique(places)}
     place = max(sums, key=lambda key: sums[key])
     held = sum(max(value, 0.0) for value in sums.values())
     return Structure(
         size=math.sqrt(max(float(product.mean()), 0.0)),
+        noise=1.4826 * float(np.median(np.abs(rough))) / math.sqrt(1.5),
         place=place,
         share=sums[place] / held if held > 0.0 else 0.0,
         bent=_bent(residual[places == place]),
