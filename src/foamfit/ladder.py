@@ -525,7 +525,7 @@ def _remains(tried: Sequence[Tried], best: int) -> str:
     told = (
         f"No rung reaches the noise (at best runs test p {p_value(runs)}, neighbours test p "
         f"{p_value(near)}): the residuals of {curve} hold a structure of {size:.2%} of the range "
-        f"over noise of {noise:.2%}, {found.share:.0%} of it on {found.place}"
+        f"(neighbours scatter by {noise:.2%}), {found.share:.0%} of it on {found.place}"
     )
     if found.bent > BENT and found.straight:
         told += (
