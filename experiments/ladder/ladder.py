@@ -289,12 +289,13 @@ not part of this repository.
 {foams}
 
 No rung reaches the noise on any specimen: what one or two springs leave over follows itself for
-tens of samples, and is as large as the scatter between neighbouring samples or larger. AICc and BIC therefore count some twenty or thirty
-effective samples instead of 1,200, and the evidence for two springs is weak where the misfit alone
-(2.3 to 1.0 %) would call it overwhelming; where AICc and BIC disagree, the simpler model is taken
-and the result says so. Two springs have parameters that the loop does not determine. What remains
-after one spring is mostly a bend along the loading branch d, which the law draws as a straight
-line. What the results say:
+tens of samples, and is about as large as the scatter between neighbouring samples or larger. AICc
+and BIC therefore count some twenty or thirty effective samples instead of 1,200, and the evidence
+for two springs is weak where the misfit alone (2.3 to 1.0 %) would call it overwhelming; where AICc
+and BIC disagree, the simpler model is taken and the result says so. Two springs have parameters
+that the loop does not determine. Where one spring is taken, what remains is mostly a bend along
+the loading branch d, which the law draws as a straight line.
+What the results say:
 
 {said}
 """
