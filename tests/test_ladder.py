@@ -199,11 +199,13 @@ def test_a_clear_structure_is_found(name):
     assert len([rung for rung in result.ladder.rungs if rung.chosen]) == 1
 
 
-def test_two_bistable_springs_are_told_from_fewer():
+def test_two_bistable_springs_are_told_from_fewer(monkeypatch):
+    """With all starts, which two springs need; for time, without the rung of a linear spring."""
+    monkeypatch.setattr(ladder, "LADDER", ("bistable", *ladder.LADDER[2:]))
     test = impact([SOFT, STIFF], HALVES, velocity=4.5)
-    result = ff.fit(test, model="auto", starts=12)
+    result = ff.fit(test, model="auto")
     assert result.ladder.chosen.name == "bistable+bistable without damping"
-    below = result.ladder.rungs[:4]
+    below = result.ladder.rungs[:2]
     assert all(rung.bic > result.ladder.chosen.bic + evidence.MARGIN for rung in below)
     assert result.ladder.rungs[0].neighbours_p < 1e-6
 

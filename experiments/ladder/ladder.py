@@ -351,7 +351,7 @@ def picture(table: pd.DataFrame, path: Path) -> None:
     truths = [name_of(*one) for one in STRUCTURES]
     rungs = [name_of(name, with_) for name in LADDER for with_ in (False, True)]
     rungs = [name for name in rungs if name in truths or (table["chosen"] == name).any()]
-    figure = Figure(figsize=(8.4, 3.9), layout="constrained")
+    figure = Figure(figsize=(8.4, 4.3), layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(1, 2, sharey=True)
     for axes, clear in zip(panels, (True, False), strict=True):
@@ -390,7 +390,7 @@ def picture(table: pd.DataFrame, path: Path) -> None:
         axes.set_xlabel("chosen", fontsize=9)
         axes.tick_params(length=0)
     panels[0].set_ylabel("true (framed)", fontsize=9)
-    figure.savefig(path, dpi=200)
+    figure.savefig(path, dpi=200, bbox_inches="tight")
 
 
 def write_page(folder: Path) -> None:
