@@ -319,13 +319,13 @@ def test_the_figure_of_a_stopped_fit_says_so():
 
 
 def test_a_stopped_fit_is_never_ok(monkeypatch):
-    from foamfit import identification
+    from foamfit import modelfit
     from foamfit.search import SearchStoppedError
 
     def stop(*_: object) -> None:
         raise SearchStoppedError
 
-    monkeypatch.setattr(identification, "_refine", stop)
+    monkeypatch.setattr(modelfit, "_refine", stop)
     result = ff.fit(synthetic_impact()[1], starts=4)
     assert result.stopped == "the time limit"
     assert result.status == "warnings"

@@ -222,7 +222,12 @@ def _hold_and_vary(
 @main.command()
 @_TEST
 @_SPECIMEN
-@click.option("--model", default="bistable", show_default=True, help="Springs from the base up.")
+@click.option(
+    "--model",
+    default="bistable",
+    show_default=True,
+    help="Springs from the base up; auto takes the simplest that holds.",
+)
 @_DRIVE
 @click.option(
     "--out",
@@ -288,6 +293,7 @@ def fit(
     \b
     Examples:
         foamfit fit TEST.csv
+        foamfit fit TEST.csv --model auto
         foamfit fit TEST.csv --drive displacement --out results/today
         foamfit fit TEST.csv --model linear+bistable --fix s1_k0=60e6
     """
@@ -296,7 +302,10 @@ def fit(
     from foamfit.result import check_target
 
     intervals, draws = _intervals(profile, bootstrap, mcmc)
-    model = Model.parse(model).name
+    auto = model.strip() == "auto"
+    model = "auto" if auto else Model.parse(model).name
+    if auto and (fix or vary):
+        raise InputError("--fix and --vary belong to one model; name it instead of --model auto")
     measurement = read_test(test, specimen)
     folder = Path("fits", test.stem, model) if out is None else out
     check_target(folder)
@@ -306,8 +315,10 @@ def fit(
 
     if time_shift:
         check_time_shift(measurement, drive or choose_drive(measurement))
-    params = make_params(measurement, model, drive, time_shift=time_shift)
-    _hold_and_vary(params, model, fix, vary)
+    params = None
+    if not auto:
+        params = make_params(measurement, model, drive, time_shift=time_shift)
+        _hold_and_vary(params, model, fix, vary)
     with _progress(quiet or as_json) as progress:
         result = identification.fit(
             measurement,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import math
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
@@ -23,6 +23,7 @@ from foamfit.plots import (
 )
 
 if TYPE_CHECKING:
+    from foamfit.ladder import Ladder
     from foamfit.result import FitResult, ParameterEstimate
 
 CURVES = {
@@ -69,6 +70,10 @@ ENERGY = {  # of the audit: label and unit
 }
 COARSE = 160  # dots per inch of what is only on the page, and should not take long
 ANSWERS = {True: ("yes", "ok"), False: ("no", "weak"), None: ("–", "fixed")}
+LADDER = (
+    "model", "damping", "misfit %", "χ²", "vary", "rank", "n_eff", "AICc", "BIC", "runs p",
+    "lag p", "n.d.", "weak", "s",
+)  # fmt: skip
 CITATION = (
     "Thevamaran, R., Fraternali, F., Daraio, C. (2014). Multiscale Mass-Spring Model for "
     "High-Rate Compression of Vertically Aligned Carbon Nanotube Foams. "
@@ -141,6 +146,9 @@ def render_report(result: FitResult, *, fit_png: bytes | None = None) -> str:
         energy=dict(_energies(energy)),
         drive_meaning=DRIVES.get(result.drive, ""),
         branches=BRANCHES,
+        ladder=result.ladder,
+        ladder_header=LADDER,
+        ladder_rows=[] if result.ladder is None else ladder_cells(result.ladder),
         fit_figure=_figure(fit_png or image(plot_fit(result), "png")),
         answers=ANSWERS,
         insight_figures=_insight_figures(result),
@@ -175,6 +183,7 @@ def summary_text(result: FitResult) -> str:
     fixed = [f"{row.name} {row.value} {row.unit}" for row in rows if row.state == "fixed"]
     lines = _wrap("", head)
     lines += _wrap("", "misfit (RMS over range): " + (", ".join(misfits) or "no curve to compare"))
+    lines += [] if result.ladder is None else ["", *_ladder_lines(result.ladder)]
     lines += ["", *_aligned([row for row in rows if row.state != "fixed"])]
     lines += _wrap("", "fixed: " + ", ".join(fixed)) if fixed else []
     lines += list(_checks(result))
@@ -309,12 +318,79 @@ def _visited(result: FitResult) -> dict[str, tuple[str, ...] | None]:
     return {name: result.visited.get(name, ()) if name in bistable else None for name in names}
 
 
+def ladder_cells(ladder: Ladder) -> list[tuple[str, ...]]:
+    """Return the rungs of a ladder as text, in the columns of `LADDER`.
+
+    The misfits are those of the curves in time where there are any, else that of stress-strain.
+    """
+    cells = []
+    for rung in ladder.rungs:
+        timed = [name for name in rung.misfit if name != "stress_strain"]
+        shown = [off for name in timed if (off := rung.misfit[name]) is not None]
+        shown = shown or [off for off in rung.misfit.values() if off is not None]
+        misfits = " ".join(f"{100 * off:.2g}" for off in shown)
+        measures = [_tenth(value) for value in (rung.n_eff, rung.aicc, rung.bic)]
+        cells.append(
+            (
+                rung.model, rung.damping, misfits, f"{rung.chisqr:.4g}", str(rung.n_vary),
+                str(rung.rank), *measures, _p(rung.runs_p), _p(rung.neighbours_p),
+                str(len(rung.not_determined)), str(len(rung.weak)), f"{rung.seconds:.1f}",
+            )
+        )  # fmt: skip
+    return cells
+
+
+def _whole(value: float) -> str:
+    return f"{value:.0f}".replace("-", "−") if math.isfinite(value) else "–"
+
+
+def _p(value: float) -> str:
+    return "<1e−6" if value < 1e-6 else f"{value:.1g}".replace("-", "−")
+
+
+def _tenth(value: float) -> str:
+    return f"{value:.1f}".replace("-", "−") if math.isfinite(value) else "–"
+
+
+def _ladder_lines(ladder: Ladder) -> list[str]:
+    """Return the table of a ladder, why each rung was chosen or not, and what it all says.
+
+    To fit the width, rank and parameters varied share a column (7/9), and so do parameters not
+    determined and weak (0/2); numbers have fewer digits than in the page.
+    """
+    header = (
+        "", "model", "damping", "misfit%", "χ²", "rank", "n_eff", "AICc", "BIC", "runs p", "lag p",
+        "n.d.", "s",
+    )  # fmt: skip
+    rows = []
+    for rung, cells in zip(ladder.rungs, ladder_cells(ladder), strict=True):
+        whole = [_whole(value) for value in (rung.n_eff, rung.aicc, rung.bic)]
+        rows.append(
+            (
+                "→" if rung.chosen else "", *cells[:3], f"{rung.chisqr:.3g}",
+                f"{cells[5]}/{cells[4]}", *whole, cells[9], cells[10],
+                f"{cells[11]}/{cells[12]}", cells[13],
+            )
+        )  # fmt: skip
+    lines = _columns([header, *rows], gap=" ")
+    for rung in ladder.rungs:
+        lines += _wrap("", f"{rung.name}: {rung.why}")
+    for reason in ladder.skipped:
+        lines += _wrap("not tried: ", reason)
+    said = [sentence for sentence in ladder.sentences if sentence not in ladder.cautions]
+    return [*lines, "", *(line for sentence in said for line in _wrap("", sentence))]
+
+
 def _aligned(rows: list[Readable]) -> list[str]:
     header = ("parameter", "value ± stderr", "unit", "95 % interval", "state")
-    table = [header] + [(r.name, r.with_error, r.unit, r.interval, r.state) for r in rows]
+    return _columns([header] + [(r.name, r.with_error, r.unit, r.interval, r.state) for r in rows])
+
+
+def _columns(table: Sequence[tuple[str, ...]], gap: str = "  ") -> list[str]:
+    header = table[0]
     widths = [max(len(row[i]) for row in table) for i in range(len(header))]
     return [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        gap.join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
         for row in table
     ]
 

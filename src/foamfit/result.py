@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from foamfit.checklist import Check
     from foamfit.insight import Insight
     from foamfit.intervals import Intervals
+    from foamfit.ladder import Ladder
     from foamfit.measurement import Measurement, Outliers
     from foamfit.spring import BistableSpring
 
@@ -125,6 +126,7 @@ class FitResult:
     loss: str = "linear"
     noise: dict[str, dict[str, Any]] = field(default_factory=dict)  # of each counted curve
     intervals: Intervals | None = None
+    ladder: Ladder | None = None
 
     @property
     def bistable_springs(self) -> dict[str, BistableSpring]:
@@ -181,6 +183,7 @@ class FitResult:
                 },
                 "energy": self.energy,
                 "runtime_s": self.runtime_s,
+                **({"ladder": self.ladder.as_dict()} if self.ladder else {}),
             }
         )
         return content
@@ -197,7 +200,8 @@ class FitResult:
         -------
         Path
             The folder, with ``fit.json``, ``parameters.csv``, ``curves.csv``, ``fit.png``,
-            ``fit.pdf`` and ``report.html``; with profiles also ``profiles.csv``.
+            ``fit.pdf`` and ``report.html``; with profiles also ``profiles.csv``, of a ladder also
+            ``ladder.csv``.
 
         Raises
         ------
@@ -290,6 +294,8 @@ def _write(result: FitResult, folder: Path) -> None:
     _write_table(folder / "curves.csv", _curve_rows(result.curves, result.measurement.outliers))
     if result.intervals is not None and result.intervals.profiles:
         _write_table(folder / "profiles.csv", _profile_rows(result.intervals))
+    if result.ladder is not None:
+        _write_table(folder / "ladder.csv", result.ladder.rows())
     figure = plot_fit(result)
     png = image(figure, "png")
     (folder / "fit.png").write_bytes(png)

@@ -1,0 +1,482 @@
+"""The ladder: runs test, effective parameters, known structures, interruption, what is written."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from scipy.signal import lfilter
+
+import foamfit as ff
+from conftest import synthetic_impact, synthetic_loop
+from foamfit import evidence, ladder, modelfit
+from foamfit.cli import main
+from foamfit.measurement import Measurement, Outliers, Specimen, Striker
+from foamfit.problem import make_problem
+from foamfit.report import render_report, summary_text
+from foamfit.structure import branch_places, find_structure, neighbours_test, runs_test
+
+HEIGHT, AREA = 1.2e-3, 1.9635e-5
+
+
+# ---------------------------------------------------------------- runs test
+
+
+def exact_p(positive: int, negative: int, runs: int) -> float:
+    """Chance of so few runs or fewer, counted over all orders of the signs."""
+    n = positive + negative
+    orders = list(itertools.combinations(range(n), positive))
+    few = 0
+    for order in orders:
+        signs = np.zeros(n, dtype=int)
+        signs[list(order)] = 1
+        few += 1 + np.count_nonzero(np.diff(signs)) <= runs
+    return few / len(orders)
+
+
+@pytest.mark.parametrize(
+    "signs", ["++++----++++----", "+-+-++--+-+--++-", "+++++---+--+--+", "++++++++------"]
+)
+def test_the_runs_test_is_that_of_all_orders_counted(signs):
+    residual = np.array([1.0 if sign == "+" else -0.5 for sign in signs])
+    runs = len(list(itertools.groupby(signs)))
+    exact = exact_p(signs.count("+"), signs.count("-"), runs)
+    assert runs_test(residual) == pytest.approx(exact, abs=0.012)
+
+
+def test_the_runs_test_holds_its_level_and_sees_waves():
+    rng = np.random.default_rng(0)
+    p = np.array([runs_test(rng.standard_normal(400)) for _ in range(1000)])
+    assert np.mean(p < 0.05) == pytest.approx(0.05, abs=0.02)
+    assert np.mean(p < 0.5) == pytest.approx(0.5, abs=0.06)
+    wave = np.sin(np.linspace(0, 20, 400))
+    assert runs_test(wave + 0.5 * rng.standard_normal(400)) < 1e-6
+    assert runs_test(np.ones(11)) == pytest.approx(2.0**-10)
+    assert runs_test(np.array([1.0, -1.0] * 50)) > 0.999  # alternating is no structure
+    assert runs_test(np.zeros(5)) == 1.0
+
+
+def test_the_neighbours_test_holds_its_level_and_sees_a_short_wave():
+    rng = np.random.default_rng(4)
+    p = np.array([neighbours_test(rng.standard_normal(400)) for _ in range(1000)])
+    assert np.mean(p < 0.05) == pytest.approx(0.05, abs=0.02)
+    short = rng.standard_normal(400)
+    short[100:120] += 3.0
+    assert neighbours_test(short) < 1e-4 < 1e-2 < runs_test(short)
+
+
+# ---------------------------------------------------------------- evidence
+
+
+def tried(residual, columns):
+    """A rung of one curve, as far as the evidence looks at it."""
+    return SimpleNamespace(
+        residual=residual,
+        sizes=(residual.size,),
+        curves=[residual],
+        taus=[evidence.autocorrelation_time(residual)],
+        chisqr=float(residual @ residual),
+        grams=np.array([columns.T @ columns]),
+    )
+
+
+def test_combinations_are_not_counted_as_parameters():
+    rng = np.random.default_rng(1)
+    x = np.linspace(-1, 1, 600)
+    noise = tried(rng.standard_normal(600), np.ones((600, 1)))
+    apart = np.column_stack([np.ones_like(x), x, x**2])
+    same = np.column_stack([apart, apart[:, 0] - apart[:, 1]])
+    faint = np.column_stack([apart, 0.01 * x**3])  # its interval is ±13 natural sizes
+    counted = [
+        evidence.effective_parameters(np.array([columns.T @ columns]), noise)
+        for columns in (apart, same, faint)
+    ]
+    assert counted == [3, 3, 3]
+
+
+def test_the_criteria_are_those_of_closed_form():
+    """White noise: AICc and BIC of n samples; k = 2."""
+    residual = np.random.default_rng(2).standard_normal(500)
+    columns = np.column_stack([np.ones(500), np.linspace(-1, 1, 500)])
+    one = tried(residual, columns)
+    found = evidence.evidence(one, one)
+    fit = 500 * np.log(residual @ residual / 500)
+    assert found.rank == 2
+    assert found.aicc == pytest.approx(fit + 4 + 12 / 497, rel=1e-12)
+    assert found.bic == pytest.approx(fit + 2 * np.log(500), rel=1e-12)
+
+
+def test_correlated_residuals_are_less_evidence():
+    """A thousand samples of which each keeps two thirds of the last say what two hundred would."""
+    rng = np.random.default_rng(3)
+    small, large = (
+        scale * lfilter([1.0], [1.0, -2.0 / 3.0], rng.standard_normal(1000)) for scale in (1.0, 1.1)
+    )
+    columns = np.ones((1000, 1))
+    bic = [evidence.evidence(tried(r, columns), tried(small, columns)).bic for r in (large, small)]
+    expected = 200.0 * np.log((large @ large) / (small @ small))
+    assert bic[0] - bic[1] == pytest.approx(expected, rel=0.15)
+
+
+def test_a_bent_structure_is_found_where_it_is():
+    strain = np.concatenate([np.linspace(0, 1, 200), np.linspace(1, 0, 200)])
+    switches = np.array([[50, 1, 0, 1, 0], [150, 1, 1, 2, 0], [250, 1, 2, 3, 0]], dtype=float)
+    names = ("a", "d", "c", "e")
+    places = branch_places(("linear", "bistable"), switches, np.arange(400.0), strain, names)
+    residual = 1e-3 * np.random.default_rng(0).standard_normal(400)
+    residual[50:150] += 0.1 * (np.linspace(-1, 1, 100) ** 2 - 1 / 3)
+    found = find_structure(residual, places)
+    assert found.place == "loading, spring 2 on d"
+    assert found.straight
+    assert found.share > 0.99
+    assert found.bent > 0.99
+    rms = 0.1 * np.sqrt(4 / 45) * 0.5  # of x² - 1/3 along a quarter of the samples
+    assert found.size == pytest.approx(rms, rel=0.05)
+    assert found.noise == pytest.approx(1e-3, rel=0.15)
+
+
+# ---------------------------------------------------------------- known structures
+
+
+def impact(springs, heights, site=0.0, velocity=2.0, noise=0.005, seed=0):
+    """A synthetic impact without stated noise."""
+    chain = ff.Chain(springs, heights, AREA, site_damping=site)
+    drive = ff.Impact(7e-3, velocity)
+    long = ff.simulate(chain, drive, np.linspace(0, 20 * HEIGHT / velocity, 4001))
+    time = np.linspace(0, 1.05 * long.contact_end, 201)
+    run = ff.simulate(chain, drive, time)
+    rng = np.random.default_rng(seed)
+    curves = [
+        y + noise * np.ptp(y) * rng.standard_normal(y.size)
+        for y in (run.base_stress, run.displacement[-1])
+    ]
+    return Measurement(
+        name="synthetic impact",
+        path=None,
+        data_sha256="",
+        time=time,
+        stress=curves[0],
+        displacement=curves[1],
+        specimen=Specimen(HEIGHT, AREA),
+        striker=Striker(7e-3, velocity),
+        motion="measured",
+    )
+
+
+SPRING = ff.published["foam-1/model-1"].bistable
+SOFT = ff.BistableSpring(
+    k0=4e6, kc=60e6, dsigma=-0.4e6, eps_a=0.2, eps_c=0.5, kh_plus=4e6, kh_minus=1.2e6
+)
+STIFF = ff.BistableSpring(
+    k0=15e6, kc=200e6, dsigma=-1.2e6, eps_a=0.2, eps_c=0.5, kh_plus=15e6, kh_minus=4e6
+)
+LINE = ff.LinearSpring(12e6)
+HALVES = [0.5 * HEIGHT] * 2
+CASES = {
+    "bistable without damping": ([SPRING], [HEIGHT], 0.0),
+    "bistable with damping": ([replace(SPRING, eta=400.0)], [HEIGHT], 0.0),
+    "linear+bistable without damping": ([LINE, SOFT], HALVES, 0.0),
+    "linear+bistable with damping": ([LINE, SOFT], HALVES, 400.0),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_clear_structure_is_found(name):
+    springs, heights, site = CASES[name]
+    result = ff.fit(impact(springs, heights, site, velocity=2.6), model="auto", starts=6)
+    assert result.ladder.chosen.name == name
+    assert result.model == result.ladder.chosen.model
+    assert result.misfit["stress_time"] == result.ladder.chosen.misfit["stress_time"]
+    assert result.ladder.chosen.runs_p > 1e-3
+    assert len([rung for rung in result.ladder.rungs if rung.chosen]) == 1
+
+
+def test_two_bistable_springs_are_told_from_fewer(monkeypatch):
+    """With all starts, which two springs need; for time, without the rung of a linear spring."""
+    monkeypatch.setattr(ladder, "LADDER", ("bistable", *ladder.LADDER[2:]))
+    test = impact([SOFT, STIFF], HALVES, velocity=4.5)
+    result = ff.fit(test, model="auto")
+    assert result.ladder.chosen.name == "bistable+bistable without damping"
+    below = result.ladder.rungs[:2]
+    assert all(rung.bic > result.ladder.chosen.bic + evidence.MARGIN for rung in below)
+    assert result.ladder.rungs[0].neighbours_p < 1e-6
+
+
+def test_a_linear_spring_in_series_adds_combinations_and_no_evidence():
+    """Along a given motion it only bends the branches of one bistable spring."""
+    _, loop = synthetic_loop()
+    one = ff.fit(loop, starts=4)
+    chain = ff.fit(loop, model="linear+bistable", starts=8)
+    both = []
+    for result in (one, chain):
+        problem = make_problem(loop, result.model, result.drive, result.params, None, False)
+        both.append(evidence.weigh(problem, result, "none", 0.0))
+    best, found = evidence.choose(both)
+    assert best == 0
+    varied = [sum(item.vary for item in result.parameters.values()) for result in (one, chain)]
+    assert varied == [7, 9]
+    assert found[0].rank == 7
+    assert found[1].rank < 9
+
+
+# ---------------------------------------------------------------- which rungs
+
+
+def test_only_models_that_the_test_allows_are_tried():
+    _, test = synthetic_impact()
+    assert ladder._models(test) == (list(ladder.LADDER), [])
+    given = replace(test, specimen=replace(test.specimen, heights=(0.6e-3, 0.59e-3)))
+    models, skipped = ladder._models(given)
+    assert models == ["bistable", "linear+bistable", "bistable+bistable"]
+    assert skipped == ["linear+bistable+bistable: [specimen] heights are those of 2 springs"]
+    followed = replace(test, interior={1: test.displacement * 0.4})
+    models, skipped = ladder._models(followed)
+    assert models == list(ladder.LADDER[1:])
+    assert "motion was measured" in skipped[0]
+    with pytest.raises(ff.InputError, match="no model of the ladder"):
+        ladder._models(replace(test, interior={5: test.displacement}))
+
+
+def test_a_drive_without_dampers_has_one_rung_for_each_model():
+    result = ff.fit(synthetic_loop()[1], model="auto", starts=4)
+    assert [(rung.model, rung.damping) for rung in result.ladder.rungs] == [("bistable", "none")]
+    assert result.ladder.ended == "the residuals are structureless"
+    assert result.status == "ok"
+
+
+def test_only_the_chosen_rung_gets_the_intervals_that_were_asked_for(monkeypatch):
+    """Rungs are weighed with local ones; options reach every rung."""
+    given = []
+    original = modelfit.judge
+
+    def watched(found, choice, tell):
+        given.append((found.problem.model.name, choice.method, found.problem.objective.loss))
+        return original(found, choice, tell)
+
+    monkeypatch.setattr(ladder.modelfit, "judge", watched)
+    loop = synthetic_loop()[1]
+    result = ff.fit(loop, model="auto", starts=4, intervals="profile", loss="huber")
+    assert given == [("bistable", "local", "huber"), ("bistable", "profile", "huber")]
+    known = [p for p in result.parameters.values() if p.ci95 is not None]
+    assert {p.ci95_method for p in known} == {"profile likelihood"}
+    assert result.ladder.chosen.model == result.model
+    assert result.loss == "huber"
+
+
+def test_outliers_leave_the_ladder_standing():
+    """Places of structure go by the samples that count."""
+    _, test = synthetic_impact(samples=201)
+    stress = test.stress * 1.0
+    left_out = np.zeros(201, bool)
+    left_out[[30, 31]] = True
+    stress[left_out] += 0.3 * np.ptp(stress)
+    stress += 0.02 * np.ptp(stress) * np.sin(np.linspace(0.0, 80.0, 201))
+    at = test.time[left_out]
+    spikes = {"stress": Outliers(left_out, at, stress[left_out])}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ladder, "LADDER", ladder.LADDER[:1])
+        result = ff.fit(replace(test, stress=stress, outliers=spikes), model="auto", starts=4)
+    assert any("hold a structure" in text for text in result.warnings)
+
+
+# ---------------------------------------------------------------- interruption
+
+
+@pytest.fixture(scope="module")
+def wavy():
+    """A loop that no rung follows: a wave of 5 % lies on it."""
+    _, loop = synthetic_loop()
+    wave = 0.05 * np.ptp(loop.stress) * np.sin(np.linspace(0, 60, loop.stress.size))
+    return replace(loop, stress=loop.stress + wave, name="synthetic loop with a wave")
+
+
+def test_an_interrupted_ladder_keeps_what_is_done(wavy, monkeypatch):
+    calls = 0
+    original = modelfit.identify
+
+    def interrupted(*args):
+        nonlocal calls
+        calls += 1
+        if calls == 2:
+            raise KeyboardInterrupt
+        return original(*args)
+
+    monkeypatch.setattr(ladder.modelfit, "identify", interrupted)
+    result = ff.fit(wavy, model="auto", starts=2)
+    assert [rung.model for rung in result.ladder.rungs] == ["bistable"]
+    assert (result.stopped, result.ladder.stopped) == ("Ctrl-C", "Ctrl-C")
+    assert result.status == "warnings"
+    assert "stopped by Ctrl-C" in result.warnings[0]
+    calls = 1
+    with pytest.raises(KeyboardInterrupt):
+        ff.fit(wavy, model="auto", starts=2)
+
+
+def test_the_time_limit_is_shared_over_the_rungs(wavy, monkeypatch):
+    """A clock that gains a second with each look: what is left for a rung shrinks."""
+    now = itertools.count(0.0, 1.0)
+    monkeypatch.setattr(ladder.time, "monotonic", lambda: next(now))
+    given = []
+    original = modelfit.identify
+
+    def watched(measurement, model, params, options, progress):
+        given.append(options.max_time)
+        return original(measurement, model, params, replace(options, max_time=None), progress)
+
+    monkeypatch.setattr(ladder.modelfit, "identify", watched)
+    result = ff.fit(wavy, model="auto", starts=2, max_time=2.5)
+    assert given == [1.5, 0.5]
+    assert len(result.ladder.rungs) == 2
+    assert result.stopped == "the time limit"
+
+
+def test_a_rung_that_the_time_limit_cut_says_so():
+    result = ff.fit(synthetic_impact()[1], model="auto", max_time=1e-6)
+    (rung,) = result.ladder.rungs
+    assert rung.stopped == result.ladder.stopped == "the time limit"
+    assert rung.chosen
+    assert "richer models were not tried" in result.warnings[0]
+
+
+def test_a_rung_that_cannot_be_simulated_is_left_out(wavy, monkeypatch):
+    original = modelfit.identify
+
+    def failing(measurement, model, *rest):
+        if model == "linear+bistable":
+            raise ff.SimulationError("none could be simulated")
+        return original(measurement, model, *rest)
+
+    monkeypatch.setattr(ladder.modelfit, "identify", failing)
+    monkeypatch.setattr(ladder, "LADDER", ladder.LADDER[:2])
+    result = ff.fit(wavy, model="auto", starts=2)
+    assert result.ladder.skipped == ("linear+bistable: none could be simulated",)
+    monkeypatch.setattr(ladder, "LADDER", ladder.LADDER[1:2])
+    with pytest.raises(ff.SimulationError, match="no rung could be tried"):
+        ff.fit(wavy, model="auto", starts=2)
+
+
+# ---------------------------------------------------------------- what is written
+
+
+@pytest.fixture(scope="module")
+def climbed(wavy):
+    """Two rungs, neither of which reaches the noise."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ladder, "LADDER", ladder.LADDER[:2])
+        return ff.fit(wavy, model="auto", starts=4)
+
+
+def test_what_remains_is_said(climbed):
+    warning = next(text for text in climbed.warnings if text.startswith("No rung reaches"))
+    assert "residuals of stress_strain hold a structure of" in warning
+    size = float(warning.split("structure of ")[1].split("%")[0])
+    assert size == pytest.approx(5 / np.sqrt(2), rel=0.25)  # what the springs follow of it is less
+    assert climbed.ladder.ended == "the top of the ladder was reached"
+
+
+def test_undetermined_parameters_of_the_chosen_model_are_named(climbed):
+    """A loop that never closes leaves branches c and e out of every rung."""
+    _, test = synthetic_impact(velocity=1.75)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ladder, "LADDER", ladder.LADDER[:1])
+        result = ff.fit(test, model="auto", starts=4)
+    (sentence,) = [text for text in result.ladder.cautions if "does not determine" in text]
+    assert "s1_kc" in sentence
+    assert "no rung of the ladder has all parameters determined" in sentence
+    assert sentence in result.warnings
+    assert result.ladder.chosen.rank <= 3 < result.ladder.chosen.n_vary
+    assert any("combinations" in text for text in result.ladder.sentences)
+    for name in result.ladder.chosen.not_determined:
+        assert result.parameters[name].state == "not determined"
+
+
+def test_the_folder_holds_the_ladder(climbed, tmp_path):
+    folder = climbed.save(tmp_path / "auto")
+    content = json.loads((folder / "fit.json").read_text())["ladder"]
+    with (folder / "ladder.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(content["rungs"]) == 2
+    for row, rung, original in zip(rows, content["rungs"], climbed.ladder.rungs, strict=True):
+        assert row["model"] == rung["model"] == original.model
+        assert float(row["bic"]) == rung["bic"] == original.bic
+        assert float(row["misfit_stress_strain"]) == original.misfit["stress_strain"]
+        assert row["chosen"] == str(rung["chosen"]) == str(original.chosen)
+        assert row["why"] == rung["why"] != ""
+        assert row["not_determined"].split() == rung["not_determined"]
+    assert "misfit_displacement_time" not in rows[0]
+    assert content["sentences"] == list(climbed.ladder.sentences)
+
+
+def test_the_report_and_the_summary_show_the_ladder(climbed):
+    page = render_report(climbed, fit_png=b"\x89PNG" + bytes(20))
+    text = summary_text(climbed)
+    assert "The simplest model that holds" in page
+    for rung in climbed.ladder.rungs:
+        assert rung.why in page
+        assert f"{rung.bic:.1f}".replace("-", "−") in page
+        assert f"{rung.bic:.0f}".replace("-", "−") in text
+        assert f" {rung.rank}/{rung.n_vary} " in text
+        assert f"{rung.name}: {rung.why}" in " ".join(text.split())
+    for sentence in climbed.ladder.sentences:
+        assert sentence.replace("<", "&lt;") in page
+        assert " ".join(text.split()).count(sentence) == 1
+    assert max(map(len, text.splitlines())) <= 100
+    named = ff.fit(synthetic_loop()[1], starts=2)
+    assert "The simplest model" not in render_report(named, fit_png=b"\x89PNG" + bytes(20))
+    assert "ladder" not in named.to_json_dict()
+
+
+def run(*args):
+    return CliRunner().invoke(main, [str(arg) for arg in args])
+
+
+@pytest.fixture
+def loop_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    _, loop = synthetic_loop()
+    rows = [f"{s:.6g},{d:.8g}" for s, d in zip(loop.stress, loop.displacement, strict=True)]
+    path = tmp_path / "loop.csv"
+    path.write_text("\n".join(["stress (Pa),displacement (m)", *rows]) + "\n")
+    path.with_suffix(".toml").write_text(
+        f'[specimen]\nheight = "{loop.specimen.height} m"\narea = "{loop.specimen.area} m^2"\n'
+    )
+    return path
+
+
+def test_the_command_writes_to_auto(loop_file, tmp_path):
+    done = run("fit", loop_file, "--model", "auto", "--starts", 4)
+    assert done.exit_code == 0, done.output
+    assert "bistable is the simplest that holds" in done.stdout
+    folder = tmp_path / "fits" / "loop" / "auto"
+    content = json.loads((folder / "fit.json").read_text())
+    assert content["model"] == "bistable"
+    assert [rung["chosen"] for rung in content["ladder"]["rungs"]] == [True]
+    assert (folder / "ladder.csv").is_file()
+
+
+def test_the_command_refuses_parameters_of_one_model(loop_file, tmp_path):
+    for option in (("--fix", "s1_eta=0"), ("--vary", "s1_eta")):
+        done = run("fit", loop_file, "--model", "auto", *option)
+        assert (done.exit_code, done.stdout) == (1, "")
+        assert "belong to one model" in done.stderr
+    assert not (tmp_path / "fits").exists()
+    with pytest.raises(ff.InputError, match="belong to one model"):
+        ff.fit(synthetic_loop()[1], model="auto", params=ff.make_params(synthetic_loop()[1]))
+
+
+def test_no_acceptable_rung_is_exit_code_two(loop_file, tmp_path):
+    rows = loop_file.read_text().splitlines()
+    noise = np.abs(np.random.default_rng(0).standard_normal(len(rows))) * 1e6
+    for i in range(1, len(rows)):
+        rows[i] = f"{noise[i]:.6g},{rows[i].split(',')[1]}"
+    loop_file.write_text("\n".join(rows) + "\n")
+    done = run("fit", loop_file, "--model", "auto", "--starts", 2)
+    assert done.exit_code == 2
+    assert "no acceptable fit" in done.stderr
+    assert (tmp_path / "fits" / "loop" / "auto" / "ladder.csv").is_file()
