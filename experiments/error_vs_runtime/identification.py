@@ -12,15 +12,18 @@ The eight methods are run twice: in the `lmfit.Parameters` of `foamfit.make_para
 bounds, what a user of lmfit would write), and in the coordinates of the project's own search,
 lent to them as `lmfit.Parameters` too, in which every point is admissible.
 
-    python experiments/error_vs_runtime/identification.py            # at most 35 minutes of one core
+    python experiments/error_vs_runtime/identification.py           # at most 35 min of one core
     python experiments/error_vs_runtime/identification.py --budget 1 --seeds 2
-    python experiments/error_vs_runtime/identification.py --redraw   # figures and table only
+    python experiments/error_vs_runtime/identification.py --redraw  # figures and tables only
 
-Writes beside itself: identification_runs.csv.gz (every improvement by more than 0.1 %) with
-identification_runs.json (machine, versions, arguments), identification.csv, identification.md,
-identification_profiles.png, identification_si.png and identification_box.png. FOAMFIT_DATA names
-the folder of the measurements by others; without it the shoe foam is left out.
+Writes beside itself: identification_runs.csv.gz (every improvement by more than 2 %, and when a
+problem was solved) with identification_runs.json (machine, versions, arguments), after each
+problem; identification.csv, identification.md, identification_profiles.png, identification_si.png
+and identification_box.png. FOAMFIT_DATA names the folder of the measurements by others; without it
+the shoe foam is left out.
 """
+
+# ruff: noqa: E402  (the number of threads is read when NumPy is imported)
 
 from __future__ import annotations
 
@@ -30,7 +33,6 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_name] = "1"  # one thread for all, so that processor time is the time on the clock
 
 import argparse
-import json
 import platform
 import tempfile
 import time
@@ -44,9 +46,17 @@ from pathlib import Path
 import lmfit
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from identification_report import (
+    COLUMNS,
+    COORDINATES,
+    LEAST_SQUARES,
+    METHODS,
+    OWN,
+    SLOPES,
+    SOLVED,
+    Setup,
+    report,
+)
 from numpy.typing import NDArray
 
 import foamfit as ff
@@ -58,30 +68,9 @@ from foamfit.space import Space
 Array = NDArray[np.float64]
 
 HERE = Path(__file__).parent
-SOLVED = 1.05  # cost over the best known cost at which a problem counts as solved
-ENOUGH = 1.001  # and at which a run ends
-RECORDED = 0.999  # cost over the last recorded one below which it is recorded
-OWN = "foamfit.fit"
-LEAST_SQUARES = ("leastsq", "least_squares")
-DIRECT = ("nelder", "powell")
-GLOBAL = ("differential_evolution", "basinhopping", "dual_annealing", "ampgo")
-METHODS = (*LEAST_SQUARES, *DIRECT, *GLOBAL)
-COORDINATES = {
-    "si": "lmfit.Parameters in SI, bounds of make_params",
-    "box": "lmfit.Parameters in the coordinates of foamfit's search",
-}
-# Colours of Okabe and Ito, told apart by all; lines differ in their dashes too.
-STYLES: dict[str, tuple[str, str]] = {
-    OWN: ("#000000", "-"),
-    "leastsq": ("#0072B2", "-"),
-    "least_squares": ("#56B4E9", "--"),
-    "nelder": ("#009E73", "-"),
-    "powell": ("#999933", "--"),
-    "differential_evolution": ("#D55E00", "-"),
-    "basinhopping": ("#E69F00", "--"),
-    "dual_annealing": ("#CC79A7", "-."),
-    "ampgo": ("#7F7F7F", ":"),
-}
+GZIP = {"method": "gzip", "mtime": 0}
+ENOUGH = 1.001  # cost over the best known at which a run ends
+RECORDED = 0.98  # cost over the last recorded one below which it is recorded
 
 
 # ---------------------------------------------------------------- problems
@@ -149,18 +138,19 @@ class Recorder:
         Of the problem: only evaluations of the same curves count as progress.
     budget : float
         Processor time after which the run is over, s.
-    enough : float
-        Cost at which it is over too.
+    known : float
+        Best known cost; near it the run is over too.
     """
 
     objective: Objective
     budget: float
-    enough: float
+    known: float
     cost: float = np.inf
     values: Array | None = None
     evaluations: int = 0
     rows: list[tuple[float, int, float]] = field(default_factory=list)
     began: float = field(default_factory=time.process_time)
+    ended: float = np.nan
 
     def note(self, objective: Objective, values: Array, residual: Array) -> None:
         """Take down an evaluation.
@@ -176,9 +166,10 @@ class Recorder:
             cost = float(residual @ residual)
             if cost < self.cost:
                 self.cost, self.values = cost, values.copy()
-                if not self.rows or cost < RECORDED * self.rows[-1][2]:
+                last = self.rows[-1][2] if self.rows else np.inf
+                if cost < RECORDED * last or cost <= SOLVED * self.known < last:
                     self.rows.append((seconds, self.evaluations, cost))
-        if seconds > self.budget or self.cost <= self.enough:
+        if seconds > self.budget or self.cost <= ENOUGH * self.known:
             raise RunOver
 
     def finished(self) -> list[tuple[float, int, float]]:
@@ -195,8 +186,7 @@ class Recorder:
         residual = self.objective.residual(self.values)
         if not np.isclose(float(residual @ residual), self.cost, rtol=1e-6):
             raise RuntimeError("the method did not minimise the cost of the problem")
-        seconds = min(time.process_time() - self.began, self.budget)
-        return [*self.rows, (seconds, self.evaluations, self.cost)]
+        return [*self.rows, (min(self.ended, self.budget), self.evaluations, self.cost)]
 
 
 @contextmanager
@@ -311,43 +301,53 @@ def best_known(case: Case, problem: Problem) -> float:
     return min(costs)
 
 
-def run_all(options: argparse.Namespace) -> tuple[pd.DataFrame, dict[str, object]]:
-    """Run every method on every problem and seed; returns the improvements and what was asked."""
-    frames = []
-    meta: dict[str, object] = machine() | {
-        "budget_s": options.budget, "seeds": options.seeds, "derivatives": options.derivatives,
-    }  # fmt: skip
-    known: dict[str, float] = {}
-    sizes: dict[str, int] = {}
+def run_all(options: argparse.Namespace, log: Path, notes: Path) -> None:
+    """Run every method on every problem and seed; writes what was run after each problem."""
+    setup = Setup(machine(), options.budget, options.seeds, options.derivatives, {}, {})
+    frames: list[pd.DataFrame] = []
     for key in options.problems:
         case = CASES[key]
         if case.specimen is not None and not os.environ.get("FOAMFIT_DATA"):
             print(f"{key}: left out, FOAMFIT_DATA names no folder of measurements")
             continue
         problem = case.problem()
-        known[key] = best_known(case, problem)
-        sizes[key] = problem.objective.n_data
-        print(f"{key}: best known cost {known[key]:.6g} of {sizes[key]} samples")
-        runs = [(OWN, "own"), *((m, c) for c in options.coordinates for m in options.methods)]
-        for method, coordinates in runs:
-            ended = []
-            for seed in range(options.seeds):
-                recorder = Recorder(problem.objective, options.budget, ENOUGH * known[key])
-                with recorded(recorder):
-                    if method == OWN:
-                        run_own(case, problem, seed)
-                    else:
-                        run_lmfit(problem, method, coordinates, seed, options.derivatives)
-                rows = recorder.finished()
-                ended.append(f"{rows[-1][2] / known[key]:.3g}")
-                frame = pd.DataFrame(rows, columns=["seconds", "evaluations", "cost"])
-                frames.append(
-                    frame.assign(problem=key, coordinates=coordinates, method=method, seed=seed)
-                )
-            print(f"  {coordinates:4} {method:24} cost over best known: {' '.join(ended)}")
-    meta |= {"best_known": known, "n_data": sizes}
-    order = ["problem", "coordinates", "method", "seed", "seconds", "evaluations", "cost"]
-    return pd.concat(frames, ignore_index=True)[order], meta
+        known = best_known(case, problem)
+        print(f"{key}: best known cost {known:.6g} of {problem.objective.n_data} samples")
+        for coordinates, method in [
+            ("own", OWN), *((c, m) for c in options.coordinates for m in options.methods)
+        ]:  # fmt: skip
+            recorders = [
+                run(case, problem, coordinates, method, seed, known, options)
+                for seed in range(options.seeds)
+            ]
+            for seed, recorder in enumerate(recorders):
+                rows = [(key, coordinates, method, seed, *row) for row in recorder.finished()]
+                frames.append(pd.DataFrame(rows, columns=COLUMNS))
+            ended = " ".join(f"{recorder.cost / known:.3g}" for recorder in recorders)
+            print(f"  {coordinates:4} {method:24} cost over best known: {ended}", flush=True)
+        setup.titles[key], setup.known[key] = case.title, known
+        pd.concat(frames).to_csv(log, index=False, float_format="%.5g", compression=GZIP)
+        setup.write(notes)
+
+
+def run(
+    case: Case,
+    problem: Problem,
+    coordinates: str,
+    method: str,
+    seed: int,
+    known: float,
+    options: argparse.Namespace,
+) -> Recorder:
+    """Run one method on one problem from one seed until the time is up or it is solved."""
+    recorder = Recorder(problem.objective, options.budget, known)
+    with recorded(recorder):
+        if method == OWN:
+            run_own(case, problem, seed)
+        else:
+            run_lmfit(problem, method, coordinates, seed, options.derivatives)
+    recorder.ended = time.process_time() - recorder.began
+    return recorder
 
 
 def machine() -> dict[str, str]:
@@ -365,296 +365,8 @@ def machine() -> dict[str, str]:
     }
 
 
-# ---------------------------------------------------------------- table
-
-
-def solved_after(runs: pd.DataFrame, known: dict[str, float]) -> pd.DataFrame:
-    """One row for each run: seconds until it was solved (inf if never) and how it ended."""
-    rows = []
-    keys = ["problem", "coordinates", "method", "seed"]
-    for (problem, coordinates, method, seed), run in runs.groupby(keys, sort=False):
-        reached = run[run["cost"] <= SOLVED * known[str(problem)]]
-        rows.append(
-            {
-                "problem": problem,
-                "coordinates": coordinates,
-                "method": method,
-                "seed": seed,
-                "solved_after_s": reached["seconds"].iloc[0] if len(reached) else np.inf,
-                "misfit_ratio": (run["cost"].iloc[-1] / known[str(problem)]) ** 0.5,
-                "ended_after_s": run["seconds"].iloc[-1],
-                "evaluations": run["evaluations"].iloc[-1],
-            }
-        )
-    return pd.DataFrame(rows)
-
-
-def tabulate(ends: pd.DataFrame) -> pd.DataFrame:
-    """One row for each problem and method: how many seeds it solved, how fast, how far it came."""
-    rows = []
-    keys = ["problem", "coordinates", "method"]
-    for (problem, coordinates, method), runs in ends.groupby(keys, sort=False):
-        # inf - inf is no number: quartiles of times by rank, not by interpolation
-        low, middle, high = np.quantile(
-            runs["solved_after_s"], (0.25, 0.5, 0.75), method="inverted_cdf"
-        )
-        rows.append(
-            {
-                "problem": problem,
-                "coordinates": coordinates,
-                "method": method,
-                "solved": int(np.isfinite(runs["solved_after_s"]).sum()),
-                "seeds": len(runs),
-                "solved after, quartile 1 (s)": low,
-                "solved after, median (s)": middle,
-                "solved after, quartile 3 (s)": high,
-                "misfit over best known at the end, median": runs["misfit_ratio"].median(),
-                "misfit over best known at the end, worst": runs["misfit_ratio"].max(),
-                "evaluations per second, median": (
-                    runs["evaluations"] / runs["ended_after_s"]
-                ).median(),
-            }
-        )
-    return pd.DataFrame(rows)
-
-
-def profile(ends: pd.DataFrame, coordinates: str) -> dict[str, Array]:
-    """Performance ratios of each method over all problem-seeds (Dolan & Moré 2002, eq. 1).
-
-    The ratio is the time a method took to solve a problem from a seed, over the shortest time of
-    all methods there; inf where it did not.
-    """
-    among = ends[ends["coordinates"].isin(("own", coordinates))]
-    times = among.pivot_table(
-        index=["problem", "seed"], columns="method", values="solved_after_s", sort=False
-    ).replace(np.nan, np.inf)
-    best = times.min(axis=1)
-    ratios = times.div(best.where(np.isfinite(best), 1.0), axis=0)
-    return {name: ratios[name].to_numpy() for name in STYLES if name in ratios}
-
-
-# ---------------------------------------------------------------- figures
-
-
-def draw_profiles(ends: pd.DataFrame, meta: dict[str, object], path: Path) -> None:
-    """Share of problem-seeds solved within a factor of the shortest time."""
-    shown = [c for c in COORDINATES if c in set(ends["coordinates"])]
-    figure = Figure(figsize=(4.4 * len(shown) + 0.2, 4.4), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes_row = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
-    for axes, coordinates in zip(axes_row, shown, strict=True):
-        ratios = profile(ends, coordinates)
-        finite = np.concatenate([r[np.isfinite(r)] for r in ratios.values()])
-        last = 10.0 ** np.ceil(np.log10(max(finite.max() * 1.05, 10.0)))
-        for name in reversed(ratios):
-            colour, dash = STYLES[name]
-            steps = np.sort(ratios[name][np.isfinite(ratios[name])])
-            share = np.arange(1, steps.size + 1) / ratios[name].size
-            axes.step(
-                np.concatenate([[1.0], steps, [last]]),
-                np.concatenate([[0.0], share, share[-1:] if share.size else [0.0]]),
-                where="post", color=colour, linestyle=dash, label=name,
-                linewidth=2.2 if name == OWN else 1.4,
-            )  # fmt: skip
-        axes.set(xscale="log", xlim=(1.0, last), ylim=(-0.02, 1.02))
-        axes.set_title(COORDINATES[coordinates], fontsize=9)
-        axes.set_xlabel("time over the shortest time, τ (–)", fontsize=9)
-        _plain(axes)
-    axes_row[0].set_ylabel("share of problem-seeds solved within τ (–)", fontsize=9)
-    count = next(iter(ratios.values())).size
-    figure.suptitle(
-        f"{count} problem-seeds; solved: cost within 5 % of the best known, "
-        f"in at most {meta['budget_s']:g} s",
-        fontsize=10,
-    )
-    _legend(figure, axes_row[0], columns=3 if len(shown) > 1 else 2)
-    figure.savefig(path, dpi=200)
-
-
-def draw_curves(runs: pd.DataFrame, coordinates: str, meta: dict[str, object], path: Path) -> None:
-    """Misfit over the best known against seconds: median and quartiles over the seeds."""
-    known: dict[str, float] = meta["best_known"]  # type: ignore[assignment]
-    budget = float(meta["budget_s"])  # type: ignore[arg-type]
-    problems = [key for key in CASES if key in known]
-    groups = (("least squares", LEAST_SQUARES), ("direct", DIRECT), ("global", GLOBAL))
-    figure = Figure(figsize=(8.8, 2.1 * len(problems) + 1.1), layout="constrained")
-    FigureCanvasAgg(figure)
-    grid = figure.subplots(len(problems), len(groups), sharex=True, sharey=True, squeeze=False)
-    clock = np.geomspace(0.01, budget, 200)
-    for key, row in zip(problems, grid, strict=True):
-        for axes, (title, methods) in zip(row, groups, strict=True):
-            for name in (*methods, OWN):
-                among = ("own",) if name == OWN else (coordinates,)
-                mine = (runs["problem"] == key) & (runs["method"] == name)
-                chosen = runs[mine & runs["coordinates"].isin(among)]
-                if len(chosen):
-                    _band(axes, clock, chosen, known[key], name)
-            axes.set(xscale="log", yscale="log", xlim=(clock[0], budget), ylim=(0.9, 100.0))
-            axes.axhline(1.0, color="0.7", linewidth=0.6, zorder=0)
-            _plain(axes)
-            if axes is row[0]:
-                axes.set_ylabel("misfit over\nbest known (–)", fontsize=9)
-            elif axes is row[1]:
-                axes.set_title(CASES[key].title, fontsize=9)
-            if key == problems[-1]:
-                axes.set_xlabel(f"seconds, {title} methods", fontsize=9)
-    figure.suptitle(f"{COORDINATES[coordinates]}: median and quartiles of {meta['seeds']} seeds",
-                    fontsize=10)  # fmt: skip
-    _legend(figure, grid[0, 0], columns=5, everyone=True)
-    figure.savefig(path, dpi=200)
-
-
-def _band(axes: Axes, clock: Array, runs: pd.DataFrame, known: float, name: str) -> None:
-    """Draw one method: what each seed had reached at each second, as median and quartiles."""
-    reached = []
-    for _, run in runs.groupby("seed", sort=False):
-        at = np.searchsorted(run["seconds"].to_numpy(), clock, side="right") - 1
-        misfit = np.sqrt(run["cost"].to_numpy() / known)
-        reached.append(np.where(at >= 0, misfit[at], np.inf))
-    low, middle, high = np.quantile(reached, (0.25, 0.5, 0.75), axis=0, method="inverted_cdf")
-    colour, dash = STYLES[name]
-    axes.fill_between(clock, low, np.minimum(high, 1e6), color=colour, alpha=0.15, linewidth=0)
-    axes.plot(clock, middle, color=colour, linestyle=dash, linewidth=2.0 if name == OWN else 1.3)
-
-
-def _plain(axes: Axes) -> None:
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.tick_params(labelsize=8)
-    axes.grid(color="0.92", linewidth=0.5)
-    axes.set_axisbelow(True)
-
-
-def _legend(figure: Figure, axes: Axes, columns: int, everyone: bool = False) -> None:
-    """Put the legend below the panels, in the order of the styles."""
-    if everyone:
-        from matplotlib.lines import Line2D
-
-        handles = [Line2D([], [], color=c, linestyle=d, label=n) for n, (c, d) in STYLES.items()]
-    else:
-        handles = axes.get_legend_handles_labels()[0][::-1]
-    figure.legend(
-        handles=handles, frameon=False, fontsize=8, loc="outside lower center", ncols=columns,
-        handlelength=3.2,
-    )  # fmt: skip
-
-
-# ---------------------------------------------------------------- page
-
-PAGE = """\
-# Identification: misfit against run time
-
-Made by `python experiments/error_vs_runtime/identification.py`{again}. {count} problem-seeds: \
-{problems} problems, {seeds} seeds each, at most {budget:g} s for a run, one thread, seconds of \
-processor time (on an idle machine the time on the clock).
-
-Machine: {processor}; Python {python}, foamfit {foamfit}, lmfit {lmfit}, SciPy {scipy}, NumPy \
-{numpy}, numba {numba}.
-
-Everyone minimises the same residual, is stopped by the same clock, and starts again from the next \
-random point of the seed when it ends early. *Solved* is a cost (sum of squares) within 5 % of the \
-best known, which is the lowest of three long searches of `foamfit.fit` and of every run. In the \
-column "in", *si* are the `lmfit.Parameters` that `foamfit.make_params` gives, and *box* lends the \
-coordinates of foamfit's own search, in which every point is an admissible chain. {slopes}
-
-{findings}
-
-![Performance profiles](identification_profiles.png)
-
-*Performance profiles (Dolan & Moré, Math. Program. 91, 201, 2002): the share of problem-seeds that \
-a method solves within a factor τ of the shortest time. Left edge: how often it is the fastest; \
-right edge: how often it solves at all.*
-
-{curves}
-
-*Reconstruction: simulated from published parameters with 1 % noise, not measured. {shoe}*
-
-{table}
-"""
-SLOPES = {
-    "differences": "`leastsq` and `least_squares` take forward differences with a step of 1e-5; "
-    "`least_squares` scales its variables by the Jacobian.",
-    "problem": "`leastsq` and `least_squares` are given the derivatives that the project's own "
-    "search uses (`Problem.slopes`); `least_squares` scales its variables by the Jacobian.",
-}
-SHOE = "Shoe foam: first cycle of turbo-comp-1, a measurement by others, arXiv:2602.12694."
-
-
-def findings(ends: pd.DataFrame) -> str:
-    """Say in two sentences what the runs say."""
-    out = []
-    for coordinates in COORDINATES:
-        among = ends[ends["coordinates"] == coordinates]
-        if among.empty:
-            continue
-        own = ends[ends["coordinates"] == "own"]["solved_after_s"]
-        solved = among.groupby("method", sort=False)["solved_after_s"].agg(
-            lambda times: int(np.isfinite(times).sum())
-        )
-        best = solved.idxmax()
-        ratios = profile(ends, coordinates)
-        first = np.mean(ratios[OWN] == 1.0)
-        out.append(
-            f"In *{coordinates}*, `{OWN}` solves {int(np.isfinite(own).sum())} of {len(own)} "
-            f"problem-seeds and is the fastest in {first:.0%}; of lmfit's methods "
-            f"`{best}` solves most, {solved[best]} of {len(own)}."
-        )
-    return " ".join(out)
-
-
-def page(ends: pd.DataFrame, table: pd.DataFrame, meta: dict[str, object]) -> str:
-    """The page: what was done, on what machine, figures and table."""
-    known: dict[str, float] = meta["best_known"]  # type: ignore[assignment]
-    shown = [c for c in COORDINATES if c in set(ends["coordinates"])]
-    lines = [
-        "| problem | in | method | solved | seconds until solved: median (quartiles) | "
-        "misfit over best known: median (worst) | evaluations per second |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    for row in table.to_dict("records"):
-        times = [row[f"solved after, {q} (s)"] for q in ("median", "quartile 1", "quartile 3")]
-        middle, low, high = (f"{t:.2f}" if np.isfinite(t) else "never" for t in times)
-        end = [row[f"misfit over best known at the end, {q}"] for q in ("median", "worst")]
-        lines.append(
-            f"| {row['problem']} | {row['coordinates']} | {row['method']} "
-            f"| {row['solved']} of {row['seeds']} | {middle} ({low}–{high}) "
-            f"| {end[0]:.3g} ({end[1]:.3g}) | {row['evaluations per second, median']:.0f} |"
-        )
-    curves = "\n\n".join(
-        f"![Misfit against seconds, {COORDINATES[c]}](identification_{c}.png)" for c in shown
-    )
-    return PAGE.format(
-        again="; `--redraw` draws the recorded runs again",
-        count=len(known) * int(meta["seeds"]),  # type: ignore[call-overload]
-        problems=len(known),
-        budget=meta["budget_s"],
-        slopes=SLOPES[str(meta["derivatives"])],
-        findings=findings(ends),
-        curves=curves,
-        shoe=SHOE if "shoe-foam" in known else "",
-        table="\n".join(lines),
-        **{k: meta[k] for k in
-           ("seeds", "processor", "python", "foamfit", "lmfit", "scipy", "numpy", "numba")},
-    )  # fmt: skip
-
-
-def report(runs: pd.DataFrame, meta: dict[str, object], folder: Path) -> None:
-    """Write table, page and figures of recorded runs."""
-    known: dict[str, float] = meta["best_known"]  # type: ignore[assignment]
-    lowest = runs.groupby("problem")["cost"].min()
-    meta["best_known"] = {key: min(cost, float(lowest[key])) for key, cost in known.items()}
-    ends = solved_after(runs, meta["best_known"])  # type: ignore[arg-type]
-    table = tabulate(ends)
-    table.to_csv(folder / "identification.csv", index=False, float_format="%.4g")
-    (folder / "identification.md").write_text(page(ends, table, meta))
-    draw_profiles(ends, meta, folder / "identification_profiles.png")
-    for coordinates in COORDINATES:
-        if coordinates in set(ends["coordinates"]):
-            draw_curves(runs, coordinates, meta, folder / f"identification_{coordinates}.png")
-    print(findings(ends))
-
-
 def _listed(choices: dict[str, object] | tuple[str, ...]) -> Callable[[str], list[str]]:
-    """Reader of a list like "impact,chain" for argparse."""
+    """Read a list like "impact,chain" for argparse."""
 
     def read(text: str) -> list[str]:
         given = text.split(",")
@@ -678,15 +390,11 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=HERE)
     options = parser.parse_args()
     log, notes = (options.out / f"identification_runs.{end}" for end in ("csv.gz", "json"))
-    if options.redraw:
-        runs, meta = pd.read_csv(log), json.loads(notes.read_text())
-    else:
-        runs, meta = run_all(options)
-        compression = {"method": "gzip", "mtime": 0}
-        runs.to_csv(log, index=False, float_format="%.6g", compression=compression)
-        notes.write_text(json.dumps(meta, indent=1) + "\n")
-        runs = pd.read_csv(log)  # what is drawn now is what is drawn again
-    report(runs, meta, options.out)
+    if not options.redraw:
+        run_all(options, log, notes)
+    if not log.exists():
+        raise SystemExit(f"nothing was run: there is no {log}")
+    report(pd.read_csv(log), Setup.read(notes), options.out)
 
 
 if __name__ == "__main__":
