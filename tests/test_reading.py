@@ -56,6 +56,8 @@ def expect(test):
         "TIME (MS),STRESS (MPA),DISPLACEMENT (MM)",
         "Time / ms,Nominal stress / N/mm^2,Top displacement / mm",
         "time ms,stress N/mm²,displacement mm",
+        "Time/ms,Stress/MPa,Displacement/mm",
+        "t/ms,nominal stress/N/mm^2,Top displacement /mm",
     ],
 )
 def test_units_stand_in_the_headers(tmp_path, header):
@@ -258,6 +260,14 @@ def test_refuses_what_is_no_table(tmp_path, content, words):
     path = write(tmp_path)
     path.write_bytes(content)
     refused(path, "test.csv", *words)
+
+
+@pytest.mark.parametrize("other", ["Force/A", "Load/Height", "stress/strain", "time/force", "1/t"])
+def test_a_quotient_of_two_quantities_is_no_channel(tmp_path, other):
+    rows = [f"{row},{i}" for i, row in enumerate(numbers())]
+    test = read_test(write(tmp_path, f"Time/ms,Stress/MPa,Displacement/mm,{other}", rows))
+    expect(test)
+    assert any(f"not used: '{other}'" in note for note in test.notes)
 
 
 @pytest.mark.parametrize(

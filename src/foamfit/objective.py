@@ -28,6 +28,9 @@ Array = NDArray[np.float64]
 
 # Of every objective; to them come displacement_1_time … where masses inside were followed.
 CURVES = ("stress_time", "displacement_time", "stress_strain")
+# Those that need a motion, and what is said of one that is no measurement of its own.
+MOTION_CURVES = ("displacement_time", "stress_strain")
+INTEGRATED = "integrated from force"
 DRIVES = ("impact", "stress", "displacement")
 # What a residual is, in units of the curve's scale, where a simulation failed.
 PENALTY = 10.0
@@ -125,7 +128,7 @@ def default_weights(measurement: Measurement, drive: str, springs: int = 1) -> d
     weights |= dict.fromkeys(interior_curves(measurement, springs), 1.0)
     if drive == "impact":
         weights["stress_time"] = 1.0
-        if measurement.displacement is not None and measurement.motion != "integrated from force":
+        if measurement.displacement is not None and measurement.motion != INTEGRATED:
             weights["displacement_time"] = 1.0
     elif drive == "stress":
         weights["displacement_time"] = 1.0
@@ -409,13 +412,17 @@ class Objective:
         return columns
 
     def misfit(self, curves: Simulated) -> dict[str, float | None]:
-        """RMS of simulated minus measured over the measured range, per curve; None if not there."""
-        out: dict[str, float | None] = {}
-        for name in self.curves:
-            measured, simulated = self.measured[name], curves.curve(name)
-            if measured is None or simulated is None:
-                out[name] = None
-            else:
-                miss = np.sqrt(np.mean((simulated - measured) ** 2))
-                out[name] = float(miss / np.ptp(measured))
-        return out
+        """RMS of simulated minus measured over the measured range, per curve; None if not there.
+
+        A motion that was integrated from the force is there only if it is counted.
+        """
+        derived = MOTION_CURVES if self.measurement.motion == INTEGRATED else ()
+        there = [name for name in self.curves if name in self.counted or name not in derived]
+        return {name: self.off(curves, name) if name in there else None for name in self.curves}
+
+    def off(self, curves: Simulated, name: str) -> float | None:
+        """RMS of simulated minus measured over the measured range of one curve, if it is there."""
+        measured, simulated = self.measured[name], curves.curve(name)
+        if measured is None or simulated is None:
+            return None
+        return float(np.sqrt(np.mean((simulated - measured) ** 2)) / np.ptp(measured))

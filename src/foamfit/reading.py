@@ -96,7 +96,17 @@ def _parse_header(text: str) -> _Header:
         unit = "/".join(token for token in rest if token.lower() != "per")  # m_s2, N_per_kg
         if is_unit(unit, any_case=True):
             return _Header(text, tuple(t.lower() for t in tokens[:i]), unit)
-    return _Header(text, tuple(t.lower() for t in tokens), None)
+    return _over_unit(text) or _Header(text, tuple(t.lower() for t in tokens), None)
+
+
+def _over_unit(text: str) -> _Header | None:
+    """Header of a quantity over its unit, Time/ms; None where these two do not belong together."""
+    name, _, unit = (part.strip() for part in text.partition("/"))
+    header = _Header(text, tuple(re.split(r"[\s_]+", name.lower())), unit)
+    for channel, (si, _, _) in _CHANNELS.items():
+        if unit and _rank(header, channel) is not None and factor(unit, si) is not None:
+            return header
+    return None
 
 
 def _kind(channel: str) -> tuple[str, str, tuple[str, ...]]:
