@@ -228,6 +228,13 @@ def test_what_cannot_be_compared_is_refused() -> None:
         compare([{"schema": 1, "test": "foam-2"}])
 
 
+def test_an_unknown_published_set_says_which_there_are() -> None:
+    with pytest.raises(KeyError, match=r"no published set 'foam-3'; there are foam-1/model-1.*"):
+        ff.published["foam-3"]
+    assert ff.published.get("foam-3") is None
+    assert "foam-3" not in ff.published
+
+
 @pytest.mark.parametrize(
     ("place", "change", "words"),
     [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import lmfit
@@ -202,6 +203,38 @@ def test_without_a_mass_inside_the_softest_spring_is_put_at_the_base():
     assert base.sigma_a < 0.7 * top.sigma_a
     assert result.curves.interior == {}
     assert "displacement_1_time" not in result.misfit
+
+
+def test_the_result_says_that_a_motion_was_integrated_from_the_force():
+    _, impact = synthetic_impact()
+    result = ff.fit(replace(impact, motion="integrated from force"), starts=2)
+    content = result.to_json_dict()
+    assert content["misfit"]["stress_time"] < 0.02
+    assert content["misfit"]["displacement_time"] is None
+    assert content["misfit"]["stress_strain"] is None
+    note = next(note for note in result.notes if "integrated from the force" in note)
+    assert re.search(r"the displacement-time curve is \d+\.\d% of its range off", note)
+
+
+@pytest.mark.parametrize(
+    ("model", "drive", "why"),
+    [
+        ("bistable", "impact", "a single spring has none"),
+        ("linear+bistable", "displacement", "none moves in the displacement drive"),
+    ],
+)
+def test_interior_masses_that_are_not_there_are_said_to_change_nothing(model, drive, why):
+    _, impact = synthetic_impact()
+    asked, plain = (
+        ff.fit(impact, model=model, drive=drive, starts=1, interior_mass=mass)
+        for mass in (True, False)
+    )
+    assert any(why in note for note in asked.notes)
+    assert not any(why in note for note in plain.notes)
+    assert asked.params.valuesdict() == plain.params.valuesdict()
+    assert asked.warnings == plain.warnings
+    states = [{n: p.state for n, p in fit.parameters.items()} for fit in (asked, plain)]
+    assert states[0] == states[1]
 
 
 def test_a_mass_inside_is_left_out_of_a_single_spring_and_refused_as_the_top():
