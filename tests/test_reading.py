@@ -111,6 +111,21 @@ def test_columns_of_the_toml_come_first(tmp_path):
     expect(read_test(write(tmp_path, "A,B,C", toml=toml)))
 
 
+def test_a_unit_after_a_slash_counts_for_a_column_of_the_toml(tmp_path):
+    columns = """[columns]
+time = { column = "Zeit/ms" }
+stress = { column = "Spannung/MPa" }
+displacement = { column = "Weg/mm" }
+"""
+    expect(read_test(write(tmp_path, "Zeit/ms,Spannung/MPa,Weg/mm", toml=SPECIMEN + columns)))
+    path = write(tmp_path, "Zeit/ms,Spannung/MPa,Weg/Faden", toml=SPECIMEN + columns)
+    refused(path, "'Weg/mm' is nowhere", "Weg/Faden")
+    path = write(
+        tmp_path, "Zeit/ms,Spannung/mm,Weg/mm", toml=SPECIMEN + columns.replace("MPa", "mm")
+    )
+    refused(path, "column 'Spannung/mm' has no unit")
+
+
 def test_force_and_strain_use_the_specimen(tmp_path):
     rows = [f"{i},{200 * y},{40 * y}" for i, y in enumerate(LOOP)]
     expect(read_test(write(tmp_path, "time (ms),Normal force (N),strain (%)", rows)))
