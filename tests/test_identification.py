@@ -138,6 +138,17 @@ def test_without_stated_noise_the_errors_come_from_the_residuals():
     ("options", "message"),
     [
         ({"starts": 0}, "starts = 0"),
+        ({"starts": 1.5}, "starts = 1.5"),
+        ({"seed": -1}, "seed = -1"),
+        ({"seed": "a"}, "seed = 'a'"),
+        ({"seed": None}, "seed = None"),
+        ({"max_time": "5 s"}, "max_time = '5 s'"),
+        ({"max_time": np.nan}, "max_time = nan"),
+        ({"model": 3}, "model = 3"),
+        ({"model": None}, "model = None"),
+        ({"params": {"s1_k0": 5e6}}, "params must be lmfit.Parameters"),
+        ({"weights": [1.0]}, "weights must be a mapping"),
+        ({"weights": {"stress_strain": "all"}}, "'stress_strain' = all"),
         ({"max_time": -1.0}, "max_time"),
         ({"model": "rubber"}, "rubber"),
         ({"drive": "sideways"}, "sideways"),
@@ -149,6 +160,11 @@ def test_without_stated_noise_the_errors_come_from_the_residuals():
 def test_wrong_calls_are_refused(options, message):
     with pytest.raises(ff.InputError, match=message):
         ff.fit(synthetic_loop()[1], **options)
+
+
+def test_a_path_is_no_measurement():
+    with pytest.raises(ff.InputError, match=r"measurement is a str; give what foamfit\.read_test"):
+        ff.fit("test.csv")
 
 
 SOFT = ff.published["foam-1/model-1"].bistable

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -479,6 +480,23 @@ def test_inadmissible_chains_are_refused_by_name(change: dict[str, object], name
     good = {"springs": list(SCENE.springs), "heights": [1e-3, 1e-3], "area": AREA}
     with pytest.raises(ValueError, match=rf"\b{name}"):
         ff.Chain(**{**good, **change})
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"chain": None}, "chain is a NoneType; it must be a Chain"),
+        ({"chain": SCENE.springs[0]}, "chain is a LinearSpring; it must be a Chain"),
+        ({"drive": np.zeros(3)}, "drive is a ndarray; it must be an Impact"),
+        ({"t": None}, "t must be an array of numbers"),
+        ({"t": "1 ms"}, "t must be an array of numbers"),
+        ({"rtol": "1e-6"}, "rtol = '1e-6' is not admissible: it must be a number"),
+    ],
+)
+def test_what_is_no_scene_is_refused_by_name(change: dict[str, Any], words: str) -> None:
+    good: dict[str, Any] = {"chain": SCENE, "drive": ff.Impact(7e-3, 1.0), "t": GOOD}
+    with pytest.raises(ValueError, match=rf"^{words}"):
+        ff.simulate(**(good | change))
 
 
 @pytest.mark.parametrize("rtol", [0.0, -1e-6, math.nan, math.inf])

@@ -150,3 +150,20 @@ class DisplacementDrive:
 
 
 Drive = Impact | StressDrive | DisplacementDrive
+
+
+def check_scene(chain: object, drive: object) -> None:
+    """Refuse what is no chain or no drive.
+
+    Raises
+    ------
+    ValueError
+        Naming which.
+    """
+    if not isinstance(chain, Chain):
+        raise ValueError(f"chain is a {type(chain).__name__}; it must be a Chain")
+    if not isinstance(drive, Drive):
+        raise ValueError(
+            f"drive is a {type(drive).__name__}; it must be an Impact, a StressDrive or a "
+            "DisplacementDrive"
+        )

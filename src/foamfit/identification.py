@@ -7,6 +7,7 @@ import time
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from numbers import Integral, Real
 
 import lmfit
 import numpy as np
@@ -79,10 +80,7 @@ def fit(
         If nothing that was tried could be simulated.
     """
     began = time.perf_counter()
-    if starts is not None and starts < 1:
-        raise InputError(f"starts = {starts} is not admissible; it must be at least 1")
-    if max_time is not None and not max_time > 0:
-        raise InputError(f"max_time = {max_time:g} s is not admissible; it must be positive")
+    _check_call(measurement, seed, starts, max_time, params, weights)
     problem = make_problem(measurement, model, drive, params, weights, interior_mass)
     starts = STARTS * len(problem.model.kinds) if starts is None else starts
     deadline = None if max_time is None else time.monotonic() + max_time
@@ -98,6 +96,33 @@ def fit(
         return _finish(problem, tracker.best_values, record)
     except KeyboardInterrupt:  # what was found is not given up for a late Ctrl-C
         return _finish(problem, tracker.best_values, replace(record, stopped="Ctrl-C"))
+
+
+def _check_call(
+    measurement: object,
+    seed: object,
+    starts: object,
+    max_time: object,
+    params: object,
+    weights: object,
+) -> None:
+    """Refuse arguments of `fit` that are of no use, by name."""
+    if not isinstance(measurement, Measurement):
+        raise InputError(
+            f"measurement is a {type(measurement).__name__}; give what foamfit.read_test returns"
+        )
+    for name, value, least in (("seed", seed, 0), ("starts", starts, 1)):
+        whole = isinstance(value, Integral) and int(value) >= least
+        if not whole and (name == "seed" or value is not None):
+            raise InputError(
+                f"{name} = {value!r} is not admissible; it must be a whole number, at least {least}"
+            )
+    if max_time is not None and not (isinstance(max_time, Real) and float(max_time) > 0):
+        raise InputError(f"max_time = {max_time!r} is not admissible; it must be positive, in s")
+    if params is not None and not isinstance(params, lmfit.Parameters):
+        raise InputError("params must be lmfit.Parameters, as foamfit.make_params returns them")
+    if weights is not None and not isinstance(weights, Mapping):
+        raise InputError("weights must be a mapping of curves to numbers, like {'stress_time': 1}")
 
 
 def _finish(problem: Problem, values: Array, record: SearchRecord) -> FitResult:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from numbers import Real
 
 import numpy as np
 from numpy.typing import NDArray
@@ -248,7 +249,8 @@ class Objective:
 
     def _check_weights(self) -> None:
         for name, weight in self.weights.items():
-            if name not in self.curves or not 0 <= weight < np.inf:
+            number = isinstance(weight, Real)
+            if name not in self.curves or not number or not 0 <= weight < np.inf:
                 raise InputError(
                     f"weights: '{name}' = {weight} is not admissible; give "
                     f"{', '.join(self.curves)} a weight of zero or more"

@@ -41,7 +41,7 @@ def as_number(value: object, name: str) -> float:
 
 
 def as_samples(values: ArrayLike, name: str) -> Array:
-    """Return values as a new array of floats.
+    """Return values as a new array of floats, contiguous and writable.
 
     Raises
     ------
@@ -50,7 +50,7 @@ def as_samples(values: ArrayLike, name: str) -> Array:
     """
     try:
         if np.asarray(values).dtype.kind in "biuf":
-            return np.array(values, dtype=np.float64)
+            return np.array(values, dtype=np.float64, order="C")
     except (TypeError, ValueError):  # rows of several lengths
         pass
     raise ValueError(f"{name} must be an array of numbers")
