@@ -149,7 +149,7 @@ class Recorder:
     values: Array | None = None
     evaluations: int = 0
     rows: list[tuple[float, int, float]] = field(default_factory=list)
-    began: float = field(default_factory=time.process_time)
+    began: float = field(default_factory=lambda: time.process_time())
     ended: float = np.nan
 
     def note(self, objective: Objective, values: Array, residual: Array) -> None:
@@ -181,11 +181,10 @@ class Recorder:
             If the recorded cost is not that of the recorded point: the method minimised another
             function than the others.
         """
-        if self.values is None:
-            raise RuntimeError("nothing was evaluated")
-        residual = self.objective.residual(self.values)
-        if not np.isclose(float(residual @ residual), self.cost, rtol=1e-6):
-            raise RuntimeError("the method did not minimise the cost of the problem")
+        if self.values is not None:
+            residual = self.objective.residual(self.values)
+            if not np.isclose(float(residual @ residual), self.cost, rtol=1e-6):
+                raise RuntimeError("the method did not minimise the cost of the problem")
         return [*self.rows, (min(self.ended, self.budget), self.evaluations, self.cost)]
 
 
@@ -220,57 +219,85 @@ def random_points(space: Space, rng: np.random.Generator) -> Iterator[Array]:
         yield from box_starts(space, rng, 32)
 
 
-def run_lmfit(problem: Problem, method: str, coordinates: str, seed: int, derivatives: str) -> None:
-    """Minimise by a method of lmfit, over and over from other points of the box."""
-    space = problem.space()
-    names = problem.free()
-    places = [problem.model.index[name] for name in names]
+@dataclass(frozen=True)
+class Variables:
+    """What a method of lmfit varies, and the way from there to the problem's flat vector.
 
-    if coordinates == "box":
-        params = lmfit.Parameters()
-        for j, (low, high) in enumerate(zip(*space.box, strict=True)):
-            params.add(f"u{j}", min=low, max=high, value=0.5 * (low + high))
-        free = tuple(params)
+    Parameters
+    ----------
+    problem : Problem
+        The problem.
+    space : Space
+        Its box.
+    coordinates : str
+        "si" or "box".
+    """
 
-        def vector(p: lmfit.Parameters) -> Array:
-            return space.decode(np.array([p[name].value for name in free]))
+    problem: Problem
+    space: Space
+    coordinates: str
 
-    else:
-        params, free, vector = problem.params.copy(), names, problem.vector
+    def params(self, point: Array) -> lmfit.Parameters:
+        """Parameters at a point of the box, off their bounds, where least_squares wants them."""
+        if self.coordinates == "box":
+            params = lmfit.Parameters()
+            for j, (low, high) in enumerate(zip(*self.space.box, strict=True)):
+                params.add(f"u{j}", min=low, max=high)
+            free, start = tuple(params), point
+        else:
+            params, free = self.problem.params.copy(), self.problem.free()
+            start = self._free(self.space.decode(point))
+        for name, value in zip(free, start, strict=True):
+            low, high = params[name].min, params[name].max
+            margin = 1e-9 * (high - low)
+            params[name].value = float(np.clip(value, low + margin, high - margin))
+        params.update_constraints()
+        return params
 
-    def residual(p: lmfit.Parameters) -> Array:
-        return problem.objective.residual(vector(p))
+    def residual(self, params: lmfit.Parameters) -> Array:
+        """Residual of the problem."""
+        return self.problem.objective.residual(self._vector(params))
 
-    def jacobian(p: lmfit.Parameters) -> Array:
-        """Slopes of the residual by the free parameters, and those by the coordinates."""
-        slopes = problem.slopes(vector(p), names)
-        if coordinates == "si":
+    def jacobian(self, params: lmfit.Parameters) -> Array:
+        """Derivative of the residual by what varies, (n_data, n_free)."""
+        slopes = self.problem.slopes(self._vector(params), self.problem.free())
+        if self.coordinates == "si":
             return slopes
-        point = np.array([p[name].value for name in free])
-        step = 1e-6
+        point, step = _values(params), 1e-6
         columns = [
-            (space.decode(point + step * unit) - space.decode(point - step * unit))[places]
-            for unit in np.eye(point.size)
+            self._free(self.space.decode(point + move) - self.space.decode(point - move))
+            for move in step * np.eye(point.size)
         ]
         return np.asarray(slopes @ (np.transpose(columns) / (2.0 * step)))
 
+    def _vector(self, params: lmfit.Parameters) -> Array:
+        if self.coordinates == "box":
+            return self.space.decode(_values(params))
+        return self.problem.vector(params)
+
+    def _free(self, values: Array) -> Array:
+        return values[[self.problem.model.index[name] for name in self.problem.free()]]
+
+
+def _values(params: lmfit.Parameters) -> Array:
+    return np.array([parameter.value for parameter in params.values()])
+
+
+def run_lmfit(problem: Problem, method: str, coordinates: str, seed: int, derivatives: str) -> None:
+    """Minimise by a method of lmfit, over and over from other points of the box."""
+    variables = Variables(problem, problem.space(), coordinates)
     rng = np.random.default_rng(seed)
-    for point in random_points(space, rng):
-        start = point if coordinates == "box" else space.decode(point)[places]
-        for name, value in zip(free, start, strict=True):
-            low, high = params[name].min, params[name].max
-            margin = 1e-9 * (high - low)  # least_squares wants its start off the bounds
-            params[name].value = float(np.clip(value, low + margin, high - margin))
-        params.update_constraints()
+    for point in random_points(variables.space, rng):
         options = _options(method, int(rng.integers(2**31)))
         if method in LEAST_SQUARES and derivatives == "problem":
-            options |= {"Dfun" if method == "leastsq" else "jac": jacobian}
+            options |= {"Dfun" if method == "leastsq" else "jac": variables.jacobian}
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")  # of lmfit's covariances, which nobody reads here
             try:
                 lmfit.minimize(
-                    residual, params, method=method, calc_covar=False, max_nfev=10**9, **options
-                )
+                    variables.residual, variables.params(point), method=method, calc_covar=False,
+                    max_nfev=10**9, **options,
+                )  # fmt: skip
             except (ValueError, np.linalg.LinAlgError):
                 continue  # a method that breaks down starts again, on its own time
 
