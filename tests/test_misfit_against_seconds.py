@@ -20,7 +20,6 @@ import identification_report as report
 FILES = {
     "identification.csv",
     "identification.md",
-    "identification_box.png",
     "identification_profiles.png",
     "identification_runs.csv.gz",
     "identification_runs.json",
@@ -113,7 +112,16 @@ def test_the_derivatives_of_the_problem_serve_in_both_coordinates(coordinates: s
 def test_what_was_recorded_is_drawn_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    short = ["--budget", "0.05", "--seeds", "2", "--methods", "leastsq,powell"]
+    short = [
+        "--budget",
+        "0.05",
+        "--seeds",
+        "2",
+        "--methods",
+        "leastsq,powell",
+        "--coordinates",
+        "si",
+    ]
     out = ["identification.py", "--out", str(tmp_path), "--problems", "displacement"]
     monkeypatch.setattr(sys, "argv", [*out, *short])
     monkeypatch.setattr(identification, "best_known", lambda *_: 5155.0)

@@ -161,6 +161,8 @@ class Recorder:
             When the run is over.
         """
         seconds = time.process_time() - self.began
+        if seconds > self.budget:
+            raise RunOver
         self.evaluations += 1
         if objective.measurement is self.objective.measurement:
             cost = float(residual @ residual)
@@ -169,7 +171,7 @@ class Recorder:
                 last = self.rows[-1][2] if self.rows else np.inf
                 if cost < RECORDED * last or cost <= SOLVED * self.known < last:
                     self.rows.append((seconds, self.evaluations, cost))
-        if seconds > self.budget or self.cost <= ENOUGH * self.known:
+        if self.cost <= ENOUGH * self.known:
             raise RunOver
 
     def finished(self) -> list[tuple[float, int, float]]:

@@ -196,7 +196,7 @@ def draw_curves(runs: pd.DataFrame, coordinates: str, setup: Setup, path: Path) 
                     chosen = among[(among["problem"] == key) & (among["method"] == name)]
                     if len(chosen):
                         _band(axes, clock, chosen, setup.known[key], name)
-                axes.set(xscale="log", yscale="log", xlim=(clock[0], clock[-1]), ylim=(0.9, 1000.0))
+                axes.set(xscale="log", yscale="log", xlim=(clock[0], clock[-1]), ylim=(0.9, 300.0))
                 axes.axhline(1.0, color="0.75", linewidth=0.8, zorder=0)
                 _grid(axes)
                 if key == list(setup.known)[-1]:
