@@ -485,6 +485,36 @@ def test_refuses_calls_of_simulate(here: Path, args: list[str], words: tuple[str
     refused(here, "simulate", scene(here, PUBLISHED + IMPACT), *args, words=words)
 
 
+@pytest.mark.parametrize("option", ["--out", "--plot"])
+@pytest.mark.parametrize("name", ["scene.toml", "../{here}/scene.toml"])
+def test_simulate_keeps_its_scene(here: Path, option: str, name: str) -> None:
+    path = scene(here, PUBLISHED + IMPACT)
+    name = name.format(here=here.name)
+    words = ("scene.toml is read by this command", "another file")
+    refused(here, "simulate", path, option, name, words=words)
+
+
+def test_simulate_keeps_the_history_that_drives_it(here: Path) -> None:
+    (here / "drive.csv").write_text("time (ms),stress (MPa)\n0,0\n1,1\n2,0\n")
+    path = scene(here, OWN + DRIVE).rename(here / "drive.toml")  # without --out: drive.csv
+    refused(here, "simulate", path, words=("drive.csv is read by this command", "another file"))
+    accepted("simulate", path, "--out", "response.csv")
+
+
+def test_simulate_writes_two_files_or_none(here: Path) -> None:
+    path = scene(here, PUBLISHED + IMPACT)
+    refused(here, "simulate", path, "--out", "a.png", "--plot", "a.png", words=("a.png", "two"))
+
+
+def test_compare_and_fit_keep_what_they_read(here: Path, fitted: tuple[Path, Result]) -> None:
+    folder = here / "old"
+    shutil.copytree(next(fitted[0].rglob("fit.json")).parent, folder)
+    args = ("--published", "foam-1/model-1", "--csv", folder / "fit.json")
+    refused(here, "compare", folder, *args, words=("fit.json is read by this command",))
+    write(folder)
+    refused(here, "fit", folder / "test.csv", "--out", folder, words=("old holds test.csv",))
+
+
 def test_a_defect_is_one_line_too(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: object) -> None:
         raise KeyError("two\nlines")

@@ -246,6 +246,46 @@ def test_what_cannot_be_compared_is_refused() -> None:
         compare([{"schema": 1, "test": "foam-2"}])
 
 
+def test_an_unknown_published_set_says_which_there_are() -> None:
+    with pytest.raises(KeyError, match=r"no published set 'foam-3'; there are foam-1/model-1.*"):
+        ff.published["foam-3"]
+    assert ff.published.get("foam-3") is None
+    assert "foam-3" not in ff.published
+
+
+@pytest.mark.parametrize(
+    ("place", "change", "words"),
+    [
+        ((), {"drive": None}, "the result is no whole result of a fit: 'drive' cannot be 'None'"),
+        (("parameters",), None, "'parameters' is missing; fit again"),
+        (("parameters",), [1], r"'parameters' cannot be '\[1\]'"),
+        (("parameters", "s1_k0"), 3.0, "s1_k0 is no whole result of a fit: 'value' is missing"),
+        (("parameters", "s1_k0", "state"), None, "s1_k0 is .*: 'state' is missing"),
+        (("parameters", "s1_k0", "value"), "soft", "s1_k0 is .*: 'value' cannot be 'soft'"),
+        (("parameters", "s1_k0", "stderr"), True, "s1_k0 is .*: 'stderr' cannot be 'True'"),
+        (("correlation",), {"names": ["s1_k0"]}, "'correlation' must have names and a square"),
+        (("correlation",), "high", "'correlation' must have names and a square"),
+    ],
+)
+def test_an_incomplete_result_is_refused_in_plain_words(
+    place: tuple[str, ...], change: Any, words: str
+) -> None:
+    content = json.loads(json.dumps(published_fit().to_json_dict()))
+    if not place:
+        content |= change
+    else:
+        inner = content
+        for key in place[:-1]:
+            inner = inner[key]
+        if change is None:
+            del inner[place[-1]]
+        else:
+            inner[place[-1]] = change
+    with pytest.raises(ff.InputError, match=words) as refusal:
+        compare([content])
+    assert "Error(" not in str(refusal.value)
+
+
 def test_the_text_is_aligned_and_narrow() -> None:
     chain = published_fit("foam-1/model-3", off=-1.234)
     wide = with_parameter(chain, "s1_k0", value=2e11, stderr=5e15, state="weak")

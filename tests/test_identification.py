@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import lmfit
@@ -138,6 +139,17 @@ def test_without_stated_noise_the_errors_come_from_the_residuals():
     ("options", "message"),
     [
         ({"starts": 0}, "starts = 0"),
+        ({"starts": 1.5}, "starts = 1.5"),
+        ({"seed": -1}, "seed = -1"),
+        ({"seed": "a"}, "seed = 'a'"),
+        ({"seed": None}, "seed = None"),
+        ({"max_time": "5 s"}, "max_time = '5 s'"),
+        ({"max_time": np.nan}, "max_time = nan"),
+        ({"model": 3}, "model = 3"),
+        ({"model": None}, "model = None"),
+        ({"params": {"s1_k0": 5e6}}, "params must be lmfit.Parameters"),
+        ({"weights": [1.0]}, "weights must be a mapping"),
+        ({"weights": {"stress_strain": "all"}}, "'stress_strain' = all"),
         ({"max_time": -1.0}, "max_time"),
         ({"model": "rubber"}, "rubber"),
         ({"drive": "sideways"}, "sideways"),
@@ -149,6 +161,11 @@ def test_without_stated_noise_the_errors_come_from_the_residuals():
 def test_wrong_calls_are_refused(options, message):
     with pytest.raises(ff.InputError, match=message):
         ff.fit(synthetic_loop()[1], **options)
+
+
+def test_a_path_is_no_measurement():
+    with pytest.raises(ff.InputError, match=r"measurement is a str; give what foamfit\.read_test"):
+        ff.fit("test.csv")
 
 
 SOFT = ff.published["foam-1/model-1"].bistable
@@ -203,6 +220,38 @@ def test_without_a_mass_inside_the_softest_spring_is_put_at_the_base():
     assert base.sigma_a < 0.7 * top.sigma_a
     assert result.curves.interior == {}
     assert "displacement_1_time" not in result.misfit
+
+
+def test_the_result_says_that_a_motion_was_integrated_from_the_force():
+    _, impact = synthetic_impact()
+    result = ff.fit(replace(impact, motion="integrated from force"), starts=2)
+    content = result.to_json_dict()
+    assert content["misfit"]["stress_time"] < 0.02
+    assert content["misfit"]["displacement_time"] is None
+    assert content["misfit"]["stress_strain"] is None
+    note = next(note for note in result.notes if "integrated from the force" in note)
+    assert re.search(r"the displacement-time curve is \d+\.\d% of its range off", note)
+
+
+@pytest.mark.parametrize(
+    ("model", "drive", "why"),
+    [
+        ("bistable", "impact", "a single spring has none"),
+        ("linear+bistable", "displacement", "none moves in the displacement drive"),
+    ],
+)
+def test_interior_masses_that_are_not_there_are_said_to_change_nothing(model, drive, why):
+    _, impact = synthetic_impact()
+    asked, plain = (
+        ff.fit(impact, model=model, drive=drive, starts=1, interior_mass=mass)
+        for mass in (True, False)
+    )
+    assert any(why in note for note in asked.notes)
+    assert not any(why in note for note in plain.notes)
+    assert asked.params.valuesdict() == plain.params.valuesdict()
+    assert asked.warnings == plain.warnings
+    states = [{n: p.state for n, p in fit.parameters.items()} for fit in (asked, plain)]
+    assert states[0] == states[1]
 
 
 def test_a_mass_inside_is_left_out_of_a_single_spring_and_refused_as_the_top():

@@ -81,6 +81,22 @@ def test_each_channel_is_counted_once():
     assert objective(impact, "stress").counted == ("displacement_time",)
 
 
+def test_a_motion_integrated_from_the_force_has_no_misfit_unless_it_is_counted():
+    spring, impact = synthetic_impact()
+    integrated = replace(impact, motion="integrated from force")
+    one = objective(integrated)
+    curves = one.simulate(values_of(spring), everything=True)
+    misfit = one.misfit(curves)
+    assert misfit["stress_time"] > 0.0
+    assert misfit["displacement_time"] is None
+    assert misfit["stress_strain"] is None
+    assert one.off(curves, "displacement_time") > 0.0
+    assert all(objective(impact).misfit(curves).values())
+    assert objective(integrated, "stress").misfit(curves)["displacement_time"] > 0.0
+    other = objective(integrated, "displacement")
+    assert other.misfit(other.simulate(values_of(spring)))["stress_strain"] > 0.0
+
+
 def test_failures_cost_a_finite_penalty_and_are_counted():
     spring, measurement = synthetic_impact()
     plain = objective(replace(measurement, noise=Noise()))

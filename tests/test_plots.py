@@ -56,6 +56,19 @@ def test_the_curves_are_drawn_in_these_units() -> None:
     np.testing.assert_allclose(line(loop, "springs along measured strain").get_xdata(), strain)
 
 
+def test_a_motion_that_was_not_measured_says_so_in_the_legend() -> None:
+    result = fabricated.result()
+    moved = replace(result, measurement=replace(result.measurement, motion="integrated from force"))
+    figure = plot_fit(moved)
+    stress_time, displacement_time, loop = figure.axes
+    points = line(stress_time, "measured")
+    for ax in (displacement_time, loop):
+        other = line(ax, "measured, motion integrated from force")
+        assert other.get_marker() != points.get_marker()
+    legend = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert legend[:3] == ["measured", "fitted", "measured, motion integrated from force"]
+
+
 def test_masses_inside_are_drawn_with_the_top() -> None:
     time = fabricated.result().curves.time
     measured, fitted = 1e-4 * np.sin(time / time[-1]), 1.1e-4 * np.sin(time / time[-1])

@@ -56,6 +56,8 @@ def expect(test):
         "TIME (MS),STRESS (MPA),DISPLACEMENT (MM)",
         "Time / ms,Nominal stress / N/mm^2,Top displacement / mm",
         "time ms,stress N/mm²,displacement mm",
+        "Time/ms,Stress/MPa,Displacement/mm",
+        "t/ms,nominal stress/N/mm^2,Top displacement /mm",
     ],
 )
 def test_units_stand_in_the_headers(tmp_path, header):
@@ -107,6 +109,21 @@ def test_columns_of_the_toml_come_first(tmp_path):
         'strain = { column = "C", unit = "%", scale = 10 }\n'
     )
     expect(read_test(write(tmp_path, "A,B,C", toml=toml)))
+
+
+def test_a_unit_after_a_slash_counts_for_a_column_of_the_toml(tmp_path):
+    columns = """[columns]
+time = { column = "Zeit/ms" }
+stress = { column = "Spannung/MPa" }
+displacement = { column = "Weg/mm" }
+"""
+    expect(read_test(write(tmp_path, "Zeit/ms,Spannung/MPa,Weg/mm", toml=SPECIMEN + columns)))
+    path = write(tmp_path, "Zeit/ms,Spannung/MPa,Weg/Faden", toml=SPECIMEN + columns)
+    refused(path, "'Weg/mm' is nowhere", "Weg/Faden")
+    path = write(
+        tmp_path, "Zeit/ms,Spannung/mm,Weg/mm", toml=SPECIMEN + columns.replace("MPa", "mm")
+    )
+    refused(path, "column 'Spannung/mm' has no unit")
 
 
 def test_force_and_strain_use_the_specimen(tmp_path):
@@ -258,6 +275,14 @@ def test_refuses_what_is_no_table(tmp_path, content, words):
     path = write(tmp_path)
     path.write_bytes(content)
     refused(path, "test.csv", *words)
+
+
+@pytest.mark.parametrize("other", ["Force/A", "Load/Height", "stress/strain", "time/force", "1/t"])
+def test_a_quotient_of_two_quantities_is_no_channel(tmp_path, other):
+    rows = [f"{row},{i}" for i, row in enumerate(numbers())]
+    test = read_test(write(tmp_path, f"Time/ms,Stress/MPa,Displacement/mm,{other}", rows))
+    expect(test)
+    assert any(f"not used: '{other}'" in note for note in test.notes)
 
 
 @pytest.mark.parametrize(

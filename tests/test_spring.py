@@ -273,6 +273,24 @@ def test_inadmissible_parameters_are_refused_by_name(name: str, value: float) ->
         ff.BistableSpring(**{**parameters, name: value})
 
 
+@pytest.mark.parametrize("wrong", [None, "5.5 MPa", "5.5", [1.0, 2.0], 1j, {}])
+def test_what_is_no_number_is_refused_by_name(wrong: object) -> None:
+    for item in dataclasses.fields(ff.BistableSpring):
+        with pytest.raises(ValueError, match=rf"^{item.name} = .* must be a number"):
+            dataclasses.replace(SPRING, **{item.name: wrong})
+    for name in ("k0", "eta"):
+        with pytest.raises(ValueError, match=rf"^{name} = .* must be a number"):
+            ff.LinearSpring(**{"k0": 60e6, name: wrong})
+
+
+@pytest.mark.parametrize("wrong", [None, "abc", ["0.1", "0.2"], [[0.1], [0.1, 0.2]], [1j]])
+def test_a_history_of_other_things_is_refused_by_name(wrong: object) -> None:
+    with pytest.raises(ValueError, match=r"^strain must be an array of numbers"):
+        SPRING.stress(wrong)
+    with pytest.raises(ValueError, match=r"^stress must be an array of numbers"):
+        SPRING.strain(wrong)
+
+
 @pytest.mark.parametrize("beyond", [0.0, 1e-9, 1.0])
 def test_strain_past_the_pole_is_refused(beyond: float) -> None:
     with pytest.raises((ValueError, ff.SimulationError)):

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from foamfit.conditioning import engineering, line_at, noise_level
-from foamfit.measurement import Array, Measurement, Striker, interior_channel
+from foamfit.measurement import INTEGRATED, Array, Measurement, Striker, interior_channel
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ def audit(measurement: Measurement) -> EnergyAudit:
         missing.append("The absorbed energy needs stress and displacement.")
     rebound = _rebound(test)
     impulse, change = _momentum(test, striker, rebound)
-    if test.motion == "integrated from force":
+    if test.motion == INTEGRATED:
         missing.append("The motion comes from the force, so the balances check nothing here.")
     elif change is None:
         missing.append("The balance of momentum needs an impact of known mass with its rebound.")
@@ -225,7 +225,7 @@ def _momentum(
     impulse = test.specimen.area * float(np.trapezoid(stress, time) + 0.5 * stress[0] * time[0])
     if not (striker.mass and striker.velocity) or rebound is None:
         return impulse, None
-    if test.motion == "integrated from force":
+    if test.motion == INTEGRATED:
         return impulse, None
     return impulse, striker.mass * (striker.velocity + rebound)
 

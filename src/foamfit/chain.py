@@ -5,21 +5,34 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foamfit.spring import BistableSpring, LinearSpring, Spring
+from foamfit.spring import BistableSpring, LinearSpring, Spring, as_number, as_samples
 
 Array = NDArray[np.float64]
 
 
-def _finite(value: float, name: str, least: float, strict: bool) -> float:
-    number = float(value)
+def _finite(value: object, name: str, least: float, strict: bool) -> float:
+    number = as_number(value, name)
     if not math.isfinite(number) or number < least or (strict and number == least):
         wanted = f"greater than {least:g}" if strict else f"at least {least:g}"
         raise ValueError(f"{name} = {number:g} is not admissible: it must be finite and {wanted}")
     return number
+
+
+def _listed(values: Any, name: str, wanted: str) -> tuple[Any, ...]:
+    """Return what must be a sequence as a tuple."""
+    try:
+        if not isinstance(values, str | bytes):
+            return tuple(values)
+    except TypeError:
+        pass
+    raise ValueError(
+        f"{name} = {values!r} is not admissible: it must be a sequence of {wanted}, base first"
+    )
 
 
 @dataclass(frozen=True, init=False)
@@ -60,6 +73,7 @@ class Chain:
         site_damping: float = 0.0,
     ) -> None:
         """Check and freeze the chain."""
+        springs = _listed(springs, "springs", "BistableSpring or LinearSpring")
         n = len(springs)
         if n == 0:
             raise ValueError("springs is empty: a chain needs at least one spring")
@@ -69,7 +83,8 @@ class Chain:
                     f"springs: spring {i} is a {type(spring).__name__}; "
                     "it must be a BistableSpring or a LinearSpring"
                 )
-        masses = [0.0] * n if masses is None else masses
+        heights = _listed(heights, "heights", "numbers")
+        masses = _listed([0.0] * n if masses is None else masses, "masses", "numbers")
         for name, values in (("heights", heights), ("masses", masses)):
             if len(values) != n:
                 raise ValueError(
@@ -89,7 +104,7 @@ class Chain:
 
 
 def _samples(values: ArrayLike, name: str) -> Array:
-    samples = np.array(values, dtype=np.float64)
+    samples = as_samples(values, name)
     if samples.ndim != 1 or samples.size == 0:
         raise ValueError(f"{name} must be a one-dimensional array with at least one sample")
     if not np.all(np.isfinite(samples)):
@@ -135,3 +150,20 @@ class DisplacementDrive:
 
 
 Drive = Impact | StressDrive | DisplacementDrive
+
+
+def check_scene(chain: object, drive: object) -> None:
+    """Refuse what is no chain or no drive.
+
+    Raises
+    ------
+    ValueError
+        Naming which.
+    """
+    if not isinstance(chain, Chain):
+        raise ValueError(f"chain is a {type(chain).__name__}; it must be a Chain")
+    if not isinstance(drive, Drive):
+        raise ValueError(
+            f"drive is a {type(drive).__name__}; it must be an Impact, a StressDrive or a "
+            "DisplacementDrive"
+        )

@@ -13,6 +13,7 @@ import numpy as np
 from foamfit.clocks import shift_hint
 from foamfit.conditioning import engineering
 from foamfit.errors import InputError
+from foamfit.measurement import INTEGRATED
 from foamfit.model import split_name
 from foamfit.objective import check_time_shift
 from foamfit.uncertainty import WEAK
@@ -310,7 +311,7 @@ def _energy(e: Evidence) -> Check:
     warnings = tuple(e.balance.energy_warnings())
     if taken is None and not warnings:
         return Check("energy", question, None, "The test does not say enough to tell.")
-    if e.balance.motion == "integrated from force" and not warnings:
+    if e.balance.motion == INTEGRATED and not warnings:
         return Check("energy", question, None, "The motion comes from the force.")
     found = "The loop gives out more than it takes up."
     if taken is not None:

@@ -8,7 +8,7 @@ import math
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -309,6 +309,11 @@ def fit(
     measurement = read_test(test, specimen)
     folder = Path("fits", test.stem, model) if out is None else out
     check_target(folder)
+    for path in (test, specimen or test.with_suffix(".toml")):
+        if folder.resolve() in path.resolve().parents and folder.is_dir():
+            raise InputError(
+                f"{folder} holds {path.name} and would be replaced as a whole; choose another --out"
+            )
     from foamfit import identification
     from foamfit.objective import check_time_shift, choose_drive
     from foamfit.problem import make_params
@@ -424,13 +429,11 @@ def simulate(scene: Path, out: Path | None, plot: Path | None, rtol: float) -> N
         samples = 501
     Instead of the springs, published = "foam-1/model-3" under [chain] takes a published set.
     """
-    from foamfit.scene import read_scene, write_response
+    from foamfit.scene import files_of_scene, read_scene, write_response
     from foamfit.simulation import simulate as run
 
     target = Path(scene.with_suffix(".csv").name) if out is None else out
-    for path in (target, plot):
-        if path is not None:
-            _check_file(path)
+    _check_files((target, plot), files_of_scene(scene))
     if plot is not None:
         from foamfit.plots import figure_format
 
@@ -446,8 +449,19 @@ def simulate(scene: Path, out: Path | None, plot: Path | None, rtol: float) -> N
         click.echo(f"drawn in {plot}")
 
 
+def _check_files(outputs: tuple[Path | None, ...], inputs: Iterable[Path]) -> None:
+    """Refuse files that could not be written, or that are read too, before anything is computed."""
+    given = [path for path in outputs if path is not None]
+    for path in given:
+        _check_file(path)
+        if path.resolve() in [source.resolve() for source in inputs]:
+            raise InputError(f"{path} is read by this command and would be lost; name another file")
+    if len({path.resolve() for path in given}) < len(given):
+        raise InputError(f"{given[0]} cannot be two things; name two files")
+
+
 def _check_file(path: Path) -> None:
-    """Refuse a file that could not be written, before anything is computed."""
+    """Refuse a file that could not be written."""
     if path.is_dir():
         raise InputError(f"{path} is a folder; name a file")
     if not path.parent.is_dir():
@@ -482,9 +496,7 @@ def compare(
     from foamfit.comparison import comparison_text, write_csv
     from foamfit.plots import figure_format, plot_comparison
 
-    for path in (plot, table):
-        if path is not None:
-            _check_file(path)
+    _check_files((plot, table), [p / "fit.json" if p.is_dir() else p for p in results])
     if plot is not None:
         figure_format(plot)
     comparison = side_by_side(results, name)

@@ -27,6 +27,13 @@ from foamfit.spring import LinearSpring
 
 Result = FitResult | Mapping[str, Any] | str | Path
 
+# What is read of a result, and of each of its parameters.
+CONTENT = {"test": str, "model": str, "drive": str, "status": str, "parameters": Mapping}
+_NUMBER = int | float | None
+ESTIMATE = {
+    "value": _NUMBER, "stderr": _NUMBER, "unit": str, "vary": bool, "state": str, "why": str,
+}  # fmt: skip
+
 WIDTH = 100
 NOTHING = 3.0  # standard error over value past which a difference says nothing
 WORST_FIRST = ("not determined", "weak", "determined", "fixed")
@@ -215,45 +222,55 @@ def _side(result: Result) -> _Side:
         content: Mapping[str, Any] = result.to_json_dict()
     else:
         content = result if isinstance(result, Mapping) else load_result(result)
-    try:
-        estimates = {
-            name: ParameterEstimate(
-                value=math.nan if p["value"] is None else float(p["value"]),
-                stderr=p["stderr"],
-                ci95=None,
-                unit=p["unit"],
-                vary=p["vary"],
-                state=p["state"],
-                why=p["why"],
-            )
-            for name, p in content["parameters"].items()
-        }
-        test, model, drive = content["test"], content["model"], content["drive"]
-        return _Side(
-            label=f"{test}: {model}, {drive} drive",
-            kinds=Model.parse(model).kinds,
-            estimates=estimates,
-            correlation=_correlation(content.get("correlation")),
-            drive=drive,
-            status=content["status"],
-            stopped=content.get("stopped"),
-            test=test,
-            sha=content.get("data_sha256", ""),
-        )
-    except (KeyError, TypeError, AttributeError) as error:
-        where = result if isinstance(result, str | Path) else "the result"
-        raise InputError(f"{where} is no whole result of a fit ({error!r})") from error
+    where = str(result) if isinstance(result, str | Path) else "the result"
+    given = _whole(content, CONTENT, where)
+    test, model, drive = given["test"], given["model"], given["drive"]
+    return _Side(
+        label=f"{test}: {model}, {drive} drive",
+        kinds=Model.parse(model).kinds,
+        estimates={name: _read_estimate(p, where, name) for name, p in given["parameters"].items()},
+        correlation=_correlation(given.get("correlation"), where),
+        drive=drive,
+        status=given["status"],
+        stopped=given.get("stopped"),
+        test=test,
+        sha=str(given.get("data_sha256", "")),
+    )
 
 
-def _correlation(content: Mapping[str, Any] | None) -> dict[tuple[str, str], float]:
+def _whole(content: Any, wanted: Mapping[str, Any], where: str) -> Mapping[str, Any]:
+    """Return what a result holds if it holds all that is wanted, each of its kind."""
+    given = content if isinstance(content, Mapping) else {}
+    for key, kind in wanted.items():
+        fine = key in given and isinstance(given[key], kind)
+        if not fine or (kind is _NUMBER and isinstance(given[key], bool)):
+            fault = f"cannot be {str(given[key])[:40]!r}" if key in given else "is missing"
+            raise InputError(f"{where} is no whole result of a fit: '{key}' {fault}; fit again")
+    return given
+
+
+def _read_estimate(content: Mapping[str, Any], where: str, name: str) -> ParameterEstimate:
+    """Read one parameter of a result."""
+    p = _whole(content, ESTIMATE, f"{where}: {name}")
+    value = math.nan if p["value"] is None else float(p["value"])
+    return ParameterEstimate(value, p["stderr"], None, p["unit"], p["vary"], p["state"], p["why"])
+
+
+def _correlation(content: Any, where: str) -> dict[tuple[str, str], float]:
     if content is None:
         return {}
-    return {
-        (one, other): value
-        for one, row in zip(content["names"], content["matrix"], strict=True)
-        for other, value in zip(content["names"], row, strict=True)
-        if value is not None
-    }
+    try:
+        return {
+            (str(one), str(other)): float(value)
+            for one, row in zip(content["names"], content["matrix"], strict=True)
+            for other, value in zip(content["names"], row, strict=True)
+            if value is not None
+        }
+    except (KeyError, TypeError, ValueError):
+        raise InputError(
+            f"{where} is no whole result of a fit: 'correlation' must have names and a square "
+            "matrix of numbers; fit again"
+        ) from None
 
 
 def _published_side(name: str) -> _Side:

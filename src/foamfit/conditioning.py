@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from foamfit.errors import InputError
 from foamfit.measurement import (
+    INTEGRATED,
     Array,
     NoiseLevel,
     Outliers,
@@ -282,12 +283,7 @@ def checks(record: Record, specimen: Specimen, striker: Striker | None, motion: 
             f"The stress goes down to {engineering(lowest, 'Pa')} after the peak (adhesion, drift "
             "or ringing); it is kept."
         )
-    if (
-        striker
-        and striker.velocity
-        and record.time is not None
-        and motion != "integrated from force"
-    ):
+    if striker and striker.velocity and record.time is not None and motion != INTEGRATED:
         early = displacement <= 0.15 * displacement.max()
         early[int(np.argmax(displacement)) :] = False
         if early.sum() >= 3:

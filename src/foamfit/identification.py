@@ -84,6 +84,12 @@ def fit(
     SimulationError
         If nothing that was tried could be simulated.
     """
+    if not isinstance(measurement, Measurement):
+        raise InputError(
+            f"measurement is a {type(measurement).__name__}; give what foamfit.read_test returns"
+        )
+    if params is not None and not isinstance(params, lmfit.Parameters):
+        raise InputError("params must be lmfit.Parameters, as foamfit.make_params returns them")
     options = Options(
         drive=drive,
         seed=seed,

@@ -115,15 +115,22 @@ def _foam_2() -> PublishedSet:
     )
 
 
-published: dict[str, PublishedSet] = {
-    item.name: item
+class _Sets(dict[str, PublishedSet]):
+    """Published sets by their names; a name that is none of them is refused with those that are."""
+
+    def __missing__(self, name: object) -> PublishedSet:
+        raise KeyError(f"there is no published set {name!r}; there are {', '.join(self)}")
+
+
+published: dict[str, PublishedSet] = _Sets(
+    (item.name, item)
     for item in (
         _one_spring("foam-1/model-1", 0.450, None, None),
         _one_spring("foam-1/model-2", 0.425, 1e4, 0.894),
         _model_3(),
         _foam_2(),
     )
-}
+)
 
 
 def table() -> str:

@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+# What is said of a motion that is no measurement of its own.
+INTEGRATED = "integrated from force"
+
 
 def interior_channel(node: int) -> str:
     """Name of the channel that holds the displacement of an interior mass, 1 above the base."""

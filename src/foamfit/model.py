@@ -69,6 +69,8 @@ class Model:
         InputError
             If a spring in it is unknown.
         """
+        if not isinstance(name, str):
+            raise InputError(f"model = {name!r} must be a text like 'linear+bistable'")
         kinds = tuple(part.strip() for part in name.split("+"))
         for kind in kinds:
             if kind not in KINDS:

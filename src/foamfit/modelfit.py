@@ -7,6 +7,7 @@ import time
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from numbers import Integral, Real
 
 import lmfit
 import numpy as np
@@ -59,11 +60,19 @@ class Options:
 
     def __post_init__(self) -> None:
         """Refuse what is of no use."""
-        if self.starts is not None and self.starts < 1:
-            raise InputError(f"starts = {self.starts} is not admissible; it must be at least 1")
-        if self.max_time is not None and not self.max_time > 0:
+        for name, value, least in (("seed", self.seed, 0), ("starts", self.starts, 1)):
+            whole = isinstance(value, Integral) and int(value) >= least
+            if not whole and (name == "seed" or value is not None):
+                raise InputError(
+                    f"{name} = {value!r} is not admissible; it must be a whole number, at least "
+                    f"{least}"
+                )
+        limit = self.max_time
+        if limit is not None and not (isinstance(limit, Real) and float(limit) > 0):
+            raise InputError(f"max_time = {limit!r} is not admissible; it must be positive, in s")
+        if self.weights is not None and not isinstance(self.weights, Mapping):
             raise InputError(
-                f"max_time = {self.max_time:g} s is not admissible; it must be positive"
+                "weights must be a mapping of curves to numbers, like {'stress_time': 1}"
             )
         _ = self.choice
 

@@ -9,6 +9,7 @@ silently.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from numbers import Real
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from scipy.signal import savgol_filter
 from foamfit import kernels
 from foamfit.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.errors import InputError, SimulationError
-from foamfit.measurement import Measurement, NoiseLevel, interior_channel
+from foamfit.measurement import INTEGRATED, Measurement, NoiseLevel, interior_channel
 from foamfit.model import Model
 from foamfit.noise import with_noise
 from foamfit.simulation import Motion, Plan
@@ -28,6 +29,8 @@ Array = NDArray[np.float64]
 
 # Of every objective; to them come displacement_1_time … where masses inside were followed.
 CURVES = ("stress_time", "displacement_time", "stress_strain")
+# Those that need a motion.
+MOTION_CURVES = ("displacement_time", "stress_strain")
 DRIVES = ("impact", "stress", "displacement")
 # What a residual is, in units of the curve's scale, where a simulation failed.
 PENALTY = 10.0
@@ -134,7 +137,7 @@ def default_weights(measurement: Measurement, drive: str, springs: int = 1) -> d
     weights |= dict.fromkeys(interior_curves(measurement, springs), 1.0)
     if drive == "impact":
         weights["stress_time"] = 1.0
-        if measurement.displacement is not None and measurement.motion != "integrated from force":
+        if measurement.displacement is not None and measurement.motion != INTEGRATED:
             weights["displacement_time"] = 1.0
     elif drive == "stress":
         weights["displacement_time"] = 1.0
@@ -166,7 +169,7 @@ def check_time_shift(measurement: Measurement, drive: str) -> None:
     missing = None
     if measurement.time is None:
         missing = "it has no time"
-    elif measurement.displacement is None or measurement.motion == "integrated from force":
+    elif measurement.displacement is None or measurement.motion == INTEGRATED:
         missing = "its motion is not measured apart from the force"
     if missing:
         raise InputError(
@@ -334,7 +337,8 @@ class Objective:
 
     def _check_weights(self) -> None:
         for name, weight in self.weights.items():
-            if name not in self.curves or not 0 <= weight < np.inf:
+            number = isinstance(weight, Real)
+            if name not in self.curves or not number or not 0 <= weight < np.inf:
                 raise InputError(
                     f"weights: '{name}' = {weight} is not admissible; give "
                     f"{', '.join(self.curves)} a weight of zero or more"
@@ -645,18 +649,20 @@ class Objective:
     def misfit(self, curves: Simulated) -> dict[str, float | None]:
         """RMS of simulated minus measured over the measured range, per curve; None if not there.
 
-        Outliers are left out.
+        Outliers are left out. A motion that was integrated from the force is there only if it is
+        counted.
         """
-        out: dict[str, float | None] = {}
-        for name in self.curves:
-            measured, simulated = self.measured[name], curves.curve(name)
-            if measured is None or simulated is None:
-                out[name] = None
-            else:
-                kept = self._kept[name]
-                miss = np.sqrt(np.mean((simulated - measured)[kept] ** 2))
-                out[name] = float(miss / np.ptp(measured))
-        return out
+        derived = MOTION_CURVES if self.measurement.motion == INTEGRATED else ()
+        there = [name for name in self.curves if name in self.counted or name not in derived]
+        return {name: self.off(curves, name) if name in there else None for name in self.curves}
+
+    def off(self, curves: Simulated, name: str) -> float | None:
+        """RMS of simulated minus measured over the measured range of one curve, if it is there."""
+        measured, simulated = self.measured[name], curves.curve(name)
+        if measured is None or simulated is None:
+            return None
+        miss = (simulated - measured)[self._kept[name]]
+        return float(np.sqrt(np.mean(miss**2)) / np.ptp(measured))
 
 
 def _later(

@@ -360,6 +360,7 @@ class _Line:
     y: Array
     kind: Literal["measured", "fitted", "along"]
     node: int = 0  # the mass inside that it belongs to, 0 = the top
+    source: str = "measured"  # where the motion of a measured line came from
 
 
 @dataclass(frozen=True)
@@ -400,7 +401,12 @@ def _panels(result: FitResult) -> Iterator[_Panel]:
         ("stress_strain", "strain", "–", "stress", "Pa", loop),
     ]
     for key, x_name, x_unit, y_name, y_unit, curves in everything:
-        lines = [_Line(x, y, kind) for kind, x, y in curves if x is not None and y is not None]
+        source = "measured" if key == "stress_time" else result.measurement.motion or "measured"
+        lines = [
+            _Line(x, y, kind, source=source)
+            for kind, x, y in curves
+            if x is not None and y is not None
+        ]
         if key == "displacement_time" and c.time is not None:
             for node, (measured, fitted) in c.interior.items():
                 lines.append(_Line(c.time, measured, "measured", node))
@@ -519,10 +525,13 @@ def _draw(ax: Axes, panel: _Panel) -> None:
         color = INSIDE[(line.node - 1) % len(INSIDE)] if line.node else VERMILION
         if line.kind == "measured":
             some = _evenly(x, y, MARKERS)
+            of_its_own = line.source == "measured"
             ax.plot(x, y, color=GREY, lw=0.5, alpha=0.6, zorder=1)
             ax.plot(
-                x[some], y[some], "o", ms=2.6, mfc="white", mec=GREY, mew=0.6, zorder=2,
-                label="_measured inside" if line.node else "measured",
+                x[some], y[some], "o" if of_its_own else "s", ms=2.6, mfc="white", mec=GREY,
+                mew=0.6, zorder=2,
+                label="_measured inside" if line.node
+                else "measured" if of_its_own else f"measured, motion {line.source}",
             )  # fmt: skip
         elif line.kind == "fitted":
             name = f"mass {line.node}" if line.node else "fitted"

@@ -120,6 +120,7 @@ class Problem:
     objective: Objective
     params: lmfit.Parameters
     scales: Scales
+    notes: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -255,6 +256,11 @@ def make_problem(
     drive = choose_drive(measurement) if drive is None else drive
     count = len(model.kinds)
     check_interior(measurement, count)
+    notes: tuple[str, ...] = ()
+    if interior_mass and (count == 1 or drive != "impact"):
+        why = "a single spring has none" if count == 1 else f"none moves in the {drive} drive"
+        notes = (f"Interior masses were asked for, but {why}; the fit is the same without them.",)
+        interior_mass = False
     chosen = default_weights(measurement, drive, count) if weights is None else dict(weights)
     objective = Objective(
         measurement, model, drive, chosen,
@@ -273,4 +279,4 @@ def make_problem(
     _check_held(wanted)
     if not any(parameter.vary for parameter in wanted.values()):
         raise InputError("no parameter varies; let at least one vary")
-    return Problem(measurement, model, objective, wanted, Scales.of(measurement))
+    return Problem(measurement, model, objective, wanted, Scales.of(measurement), notes)

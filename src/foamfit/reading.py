@@ -97,7 +97,17 @@ def _parse_header(text: str) -> _Header:
         unit = "/".join(token for token in rest if token.lower() != "per")  # m_s2, N_per_kg
         if is_unit(unit, any_case=True):
             return _Header(text, tuple(t.lower() for t in tokens[:i]), unit)
-    return _Header(text, tuple(t.lower() for t in tokens), None)
+    return _over_unit(text) or _Header(text, tuple(t.lower() for t in tokens), None)
+
+
+def _over_unit(text: str) -> _Header | None:
+    """Header of a quantity over its unit, Time/ms; None where these two do not belong together."""
+    name, _, unit = (part.strip() for part in text.partition("/"))
+    header = _Header(text, tuple(re.split(r"[\s_]+", name.lower())), unit)
+    for channel, (si, _, _) in _CHANNELS.items():
+        if unit and _rank(header, channel) is not None and factor(unit, si) is not None:
+            return header
+    return None
 
 
 def _kind(channel: str) -> tuple[str, str, tuple[str, ...]]:
@@ -257,6 +267,9 @@ def _factor(table: _Table, channel: str, header: _Header, given: Column | None) 
     unit = given.unit if given and given.unit is not None else header.unit
     scale, scale_unit = (given.scale, given.scale_unit) if given else (1.0, "")
     where = f"{table.path}: column {header.text!r}"
+    over = header.text.partition("/")[2].strip()  # Weg/mm, which only the TOML calls displacement
+    if unit is None and over and factor(over, si, times=scale_unit) is not None:
+        unit = over
     if unit is None and not scale_unit and channel != "strain":
         raise InputError(
             f"{where} has no unit; write it in the header like '{example}' or in [columns]."
@@ -388,9 +401,9 @@ def _needed(table: _Table, columns: dict[str, int], settings: Settings) -> dict[
     sources = "velocity" in has or (striker.velocity and (striker.mass or "acceleration" in has))
     if "time" not in has or not sources:
         raise InputError(
-            f"{table.path}: no column is a displacement or a strain (there are {listed}), and "
-            "without one a time column and the [striker] mass and velocity are needed to integrate "
-            "the motion."
+            f"{table.path}: no column is a displacement or a strain (there are {listed}); name one "
+            "like 'displacement (mm)' or in [columns], or give a time column and the [striker] "
+            "mass and velocity to integrate the motion."
         )
     return {c: k for c, k in columns.items() if c in has}
 

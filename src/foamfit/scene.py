@@ -64,6 +64,13 @@ def read_scene(path: Path) -> tuple[Chain, Drive, Array]:
     return chain, drive, time
 
 
+def files_of_scene(path: Path) -> tuple[Path, ...]:
+    """Files that a scene is read from: itself and that of its drive, if it names one."""
+    drive = load_toml(path, "give the TOML file of a scene").get("drive")
+    file = drive.get("file") if isinstance(drive, dict) else None
+    return (path, path.parent / file) if isinstance(file, str) else (path,)
+
+
 def _table(path: Path, document: dict[str, Any], name: str) -> dict[str, Any]:
     table = document.get(name)
     if not isinstance(table, dict):

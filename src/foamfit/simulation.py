@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foamfit import implicit, kernels, series, taylor
-from foamfit.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
+from foamfit.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive, check_scene
 from foamfit.errors import SimulationError
 from foamfit.series import equilibrium_tangents
+from foamfit.spring import as_number, as_samples
 
 Array = NDArray[np.float64]
 
@@ -274,7 +275,7 @@ def _switches(time: Array, strain: Array, branches: NDArray[np.int64]) -> Array:
 
 
 def _time(t: ArrayLike) -> Array:
-    time = np.array(t, dtype=np.float64, order="C")  # a copy of one compiled type: writable
+    time = as_samples(t, "t")  # a copy of one compiled type: writable
     if time.ndim != 1 or time.size == 0:
         raise ValueError("t must be a one-dimensional array with at least one sample")
     if not np.all(np.isfinite(time)):
@@ -370,7 +371,8 @@ def simulate(chain: Chain, drive: Drive, t: ArrayLike, rtol: float = 1e-6) -> Re
     SimulationError
         If the scene has no finite answer; the message says why.
     """
-    if not 1e-14 <= rtol <= 1e-1:
+    check_scene(chain, drive)
+    if not 1e-14 <= as_number(rtol, "rtol") <= 1e-1:
         raise ValueError(f"rtol = {rtol:g} is not admissible: it must be between 1e-14 and 0.1")
     scene = plan(chain, drive, t)
     rows = np.array([spring.row for spring in chain.springs])

@@ -24,8 +24,40 @@ def _require(holds: bool, name: str, value: float, wanted: str) -> None:
         raise ValueError(f"{name} = {value:g} is not admissible: it must be {wanted}")
 
 
+def as_number(value: object, name: str) -> float:
+    """Return a value as a float, finite or not.
+
+    Raises
+    ------
+    ValueError
+        If it is no real number; the message names it.
+    """
+    try:
+        if not isinstance(value, str | bytes):
+            return float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        pass
+    raise ValueError(f"{name} = {value!r} is not admissible: it must be a number")
+
+
+def as_samples(values: ArrayLike, name: str) -> Array:
+    """Return values as a new array of floats, contiguous and writable.
+
+    Raises
+    ------
+    ValueError
+        If they are no real numbers; the message names them.
+    """
+    try:
+        if np.asarray(values).dtype.kind in "biuf":
+            return np.array(values, dtype=np.float64, order="C")
+    except (TypeError, ValueError):  # rows of several lengths
+        pass
+    raise ValueError(f"{name} must be an array of numbers")
+
+
 def _as_history(values: ArrayLike, name: str) -> Array:
-    history = np.ascontiguousarray(values, dtype=np.float64)
+    history = np.ascontiguousarray(as_samples(values, name))
     if history.ndim > 1:
         raise ValueError(f"{name} must be one history (one dimension), not {history.ndim}")
     if not np.all(np.isfinite(history)):
@@ -78,7 +110,7 @@ class BistableSpring:
     def __post_init__(self) -> None:
         """Refuse what is not admissible, by name."""
         for item in fields(self):
-            value = float(getattr(self, item.name))
+            value = as_number(getattr(self, item.name), item.name)
             _require(math.isfinite(value), item.name, value, "finite")
             object.__setattr__(self, item.name, value)
         _require(self.k0 > 0, "k0", self.k0, "positive")
@@ -227,7 +259,7 @@ class LinearSpring:
     def __post_init__(self) -> None:
         """Refuse what is not admissible, by name."""
         for name in ("k0", "eta"):
-            value = float(getattr(self, name))
+            value = as_number(getattr(self, name), name)
             _require(math.isfinite(value), name, value, "finite")
             object.__setattr__(self, name, value)
         _require(self.k0 > 0, "k0", self.k0, "positive")

@@ -17,9 +17,16 @@ from foamfit.conditioning import engineering
 from foamfit.errors import SimulationError
 from foamfit.insight import Insight, look, unreached, visited
 from foamfit.intervals import Intervals
-from foamfit.measurement import interior_channel
+from foamfit.measurement import INTEGRATED, interior_channel
 from foamfit.model import split_name, unit_of
-from foamfit.objective import LOSSES, MODEL_ERROR, Objective, Simulated, soften
+from foamfit.objective import (
+    LOSSES,
+    MODEL_ERROR,
+    MOTION_CURVES,
+    Objective,
+    Simulated,
+    soften,
+)
 from foamfit.problem import Problem
 from foamfit.result import Correlation, Curves, FitResult, ParameterEstimate, Switch
 from foamfit.search import SearchRecord
@@ -146,10 +153,10 @@ def _noise_notes(objective: Objective) -> list[str]:
 def _notes(problem: Problem, values: Array, simulated: Simulated) -> tuple[str, ...]:
     """What was left out of the model, and what it would change."""
     objective, specimen = problem.objective, problem.measurement.specimen
-    unused: tuple[str, ...] = ()
+    unused = problem.notes + _along_integrated(problem, simulated)
     if len(problem.model.kinds) == 1 and problem.measurement.interior:
         names = ", ".join(map(interior_channel, sorted(problem.measurement.interior)))
-        unused = (f"A single spring has no mass inside, so {names} is left out.",)
+        unused += (f"A single spring has no mass inside, so {names} is left out.",)
     if objective.drive == "stress":
         return (
             *unused,
@@ -159,12 +166,15 @@ def _notes(problem: Problem, values: Array, simulated: Simulated) -> tuple[str, 
         return unused
     left_out = "The interior masses are left out"
     if specimen.mass is None:
-        return (f"{left_out}; with [specimen] mass foamfit could say what they would change.",)
+        return (
+            *unused,
+            f"{left_out}; with [specimen] mass foamfit could say what they would change.",
+        )
     heavy = replace(objective, interior_mass=True)
     try:
         other = heavy.simulate(values)
     except SimulationError as error:
-        return (f"{left_out}; with them the simulation ends: {error}.",)
+        return (*unused, f"{left_out}; with them the simulation ends: {error}.")
     changes = [
         f"{name} by {np.sqrt(np.mean((one - two) ** 2)) / np.ptp(one):.2%}"
         for name, one, two in (
@@ -175,8 +185,28 @@ def _notes(problem: Problem, values: Array, simulated: Simulated) -> tuple[str, 
         if one is not None and two is not None
     ]
     return (
+        *unused,
         f"{left_out}; the specimen's {specimen.mass * 1e6:.3g} mg between the springs would change "
         f"{' and '.join(changes)} (RMS over range).",
+    )
+
+
+def _along_integrated(problem: Problem, simulated: Simulated) -> tuple[str, ...]:
+    """How far the fit is from a motion that was integrated from the force it is fitted to."""
+    objective = problem.objective
+    names = [name for name in MOTION_CURVES if name not in objective.counted]
+    if problem.measurement.motion != INTEGRATED or not names:
+        return ()
+    off = [
+        f"the {name.replace('_', '-')} curve is {share:.1%} of its range off"
+        for name in names
+        if (share := objective.off(simulated, name)) is not None
+    ]
+    if not off:
+        return ()
+    return (
+        "The motion was integrated from the force, so it is no second measurement and has no "
+        f"misfit; against it {' and '.join(off)}.",
     )
 
 

@@ -1,0 +1,137 @@
+"""The runs of experiments/error_vs_runtime/identification.py: clock, arithmetic, and redrawing."""
+
+from __future__ import annotations
+
+import itertools
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from conftest import EXPERIMENTS
+
+sys.path.insert(0, str(EXPERIMENTS / "error_vs_runtime"))
+
+import identification
+import identification_report as report
+
+FILES = {
+    "identification.csv",
+    "identification.md",
+    "identification_profiles.png",
+    "identification_runs.csv.gz",
+    "identification_runs.json",
+    "identification_si.png",
+}
+
+
+def test_performance_ratios_are_those_of_a_table_by_hand() -> None:
+    times = {"foamfit.fit": (1.0, 2.0, np.inf), "powell": (4.0, 1.0, np.inf)}
+    ends = pd.DataFrame(
+        [
+            {"problem": "p", "seed": seed, "method": name, "solved_after_s": after,
+             "coordinates": "own" if name == "foamfit.fit" else "si"}
+            for name, row in times.items()
+            for seed, after in enumerate(row)
+        ]
+    )  # fmt: skip
+    ratios = report.profile(ends, "si")
+    np.testing.assert_array_equal(ratios["foamfit.fit"], [1.0, 2.0, np.inf])
+    np.testing.assert_array_equal(ratios["powell"], [4.0, 1.0, np.inf])
+
+
+def test_a_run_is_solved_at_its_first_cost_within_five_percent() -> None:
+    rows = [(0.1, 5, 9.0), (0.2, 9, 1.04), (0.3, 12, 1.0)]
+    runs = pd.DataFrame([("p", "si", "powell", 0, *row) for row in rows], columns=report.COLUMNS)
+    end = report.solved_after(runs, {"p": 1.0}).iloc[0]
+    assert (end["solved_after_s"], end["misfit_ratio"], end["evaluations"]) == (0.2, 1.0, 12)
+    never = report.solved_after(runs[:1], {"p": 1.0}).iloc[0]
+    assert (never["solved_after_s"], never["misfit_ratio"]) == (np.inf, 3.0)
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A clock on which every look takes a millisecond."""
+    ticks = itertools.count()
+    monkeypatch.setattr("time.process_time", lambda: 1e-3 * next(ticks))
+
+
+@pytest.mark.parametrize("coordinates", list(report.COORDINATES))
+@pytest.mark.parametrize("method", report.METHODS)
+def test_every_method_lowers_the_same_cost_until_its_time_is_up(
+    method: str, coordinates: str, clock: None
+) -> None:
+    problem = identification.CASES["displacement"].problem()
+    plain = type(problem.objective).residual
+    recorder = identification.Recorder(problem.objective, 0.4, known=0.0)
+    with identification.recorded(recorder):
+        identification.run_lmfit(problem, method, coordinates, 3, "differences")
+    assert type(problem.objective).residual is plain
+    recorder.ended = 0.4
+    seconds, evaluations, costs = np.transpose(recorder.finished())
+    assert np.all(np.diff(seconds) >= 0.0)
+    assert np.all(np.diff(costs) <= 0.0)
+    assert evaluations[-1] == pytest.approx(400, abs=2)
+    assert costs[-1] < costs[0]
+
+
+def test_a_run_ends_where_nothing_is_left_to_gain(clock: None) -> None:
+    case = identification.CASES["displacement"]
+    problem = case.problem()
+    recorder = identification.Recorder(problem.objective, np.inf, known=1e9)
+    with identification.recorded(recorder):
+        identification.run_own(case, problem, seed=0)
+    assert recorder.cost <= identification.ENOUGH * 1e9
+    assert recorder.rows[-1][2] == recorder.cost  # when it was solved is recorded
+
+
+@pytest.mark.parametrize("coordinates", list(report.COORDINATES))
+def test_the_derivatives_of_the_problem_serve_in_both_coordinates(coordinates: str) -> None:
+    problem = identification.CASES["displacement"].problem()
+    space = problem.space()
+    point = space.encode(problem.vector())
+    variables = identification.Variables(problem, space, coordinates)
+    params = variables.params(point)
+    jacobian = variables.jacobian(params)
+    moving = [name for name, parameter in params.items() if parameter.vary]
+    assert jacobian.shape == (problem.objective.n_data, len(moving))
+    for column, name in enumerate(moving):
+        sides = []
+        for sign in (1.0, -1.0):
+            moved = params.copy()
+            moved[name].value += sign * 1e-5 * abs(params[name].value)
+            sides.append((moved[name].value, variables.residual(moved)))
+        (up, high), (down, low) = sides
+        expected = (high - low) / (up - down)
+        size = max(float(np.abs(expected).max()), 1e-300)
+        np.testing.assert_allclose(jacobian[:, column], expected, rtol=0, atol=2e-3 * size)
+
+
+def test_what_was_recorded_is_drawn_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    short = [
+        "--budget",
+        "0.05",
+        "--seeds",
+        "2",
+        "--methods",
+        "leastsq,powell",
+        "--coordinates",
+        "si",
+    ]
+    out = ["identification.py", "--out", str(tmp_path), "--problems", "displacement"]
+    monkeypatch.setattr(sys, "argv", [*out, *short])
+    monkeypatch.setattr(identification, "best_known", lambda *_: 5155.0)
+    identification.main()
+    assert "foamfit.fit" in capsys.readouterr().out
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert set(before) == FILES
+    for name in FILES - {"identification_runs.csv.gz", "identification_runs.json"}:
+        (tmp_path / name).unlink()
+    monkeypatch.setattr(sys, "argv", ["identification.py", "--redraw", "--out", str(tmp_path)])
+    identification.main()
+    again = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert again == before
