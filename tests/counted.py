@@ -2,7 +2,8 @@
 
 `NUMBA_DISABLE_JIT=1 python tests/counted.py`, by tests/test_counting.py. Nothing is asked of the
 loops themselves: springs and masses are arrays that note what is read of them, dashpots are numbers
-that note the arithmetic done with them, and `sys.setprofile` sees every call.
+that note the arithmetic done with them, and `sys.setprofile` and `sys.settrace` see every call and
+every line.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+import re
 import sys
 from collections import Counter
 from pathlib import Path
@@ -95,6 +97,27 @@ class Masses(np.ndarray):
         return super().__getitem__(key)
 
 
+# Where a dashpot is kept in an array of its own, the arithmetic with it is seen by the lines run.
+DASHPOT = re.compile(r"[*/] *\(?[\w.]*(eta\[|rows\[\w+, ETA)|(eta\[\w+\]|, ETA\]) *[*/]")
+
+
+@functools.cache
+def _dashpot_lines(filename: str) -> frozenset[int]:
+    """Lines of a module of the project on which something is reckoned with a dashpot."""
+    lines = Path(filename).read_text().splitlines() if _module(filename) else []
+    return frozenset(n for n, line in enumerate(lines, start=1) if DASHPOT.search(line))
+
+
+def tracer(frame: Any, event: str, _: Any) -> Any:
+    """Count the lines run on which something is reckoned with a dashpot."""
+    lines = _dashpot_lines(frame.f_code.co_filename)
+    if not lines or _module(frame.f_code.co_filename) == "implicit":
+        return None
+    if event == "line" and frame.f_lineno in lines:
+        COUNTS["dashpot lines"] += 1
+    return tracer
+
+
 def profiler(frame: Any, event: str, _: Any) -> None:
     """Count the calls of the project's functions by module, and evaluations of the law by kind."""
     module = _module(frame.f_code.co_filename) if event == "call" else ""
@@ -117,11 +140,13 @@ def run(chain: ff.Chain, drive: Drive, t: np.ndarray) -> dict[str, Any]:
     rows = np.array([spring.row for spring in chain.springs]).view(Springs)
     COUNTS.clear()
     sys.setprofile(profiler)
+    sys.settrace(tracer)
     try:
         with np.errstate(all="ignore"):
             motion = made.run(rows, np.array(chain.heights), drag=CountedDrag(made.drag))
     finally:
         sys.setprofile(None)
+        sys.settrace(None)
     return {
         **COUNTS,
         "solver": made.solver,

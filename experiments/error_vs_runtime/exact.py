@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,7 +28,7 @@ from foamfit.chain import Drive
 from foamfit.simulation import plan
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
-import reference  # noqa: E402
+import reference
 
 Array = np.ndarray
 
@@ -117,7 +118,7 @@ def _way(series: Series, most: float, rising: bool, areal: float) -> tuple[list[
     cuts = series.switches[series.switches < most]
     ends = np.unique([*np.sqrt(most - cuts), *np.linspace(0.0, np.sqrt(most), 9)])
     energy, since, out = 0.0, 0.0, []
-    for low, high in zip(ends[:-1], ends[1:], strict=True):
+    for low, high in pairwise(ends):
         springs = series.frozen(most - (0.5 * (low + high)) ** 2, most, rising)
         half = 0.5 * (high - low)
         x = low + half * (_X + 1.0)
@@ -149,9 +150,9 @@ def _turning_stress(series: Series, areal: float, speed: float) -> float:
 
         step = more(high)
         if taken + step >= wanted:
-            spent = taken
+            miss = taken - wanted
             return float(
-                brentq(lambda top: spent + more(top) - wanted, low, high, xtol=1e-12, rtol=1e-15)
+                brentq(lambda top, f=more, m=miss: f(top) + m, low, high, xtol=1e-12, rtol=1e-15)
             )
         taken, low = taken + step, high
     raise ValueError("the striker's energy is more than the springs can take")

@@ -1,7 +1,7 @@
 """What does an answer cost? Error against run time of the simulation, scene by scene.
 
-For every scene of `scenes.py`: the error of the project's solver, of three fixed-step schemes and of
-three of SciPy's integrators against a reference of 12 digits, over the median time of many runs.
+For every scene of `scenes.py`: the error of the project's solver, of three fixed-step schemes and
+of three of SciPy's integrators against a reference of 12 digits, over the median time of many runs.
 All solvers of a scene take turns in one process, and processor time is counted, so that a busy
 machine disturbs all of them alike; ratios compare medians of one run. A table (CSV, Markdown) and a
 figure per scene, the scaling with springs and samples, and a summary go to `forward/`.
@@ -29,8 +29,8 @@ from pathlib import Path
 import numba
 import numpy as np
 import pandas as pd
-import scipy
 import scenes as kinds
+import scipy
 from drawing import draw_scaling, draw_scene
 from scenes import KERNEL, PUBLIC, Competitor, Scene
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -254,7 +255,7 @@ class System:
     def room(self) -> Callable[[np.ndarray], tuple[int, float, int, int]]:
         """Return the function that looks for the first of some states (size, n) past a switch.
 
-        It gives the index (-1 = none), the room left there, the spring (-1 = contact ends) and side.
+        It gives the index (-1 = none), the room left there, the spring (-1 = contact) and side.
         """
         if not self.series:
             still = self.rows, self.branches, self.heights, self.pressed
@@ -345,7 +346,9 @@ def _phase(
         if first >= 0:
             dense = dense or solver.dense_output()
             low = times[first - 1] if first > 0 else solver.t_old
-            end = _root(lambda at: room(dense(at)[:, None])[1], low, times[first])  # type: ignore[misc]
+            end = _root(
+                lambda at, room=room, dense=dense: room(dense(at)[:, None])[1], low, times[first]
+            )
             who, side = room(dense(times[first])[:, None])[2:]
             last = done + int(np.searchsorted(times[:-1], end))
             system.write(states[:, : last - done], out_w[done:last], out_s[done:last])
@@ -403,7 +406,7 @@ def _pieces(row: np.ndarray, driven: np.ndarray, by_stress: bool) -> list[tuple[
     }
     turns = [0, *(np.flatnonzero(np.diff(np.sign(np.diff(driven)))) + 1), driven.size - 1]
     out, branch = [], first_branch(row)
-    for a, b in zip(turns[:-1], turns[1:], strict=True):
+    for a, b in pairwise(turns):
         here, there = driven[a], driven[b]
         while True:
             low, high = ends[branch] if row[KIND] == BISTABLE else (-np.inf, np.inf)
@@ -451,7 +454,7 @@ def quasi_static(
             sense = 1.0 if stop > start else -1.0
             while (
                 last < driven.size
-                and 0.0 <= sense * (driven[last] - start)
+                and sense * (driven[last] - start) >= 0.0
                 and (sense * (solver.t - driven[last]) >= 0.0)
             ):
                 last += 1
