@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +55,7 @@ def draw_scene(table: pd.DataFrame, title: str, wanted: float, path: Path) -> No
         ax.set_ylabel("largest error over range (–)")
         ax.grid(color="0.93", linewidth=0.5)
         ax.set_axisbelow(True)
-        ax.set_title(title)
+        figure.suptitle(textwrap.fill(title, 60), fontsize=8)
         x = ax.get_xlim()[1]
         ax.annotate(
             f"{wanted:.0e}".replace("e-0", "e-"), (x, wanted), (-2, 2), color="0.5", ha="right",
