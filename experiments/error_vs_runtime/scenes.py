@@ -124,11 +124,13 @@ def scenes() -> list[Scene]:
         Scene(
             "100_springs_impact", "100 springs, impact at 2.2 m/s", graded(100),
             ff.Impact(MASS, 2.2), t, own=(1e-3, 1e-6, 1e-9, 1e-12), outside=rtol, longest=0.5,
+            looks=4,
         ),
         Scene(
             "1000_springs_impact", "1000 springs, impact at 2.2 m/s", graded(1000),
-            ff.Impact(MASS, 2.2), t, own=(1e-6, 1e-10), outside=(1e-6, 1e-7, 1e-8, 1e-9),
+            ff.Impact(MASS, 2.2), t, own=(1e-6, 1e-10), outside=(1e-7, 1e-8, 1e-10, 1e-11),
             substeps=(1, 4, 16), longest=4.0,
+            looks=4,
         ),
     ]  # fmt: skip
 
