@@ -1,0 +1,465 @@
+"""SciPy's integrators as the outside yardstick, restarted at every switch of a branch.
+
+Made as strong as is sensible: right-hand sides, Jacobians and switching functions are compiled, the
+solver objects are stepped directly (`solve_ivp` costs more per step), a switch is a root of the
+solver's own dense output, and massless springs in series enter through their common stress, for
+which everything is explicit: C(s) ds/dt = dw/dt with the compliance C = Σ h_i/k_i of eq. 2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numba import njit
+from scipy.integrate import DOP853, LSODA, Radau
+from scipy.optimize import brentq
+
+from foamfit.kernels import (
+    EPS_A,
+    EPS_C,
+    EPS_HAT_A,
+    EPS_HAT_C,
+    ETA,
+    K0,
+    KIND,
+    SIGMA_A,
+    SIGMA_C,
+    SIGMA_HAT_A,
+    SIGMA_HAT_C,
+    A,
+    C,
+    D,
+    E,
+    above,
+    below,
+    branch_shape,
+    first_branch,
+    interval,
+    slope_on,
+    strain_on,
+    stress_on,
+)
+from foamfit.law import BISTABLE
+
+METHODS = {"DOP853": DOP853, "LSODA": LSODA, "Radau": Radau}
+TINY = 4 * np.finfo(float).eps
+
+compiled = njit(cache=True, error_model="numpy")
+
+
+# ---------------------------------------------------------------- a mass above every spring
+
+
+@compiled
+def nodes_rate(y, rows, branches, heights, mass, drag):
+    """d/dt of (displacements, velocities) of the nodes."""
+    n = mass.size
+    out = np.empty(2 * n)
+    over = -drag * y[2 * n - 1]
+    for i in range(n - 1, -1, -1):
+        u, rate = y[i], y[n + i]
+        if i > 0:
+            u -= y[i - 1]
+            rate -= y[n + i - 1]
+        stress = stress_on(rows[i], branches[i], u / heights[i]) + rows[i, ETA] * rate / heights[i]
+        out[i] = y[n + i]
+        out[n + i] = (over - stress) / mass[i]
+        over = stress
+    return out
+
+
+@compiled
+def nodes_jacobian(y, rows, branches, heights, mass, drag):
+    """Derivative of `nodes_rate` by the state, (2n, 2n)."""
+    n = mass.size
+    out = np.zeros((2 * n, 2 * n))
+    out[2 * n - 1, 2 * n - 1] = -drag / mass[n - 1]
+    for i in range(n):
+        out[i, n + i] = 1.0
+        u = y[i] - (y[i - 1] if i > 0 else 0.0)
+        stiff = slope_on(rows[i], branches[i], u / heights[i]) / heights[i]
+        dash = rows[i, ETA] / heights[i]
+        for by, part in ((0, stiff), (n, dash)):
+            out[n + i, by + i] -= part / mass[i]
+            if i > 0:
+                out[n + i, by + i - 1] += part / mass[i]
+                out[n + i - 1, by + i] += part / mass[i - 1]
+                out[n + i - 1, by + i - 1] -= part / mass[i - 1]
+    return out
+
+
+@compiled
+def nodes_room(states, rows, branches, heights, pressed):
+    """First of some states (2n, samples) at which a spring has left its branch, or contact ended.
+
+    Returns its index (-1 = none), the least room left there in strain (base stress over k0 for
+    contact), the spring (-1 = contact) and the side; the last state's where there is none.
+    """
+    n = heights.size
+    least, who, side = np.inf, -1, 0
+    for j in range(states.shape[1]):
+        least = np.inf
+        for i in range(n):
+            eps = (states[i, j] - (states[i - 1, j] if i > 0 else 0.0)) / heights[i]
+            low, high = interval(rows[i], branches[i])
+            if eps - low < least:
+                least, who, side = eps - low, i, -1
+            if high - eps < least:
+                least, who, side = high - eps, i, 1
+        if pressed:
+            eps = states[0, j] / heights[0]
+            base = stress_on(rows[0], branches[0], eps)
+            base += rows[0, ETA] * states[n, j] / heights[0]
+            if base / rows[0, K0] < least:
+                least, who, side = base / rows[0, K0], -1, 0
+        if least < 0.0:
+            return j, least, who, side
+    return -1, least, who, side
+
+
+@compiled
+def nodes_output(states, rows, branches, heights, out_w, out_s):
+    """Displacement of the top and base stress at states (2n, samples)."""
+    n = heights.size
+    for j in range(states.shape[1]):
+        eps = states[0, j] / heights[0]
+        out_w[j] = states[n - 1, j]
+        dash = rows[0, ETA] * states[n, j] / heights[0]
+        out_s[j] = stress_on(rows[0], branches[0], eps) + dash
+
+
+# ---------------------------------------------------------------- massless springs in series
+
+
+@compiled
+def series_compliance(s, rows, branches, heights):
+    """C = Σ h_i dε_i/ds (m/Pa) of springs under one stress, and dC/ds; k/(k+s)² where curved."""
+    soft, change = 0.0, 0.0
+    for i in range(heights.size):
+        curved, k, _, _ = branch_shape(rows[i], branches[i])
+        part = heights[i] * (k / (k + s) ** 2 if curved else 1.0 / k)
+        soft += part
+        change -= 2.0 * part / (k + s) if curved else 0.0
+    return soft, change
+
+
+@compiled
+def series_rate(y, rows, branches, heights, mass, drag):
+    """d/dt of (common stress, velocity of the striker)."""
+    out = np.empty(2)
+    out[0] = y[1] / series_compliance(y[0], rows, branches, heights)[0]
+    out[1] = -(y[0] + drag * y[1]) / mass[0]
+    return out
+
+
+@compiled
+def series_jacobian(y, rows, branches, heights, mass, drag):
+    """Derivative of `series_rate` by the state, (2, 2)."""
+    soft, change = series_compliance(y[0], rows, branches, heights)
+    out = np.empty((2, 2))
+    out[0, 0], out[0, 1] = -y[1] * change / soft**2, 1.0 / soft
+    out[1, 0], out[1, 1] = -1.0 / mass[0], -drag / mass[0]
+    return out
+
+
+@compiled
+def series_limits(rows, branches, pressed):
+    """Stresses between which no spring leaves its branch, and which spring is at either.
+
+    Below lies the end of contact (-1) at the latest, once there has been one.
+    """
+    low, high, who_low, who_high = (0.0 if pressed else -np.inf), np.inf, -1, -1
+    for i in range(branches.size):
+        if branches[i] == A:
+            down, up = -np.inf, rows[i, SIGMA_A]
+        elif branches[i] == D:
+            down, up = rows[i, SIGMA_A], rows[i, SIGMA_HAT_C]
+        elif branches[i] == C:
+            down, up = rows[i, SIGMA_C], np.inf
+        elif branches[i] == E:
+            down, up = rows[i, SIGMA_HAT_A], rows[i, SIGMA_C]
+        else:
+            down, up = -np.inf, np.inf
+        if down > low:
+            low, who_low = down, i
+        if up < high:
+            high, who_high = up, i
+    return low, high, who_low, who_high
+
+
+@compiled
+def series_room(states, low, high, who_low, who_high):
+    """See `nodes_room`; the room is one of stress."""
+    left, who, side = np.inf, -1, 0
+    for j in range(states.shape[1]):
+        s = states[0, j]
+        if s - low < high - s:
+            left, who, side = s - low, who_low, -1
+        else:
+            left, who, side = high - s, who_high, 1
+        if left < 0.0:
+            return j, left, who, side
+    return -1, left, who, side
+
+
+@compiled
+def series_output(states, rows, branches, heights, out_w, out_s):
+    """Displacement of the top and base stress at states (2, samples)."""
+    for j in range(states.shape[1]):
+        out_s[j] = states[0, j]
+        out_w[j] = 0.0
+        for i in range(heights.size):
+            out_w[j] += heights[i] * strain_on(rows[i], branches[i], states[0, j])
+
+
+# ---------------------------------------------------------------- an impact
+
+
+@dataclass
+class System:
+    """An impact for SciPy: its state, and what the branches of the moment make of it."""
+
+    rows: np.ndarray
+    heights: np.ndarray
+    mass: np.ndarray
+    drag: float
+    speed: float
+
+    def __post_init__(self) -> None:
+        """Choose the state: nodes where every spring has a mass above it, else the stress."""
+        self.series = self.mass.size == 1 and self.heights.size > 1
+        assert self.series or self.mass.size == self.heights.size
+        self.branches = np.array([first_branch(row) for row in self.rows])
+        self.pressed = False
+        n = self.mass.size
+        if self.series:
+            assert not self.rows[:, ETA].any()
+            self.y = np.array([0.0, self.speed])
+            stiff = 1.0 / series_compliance(0.0, self.rows, self.branches, self.heights)[0]
+            self.scale = np.array([self.speed * np.sqrt(stiff * self.mass[0]), self.speed])
+            self.rate, self.slope, self.output = series_rate, series_jacobian, series_output
+        else:
+            self.y = np.zeros(2 * n)
+            self.y[-1] = self.speed
+            self.scale = np.repeat([self.heights.sum(), self.speed], n)
+            self.rate, self.slope, self.output = nodes_rate, nodes_jacobian, nodes_output
+
+    def still(self) -> tuple[Any, ...]:
+        """What the compiled functions want to know besides the state."""
+        return self.rows, self.branches, self.heights, self.mass, self.drag
+
+    def room(self) -> Callable[[np.ndarray], tuple[int, float, int, int]]:
+        """Return the function that looks for the first of some states (size, n) past a switch.
+
+        It gives the index (-1 = none), the room left there, the spring (-1 = contact) and side.
+        """
+        if not self.series:
+            still = self.rows, self.branches, self.heights, self.pressed
+            return lambda states: nodes_room(states, *still)
+        limits = series_limits(self.rows, self.branches, self.pressed)
+        return lambda states: series_room(states, *limits)
+
+    def write(self, states: np.ndarray, out_w: np.ndarray, out_s: np.ndarray) -> None:
+        """Fill displacement of the striker and base stress at states (size, n)."""
+        self.output(states, self.rows, self.branches, self.heights, out_w, out_s)
+
+
+def impact(
+    rows: np.ndarray,
+    heights: np.ndarray,
+    mass: np.ndarray,
+    drag: float,
+    speed: float,
+    t: np.ndarray,
+    method: str,
+    rtol: float,
+    looks: int = 0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Displacement of the striker and base stress, (n,) each, of an impact at the samples t.
+
+    A switch is looked for at the samples, at the ends of steps, and at `looks` points inside them:
+    where masses ring, a spring may leave its branch and come back within a step.
+    """
+    system = System(rows, heights, mass, drag, speed)
+    out_w, out_s = np.zeros(t.size), np.zeros(t.size)
+    now, done = float(t[0]), 0
+    for _ in range(1000 + 20 * heights.size):
+        with np.errstate(all="ignore"):  # a stage past a pole: the step is rejected
+            now, done, who, side = _phase(system, now, t, done, method, rtol, looks, out_w, out_s)
+        if who is None:
+            return out_w, out_s
+        if who == -1:  # contact ends: the striker flies
+            last_w, last_s = np.empty(1), np.empty(1)
+            system.write(system.y[:, None], last_w, last_s)
+            out_w[done:] = last_w[0] + system.y[-1] * (t[done:] - now)
+            return out_w, out_s
+        branch = system.branches[who]
+        system.branches[who] = above(branch) if side > 0 else below(branch)
+    raise RuntimeError(f"{method}: too many switches at rtol = {rtol:g}")
+
+
+def _phase(
+    system: System,
+    now: float,
+    t: np.ndarray,
+    done: int,
+    method: str,
+    rtol: float,
+    looks: int,
+    out_w: np.ndarray,
+    out_s: np.ndarray,
+) -> tuple[float, int, int | None, int]:
+    """Go on from `now` to the next switch: its time, samples done, spring (None = none), side."""
+    still, room = system.still(), system.room()
+    options: dict[str, Any] = {}
+    if method != "DOP853":
+        options["jac"] = lambda _, y: system.slope(y, *still)
+    solver: Any = METHODS[method](
+        lambda _, y: system.rate(y, *still), now, system.y, float(t[-1]),
+        rtol=rtol, atol=rtol * system.scale, **options,
+    )  # fmt: skip
+    inside = np.arange(1, looks + 1) / (looks + 1)
+    while solver.status == "running":
+        message = solver.step()
+        if solver.status == "failed" or not np.isfinite(solver.y).all():
+            raise RuntimeError(f"{method}: {message or 'not finite'}")
+        last = done
+        if t[done] <= solver.t:
+            last = int(np.searchsorted(t, solver.t, side="right"))
+        dense = solver.dense_output() if last > done else None
+        times = np.append(t[done:last], solver.t)
+        states = dense(times) if dense else solver.y[:, None]
+        if looks:
+            dense = dense or solver.dense_output()
+            between = solver.t_old + inside * (solver.t - solver.t_old)
+            lost = room(dense(between))[0]
+            if lost >= 0 and room(states)[0] != 0:
+                before = int(np.searchsorted(times, between[lost]))
+                times = np.append(times[:before], between[lost])
+                states = dense(times)
+                last = done + before
+        first = room(states)[0]
+        if first >= 0:
+            dense = dense or solver.dense_output()
+            low = times[first - 1] if first > 0 else solver.t_old
+            end = _root(
+                lambda at, room=room, dense=dense: room(dense(at)[:, None])[1], low, times[first]
+            )
+            who, side = room(dense(times[first])[:, None])[2:]
+            last = done + int(np.searchsorted(times[:-1], end))
+            system.write(states[:, : last - done], out_w[done:last], out_s[done:last])
+            system.y = dense(end)
+            return end, last, who, side
+        if last > done:
+            system.write(states[:, :-1], out_w[done:last], out_s[done:last])
+            done = last
+            system.pressed = system.pressed or out_s[last - 1] > 10.0 * rtol * system.rows[0, K0]
+            room = system.room()
+    return now, done, None, 0
+
+
+def _root(gap: Callable[[float], float], low: float, high: float) -> float:
+    """Time at which `gap` becomes negative; it is so at `high`."""
+    if gap(low) <= 0.0:  # on a switch just made, up to rounding: look for where it is inside
+        for part in (0.01, 0.1, 0.3, 0.6, 0.9):
+            if gap(low + part * (high - low)) > 0.0:
+                low += part * (high - low)
+                break
+        else:
+            return low
+    return float(brentq(gap, low, high, xtol=TINY * high, rtol=TINY))
+
+
+# ---------------------------------------------------------------- one spring without inertia
+
+
+@compiled
+def along_strain(x, y, row, branch):
+    """dσ/dε."""
+    return slope_on(row, branch, x)
+
+
+@compiled
+def along_stress(x, y, row, branch):
+    """dε/dσ."""
+    return 1.0 / slope_on(row, branch, y)
+
+
+@compiled
+def change_along_stress(y, row, branch):
+    """Derivative of dε/dσ = (1-x)²/k by ε."""
+    curved, k, x0, _ = branch_shape(row, branch)
+    return -2.0 * (1.0 - (y - x0)) / k if curved else 0.0
+
+
+def _pieces(row: np.ndarray, driven: np.ndarray, by_stress: bool) -> list[tuple[int, float, float]]:
+    """Cut a history at its turning points and switches: (branch, from, to), in order."""
+    ends = {
+        A: (-np.inf, row[SIGMA_A if by_stress else EPS_A]),
+        D: (row[SIGMA_A], row[SIGMA_HAT_C]) if by_stress else (row[EPS_A], row[EPS_HAT_C]),
+        C: (row[SIGMA_C if by_stress else EPS_C], np.inf),
+        E: (row[SIGMA_HAT_A], row[SIGMA_C]) if by_stress else (row[EPS_HAT_A], row[EPS_C]),
+    }
+    turns = [0, *(np.flatnonzero(np.diff(np.sign(np.diff(driven)))) + 1), driven.size - 1]
+    out, branch = [], first_branch(row)
+    for a, b in pairwise(turns):
+        here, there = driven[a], driven[b]
+        while True:
+            low, high = ends[branch] if row[KIND] == BISTABLE else (-np.inf, np.inf)
+            stop = min(there, high) if there > here else max(there, low)
+            if stop != here:
+                out.append((branch, here, stop))
+            if stop == there:
+                break
+            branch, here = (above if there > here else below)(branch), stop
+    return out
+
+
+def quasi_static(
+    row: np.ndarray, driven: np.ndarray, by_stress: bool, method: str, rtol: float
+) -> np.ndarray:
+    """One undamped spring along a history of strain, or of stress: the other quantity, (n,).
+
+    What is driven is the independent variable, so that switches and turning points are known and
+    nothing has to be searched; one solver for each piece between them.
+    """
+    out = np.zeros(driven.size)
+    function = along_stress if by_stress else along_strain
+    branch = first_branch(row)
+    y = np.array([strain_on(row, branch, driven[0]) if by_stress else
+                  stress_on(row, branch, driven[0])])  # fmt: skip
+    atol = rtol * (1e-2 if by_stress else 1e-2 * row[K0])
+    out[0], done = y[0], 1
+    for branch, start, stop in _pieces(row, driven, by_stress):
+        options: dict[str, Any] = {}
+        if method != "DOP853":
+
+            def slope(x, y, branch=branch):  # type: ignore[no-untyped-def]
+                return np.array([[change_along_stress(y[0], row, branch) if by_stress else 0.0]])
+
+            options["jac"] = slope
+        solver = METHODS[method](
+            lambda x, y, branch=branch: (function(x, y[0], row, branch),),
+            start, y, stop, rtol=rtol, atol=atol, **options,
+        )  # fmt: skip
+        while solver.status == "running":
+            message = solver.step()
+            if solver.status == "failed":
+                raise RuntimeError(f"{method}: {message}")
+            last = done
+            sense = 1.0 if stop > start else -1.0
+            while (
+                last < driven.size
+                and sense * (driven[last] - start) >= 0.0
+                and (sense * (solver.t - driven[last]) >= 0.0)
+            ):
+                last += 1
+            if last > done:
+                out[done:last] = solver.dense_output()(driven[done:last])[0]
+                done = last
+        y = solver.y
+    return out

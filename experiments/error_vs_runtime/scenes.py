@@ -1,0 +1,257 @@
+"""The scenes whose error is set against run time, and every way in which one can be computed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import exact
+import fixed_step
+import numpy as np
+import restarted
+
+import foamfit as ff
+from foamfit.chain import Drive
+from foamfit.simulation import Plan, plan
+
+Array = np.ndarray
+Answer = tuple[Array, Array]  # displacement of the top (m) and base stress (Pa), (n,) each
+
+SAMPLES, LENGTH = 501, 0.8e-3
+MASS = 7e-3
+MODEL_2, MODEL_3 = ff.published["foam-1/model-2"], ff.published["foam-1/model-3"]
+HEIGHT, AREA = MODEL_2.chain.height, MODEL_2.chain.area
+
+PUBLIC, KERNEL = "foamfit simulate", "foamfit kernel"
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A chain under a drive, and how far each solver is taken.
+
+    Attributes
+    ----------
+    own, outside : sequences of float
+        Tolerances of the project's solver (None = it has none here) and of SciPy's.
+    substeps : sequence of int
+        Steps of the fixed-step schemes between two samples.
+    longest : float
+        A ladder of settings ends after the first that takes longer, s.
+    looks : int
+        See `restarted.impact`.
+    """
+
+    name: str
+    title: str
+    chain: ff.Chain
+    drive: Drive
+    time: Array
+    own: Sequence[float | None] = tuple(10.0**-k for k in range(2, 13))
+    outside: Sequence[float] = tuple(10.0**-k for k in range(3, 13))
+    substeps: Sequence[int] = tuple(2**k for k in range(11))
+    longest: float = 0.3
+    looks: int = 0
+
+
+def graded(count: int, mass: float = 0.0, eta: float = 0.0) -> ff.Chain:
+    """Springs of foam-1/model-2, of which k0, k_c, Δσ, k_h± and ε_a, ε_c vary by ±10 %, shuffled.
+
+    No two of them switch at one stress. `mass` (kg) is shared by the nodes between them.
+    """
+    rng = np.random.default_rng(count)
+    steps = 0.1 * (2.0 * (np.arange(count) + 0.5) / count - 1.0)
+    base = MODEL_2.bistable
+    springs = [
+        ff.BistableSpring(
+            base.k0 * f, base.kc * f, base.dsigma * f, base.eps_a * g, base.eps_c * g,
+            base.kh_plus * f, base.kh_minus * f, eta,
+        )
+        for f, g in zip(1 + rng.permutation(steps), 1 + rng.permutation(steps), strict=True)
+    ]  # fmt: skip
+    masses = [mass / max(count - 1, 1)] * (count - 1) + [0.0]
+    return ff.Chain(springs, [HEIGHT / count] * count, AREA, masses)
+
+
+def loop(spring: ff.BistableSpring, samples: int, by_stress: bool) -> Array:
+    """A history past C1 and back: stress (Pa) or strain, (samples,)."""
+    most = 1.15 * spring.sigma_hat_c if by_stress else 1.05 * spring.eps_hat_c
+    s = np.linspace(0.0, 1.0, samples)
+    return most * np.where(s < 0.5, np.sin(np.pi * s) ** 2, np.sin(np.pi * s) ** 4)
+
+
+def scenes() -> list[Scene]:
+    """Return all scenes, the small ones first."""
+    t = np.linspace(0.0, LENGTH, SAMPLES)
+    spring = MODEL_2.bistable
+    damped = ff.BistableSpring(*spring.seven, eta=50.0)
+    one = ff.Chain([spring], [HEIGHT], AREA)
+    two = MODEL_3.chain
+    bare = ff.Chain(two.springs, two.heights, AREA, site_damping=two.site_damping)
+    rtol = tuple(10.0**-k for k in range(5, 11))
+    return [
+        Scene(
+            "one_spring_displacement", "one spring, displacement drive", one,
+            ff.DisplacementDrive(HEIGHT * loop(spring, SAMPLES, False)), t, own=(None,),
+        ),
+        Scene(
+            "one_spring_stress", "one spring, stress drive", one,
+            ff.StressDrive(loop(spring, SAMPLES, True)), t, own=(None,),
+        ),
+        Scene("one_spring_impact", "one spring, impact at 2.0 m/s", one, ff.Impact(MASS, 2.0), t),
+        Scene(
+            "one_spring_impact_damped", "one spring with a dashpot of 50 Pa·s, impact at 2.0 m/s",
+            ff.Chain([damped], [HEIGHT], AREA), ff.Impact(MASS, 2.0), t,
+        ),
+        Scene(
+            "two_springs_impact", "two springs, onsite damper, impact at 2.3 m/s", bare,
+            ff.Impact(MASS, 2.3), t,
+        ),
+        Scene(
+            "two_springs_mass_impact",
+            "two springs with the specimen's mass between, onsite damper, impact at 2.3 m/s", two,
+            ff.Impact(MASS, 2.3), t, outside=tuple(10.0**-k for k in range(3, 12)), longest=1.0,
+        ),
+        Scene(
+            "10_springs_impact", "10 springs, impact at 2.2 m/s", graded(10),
+            ff.Impact(MASS, 2.2), t,
+        ),
+        Scene(
+            "10_springs_mass_impact",
+            "10 springs with dashpots of 2 Pa·s and 9 masses between, impact at 2.2 m/s",
+            graded(10, MODEL_2.specimen_mass, 2.0), ff.Impact(MASS, 2.2), t,
+            outside=rtol, looks=4, longest=0.6,
+        ),
+        Scene(
+            "100_springs_impact", "100 springs, impact at 2.2 m/s", graded(100),
+            ff.Impact(MASS, 2.2), t, own=(1e-3, 1e-6, 1e-9, 1e-12), outside=rtol, longest=0.5,
+            looks=4,
+        ),
+        Scene(
+            "1000_springs_impact", "1000 springs, impact at 2.2 m/s", graded(1000),
+            ff.Impact(MASS, 2.2), t, own=(1e-6, 1e-10), outside=(1e-7, 1e-8, 1e-10, 1e-11),
+            substeps=(1, 4, 16), longest=4.0,
+            looks=4,
+        ),
+    ]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Competitor:
+    """One solver at one setting."""
+
+    family: str
+    setting: str
+    run: Callable[[], Answer]
+
+
+def own(scene: Scene) -> dict[str, list[Competitor]]:
+    """The project's solver: `simulate`, and the bare `Plan.run` that the fit calls."""
+    made = plan(scene.chain, scene.drive, scene.time)
+    rows = np.array([spring.row for spring in scene.chain.springs])
+    heights = np.array(scene.chain.heights)
+
+    def public(rtol: float) -> Answer:
+        response = ff.simulate(scene.chain, scene.drive, scene.time, rtol)
+        return response.displacement[-1], response.base_stress
+
+    def kernel(rtol: float) -> Answer:
+        motion = made.run(rows, heights, rtol, everything=False)
+        return motion.displacement[-1], motion.base_stress
+
+    return {
+        family: [
+            Competitor(
+                family,
+                "closed form" if rtol is None else f"rtol = {rtol:.0e}",
+                lambda rtol=rtol or 1e-6, function=function: function(rtol),
+            )
+            for rtol in scene.own
+        ]
+        for family, function in ((PUBLIC, public), (KERNEL, kernel))
+    }
+
+
+def others(scene: Scene) -> dict[str, list[Competitor]]:
+    """The fixed-step schemes and SciPy's integrators."""
+    rows = np.array([spring.row for spring in scene.chain.springs])
+    heights = np.array(scene.chain.heights)
+    made = plan(scene.chain, scene.drive, scene.time)
+    if isinstance(scene.drive, ff.Impact):
+        return _impact(scene, made, rows, heights)
+    return _quasi_static(scene, rows[0], heights[0])
+
+
+def _impact(scene: Scene, made: Plan, rows: Array, heights: Array) -> dict[str, list[Competitor]]:
+    t = scene.time
+
+    def fixed(scheme: int, substeps: int) -> Answer:
+        out = np.zeros(t.size), np.zeros(t.size)
+        given = rows, heights, made.ends, made.mass, made.drag, made.speed, t
+        fixed_step.impact(*given, substeps, scheme, *out)
+        return out
+
+    def outside(method: str, rtol: float) -> Answer:
+        given = rows, heights, made.mass, made.drag, made.speed, t
+        return restarted.impact(*given, method, rtol, scene.looks)
+
+    schemes = (fixed_step.VERLET, fixed_step.RK4, fixed_step.MIDPOINT)
+    return _ladders(scene, schemes, fixed, outside)
+
+
+def _quasi_static(scene: Scene, row: Array, height: float) -> dict[str, list[Competitor]]:
+    drive = scene.drive
+    by_stress = isinstance(drive, ff.StressDrive)
+    driven = drive.stress if isinstance(drive, ff.StressDrive) else drive.displacement / height
+    driven = np.array(driven)
+
+    def answer(y: Array) -> Answer:
+        return (height * y, driven) if by_stress else (height * driven, y)
+
+    def fixed(scheme: int, substeps: int) -> Answer:
+        out = np.zeros(driven.size)
+        fixed_step.quasi_static(row, driven, by_stress, substeps, scheme, out)
+        return answer(out)
+
+    def outside(method: str, rtol: float) -> Answer:
+        return answer(restarted.quasi_static(row, driven, by_stress, method, rtol))
+
+    schemes = (fixed_step.HEUN, fixed_step.RK4, fixed_step.MIDPOINT)
+    return _ladders(scene, schemes, fixed, outside)
+
+
+def _ladders(
+    scene: Scene,
+    schemes: tuple[int, ...],
+    fixed: Callable[[int, int], Answer],
+    outside: Callable[[str, float], Answer],
+) -> dict[str, list[Competitor]]:
+    intervals = scene.time.size - 1
+    out = {}
+    for scheme in schemes:
+        family = fixed_step.NAMES[scheme]
+        out[family] = [
+            Competitor(family, f"{n * intervals} steps", lambda s=scheme, n=n: fixed(s, n))
+            for n in scene.substeps
+        ]
+    for method in restarted.METHODS:
+        family = f"SciPy {method}"
+        out[family] = [
+            Competitor(family, f"rtol = {rtol:.0e}", lambda m=method, r=rtol: outside(m, r))
+            for rtol in scene.outside
+        ]
+    return out
+
+
+def reference(scene: Scene) -> tuple[str, Answer]:
+    """Return what the reference is made of, and the reference."""
+    name, function = exact.reference_of(scene.chain, scene.drive)
+    return name, function(scene.chain, scene.drive, scene.time)
+
+
+def error(answer: Answer, truth: Answer) -> float:
+    """Largest error over range, of displacement of the top and of base stress."""
+    worst = 0.0
+    for got, want in zip(answer, truth, strict=True):
+        miss = np.abs(got - want).max() / np.ptp(want)
+        worst = max(worst, float(miss) if np.isfinite(miss) else np.inf)
+    return worst

@@ -1,0 +1,92 @@
+"""Benchmarks of the simulation, beside the tests and not among them: nothing is asserted of times.
+
+    pip install ".[benchmark]"
+    pytest tests/benchmarks/bench_forward.py --benchmark-group-by=group
+    pytest tests/benchmarks/bench_forward.py -k impact --benchmark-json=before.json
+
+The default `pytest` does not collect this file (its name does not start with `test_`). Scenes and
+SciPy's side are those of experiments/error_vs_runtime; its `forward.py` sets errors against times.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import foamfit as ff
+from foamfit.simulation import plan
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "experiments" / "error_vs_runtime"))
+import scenes as kinds
+
+SCENES = {scene.name: scene for scene in kinds.scenes()}
+# SciPy's fastest setting with an error below 2e-6; see experiments/error_vs_runtime/forward.
+BEST = {
+    "one_spring_impact": ("SciPy DOP853", "rtol = 1e-07"),
+    "two_springs_mass_impact": ("SciPy DOP853", "rtol = 1e-07"),
+}
+SIZES = (1, 10, 100, 1000)
+SAMPLES = (100, 1000, 10_000, 100_000)
+
+
+def kernel(chain: ff.Chain, drive: Any, time: np.ndarray) -> Any:
+    """The bare run that the fit calls, as a function of nothing."""
+    made = plan(chain, drive, time)
+    rows = np.array([spring.row for spring in chain.springs])
+    heights = np.array(chain.heights)
+    return lambda: made.run(rows, heights, everything=False)
+
+
+@pytest.mark.parametrize("name", BEST)
+@pytest.mark.parametrize("way", ["simulate", "kernel", "SciPy"])
+def test_impact(benchmark: Any, name: str, way: str) -> None:
+    scene = SCENES[name]
+    benchmark.group = name
+    if way == "SciPy":
+        family, setting = BEST[name]
+        ladder = kinds.others(scene)[family]
+        run = next(one.run for one in ladder if one.setting == setting)
+    elif way == "kernel":
+        run = kernel(scene.chain, scene.drive, scene.time)
+    else:
+        run = kinds.own(scene)[kinds.PUBLIC][4].run  # rtol = 1e-6
+    run()
+    benchmark(run)
+
+
+@pytest.mark.parametrize("name", ["one_spring_displacement", "one_spring_stress"])
+@pytest.mark.parametrize("way", ["simulate", "kernel"])
+def test_closed_form(benchmark: Any, name: str, way: str) -> None:
+    scene = SCENES[name]
+    benchmark.group = "closed form"
+    run = kinds.own(scene)[kinds.PUBLIC if way == "simulate" else kinds.KERNEL][0].run
+    run()
+    benchmark(run)
+
+
+@pytest.mark.parametrize("count", SIZES)
+@pytest.mark.parametrize("drive", ["stress", "impact"])
+def test_springs(benchmark: Any, drive: str, count: int) -> None:
+    benchmark.group = f"springs, {drive}"
+    t = np.linspace(0.0, kinds.LENGTH, kinds.SAMPLES)
+    load = kinds.loop(kinds.MODEL_2.bistable, t.size, True)
+    given = ff.StressDrive(load) if drive == "stress" else ff.Impact(kinds.MASS, 2.2)
+    run = kernel(kinds.graded(count), given, t)
+    run()
+    benchmark.pedantic(run, rounds=3 if count == 1000 else 20)
+
+
+@pytest.mark.parametrize("samples", SAMPLES)
+@pytest.mark.parametrize("drive", ["stress", "impact"])
+def test_samples(benchmark: Any, drive: str, samples: int) -> None:
+    benchmark.group = f"samples, {drive}"
+    t = np.linspace(0.0, kinds.LENGTH, samples)
+    load = kinds.loop(kinds.MODEL_2.bistable, samples, True)
+    given = ff.StressDrive(load) if drive == "stress" else ff.Impact(kinds.MASS, 2.0)
+    run = kernel(ff.Chain([kinds.MODEL_2.bistable], [kinds.HEIGHT], kinds.AREA), given, t)
+    run()
+    benchmark.pedantic(run, rounds=20)

@@ -1,0 +1,131 @@
+"""What a scene does not need is not computed: shown by counting, without compilation.
+
+`counted.py` runs the scenes in a process of its own, where the compiled loops are plain Python, and
+counts from outside: what is read of each spring and mass, what is reckoned with each dashpot, which
+functions are called. `implicit` is left out where it only decides, once per run, how to step.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+HERE = Path(__file__).parent
+DRIVES = ("impact", "stress", "displacement")
+CLOSED = [
+    f"{chain}, {drive}"
+    for chain in ("linear", "mixed", "bistable")
+    for drive in ("stress", "displacement")
+]
+
+
+@pytest.fixture(scope="module")
+def counted() -> dict[str, dict[str, dict[str, Any]]]:
+    """All that counted.py counts."""
+    done = subprocess.run(
+        [sys.executable, str(HERE / "counted.py")],
+        env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.fixture(scope="module")
+def counts(counted: dict[str, dict[str, dict[str, Any]]]) -> dict[str, dict[str, Any]]:
+    """Counts of every scene."""
+    return counted["scenes"]
+
+
+def total(scene: dict[str, Any], start: str, without: tuple[str, ...] = ("implicit",)) -> int:
+    """Sum of the counts whose names start so."""
+    return sum(
+        value
+        for name, value in scene.items()
+        if name.startswith(start) and not name.endswith(without)
+    )
+
+
+@pytest.mark.parametrize("drive", DRIVES)
+@pytest.mark.parametrize("chain", ["linear", "mixed"])
+def test_a_linear_spring_costs_no_evaluation_of_the_law(
+    counts: dict[str, dict[str, Any]], chain: str, drive: str
+) -> None:
+    scene = counts[f"{chain}, {drive}"]
+    assert total(scene, "linear: law columns read") == 0
+    assert total(scene, "linear: law evaluated") == 0
+    assert total(scene, "linear: other columns read") > 0  # it was there and was counted
+    # the choice of the method looks at every spring once per run, whatever its kind
+    assert scene.get("linear: law columns read in implicit", 0) <= 4 * scene["ends"][-1]
+    law = total(scene, "bistable: law columns read")
+    assert law > 0 if chain == "mixed" else law == 0
+
+
+def test_a_massless_node_has_no_state(counts: dict[str, dict[str, Any]]) -> None:
+    scenes = [counts[f"mixed, impact{masses}"] for masses in ("", ", one mass", ", two masses")]
+    assert [scene["nodes with a state"] for scene in scenes] == [1, 2, 3]
+    assert [scene["ends"] for scene in scenes] == [[3], [1, 3], [1, 2, 3]]
+    # per step of the same order, each node that has a state costs the same reads of its mass
+    per_step = [scene["masses read"] / scene["steps"] for scene in scenes]
+    assert per_step[1] / per_step[0] == pytest.approx(2.0, rel=0.35)
+    assert per_step[2] / per_step[0] == pytest.approx(3.0, rel=0.35)
+
+
+def test_an_undamped_chain_has_no_dashpot_term(counts: dict[str, dict[str, Any]]) -> None:
+    for name, scene in counts.items():
+        reckoned = total(scene, "dashpot arithmetic") + scene.get("dashpot lines", 0)
+        assert reckoned > 0 if "dashpot" in name else reckoned == 0, name
+
+
+def test_an_undamped_chain_has_no_velocity_term(counts: dict[str, dict[str, Any]]) -> None:
+    assert total(counts["bistable, impact, onsite"], "onsite arithmetic") > 0
+    for name in ("linear, impact", "bistable, impact", "mixed, impact", "mixed, impact, one mass"):
+        assert total(counts[name], "onsite arithmetic") == 0, name
+
+
+@pytest.mark.parametrize("name", CLOSED)
+def test_a_closed_form_scene_takes_no_step(counts: dict[str, dict[str, Any]], name: str) -> None:
+    scene = counts[name]
+    assert scene["solver"] == "closed form"
+    assert scene["steps"] == 0
+    used = {key for key in scene if key.startswith("calls in ")}
+    assert used == {"calls in simulation", "calls in kernels"}
+    assert "masses read" not in scene
+
+
+def test_inertia_or_damping_takes_steps(counts: dict[str, dict[str, Any]]) -> None:
+    assert counts["bistable, impact"]["solver"] == "second order"
+    assert counts["bistable, stress, dashpot"]["solver"] == "first order"
+    for name in ("bistable, impact", "bistable, stress, dashpot"):
+        assert counts[name]["steps"] > 0
+        assert counts[name]["calls in taylor"] > 0
+
+
+# ---------------------------------------------------------------- sensitivities
+
+
+@pytest.mark.parametrize("way", ["fit", "search"])
+def test_a_held_parameter_costs_no_sensitivity(
+    counted: dict[str, dict[str, dict[str, Any]]], way: str
+) -> None:
+    """Eight parameters vary, or five of them, or the other three: the work adds up."""
+    found = [counted["sensitivities"][f"{way}, {held} held"] for held in (0, 3, 5)]
+    assert [one["columns"] for one in found] == [8, 5, 3]
+    assert [set(one["carried"].values()) for one in found] == [{8}, {5}, {3}]
+    every, some, others = (one["tangents expanded"] for one in found)
+    assert min(some, others) > 0
+    assert some + others == every
+
+
+def test_a_residual_alone_costs_no_sensitivity(
+    counted: dict[str, dict[str, dict[str, Any]]],
+) -> None:
+    assert counted["sensitivities"]["none, 0 held"]["tangents expanded"] == 0
