@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -13,12 +14,17 @@ from foamfit import implicit, kernels, series, taylor
 from foamfit.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.errors import SimulationError
 from foamfit.series import equilibrium_tangents
+from foamfit.spring import BISTABLE_NAMES, LINEAR_NAMES, BistableSpring
 
 Array = NDArray[np.float64]
 
 CLOSED_FORM, FIRST_ORDER, SECOND_ORDER = "closed form", "first order", "second order"
 TAYLOR, RADAU = "Taylor series", "Radau IIA"
 MAX_STEPS = 2_000_000
+_NO_SLOPES = (
+    "the scene is too stiff for explicit steps, and implicit ones carry no sensitivities along; "
+    "take differences of the response"
+)
 # Explicit steps are given up where something relaxes, or vibrates, so many times (in radians) while
 # the scene lasts, or after so many steps.
 MOST_RELAXATION, MOST_VIBRATION, MOST_EXPLICIT = 1e4, 1e5, 200_000
@@ -60,6 +66,8 @@ class Response:
         Time (s), spring (0 at the base), branch left, branch entered, strain of that spring.
     steps : int
         Steps of the integrator; 0 for the closed form.
+    sensitivities : dict of str to Sensitivity
+        Derivatives by the parameters that were asked for.
     """
 
     time: Array
@@ -71,11 +79,13 @@ class Response:
     method: str
     switches: Array
     steps: int
+    sensitivities: dict[str, Sensitivity] = field(default_factory=dict)
 
 
 Directions = NDArray[np.int64]
 NO_DIRECTIONS: Directions = np.empty((0, 2), np.int64)
 NO_SWITCHES = np.empty((0, 5))
+_NOTHING = np.zeros(1)
 
 
 class Slopes(NamedTuple):
@@ -83,6 +93,9 @@ class Slopes(NamedTuple):
 
     displacement: Array
     base_stress: Array
+
+
+NO_SLOPES = Slopes(np.empty((0, 0, 0)), np.empty((0, 0)))
 
 
 class Motion(NamedTuple):
@@ -119,6 +132,8 @@ class Plan:
         Velocity of the striker, m/s; 0 = no impact.
     max_steps : int
         Bound on the steps of the integrator.
+    lossless : bool
+        Whether there is neither a dashpot nor a mass inside.
     implicit : bool or None
         Whether to take implicit steps; None = where explicit ones are the wrong tool.
     """
@@ -133,6 +148,7 @@ class Plan:
     time: Array
     speed: float
     max_steps: int = MAX_STEPS
+    lossless: bool = False
     implicit: bool | None = None
 
     def run(
@@ -211,7 +227,7 @@ class Plan:
         margin = 1.0 if len(self.ends) > 1 else 0.1
         nodes, n, p = (len(heights) if everything else 1), self.time.size, len(directions)
         displacement, stress, log = np.empty((nodes, n)), np.empty(n), np.empty((1024, 5))
-        slopes = Slopes(np.empty((p, nodes, n)), np.empty((p, n)))
+        slopes = Slopes(np.empty((p, nodes, n)), np.empty((p, n))) if p > 0 else NO_SLOPES
         method = RADAU if self._is_stiff(rows, heights, drag) else TAYLOR
         moved = (self.ends, self.mass, drag, self.top, self.values, self.speed, self.time)
         scene = (rows, heights, *moved)
@@ -255,6 +271,8 @@ class Plan:
         """Tell whether explicit steps would have to follow what is long over."""
         if self.implicit is not None:
             return self.implicit
+        if self.lossless and drag == 0.0 and self.speed > 0.0:  # one mass bounces once
+            return False
         vibration, relaxation = implicit.hurry_of(
             rows, heights, self.ends, self.mass, drag, self.top, self.speed, self.time
         )
@@ -277,15 +295,15 @@ def _time(t: ArrayLike) -> Array:
     time = np.array(t, dtype=np.float64, order="C")  # a copy of one compiled type: writable
     if time.ndim != 1 or time.size == 0:
         raise ValueError("t must be a one-dimensional array with at least one sample")
-    if not np.all(np.isfinite(time)):
-        raise ValueError(f"t must be finite; sample {int(np.argmin(np.isfinite(time)))} is not")
-    if np.any(np.diff(time) <= 0.0):
-        at = int(np.argmax(np.diff(time) <= 0.0)) + 1
+    at = kernels.fault(time)
+    if at >= 0 and not math.isfinite(time[at]):
+        raise ValueError(f"t must be finite; sample {at} is not")
+    if at >= 0:
         raise ValueError(f"t must increase; sample {at} is not later than the one before it")
     return time
 
 
-def plan(chain: Chain, drive: Drive, t: ArrayLike) -> Plan:
+def plan(chain: Chain, drive: Drive, t: ArrayLike, *, dashpots: bool = False) -> Plan:
     """Find what a scene needs: the nodes that have a state, and the least solver.
 
     Parameters
@@ -296,6 +314,8 @@ def plan(chain: Chain, drive: Drive, t: ArrayLike) -> Plan:
         How it is loaded.
     t : (n_t,) array
         Samples, s, increasing.
+    dashpots : bool
+        Whether to reckon with a dashpot in every spring, also where it is zero.
 
     Raises
     ------
@@ -303,8 +323,8 @@ def plan(chain: Chain, drive: Drive, t: ArrayLike) -> Plan:
         If t does not increase or has not one value per sample of the drive.
     """
     time = _time(t)
-    masses = np.array(chain.masses)
-    speed, values = 0.0, np.zeros(1)
+    masses = chain.arrays.masses.copy()
+    speed, values = 0.0, _NOTHING
     top = taylor.FREE
     if isinstance(drive, Impact):
         masses[-1] += drive.mass
@@ -321,29 +341,94 @@ def plan(chain: Chain, drive: Drive, t: ArrayLike) -> Plan:
             top = taylor.MOTION
         elif masses[-1] == 0.0:
             top = taylor.VISCOUS if chain.site_damping > 0.0 else taylor.STRESS
-    nodes = masses > 0.0
-    nodes[-1] = True
-    damped = any(spring.eta > 0.0 for spring in chain.springs) or top == taylor.VISCOUS
-    if np.any(masses > 0.0):
+    if chain.arrays.heavy:
+        nodes = masses > 0.0
+        nodes[-1] = True
+        ends, masses = np.flatnonzero(nodes) + 1, masses[nodes]
+    else:
+        ends, masses = chain.arrays.top, masses[-1:]
+    damped = dashpots or chain.arrays.damped or top == taylor.VISCOUS
+    if len(masses) > 1 or masses[0] > 0.0:
         solver = SECOND_ORDER
-    elif damped and not (top == taylor.MOTION and len(masses) == 1):
+    elif damped and not (top == taylor.MOTION and len(chain.springs) == 1):
         solver = FIRST_ORDER
     else:
         solver = CLOSED_FORM
     return Plan(
         solver=solver,
         height=chain.height,
-        ends=np.flatnonzero(nodes) + 1,
-        mass=masses[nodes] / chain.area,
+        ends=ends,
+        mass=masses / chain.area,
         drag=chain.site_damping / chain.height,
         top=top,
         values=values,
         time=time,
         speed=speed,
+        lossless=len(ends) == 1 and not damped,
     )
 
 
-def simulate(chain: Chain, drive: Drive, t: ArrayLike, rtol: float = 1e-6) -> Response:
+@dataclass(frozen=True, eq=False)
+class Sensitivity:
+    """Derivative of a response by one parameter, in SI, at fixed times.
+
+    Attributes
+    ----------
+    displacement : (n_springs, n_t) array
+        m per unit of the parameter.
+    base_stress : (n_t,) array
+        Pa per unit of the parameter. At a switch of branch its slope jumps, not its value; it jumps
+        where contact ends.
+    """
+
+    displacement: Array
+    base_stress: Array
+
+
+def _direction(chain: Chain, name: str) -> tuple[int, int]:
+    """Spring and own parameter, or height, or onsite damper, that a name like "s1_kc" means."""
+    if name == "site_eta":
+        return -1, series.DRAG
+    prefix, _, short = name.partition("_")
+    known = [f"s{i}" for i in range(1, len(chain.springs) + 1)]
+    if prefix in known:
+        spring = known.index(prefix)
+        own = BISTABLE_NAMES if isinstance(chain.springs[spring], BistableSpring) else LINEAR_NAMES
+        if short == "height":
+            return spring, series.HEIGHT
+        if short in own:
+            return spring, BISTABLE_NAMES.index(short)
+    raise ValueError(
+        f"sensitivities: '{name}' is not a parameter of this chain; give names like s1_k0, "
+        "s2_height or site_eta"
+    )
+
+
+def _sensitivities(
+    chain: Chain, names: Sequence[str], directions: Directions, slopes: Slopes
+) -> dict[str, Sensitivity]:
+    """Name the derivatives of a run; η_site acts through η_site/H, and so does every height."""
+    out = {}
+    drag = chain.site_damping / chain.height
+    for p, name in enumerate(names):
+        moved, pressed = slopes.displacement[p], slopes.base_stress[p]
+        if directions[p, 1] == series.DRAG:
+            moved, pressed = moved / chain.height, pressed / chain.height
+        elif directions[p, 1] == series.HEIGHT and drag > 0.0:
+            moved = moved - drag / chain.height * slopes.displacement[-1]
+            pressed = pressed - drag / chain.height * slopes.base_stress[-1]
+        out[name] = Sensitivity(moved, pressed)
+    return out
+
+
+def simulate(
+    chain: Chain,
+    drive: Drive,
+    t: ArrayLike,
+    rtol: float = 1e-6,
+    *,
+    sensitivities: Sequence[str] = (),
+) -> Response:
     """Simulate a chain under a drive.
 
     Parameters
@@ -357,6 +442,8 @@ def simulate(chain: Chain, drive: Drive, t: ArrayLike, rtol: float = 1e-6) -> Re
         Samples, s, increasing.
     rtol : float
         Wanted error of displacement and base stress relative to their range.
+    sensitivities : sequence of str
+        Parameters by which the response is differentiated: s1_k0 … s2_eta, s1_height, site_eta.
 
     Returns
     -------
@@ -368,13 +455,19 @@ def simulate(chain: Chain, drive: Drive, t: ArrayLike, rtol: float = 1e-6) -> Re
     ValueError
         If something is not admissible; the message names it.
     SimulationError
-        If the scene has no finite answer; the message says why.
+        If the scene has no finite answer, or only implicit steps give one and sensitivities are
+        wanted; the message says why.
     """
     if not 1e-14 <= rtol <= 1e-1:
         raise ValueError(f"rtol = {rtol:g} is not admissible: it must be between 1e-14 and 0.1")
-    scene = plan(chain, drive, t)
-    rows = np.array([spring.row for spring in chain.springs])
-    motion = scene.run(rows, np.array(chain.heights), rtol)
+    directions = NO_DIRECTIONS
+    if sensitivities:
+        wanted = [_direction(chain, name) for name in sensitivities]
+        directions = np.array([*wanted, (-1, series.DRAG)])
+    scene = plan(chain, drive, t, dashpots=any(name.endswith("_eta") for name in sensitivities))
+    motion = scene.run(chain.arrays.rows, chain.arrays.heights, rtol, directions=directions)
+    if len(directions) and motion.slopes is None:
+        raise SimulationError(_NO_SLOPES)
     return Response(
         time=scene.time,
         displacement=motion.displacement,
@@ -385,4 +478,8 @@ def simulate(chain: Chain, drive: Drive, t: ArrayLike, rtol: float = 1e-6) -> Re
         method=motion.method,
         switches=motion.switches,
         steps=motion.steps,
-    )
+        sensitivities=(
+            {} if motion.slopes is None
+            else _sensitivities(chain, sensitivities, directions, motion.slopes)
+        ),
+    )  # fmt: skip
