@@ -224,7 +224,7 @@ class Plan:
         directions: Directions,
     ) -> Motion:
         # Without an interior mass there are few steps: a margin costs little.
-        margin = 1.0 if len(self.ends) > 1 else 0.1
+        inside = len(self.ends) > 1
         nodes, n, p = (len(heights) if everything else 1), self.time.size, len(directions)
         displacement, stress, log = np.empty((nodes, n)), np.empty(n), np.empty((1024, 5))
         slopes = Slopes(np.empty((p, nodes, n)), np.empty((p, n))) if p > 0 else NO_SLOPES
@@ -233,7 +233,7 @@ class Plan:
         scene = (rows, heights, *moved)
         outcome, contact_end, steps, switches = taylor.TOO_MANY_STEPS, math.nan, 0, 0
         if method == TAYLOR:
-            tolerance = max(1e-2 * margin * rtol, 1e-16)
+            tolerance = max((1e-2 if inside else 1e-3) * rtol, 1e-16)
             order = min(max(round(4.0 - 0.5 * math.log(tolerance)), 6), 24)
             most = MOST_EXPLICIT + 20 * self.time.size
             outcome, contact_end, steps, switches = taylor.integrate(
@@ -252,7 +252,7 @@ class Plan:
         if method == RADAU:
             outcome, contact_end, steps, switches = implicit.integrate_implicit(
                 *scene,
-                max(3e-2 * margin * rtol, 1e-14),
+                max((3e-2 if inside else 3e-4) * rtol, 1e-14),
                 self.max_steps,
                 displacement,
                 stress,
