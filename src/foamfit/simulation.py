@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +21,10 @@ MAX_STEPS = 2_000_000
 # Explicit steps are given up where something relaxes, or vibrates, so many times (in radians) while
 # the scene lasts, or after so many steps.
 MOST_RELAXATION, MOST_VIBRATION, MOST_EXPLICIT = 1e4, 1e5, 200_000
+# Bounds on steps times springs, in all and before explicit steps are given up: seconds, not hours.
+MOST_WORK, MOST_EXPLICIT_WORK = 5_000_000, 1_000_000
+# From so many steps on, and where steps are implicit, a motion of masses is checked by shorter ones.
+FEW_STEPS = 1000
 
 _OUTCOMES = {
     taylor.TOO_MANY_STEPS: "the bound of {steps} steps was reached: something in the scene is "
@@ -81,6 +85,7 @@ class Motion(NamedTuple):
     switches: Array
     steps: int
     method: str = CLOSED_FORM
+    unresolved: float = 0.0  # vibrations that were damped out, relative to the ranges
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,6 +183,8 @@ class Plan:
     ) -> Motion:
         # Without an interior mass there are few steps: a margin costs little.
         margin = 1.0 if len(self.ends) > 1 else 1e-2
+        max_steps = max(min(self.max_steps, MOST_WORK // len(heights)), 1)
+        lost = np.zeros(1)
         displacement = np.empty((len(heights) if everything else 1, self.time.size))
         stress = np.empty(self.time.size)
         log = np.empty((1024, 5))
@@ -188,12 +195,12 @@ class Plan:
         if method == TAYLOR:
             tolerance = max(1e-2 * margin * rtol, 1e-16)
             order = min(max(round(4.0 - 0.5 * math.log(tolerance)), 6), 24)
-            most = MOST_EXPLICIT + 20 * self.time.size
+            most = min(MOST_EXPLICIT, MOST_EXPLICIT_WORK // len(heights)) + 20 * self.time.size
             outcome, contact_end, steps, switches = taylor.integrate(
                 *scene,
                 tolerance,
                 order,
-                min(self.max_steps, most) if self.implicit is None else self.max_steps,
+                min(max_steps, most) if self.implicit is None else max_steps,
                 displacement,
                 stress,
                 log,
@@ -204,16 +211,19 @@ class Plan:
             outcome, contact_end, steps, switches = implicit.integrate_implicit(
                 *scene,
                 max(3e-2 * margin * rtol, 1e-14),
-                self.max_steps,
+                max_steps,
                 displacement,
                 stress,
                 log,
                 np.zeros(2, np.int64),
+                rtol,
+                lost,
             )
         if outcome != taylor.DONE:
             last = log[min(switches, len(log)) - 1, 0] if switches else self.time[0]
             raise SimulationError(_OUTCOMES[outcome].format(steps=steps, time=last))
-        return Motion(displacement, stress, contact_end, log[:switches], steps, method)
+        switched = log[:switches]
+        return Motion(displacement, stress, contact_end, switched, steps, method, float(lost[0]))
 
     def _is_stiff(self, rows: Array, heights: Array, drag: float) -> bool:
         """Tell whether explicit steps would have to follow what is long over."""
@@ -307,6 +317,74 @@ def plan(chain: Chain, drive: Drive, t: ArrayLike) -> Plan:
     )
 
 
+def _verified(scene: Plan, rows: Array, heights: Array, rtol: float) -> Motion:
+    """Run a scene; where masses make its errors grow, follow it again by shorter steps and compare.
+
+    Raises
+    ------
+    SimulationError
+        If the scene has no answer within `rtol`; the message says why.
+    """
+    motion = scene.run(rows, heights, rtol)
+    if motion.unresolved > rtol:
+        scene = replace(scene, implicit=False)
+        try:
+            motion = scene.run(rows, heights, rtol)
+        except SimulationError:
+            raise SimulationError(
+                f"masses vibrate too fast to be followed, by up to {motion.unresolved:.1g} of the "
+                "range: ask for no smaller rtol than that, give the springs heavier dashpots, or "
+                "leave the masses out"
+            ) from None
+    _leave_room(rows, heights, motion.displacement, rtol)
+    forced = 0 if scene.speed > 0.0 else scene.time.size
+    many = motion.method == RADAU or motion.steps > FEW_STEPS + 2 * forced
+    if scene.solver != SECOND_ORDER or not many:
+        return motion
+    miss = math.inf
+    for factor in (1e-2, 1e-4, 1e-6):
+        if rtol * factor < 1e-14:
+            break
+        finer = scene.run(rows, heights, rtol * factor)
+        miss = max(
+            _difference(finer.displacement, motion.displacement),
+            _difference(finer.base_stress, motion.base_stress),
+        )
+        if miss <= 0.3 * rtol and finer.unresolved <= rtol:
+            return finer
+        motion = finer
+    raise SimulationError(
+        f"vibrations let the least error grow: two runs with shorter steps each differ by {miss:.1g} "
+        "of the range; ask for a larger rtol, give the springs heavier dashpots, or leave the "
+        "masses out"
+    )
+
+
+def _difference(one: Array, other: Array) -> float:
+    """Largest difference of two motions over the range of the first, rest included."""
+    span = max(float(one.max()), 0.0) - min(float(one.min()), 0.0)
+    return float(np.abs(one - other).max()) / span if span > 0.0 else 0.0
+
+
+def _leave_room(rows: Array, heights: Array, displacement: Array, rtol: float) -> None:
+    """Refuse a strain so close to the end of branch c that rounding alone spoils its stress.
+
+    Raises
+    ------
+    SimulationError
+        If it does.
+    """
+    strain = np.diff(displacement, axis=0, prepend=0.0).max(axis=1) / heights
+    bistable = (rows[:, kernels.KIND] == kernels.BISTABLE) & (strain > rows[:, kernels.EPS_C])
+    room = np.where(bistable, 1.0 - (strain - rows[:, kernels.EPS_STAR]), 1.0)
+    least = float(room.min())
+    if 1e-15 * max(1.0, float(strain.max())) > 0.3 * rtol * least:
+        raise SimulationError(
+            f"spring {int(room.argmin()) + 1} comes within {least:.1g} of the end of its branch, "
+            f"strain 1 + eps_star: there rounding alone makes errors above rtol = {rtol:g}"
+        )
+
+
 def simulate(chain: Chain, drive: Drive, t: ArrayLike, rtol: float = 1e-6) -> Response:
     """Simulate a chain under a drive.
 
@@ -332,13 +410,13 @@ def simulate(chain: Chain, drive: Drive, t: ArrayLike, rtol: float = 1e-6) -> Re
     ValueError
         If something is not admissible; the message names it.
     SimulationError
-        If the scene has no finite answer; the message says why.
+        If the scene has no finite answer, or none to the wanted error; the message says why.
     """
     if not 1e-14 <= rtol <= 1e-1:
         raise ValueError(f"rtol = {rtol:g} is not admissible: it must be between 1e-14 and 0.1")
     scene = plan(chain, drive, t)
     rows = np.array([spring.row for spring in chain.springs])
-    motion = scene.run(rows, np.array(chain.heights), rtol)
+    motion = _verified(scene, rows, np.array(chain.heights), rtol)
     return Response(
         time=scene.time,
         displacement=motion.displacement,

@@ -484,6 +484,8 @@ def integrate(
         if done == t.size:
             return DONE, contact_end, step, switches
         horizon = t[t.size - 1]
+        if not struck and t.size == 1:
+            motion[0] = push[0] = values[0]
         if not struck and t.size > 1:
             fresh = False
             while knot < t.size - 2 and now >= t[knot + 1]:
