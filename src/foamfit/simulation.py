@@ -21,16 +21,18 @@ MAX_STEPS = 2_000_000
 # Explicit steps are given up where something relaxes, or vibrates, so many times (in radians) while
 # the scene lasts, or after so many steps.
 MOST_RELAXATION, MOST_VIBRATION, MOST_EXPLICIT = 1e4, 1e5, 200_000
-# Bounds on steps times springs, in all and before explicit steps are given up: seconds, not hours.
-MOST_WORK, MOST_EXPLICIT_WORK = 5_000_000, 1_000_000
+# Bounds on steps times springs (seconds, not hours): for all but the samples of a drive, before
+# explicit steps are given up, and for everything.
+MOST_WORK, MOST_EXPLICIT_WORK, MOST_SAMPLED = 1_500_000, 500_000, 20_000_000
 # From so many steps on, and where steps are implicit, a motion of masses is checked by shorter ones.
 FEW_STEPS = 1000
 
 _OUTCOMES = {
     taylor.TOO_MANY_STEPS: "the bound of {steps} steps was reached: something in the scene is "
     "too fast to be followed (a light mass or a heavy dashpot)",
-    taylor.STEP_UNDERFLOW: "the step shrank to nothing near t = {time:g} s: a strain comes too "
-    "close to the end of its branch",
+    taylor.STEP_UNDERFLOW: "the step shrank to nothing near t = {time:g} s: there the scene changes "
+    "faster than numbers can tell (a strain at the end of its branch, a very light mass, or many "
+    "springs on a flat branch)",
     taylor.FLAT_UNDER_STRESS: "a prescribed stress acts on a flat branch (kh_plus or kh_minus = 0) "
     "that nothing slows; give the top a mass or the spring a dashpot",
     taylor.NOT_FINITE: "a stress or strain is no longer finite: the drive goes past the end of a "
@@ -183,7 +185,8 @@ class Plan:
     ) -> Motion:
         # Without an interior mass there are few steps: a margin costs little.
         margin = 1.0 if len(self.ends) > 1 else 1e-2
-        max_steps = max(min(self.max_steps, MOST_WORK // len(heights)), 1)
+        most = MOST_WORK // len(heights) + 2 * self.time.size
+        max_steps = max(min(self.max_steps, most, MOST_SAMPLED // len(heights)), 1)
         lost = np.zeros(1)
         displacement = np.empty((len(heights) if everything else 1, self.time.size))
         stress = np.empty(self.time.size)
