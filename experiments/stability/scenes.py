@@ -157,8 +157,8 @@ def designed(count: int, seed: int = 4) -> list[Point]:
     design = qmc.LatinHypercube(19, rng=seed).random(count)
     points = []
     for u in design:
-        springs = int(round(1000.0 ** (u[0] ** 7)))
-        samples = int(round(_log(u[1] ** 2, 5.0, 2e4)))
+        springs = round(1000.0 ** (u[0] ** 7))
+        samples = round(_log(u[1] ** 2, 5.0, 2e4))
         drive = DRIVES[min(int(u[2] * 4.0), 3) % 3]  # impacts twice as often
         eps_a = _log(u[3], 0.01, 0.6)
         point = Point(

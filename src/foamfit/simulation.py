@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from foamfit import implicit, kernels, taylor
 from foamfit.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.errors import SimulationError
+from foamfit.law import BISTABLE
 
 Array = NDArray[np.float64]
 
@@ -24,15 +25,16 @@ MOST_RELAXATION, MOST_VIBRATION, MOST_EXPLICIT = 1e4, 1e5, 200_000
 # Bounds on steps times springs (seconds, not hours): for all but the samples of a drive, before
 # explicit steps are given up, and for everything.
 MOST_WORK, MOST_EXPLICIT_WORK, MOST_SAMPLED = 1_500_000, 500_000, 20_000_000
-# From so many steps on, and where steps are implicit, a motion of masses is checked by shorter ones.
+# From so many steps on, and where steps are implicit, a motion of masses is run again to check it.
 FEW_STEPS = 1000
+LOST = 0.03  # so large a difference is not mended by still shorter steps
 
 _OUTCOMES = {
     taylor.TOO_MANY_STEPS: "the bound of {steps} steps was reached: something in the scene is "
     "too fast to be followed (a light mass or a heavy dashpot)",
-    taylor.STEP_UNDERFLOW: "the step shrank to nothing near t = {time:g} s: there the scene changes "
-    "faster than numbers can tell (a strain at the end of its branch, a very light mass, or many "
-    "springs on a flat branch)",
+    taylor.STEP_UNDERFLOW: "the step shrank to nothing near t = {time:g} s: there the scene "
+    "changes faster than numbers can tell (a strain at the end of its branch, a very light mass, "
+    "or many springs on a flat branch)",
     taylor.FLAT_UNDER_STRESS: "a prescribed stress acts on a flat branch (kh_plus or kh_minus = 0) "
     "that nothing slows; give the top a mass or the spring a dashpot",
     taylor.NOT_FINITE: "a stress or strain is no longer finite: the drive goes past the end of a "
@@ -228,13 +230,17 @@ class Plan:
         switched = log[:switches]
         return Motion(displacement, stress, contact_end, switched, steps, method, float(lost[0]))
 
+    def hurry(self, rows: Array, heights: Array, drag: float) -> tuple[float, float]:
+        """Vibration and relaxation (radians) that explicit steps would have to go through."""
+        return implicit.hurry_of(
+            rows, heights, self.ends, self.mass, drag, self.top, self.speed, self.time
+        )
+
     def _is_stiff(self, rows: Array, heights: Array, drag: float) -> bool:
         """Tell whether explicit steps would have to follow what is long over."""
         if self.implicit is not None:
             return self.implicit
-        vibration, relaxation = implicit.hurry_of(
-            rows, heights, self.ends, self.mass, drag, self.top, self.speed, self.time
-        )
+        vibration, relaxation = self.hurry(rows, heights, drag)
         return bool(vibration > MOST_VIBRATION or relaxation > MOST_RELAXATION)
 
 
@@ -331,7 +337,9 @@ def _verified(scene: Plan, rows: Array, heights: Array, rtol: float) -> Motion:
     motion = scene.run(rows, heights, rtol)
     if motion.unresolved > rtol:
         scene = replace(scene, implicit=False)
-        try:
+        try:  # an explicit step goes through two or three radians
+            if max(scene.hurry(rows, heights, scene.drag)) / 3.0 > MOST_WORK / len(heights):
+                raise SimulationError
             motion = scene.run(rows, heights, rtol)
         except SimulationError:
             raise SimulationError(
@@ -355,11 +363,13 @@ def _verified(scene: Plan, rows: Array, heights: Array, rtol: float) -> Motion:
         )
         if miss <= 0.3 * rtol and finer.unresolved <= rtol:
             return finer
+        if factor < 1e-2 and miss > LOST:
+            break
         motion = finer
     raise SimulationError(
-        f"vibrations let the least error grow: two runs with shorter steps each differ by {miss:.1g} "
-        "of the range; ask for a larger rtol, give the springs heavier dashpots, or leave the "
-        "masses out"
+        "vibrations let the least error grow: two runs with shorter steps each differ by "
+        f"{miss:.1g} of the range; ask for a larger rtol, give the springs heavier dashpots, or "
+        "leave the masses out"
     )
 
 
@@ -378,7 +388,7 @@ def _leave_room(rows: Array, heights: Array, displacement: Array, rtol: float) -
         If it does.
     """
     strain = np.diff(displacement, axis=0, prepend=0.0).max(axis=1) / heights
-    bistable = (rows[:, kernels.KIND] == kernels.BISTABLE) & (strain > rows[:, kernels.EPS_C])
+    bistable = (rows[:, kernels.KIND] == BISTABLE) & (strain > rows[:, kernels.EPS_C])
     room = np.where(bistable, 1.0 - (strain - rows[:, kernels.EPS_STAR]), 1.0)
     least = float(room.min())
     if 1e-15 * max(1.0, float(strain.max())) > 0.3 * rtol * least:
