@@ -179,7 +179,7 @@ def designed(count: int, seed: int = 4) -> list[Point]:
             velocity=_log(u[16], 1e-3, 100.0),
             height=_log(u[17], 1e-6, 1.0),
             springs=springs,
-            samples=max(samples, 5),
+            samples=max(min(samples, 200_000 // springs), 5),
             duration=_log(u[18], 0.1, 10.0),
         )
         points.append(point)

@@ -101,14 +101,17 @@ def judged(point: Point) -> dict[str, Any]:
 
 def study(designed_scenes: int = DESIGNED) -> pd.DataFrame:
     """Judge every scene; one line each."""
-    scenes = [("design", point) for point in designed(designed_scenes, SEED)] + list(swept())
-    lines = []
-    for number, (axis, point) in enumerate(scenes):
-        faulthandler.dump_traceback_later(LONGEST, exit=True)
-        lines.append({"axis": axis, **asdict(point), **judged(point)})
-        faulthandler.cancel_dump_traceback_later()
-        if lines[-1]["outcome"] == "failure" or number % 100 == 0:
-            print(number, lines[-1], file=sys.stderr, flush=True)
+    scenes = [*swept(), *(("design", point) for point in designed(designed_scenes, SEED))]
+    lines: list[dict[str, Any]] = []
+    try:
+        for number, (axis, point) in enumerate(scenes):
+            faulthandler.dump_traceback_later(LONGEST, exit=True)
+            lines.append({"axis": axis, **asdict(point), **judged(point)})
+            faulthandler.cancel_dump_traceback_later()
+            if lines[-1]["outcome"] == "failure" or number % 100 == 0:
+                print(number, lines[-1], file=sys.stderr, flush=True)
+    except KeyboardInterrupt:
+        print(f"stopped after {len(lines)} of {len(scenes)} scenes", file=sys.stderr)
     return pd.DataFrame(lines)
 
 
