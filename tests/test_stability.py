@@ -48,7 +48,7 @@ def judge(point: Point, answer: ff.Response) -> None:
 def cheap(point: Point) -> bool:
     """Leave to the study what takes a second or more."""
     ringing = (point.mass > 0.0 and point.springs > 1) or point.top_mass > 0.0
-    return point.springs <= (1 if ringing else 8) and point.samples <= 2000
+    return point.springs <= (1 if ringing else 8) and point.samples <= 300
 
 
 # ------------------------------------------------------------------------------------- the scenes
@@ -56,8 +56,8 @@ def cheap(point: Point) -> bool:
 
 @pytest.mark.parametrize("part", range(4))
 def test_designed_scenes(part: int) -> None:
-    points = [point for point in designed(224, seed=11) if cheap(point)][part::4]
-    assert len(points) >= 30
+    points = [point for point in designed(240, seed=11) if cheap(point)][part::4]
+    assert len(points) >= 25
     answered = 0
     for point in points:
         answer, why = ended(point)
@@ -93,7 +93,7 @@ def test_a_strain_at_the_end_of_its_branch_is_refused() -> None:
 
 
 def test_a_chaotic_motion_is_refused() -> None:
-    point = Point(drive="displacement", springs=12, mass=1e-6, samples=401, kc_ratio=1e3)
+    point = Point(drive="displacement", springs=8, mass=1e-6, samples=401, kc_ratio=1e3)
     _, why = ended(point)
     assert "vibrations let the least error grow" in why
     calm, _ = ended(dataclasses.replace(point, eta=1e3))

@@ -61,7 +61,7 @@ STAGES = 5
 # Steps that the error alone makes short, compared with the motion, before they may grow anyway:
 # then something vibrates too fast to be worth following, and is damped out. Where that would cost
 # more than the wanted error, it is followed for so many steps of one spring all the same.
-SHORT, PATIENCE, LITTLE_PATIENCE, LONGEST_PATIENCE = 5e-4, 600, 60, 12_000
+SHORT, PATIENCE, LITTLE_PATIENCE, LONGEST_PATIENCE = 5e-4, 600, 60, 10_000
 
 
 def radau(stages: int) -> tuple[Array, Array]:
