@@ -204,7 +204,7 @@ def heat_map(rows: pd.DataFrame) -> Figure:
     axes = [title for key, title in TITLES.items() if key in EDGES]
     widest = max(len(rows[rows.axis == title]) for title in axes)
     with matplotlib.rc_context({"font.size": 8, "axes.titlelocation": "left"}):
-        figure = Figure(figsize=(11.5, 5.6), layout="constrained")
+        figure = Figure(figsize=(13.0, 5.8), layout="constrained")
         left, right = figure.subplots(1, 2, sharey=True)
         share, error = np.full((2, len(axes), widest), np.nan)
         for i, title in enumerate(axes):
@@ -215,12 +215,19 @@ def heat_map(rows: pd.DataFrame) -> Figure:
                     error[i, j] = math.log10(max(row["largest error"], 1e-16))
                 for panel in (left, right):
                     panel.text(j, i + 0.3, row["range"], ha="center", va="center", fontsize=5.5)
-                left.text(j, i - 0.12, f"{row.answers} of {row.scenes}", ha="center", va="center")
+                left.text(
+                    j,
+                    i - 0.12,
+                    f"{row.answers} of {row.scenes}",
+                    ha="center",
+                    va="center",
+                    fontsize=7,
+                )
                 if row.answers:
                     shown = f"{row['largest error']:.0e}" if row["largest error"] else "0"
                     right.text(j, i - 0.12, shown, ha="center", va="center")
         shades = left.imshow(share, vmin=50, vmax=100, cmap="RdYlGn", alpha=0.65, aspect="auto")
-        figure.colorbar(shades, ax=left, label="answers (%); the rest is refused", shrink=0.6)
+        figure.colorbar(shades, ax=left, label="answers (%)", shrink=0.6)
         steps = np.arange(-16, -5)
         colours = matplotlib.colormaps["viridis_r"](np.linspace(0.0, 0.85, len(steps) - 1))
         norm = BoundaryNorm(steps, len(steps) - 1)

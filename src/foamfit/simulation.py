@@ -358,7 +358,8 @@ def _verified(scene: Plan, rows: Array, heights: Array, rtol: float) -> Motion:
         )
     forced = 0 if scene.speed > 0.0 else scene.time.size
     many = motion.steps > FEW_STEPS + 2 * forced or len(scene.ends) > 2 or room < CLOSE
-    if scene.solver != SECOND_ORDER or not (many or motion.method == RADAU):
+    many = many and scene.solver == SECOND_ORDER
+    if not (many or motion.method == RADAU):
         return motion
     miss = math.inf
     for factor in (1e-2, 1e-4, 1e-6):
