@@ -96,7 +96,9 @@ def test_the_jacobian_agrees_with_the_law_in_closed_form():
     spring, measurement = synthetic_loop()
     one = objective(measurement, "displacement")
     values = values_of(spring)
-    column = one.jacobian(values, np.array([0]), 1e-6 * values[:1])[:, 0] * np.ptp(measurement.stress)
+    column = one.jacobian(values, np.array([0]), 1e-6 * values[:1])[:, 0] * np.ptp(
+        measurement.stress
+    )
     strain = measurement.displacement / measurement.specimen.height
     up = np.arange(strain.size) < 200
     on_a = up & (strain < 0.13)
