@@ -240,7 +240,7 @@ class Plan:
         nodes, n, p = (len(heights) if everything else 1), self.time.size, len(directions)
         displacement, stress, log = np.empty((nodes, n)), np.empty(n), np.empty((1024, 5))
         slopes = Slopes(np.empty((p, nodes, n)), np.empty((p, n))) if p > 0 else NO_SLOPES
-        most = MOST_WORK // len(heights) + 2 * n
+        most = MOST_WORK // len(heights) + 2 * n + 8 * len(heights)
         max_steps = max(min(self.max_steps, most, MOST_SAMPLED // len(heights)), 1)
         lost = np.zeros(1)
         method = RADAU if self._is_stiff(rows, heights, drag) else TAYLOR
@@ -248,7 +248,7 @@ class Plan:
         scene = (rows, heights, *moved)
         outcome, contact_end, steps, switches = taylor.TOO_MANY_STEPS, math.nan, 0, 0
         if method == TAYLOR:
-            tolerance = max((1e-2 if inside else 1e-3) * rtol, 1e-16)
+            tolerance = max((1e-2 if inside else 1e-3 if self.speed > 0.0 else 1e-4) * rtol, 1e-16)
             order = min(max(round(4.0 - 0.5 * math.log(tolerance)), 6), 24)
             most = min(MOST_EXPLICIT, MOST_EXPLICIT_WORK // len(heights)) + 20 * self.time.size
             outcome, contact_end, steps, switches = taylor.integrate(
