@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foamfit import implicit, kernels, series, taylor
+from foamfit import aggregate, implicit, kernels, series, taylor
 from foamfit.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.errors import SimulationError
 from foamfit.series import equilibrium_tangents
@@ -19,7 +19,7 @@ from foamfit.spring import BISTABLE_NAMES, LINEAR_NAMES, BistableSpring
 Array = NDArray[np.float64]
 
 CLOSED_FORM, FIRST_ORDER, SECOND_ORDER = "closed form", "first order", "second order"
-TAYLOR, RADAU = "Taylor series", "Radau IIA"
+TAYLOR, RADAU, AGGREGATE = "Taylor series", "Radau IIA", "aggregate"
 MAX_STEPS = 2_000_000
 _NO_SLOPES = (
     "the scene is too stiff for explicit steps, and implicit ones carry no sensitivities along; "
@@ -28,6 +28,8 @@ _NO_SLOPES = (
 # Explicit steps are given up where something relaxes, or vibrates, so many times (in radians) while
 # the scene lasts, or after so many steps.
 MOST_RELAXATION, MOST_VIBRATION, MOST_EXPLICIT = 1e4, 1e5, 200_000
+# From so many springs on, those that carry one stress are integrated as one.
+LEAST_AGGREGATE = 9
 
 _OUTCOMES = {
     taylor.TOO_MANY_STEPS: "the bound of {steps} steps was reached: something in the scene is "
@@ -60,8 +62,9 @@ class Response:
     solver : str
         "closed form", "first order" or "second order": the least that the scene needs.
     method : str
-        "closed form", "Taylor series" (explicit steps) or "Radau IIA" (implicit steps, where light
-        masses or dashpots make the scene stiff; a vibration too fast to be followed is damped out).
+        "closed form", "Taylor series" (explicit steps), "aggregate" (the same, for many springs
+        that carry one stress) or "Radau IIA" (implicit steps, where light masses or dashpots make
+        the scene stiff; a vibration too fast to be followed is damped out).
     switches : (m, 5) array
         Time (s), spring (0 at the base), branch left, branch entered, strain of that spring.
     steps : int
@@ -229,9 +232,30 @@ class Plan:
         displacement, stress, log = np.empty((nodes, n)), np.empty(n), np.empty((1024, 5))
         slopes = Slopes(np.empty((p, nodes, n)), np.empty((p, n))) if p > 0 else NO_SLOPES
         method = RADAU if self._is_stiff(rows, heights, drag) else TAYLOR
+        if method == TAYLOR and p == 0 and self._is_one(rows):
+            method = AGGREGATE
+            log = np.empty((4 * len(heights) + 64, 5))
         moved = (self.ends, self.mass, drag, self.top, self.values, self.speed, self.time)
         scene = (rows, heights, *moved)
         outcome, contact_end, steps, switches = taylor.TOO_MANY_STEPS, math.nan, 0, 0
+        if method == AGGREGATE:
+            # The errors of so many steps add up; the scene is short of nothing but switches.
+            tolerance = max(1e-2 * margin * rtol / len(heights), 1e-16)
+            outcome, contact_end, steps, switches = aggregate.integrate_aggregate(
+                rows,
+                heights,
+                self.mass[0],
+                drag,
+                self.speed,
+                self.time,
+                tolerance,
+                min(max(round(4.0 - 0.5 * math.log(tolerance)), 6), aggregate.DEGREE),
+                self.max_steps,
+                displacement,
+                stress,
+                log,
+                np.zeros(2, np.int64),
+            )
         if method == TAYLOR:
             tolerance = max(1e-2 * margin * rtol, 1e-16)
             order = min(max(round(4.0 - 0.5 * math.log(tolerance)), 6), 24)
@@ -266,6 +290,16 @@ class Plan:
             displacement, stress, contact_end, log[:switches], steps, method,
             slopes if p > 0 and method == TAYLOR else None,
         )  # fmt: skip
+
+    def _is_one(self, rows: Array) -> bool:
+        """Tell whether an impact acts on springs so many and so plain that they count as one."""
+        return (
+            len(rows) >= LEAST_AGGREGATE
+            and len(self.ends) == 1
+            and self.top == taylor.FREE
+            and self.speed > 0.0
+            and bool(aggregate.holds(rows))
+        )
 
     def _is_stiff(self, rows: Array, heights: Array, drag: float) -> bool:
         """Tell whether explicit steps would have to follow what is long over."""
