@@ -58,6 +58,8 @@ from foamfit.taylor import DONE, NOT_FINITE, STEP_UNDERFLOW, TOO_MANY_STEPS, fly
 DEGREE, REACH = 16, 0.125
 # Springs whose switching stresses differ by less than this share switch together.
 CLOSE = 1e-13
+# Orders by which the time of the next event is guessed.
+GUESS = 3
 # Columns of `Group.law` and of `Group.place`.
 CURVED, SLOPE, ORIGIN, OFFSET, N_LAW = range(5)
 ANCHOR, UNIT, LEAST, N_PLACE = range(4)
@@ -84,7 +86,7 @@ class Group(NamedTuple):
     place: Array
 
 
-class Motion(NamedTuple):
+class Step(NamedTuple):
     """Series in time of stress s, displacement w and velocity v of the top; order 0 is the state.
 
     `powers` (order + 1, order + 1) are those of the series of (S - S(0))/unit, from the first on,
@@ -127,7 +129,7 @@ def _stresses(row: Row, branch: int) -> tuple[float, float]:
 
 
 @inner
-def _place(tree: Array, i: int, value: float) -> None:
+def _put(tree: Array, i: int, value: float) -> None:
     """Set an entry of a tournament."""
     at = tree.size // 2 + i
     tree[at] = value
@@ -153,8 +155,8 @@ def _enter(group: Group, i: int, branch: int) -> None:
     group.law[i, CURVED] = 1.0 if curved else 0.0
     group.law[i, SLOPE], group.law[i, ORIGIN], group.law[i, OFFSET] = slope, origin, offset
     low, high = _stresses(group.rows[i], branch)
-    _place(group.upper, i, high)
-    _place(group.lower, i, -low)
+    _put(group.upper, i, high)
+    _put(group.lower, i, -low)
 
 
 @inner
@@ -188,6 +190,22 @@ def _anchor(group: Group, stress: float, rising: bool) -> None:
         group.sum[m] = 0.0
     for i in range(group.heights.size):
         _add(group, i, 1.0)
+
+
+@inner
+def _begin(group: Group) -> None:
+    """Put all springs on their first branches, free of stress."""
+    rows = group.rows
+    for at in range(group.upper.size):
+        group.upper[at] = group.lower[at] = math.inf
+    least = math.inf
+    for i in range(rows.shape[0]):
+        _enter(group, i, first_branch(rows[i]))
+        least = min(least, rows[i, K0])
+        if rows[i, KIND] == BISTABLE:
+            least = min(least, rows[i, KC])
+    group.place[LEAST] = least
+    _anchor(group, 0.0, least > 0.0)
 
 
 @inner
@@ -225,7 +243,7 @@ def _switch(
 
 
 @inner
-def _next_order(group: Group, now: Motion, n: int, mass: float, drag: float) -> None:
+def _next_order(group: Group, now: Step, n: int, mass: float, drag: float) -> None:
     """Find the coefficients n > 0 of a step from the lower ones.
 
     The displacement follows from the velocity, the velocity from the stress, and the stress from
@@ -249,7 +267,7 @@ def _next_order(group: Group, now: Motion, n: int, mass: float, drag: float) -> 
 
 
 @inner
-def _start(group: Group, now: Motion) -> None:
+def _start(group: Group, now: Step) -> None:
     """Find order 0: the displacement, from the stress."""
     step = (now.s[0] - group.place[ANCHOR]) / group.place[UNIT]
     now.shifted[DEGREE] = group.sum[DEGREE]
@@ -270,7 +288,7 @@ def _longest(c: Array, n: int, limit: float, span: float) -> float:
 @inner
 def _expand(
     group: Group,
-    now: Motion,
+    now: Step,
     mass: float,
     drag: float,
     low: float,
@@ -281,14 +299,14 @@ def _expand(
 ) -> tuple[int, float]:
     """Expand a step until its terms fall below the limits: orders found, and the longest step.
 
-    Two orders tell about when the next event comes; the step is a little longer than that.
+    The first orders tell about when the next event comes; the step is a little longer than that.
     """
     _start(group, now)
     most = now.s.size - 1
-    for n in range(1, 4):
-        _next_order(group, now, n, mass, drag)
-    span = min(1.02 * first_crossing(now.s, 3, low, high, span)[0], span)
-    n = 3
+    n = min(GUESS, most)
+    for m in range(1, n + 1):
+        _next_order(group, now, m, mass, drag)
+    span = min(1.02 * first_crossing(now.s, n, low, high, span)[0], span)
     while n < most:
         fine = _longest(now.s, n, s_limit, span) == span
         if fine and _longest(now.w, n, w_limit, span) == span:
@@ -300,7 +318,7 @@ def _expand(
 
 @inner
 def _sample(
-    group: Group, now: Motion, order: int, t: Array, first: int, last: int, begin: float,
+    group: Group, now: Step, order: int, t: Array, first: int, last: int, begin: float,
     out_w: Array, out_s: Array,
 ) -> None:  # fmt: skip
     """Write displacements and base stress at the samples first … last-1 of a step."""
@@ -384,18 +402,13 @@ def integrate_aggregate(
         leaves *= 2
     group = Group(
         rows, heights, np.zeros(count, np.int64), np.zeros((count, N_LAW)),
-        np.full(2 * leaves, math.inf), np.full(2 * leaves, math.inf),
-        np.zeros(DEGREE + 1), np.full(N_PLACE, math.inf),
+        np.empty(2 * leaves), np.empty(2 * leaves), np.zeros(DEGREE + 1), np.zeros(N_PLACE),
     )  # fmt: skip
-    now = Motion(
+    now = Step(
         np.zeros(order + 1), np.zeros(order + 1), np.zeros(order + 1),
         np.zeros((order + 1, order + 1)), np.zeros(DEGREE + 1),
     )  # fmt: skip
-    for i in range(count):
-        _enter(group, i, first_branch(rows[i]))
-        slope = min(rows[i, K0], rows[i, KC]) if rows[i, KIND] == BISTABLE else rows[i, K0]
-        group.place[LEAST] = min(group.place[LEAST], slope)
-    _anchor(group, 0.0, True)
+    _begin(group)
     s_scale, w_scale = _scales(group, mass, drag, speed)
     effort[0] += 1
     done = 0

@@ -239,8 +239,8 @@ class Plan:
         scene = (rows, heights, *moved)
         outcome, contact_end, steps, switches = taylor.TOO_MANY_STEPS, math.nan, 0, 0
         if method == AGGREGATE:
-            # The errors of so many steps add up; the scene is short of nothing but switches.
-            tolerance = max(1e-2 * margin * rtol / len(heights), 1e-16)
+            # One step to a switch: the errors of many add up, and one order more costs little.
+            tolerance = max(1e-4 * rtol / len(heights), 1e-16)
             outcome, contact_end, steps, switches = aggregate.integrate_aggregate(
                 rows,
                 heights,
