@@ -252,9 +252,9 @@ def _next_order(group: Group, now: Step, n: int, mass: float, drag: float) -> No
     g, x = now.shifted, now.powers
     now.w[n] = now.v[n - 1] / n
     now.v[n] = -(now.s[n - 1] + drag * now.v[n - 1]) / (mass * n)
-    step = now.s[0] - group.place[ANCHOR]
+    step = (now.s[0] - group.place[ANCHOR]) / group.place[UNIT]
     for m in range(DEGREE - 1, n - 1, -1):  # one more pass of Horner's shift
-        g[m] += step / group.place[UNIT] * g[m + 1]
+        g[m] += step * g[m + 1]
     rest = now.w[n]
     for m in range(2, n + 1):
         power = 0.0
