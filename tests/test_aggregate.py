@@ -124,6 +124,9 @@ def test_the_work_grows_with_the_number_of_springs_and_no_faster() -> None:
         assert orders <= 16 * steps
         assert sums <= 10
     assert many[3] / 1000 < few[3] / 30
+    got = ff.simulate(built(chain_of(1000)), ff.Impact(STRIKER, 2.1), TIME)
+    assert got.method == AGGREGATE  # within the bound on steps, and every switch is listed
+    assert len(got.switches) == 3500
 
 
 def test_like_springs_switch_together_and_nearly_like_ones_one_by_one() -> None:
