@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foamfit import implicit, kernels, series, taylor
+from foamfit import aggregate, implicit, kernels, series, taylor
 from foamfit.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.errors import SimulationError
 from foamfit.law import BISTABLE
@@ -20,7 +20,7 @@ from foamfit.spring import BISTABLE_NAMES, LINEAR_NAMES, BistableSpring
 Array = NDArray[np.float64]
 
 CLOSED_FORM, FIRST_ORDER, SECOND_ORDER = "closed form", "first order", "second order"
-TAYLOR, RADAU = "Taylor series", "Radau IIA"
+TAYLOR, RADAU, AGGREGATE = "Taylor series", "Radau IIA", "aggregate"
 MAX_STEPS = 2_000_000
 _NO_SLOPES = (
     "the scene is too stiff for explicit steps, and implicit ones carry no sensitivities along; "
@@ -36,6 +36,8 @@ MOST_WORK, MOST_EXPLICIT_WORK, MOST_SAMPLED = 1_500_000, 500_000, 4_000_000
 # again to check it; so it is where a strain comes so close to the end of its branch.
 FEW_STEPS, CLOSE = 1000, 1e-3
 LOST = 0.03  # so large a difference is not mended by still shorter steps
+# From so many springs on, those that carry one stress are integrated as one.
+LEAST_AGGREGATE = 9
 
 _OUTCOMES = {
     taylor.TOO_MANY_STEPS: "the bound of {steps} steps was reached: something in the scene is "
@@ -69,10 +71,11 @@ class Response:
     solver : str
         "closed form", "first order" or "second order": the least that the scene needs.
     method : str
-        "closed form", "Taylor series" (explicit steps) or "Radau IIA" (implicit steps, where light
-        masses or dashpots make the scene stiff; a vibration too fast to be followed is damped out,
-        and refused where it is seen to exceed rtol; that which a blow starts in masses of about
-        1e-11 kg and less, up to about 1e-5 of the base stress, is not seen).
+        "closed form", "Taylor series" (explicit steps), "aggregate" (the same, for many springs
+        that carry one stress) or "Radau IIA" (implicit steps, where light masses or dashpots make
+        the scene stiff; a vibration too fast to be followed is damped out, and refused where it is
+        seen to exceed rtol; that which a blow starts in masses of about 1e-11 kg and less, up to
+        about 1e-5 of the base stress, is not seen).
     switches : (m, 5) array
         Time (s), spring (0 at the base), branch left, branch entered, strain of that spring.
     steps : int
@@ -244,9 +247,30 @@ class Plan:
         max_steps = max(min(self.max_steps, most, MOST_SAMPLED // len(heights)), 1)
         lost = np.zeros(1)
         method = RADAU if self._is_stiff(rows, heights, drag) else TAYLOR
+        if method == TAYLOR and p == 0 and self._is_one(rows):
+            method = AGGREGATE
+            log = np.empty((4 * len(heights) + 64, 5))
         moved = (self.ends, self.mass, drag, self.top, self.values, self.speed, self.time)
         scene = (rows, heights, *moved)
         outcome, contact_end, steps, switches = taylor.TOO_MANY_STEPS, math.nan, 0, 0
+        if method == AGGREGATE:
+            # One step to a switch: the errors of many add up, and one order more costs little.
+            tolerance = max(1e-4 * rtol / len(heights), 1e-16)
+            outcome, contact_end, steps, switches = aggregate.integrate_aggregate(
+                rows,
+                heights,
+                self.mass[0],
+                drag,
+                self.speed,
+                self.time,
+                tolerance,
+                min(max(round(4.0 - 0.5 * math.log(tolerance)), 6), aggregate.DEGREE),
+                self.max_steps,
+                displacement,
+                stress,
+                log,
+                np.zeros(2, np.int64),
+            )
         if method == TAYLOR:
             tolerance = max((1e-2 if inside else 1e-3 if self.speed > 0.0 else 1e-4) * rtol, 1e-16)
             order = min(max(round(4.0 - 0.5 * math.log(tolerance)), 6), 24)
@@ -283,6 +307,16 @@ class Plan:
             displacement, stress, contact_end, log[:switches], steps, method,
             slopes if p > 0 and method == TAYLOR else None, float(lost[0]),
         )  # fmt: skip
+
+    def _is_one(self, rows: Array) -> bool:
+        """Tell whether an impact acts on springs so many and so plain that they count as one."""
+        return (
+            len(rows) >= LEAST_AGGREGATE
+            and len(self.ends) == 1
+            and self.top == taylor.FREE
+            and self.speed > 0.0
+            and bool(aggregate.holds(rows))
+        )
 
     def hurry(self, rows: Array, heights: Array, drag: float) -> tuple[float, float]:
         """Vibration and relaxation (radians) that explicit steps would have to go through."""
@@ -404,7 +438,7 @@ def _verified(
         If the scene has no answer within `rtol`; the message says why.
     """
     motion = scene.run(rows, heights, rtol, directions=directions)
-    many = motion.steps > FEW_STEPS or len(scene.ends) > 2 or motion.method == RADAU
+    many = _many(motion, FEW_STEPS) or len(scene.ends) > 2 or motion.method == RADAU
     if scene.speed > 0.0 and not many and not _hard(scene, rows, heights):
         return motion
     if motion.unresolved > rtol:
@@ -426,7 +460,7 @@ def _verified(
             f"rounding alone makes errors above rtol = {rtol:g}"
         )
     forced = 0 if scene.speed > 0.0 else scene.time.size
-    many = motion.steps > FEW_STEPS + 2 * forced or len(scene.ends) > 2 or room < CLOSE
+    many = _many(motion, FEW_STEPS + 2 * forced) or len(scene.ends) > 2 or room < CLOSE
     many = many and scene.solver == SECOND_ORDER
     if not (many or motion.method == RADAU) or rtol < 1e-12:  # no finer run could tell
         return motion
@@ -449,6 +483,11 @@ def _verified(
         f"{miss:.1g} of the range; ask for a larger rtol, give the springs heavier dashpots, or "
         "leave the masses out"
     )
+
+
+def _many(motion: Motion, few: int) -> bool:
+    """Whether a motion took many steps; those of springs under one stress are but switches."""
+    return motion.steps > few and motion.method != AGGREGATE
 
 
 def _difference(one: Array, other: Array) -> float:
