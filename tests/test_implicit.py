@@ -330,7 +330,7 @@ def test_cost_of_a_long_chain_is_linear(kind: str) -> None:
         outcome, end, steps, switches = implicit.integrate_implicit(
             rows, np.array(chain.heights), scene.ends, scene.mass, scene.drag, scene.top,
             scene.values, scene.speed, scene.time, 3e-8, 10_000, np.empty((1, TIME.size)),
-            stress, np.empty((4, 5)), tally,
+            stress, np.empty((4, 5)), tally, 1e-6, np.zeros(1),
         )  # fmt: skip
         assert outcome == taylor.DONE
         assert switches == 2 * n

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -33,6 +34,21 @@ def _listed(values: Any, name: str, wanted: str) -> tuple[Any, ...]:
     raise ValueError(
         f"{name} = {values!r} is not admissible: it must be a sequence of {wanted}, base first"
     )
+
+
+class ChainArrays(NamedTuple):
+    """A chain as the kernels know it.
+
+    rows (n_springs, columns) are the springs, heights (m) and masses (kg) are (n_springs,), top
+    (1,) is the number of springs; `heavy` tells whether there are masses inside, `damped` dashpots.
+    """
+
+    rows: Array
+    heights: Array
+    masses: Array
+    top: NDArray[np.int64]
+    heavy: bool
+    damped: bool
 
 
 @dataclass(frozen=True, init=False)
@@ -97,10 +113,22 @@ class Chain:
         put(self, "masses", tuple(_finite(m, "masses", 0.0, False) for m in masses))
         put(self, "site_damping", _finite(site_damping, "site_damping", 0.0, False))
 
-    @property
+    @cached_property
     def height(self) -> float:
         """Overall height H = Σ h_i, m."""
         return math.fsum(self.heights)
+
+    @cached_property
+    def arrays(self) -> ChainArrays:
+        """The chain as the kernels know it."""
+        return ChainArrays(
+            rows=np.array([spring.row for spring in self.springs]),
+            heights=np.array(self.heights),
+            masses=np.array(self.masses),
+            top=np.array([len(self.springs)]),
+            heavy=any(mass > 0.0 for mass in self.masses[:-1]),
+            damped=any(spring.eta > 0.0 for spring in self.springs),
+        )
 
 
 def _samples(values: ArrayLike, name: str) -> Array:

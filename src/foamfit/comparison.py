@@ -20,10 +20,10 @@ from typing import Any
 from foamfit.errors import InputError
 from foamfit.literature import MM, MPA, PublishedSet
 from foamfit.literature import published as published_sets
-from foamfit.model import BISTABLE_NAMES, LINEAR_NAMES, Model
+from foamfit.model import Model
 from foamfit.report import readable
 from foamfit.result import FitResult, ParameterEstimate, load_result
-from foamfit.spring import LinearSpring
+from foamfit.spring import BISTABLE_NAMES, LINEAR_NAMES, LinearSpring
 
 Result = FitResult | Mapping[str, Any] | str | Path
 

@@ -368,9 +368,9 @@ def _values(spring: BistableSpring) -> dict[str, float]:
 
 def rough_guess(measurement: Measurement) -> dict[str, float]:
     """Read a spring off the loop as the fit does for its starts, the points only roughly placed."""
-    from foamfit.model import BISTABLE_NAMES
     from foamfit.search import Loop, read_spring, smooth_loop
     from foamfit.space import Scales
+    from foamfit.spring import BISTABLE_NAMES
 
     strain, stress = loop_of(smooth_loop(measurement))
     spring = read_spring(Loop(strain, stress), ROUGH, Scales.of(measurement))

@@ -28,6 +28,7 @@ from foamfit.kernels import (
     ETA,
     K0,
     KC,
+    KH_MINUS,
     KH_PLUS,
     OPEN,
     Array,
@@ -58,8 +59,9 @@ from foamfit.taylor import (
 
 STAGES = 5
 # Steps that the error alone makes short, compared with the motion, before they may grow anyway:
-# then something vibrates too fast to be worth following, and is damped out.
-SHORT, PATIENCE, LITTLE_PATIENCE = 5e-4, 600, 60
+# then something vibrates too fast to be worth following, and is damped out. Where that would cost
+# more than the wanted error, it is followed for so many steps of one spring all the same.
+SHORT, PATIENCE, LITTLE_PATIENCE, LONGEST_PATIENCE = 5e-4, 600, 60, 10_000
 
 
 def radau(stages: int) -> tuple[Array, Array]:
@@ -542,10 +544,52 @@ def hurry_of(
         vibration = max(vibration, math.sqrt(below_stiff / mass[-1]))
     elif top == VISCOUS:
         relaxation = max(relaxation, below_stiff / drag)
+        if below_damp > 1e4 * drag:  # explicit steps take the velocity from what little is left
+            relaxation = math.inf
     duration = t[t.size - 1] - (0.0 if speed > 0.0 else t[0])
     if speed > 0.0:
         duration = min(duration, _bounce(rows, heights, mass, drag))
     return vibration * duration, relaxation * duration
+
+
+@compiled
+def _ringing(
+    rows: Array, heights: Array, ends: Branches, mass: Array, drag: float, top: int
+) -> Array:
+    """Vibration of each mass between fixed neighbours: (masses, 2) rates 1/s, of it and its decay.
+
+    Where the dashpots are too heavy for a vibration, (Σ c)² >= 4 μ Σ k, its rate is zero; else it
+    dies out as exp(-Σ c t/(2 μ)).
+    """
+    rates = np.zeros((ends.size, 2))
+    below_stiff, below_damp = 0.0, 0.0
+    i0 = 0
+    for g in range(ends.size + 1):
+        stiff, damp = 0.0, 0.0
+        if g < ends.size and not (g == ends.size - 1 and top == STRESS):
+            soft, flow = 0.0, 0.0
+            for i in range(i0, ends[g]):
+                slope = max(max(rows[i, K0], rows[i, KC]), max(rows[i, KH_PLUS], rows[i, KH_MINUS]))
+                soft += heights[i] / slope
+                flow += heights[i] / rows[i, ETA] if rows[i, ETA] > 0.0 else math.inf
+            stiff, damp = 1.0 / soft, (0.0 if flow == math.inf else 1.0 / flow)
+            i0 = ends[g]
+        if g > 0 and (g < ends.size or top == FREE):
+            hold = below_damp + damp + (drag if g == ends.size else 0.0)
+            if hold**2 < 4.0 * mass[g - 1] * (below_stiff + stiff):
+                rates[g - 1, 0] = math.sqrt((below_stiff + stiff) / mass[g - 1])
+                rates[g - 1, 1] = 0.5 * hold / mass[g - 1]
+        below_stiff, below_damp = stiff, damp
+    return rates
+
+
+@compiled
+def _rings(rates: Array, span: float) -> bool:
+    """Tell whether a mass vibrates too fast for a step and goes on vibrating after it."""
+    for g in range(rates.shape[0]):
+        if rates[g, 0] * span > 0.5 and rates[g, 1] * span < 20.0:
+            return True
+    return False
 
 
 @compiled
@@ -565,12 +609,16 @@ def integrate_implicit(
     out_s: Array,
     log: Array,
     tally: Branches,
+    wanted: float,
+    lost: Array,
 ) -> tuple[int, float, int, int]:
     """Integrate a chain from rest (or struck) over the samples t, by implicit steps.
 
-    All but the last argument are those of `foamfit.taylor.integrate`, as are the outcomes; `tol` is
-    the truncation of a step relative to the motion so far. `tally` (2,) is filled with the linear
-    systems solved and with the blocks eliminated in them.
+    All but the last arguments are those of `foamfit.taylor.integrate`, as are the outcomes; `tol`
+    is the truncation of a step relative to the motion so far. `tally` (2,) is filled with the
+    linear systems solved and with the blocks eliminated in them; `lost` (1,) with the size,
+    relative to the motion and stress, of the vibrations that were damped out because they could not
+    be followed. Those above `wanted` are followed longer.
 
     Returns
     -------
@@ -619,6 +667,8 @@ def integrate_implicit(
     if struck:
         pace = min(pace, 5.0 * _bounce(rows, heights, areal, drag))
     short = SHORT * pace * (tol / 3e-8) ** (1.0 / 6.0)
+    ringing = _ringing(rows, heights, ends, mass, drag, top)
+    lost[0], burst = 0.0, 0.0
     w_scale, s_scale, pressed, knot, switches, rate = 0.0, 0.0, False, -1, 0, 0.0
     contact_end = math.nan
     hurry, shorts, floor, stalled = 0, 0, 0.0, 0
@@ -680,6 +730,7 @@ def integrate_implicit(
         longest = span
         target, side, level = -1, 0, 0.0  # what the step is to end at: a spring, or `count`: base
         arrived, chased, tries = False, 0, 0
+        trial_span, trial_error = math.inf, math.inf  # to see whether shorter steps are better
         while True:
             tries += 1
             if now + span <= now or tries > 200:
@@ -712,10 +763,27 @@ def integrate_implicit(
                     span *= 0.3
                     longest = span
                     continue
-                if error > 1.0 and span > floor * (1.0 + 1e-9):
+                stuck = False  # rounding, or a layer thinner than the clock can tell
+                if error > 1.0 and span <= 1e-6 * trial_span:
+                    stuck = error > 0.3 * trial_error
+                    trial_span, trial_error = span, error
+                elif trial_span == math.inf:
+                    trial_span, trial_error = span, error
+                stuck = stuck or now + 0.1 * span <= now
+                rings = error > 1.0 and _rings(ringing, span)
+                if error > 1.0 and not stuck and span <= floor * (1.0 + 1e-9):
+                    patient = shorts * count < LONGEST_PATIENCE
+                    if rings and patient and lost[0] - burst + error * tol > 0.3 * wanted:
+                        floor, hurry = 0.0, -4 * PATIENCE
+                if error > 1.0 and not stuck and span > floor * (1.0 + 1e-9):
                     span = max(span * min(max(factor, 0.1), 0.9), floor)
                     longest = span
                     continue
+                if error > 1.0 and rings and error * tol > burst:
+                    lost[0] += error * tol - burst
+                    burst = error * tol
+                elif error <= 1.0:
+                    burst = 0.0
                 proposal = max(span * min(max(factor, 0.2), 5.0), floor)
                 if error > 1.0:
                     proposal = max(proposal, 2.0 * span)

@@ -24,11 +24,15 @@ Branches = NDArray[np.int64]
 compiled = njit(cache=True, error_model="numpy")
 # For what only other loops call: without the bridge to Python, which takes long to compile; without
 # counting who holds an array, which takes long to run; and with the body put where it is called.
-BRIDGELESS: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-maker = njit(error_model="numpy", **BRIDGELESS)
-LEAN: dict[str, Any] = {"_nrt": False, **BRIDGELESS}
-inner = njit(error_model="numpy", **LEAN)
-inlined = njit(error_model="numpy", forceinline=True, **LEAN)
+_BRIDGELESS: dict[str, Any] = {
+    "error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True
+}  # fmt: skip
+_COUNTLESS: dict[str, Any] = {**_BRIDGELESS, "_nrt": False}
+maker = njit(**_BRIDGELESS)
+inner = njit(**_COUNTLESS)
+inlined = njit(**_COUNTLESS, forceinline=True)
+# A product and a sum in one rounding: faster, and no less exact.
+fused = njit(**_COUNTLESS, fastmath={"contract"})
 
 # Columns of a row.
 KIND, K0, KC, EPS_A, EPS_C, KH_PLUS, KH_MINUS, ETA = range(8)
@@ -419,6 +423,15 @@ def strains_along(rows: Array, sigma: Array, eps: Array, history: Branches) -> N
             branch = branch_at_stress(row, branch, sigma[j])
             eps[i, j] = strain_on(row, branch, sigma[j]) if branch != OPEN else -math.inf
             history[i, j] = branch
+
+
+@compiled
+def fault(t: Array) -> int:
+    """First sample that is not finite, or not later than the one before it; -1 if there is none."""
+    for j in range(t.size):
+        if not math.isfinite(t[j]) or (j > 0 and t[j] <= t[j - 1]):
+            return j
+    return -1
 
 
 @compiled

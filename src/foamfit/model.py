@@ -16,13 +16,11 @@ from numpy.typing import NDArray
 from foamfit import kernels, series
 from foamfit.chain import Chain
 from foamfit.errors import InputError
-from foamfit.spring import BistableSpring, LinearSpring, Spring
+from foamfit.spring import BISTABLE_NAMES, LINEAR_NAMES, BistableSpring, LinearSpring, Spring
 
 Array = NDArray[np.float64]
 
 KINDS = ("bistable", "linear", "unilateral")
-BISTABLE_NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus", "eta")
-LINEAR_NAMES = ("k0", "eta")
 UNITS = {
     "k0": "Pa",
     "kc": "Pa",

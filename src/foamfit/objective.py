@@ -375,7 +375,7 @@ class Objective:
         """
         specimen = self.measurement.specimen
         count = len(self.model.kinds)
-        springs = [LinearSpring(1.0, eta=1.0 if damped else 0.0)] * count
+        springs = [LinearSpring(1.0)] * count
         heights = [specimen.height / count] * count
         masses = [0.0] * count
         if self.interior_mass and count > 1 and isinstance(loading, Impact):
@@ -386,7 +386,7 @@ class Objective:
                 )
             masses = [specimen.mass / (count - 1)] * (count - 1) + [0.0]
         chain = Chain(springs, heights, specimen.area, masses)
-        return replace(make_plan(chain, loading, self.time), max_steps=MAX_STEPS)
+        return replace(make_plan(chain, loading, self.time, dashpots=damped), max_steps=MAX_STEPS)
 
     def _measured(self) -> dict[str, Array | None]:
         """Measured curves that the drive leaves free."""

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from foamfit.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.errors import InputError
 from foamfit.literature import published
-from foamfit.model import BISTABLE_NAMES, KINDS, LINEAR_NAMES
+from foamfit.model import KINDS
 from foamfit.reading import read_history
 from foamfit.settings import check_keys, load_toml
 from foamfit.simulation import Response
-from foamfit.spring import BistableSpring, LinearSpring, Spring
+from foamfit.spring import BISTABLE_NAMES, LINEAR_NAMES, BistableSpring, LinearSpring, Spring
 from foamfit.units import parse_quantity
 
 Array = NDArray[np.float64]

@@ -46,7 +46,9 @@ from foamfit.law import BISTABLE
 FREE, VISCOUS, STRESS, MOTION = range(4)
 # Columns of `Links.law`: whether the branch is curved, its slope k, its origins x0 and s0, and the
 # strains between which the spring stays on it.
-CURVED, SLOPE, ORIGIN, OFFSET, LOW, HIGH, N_LAW = range(7)
+CURVED, SLOPE, ORIGIN, OFFSET, LOW, HIGH = range(6)
+# What a step keeps of a curved branch: 1/(1 - x) at its start.
+ROOM, N_LAW = 6, 7
 # What a direction of derivatives moves, besides a spring's own parameters 0 … 7 (k0 … eta): its
 # height, or (of no spring, -1) the onsite damping of the top.
 OWN_ETA, HEIGHT, DRAG = 7, 8, 9
@@ -207,7 +209,8 @@ def make_tangents(count: int, groups: int, order: int, directions: Branches) -> 
 @inner
 def springs_of(ends: Branches, g: int) -> tuple[np.int64, np.int64]:
     """First spring of a group, and one past its last."""
-    return ends[g - 1] if g > 0 else np.int64(0), ends[g]
+    first = ends[g - 1] if g > 0 else ends[0] - ends[0]
+    return first, ends[g]
 
 
 @inlined
@@ -222,12 +225,16 @@ def _product(x: Array, y: Array, i: int, n: int, first: int, last: int) -> float
 @inlined
 def _stress_term(law: Array, i: int, eps: Array, sig: Array, n: int) -> float:
     """Order n of a spring's stress from its strain up to order n."""
-    k, x = law[i, SLOPE], eps[i, 0] - law[i, ORIGIN]
+    k = law[i, SLOPE]
+    if n > 0:
+        if law[i, CURVED] == 0.0:
+            return k * eps[i, n]
+        return (k * eps[i, n] + _product(eps, sig, i, n, 1, n)) * law[i, ROOM]
+    x = eps[i, 0] - law[i, ORIGIN]
     if law[i, CURVED] == 0.0:
-        return k * eps[i, n] if n > 0 else law[i, OFFSET] + k * x
-    if n == 0:
-        return k * x / (1.0 - x) if x < 1.0 else math.inf
-    return (k * eps[i, n] + _product(eps, sig, i, n, 1, n)) / (1.0 - x)
+        return law[i, OFFSET] + k * x
+    law[i, ROOM] = 1.0 / (1.0 - x) if x < 1.0 else math.inf
+    return k * x * law[i, ROOM]
 
 
 @inlined
@@ -379,6 +386,7 @@ def expand(links: Links, s: Series, push: Array, motion: Array, order: int) -> b
     last = ends.size - 1
     for n in range(order + 1):
         push_n = push[n] if n < 2 else 0.0
+        share = 1.0 / (n + 1)
         if top == MOTION:
             w[last, n] = motion[n] if n < 2 else 0.0
             v[last, n] = motion[1] if n == 0 else 0.0
@@ -402,17 +410,17 @@ def expand(links: Links, s: Series, push: Array, motion: Array, order: int) -> b
             if i1 - i0 > 1 or stressed:
                 for i in range(i0, i1):
                     if eta[i] > 0.0:
-                        eps[i, n + 1] = (group[g, n] - sig[i, n]) / (eta[i] * (n + 1))
+                        eps[i, n + 1] = (group[g, n] - sig[i, n]) * share / eta[i]
         for g in range(last + 1):
             if g < last or top == FREE:
                 net = (group[g + 1, n] if g < last else push_n) - group[g, n]
                 if g == last and drag > 0.0:
                     net -= drag * v[g, n]
-                v[g, n + 1] = net / (mass[g] * (n + 1))
-                w[g, n + 1] = v[g, n] / (n + 1)
+                v[g, n + 1] = net * share / mass[g]
+                w[g, n + 1] = v[g, n] * share
             elif top == VISCOUS:
                 v[g, n] = (push_n - group[g, n]) / drag
-                w[g, n + 1] = v[g, n] / (n + 1)
+                w[g, n + 1] = v[g, n] * share
     return True
 
 
@@ -552,6 +560,7 @@ def _expand_tangent(links: Links, s: Series, slope: Array, m: Moves, d: Series, 
     """Fill the derivatives in one direction up to `order`."""
     last = links.ends.size - 1
     for n in range(order + 1):
+        share = 1.0 / (n + 1)
         for g in range(last + 1):
             _group_tangent(links, s, slope, m, d, g, n)
             i0, i1 = springs_of(links.ends, g)
@@ -560,7 +569,7 @@ def _expand_tangent(links: Links, s: Series, slope: Array, m: Moves, d: Series, 
                     if links.eta[i] > 0.0:
                         flow = (s.group[g, n] - s.sig[i, n]) / links.eta[i]
                         net = d.group[g, n] - d.sig[i, n] - flow * m.eta[i]
-                        d.eps[i, n + 1] = net / (links.eta[i] * (n + 1))
+                        d.eps[i, n + 1] = net * share / links.eta[i]
         for g in range(last + 1):
             net = -d.group[g, n]
             if g < last:
@@ -570,9 +579,9 @@ def _expand_tangent(links: Links, s: Series, slope: Array, m: Moves, d: Series, 
             elif links.drag > 0.0 or m.drag != 0.0:
                 net -= links.drag * d.v[g, n] + s.v[g, n] * m.drag
             if g < last or links.top == FREE:
-                d.v[g, n + 1] = net / (links.mass[g] * (n + 1))
+                d.v[g, n + 1] = net * share / links.mass[g]
             if g < last or links.top in (FREE, VISCOUS):
-                d.w[g, n + 1] = d.v[g, n] / (n + 1)
+                d.w[g, n + 1] = d.v[g, n] * share
 
 
 @inner
@@ -671,8 +680,8 @@ def equilibrium_tangents(
             elif flat < 0:
                 flat = i
         for p in range(size):
-            i = int(directions[p, 0])
-            known, longer = 0.0, 0.0  # δσ at fixed strain, δ of the elongation at fixed stress
+            i = directions[p, 0]
+            known = longer = 0.0  # δσ at fixed strain, δ of the elongation at fixed stress
             if i >= 0 and directions[p, 1] == HEIGHT:
                 longer = eps[i, j]
             elif i >= 0:
@@ -680,12 +689,12 @@ def equilibrium_tangents(
                 factor = x / (1.0 - x) if law[i, CURVED] != 0.0 else x
                 known = factor * change[p, 0] - slope[i] * change[p, 1] + change[p, 2]
                 longer = -heights[i] * known / slope[i] if slope[i] > 0.0 else 0.0
-            common, gap = 0.0, 0.0
+            common = gap = 0.0
             if moved and flat < 0:
-                common = float(-longer / soft[count])
+                common = -longer / float(soft[count])
             elif moved:  # a flat branch takes up all that the others leave
                 common = known if i == flat else 0.0
-                gap = float(-longer - common * soft[count])
+                gap = -longer - common * float(soft[count])
             out_s[p, j] = common
             for node in range(count):
                 own = longer if 0 <= i <= node else 0.0

@@ -3,32 +3,54 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foamfit import implicit, kernels, series, taylor
+from foamfit import aggregate, implicit, kernels, series, taylor
 from foamfit.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive, check_scene
 from foamfit.errors import SimulationError
+from foamfit.law import BISTABLE
 from foamfit.series import equilibrium_tangents
-from foamfit.spring import as_number, as_samples
+from foamfit.spring import (
+    BISTABLE_NAMES,
+    LINEAR_NAMES,
+    BistableSpring,
+    as_number,
+    as_samples,
+)
 
 Array = NDArray[np.float64]
 
 CLOSED_FORM, FIRST_ORDER, SECOND_ORDER = "closed form", "first order", "second order"
-TAYLOR, RADAU = "Taylor series", "Radau IIA"
+TAYLOR, RADAU, AGGREGATE = "Taylor series", "Radau IIA", "aggregate"
 MAX_STEPS = 2_000_000
+_NO_SLOPES = (
+    "the scene is too stiff for explicit steps, and implicit ones carry no sensitivities along; "
+    "take differences of the response"
+)
 # Explicit steps are given up where something relaxes, or vibrates, so many times (in radians) while
 # the scene lasts, or after so many steps.
 MOST_RELAXATION, MOST_VIBRATION, MOST_EXPLICIT = 1e4, 1e5, 200_000
+# Bounds on steps times springs (seconds, not hours): for all but the samples of a drive, before
+# explicit steps are given up, and for everything.
+MOST_WORK, MOST_EXPLICIT_WORK, MOST_SAMPLED = 1_500_000, 500_000, 10_000_000
+# From so many steps on, and where steps are implicit or several masses are inside, a motion is run
+# again to check it; so it is where a strain comes so close to the end of its branch.
+FEW_STEPS, CLOSE = 1000, 1e-3
+LOST = 0.03  # so large a difference is not mended by still shorter steps
+# From so many springs on, those that carry one stress are integrated as one.
+LEAST_AGGREGATE = 9
 
 _OUTCOMES = {
     taylor.TOO_MANY_STEPS: "the bound of {steps} steps was reached: something in the scene is "
     "too fast to be followed (a light mass or a heavy dashpot)",
-    taylor.STEP_UNDERFLOW: "the step shrank to nothing near t = {time:g} s: a strain comes too "
-    "close to the end of its branch",
+    taylor.STEP_UNDERFLOW: "the step shrank to nothing near t = {time:g} s: there the scene "
+    "changes faster than numbers can tell (a strain at the end of its branch, a very light mass, "
+    "or many springs on a flat branch)",
     taylor.FLAT_UNDER_STRESS: "a prescribed stress acts on a flat branch (kh_plus or kh_minus = 0) "
     "that nothing slows; give the top a mass or the spring a dashpot",
     taylor.NOT_FINITE: "a stress or strain is no longer finite: the drive goes past the end of a "
@@ -55,12 +77,17 @@ class Response:
     solver : str
         "closed form", "first order" or "second order": the least that the scene needs.
     method : str
-        "closed form", "Taylor series" (explicit steps) or "Radau IIA" (implicit steps, where light
-        masses or dashpots make the scene stiff; a vibration too fast to be followed is damped out).
+        "closed form", "Taylor series" (explicit steps), "aggregate" (the same, for many springs
+        that carry one stress) or "Radau IIA" (implicit steps, where light masses or dashpots make
+        the scene stiff; a vibration too fast to be followed is damped out, and refused where it is
+        seen to exceed rtol; that which a blow starts in masses of about 1e-11 kg and less, up to
+        about 1e-5 of the base stress, is not seen).
     switches : (m, 5) array
         Time (s), spring (0 at the base), branch left, branch entered, strain of that spring.
     steps : int
         Steps of the integrator; 0 for the closed form.
+    sensitivities : dict of str to Sensitivity
+        Derivatives by the parameters that were asked for.
     """
 
     time: Array
@@ -72,11 +99,13 @@ class Response:
     method: str
     switches: Array
     steps: int
+    sensitivities: dict[str, Sensitivity] = field(default_factory=dict)
 
 
 Directions = NDArray[np.int64]
 NO_DIRECTIONS: Directions = np.empty((0, 2), np.int64)
 NO_SWITCHES = np.empty((0, 5))
+_NOTHING = np.zeros(1)
 
 
 class Slopes(NamedTuple):
@@ -84,6 +113,9 @@ class Slopes(NamedTuple):
 
     displacement: Array
     base_stress: Array
+
+
+NO_SLOPES = Slopes(np.empty((0, 0, 0)), np.empty((0, 0)))
 
 
 class Motion(NamedTuple):
@@ -96,6 +128,7 @@ class Motion(NamedTuple):
     steps: int
     method: str = CLOSED_FORM
     slopes: Slopes | None = None
+    unresolved: float = 0.0  # vibrations that were damped out, relative to the ranges
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +153,8 @@ class Plan:
         Velocity of the striker, m/s; 0 = no impact.
     max_steps : int
         Bound on the steps of the integrator.
+    lossless : bool
+        Whether there is neither a dashpot nor a mass inside.
     implicit : bool or None
         Whether to take implicit steps; None = where explicit ones are the wrong tool.
     """
@@ -134,6 +169,7 @@ class Plan:
     time: Array
     speed: float
     max_steps: int = MAX_STEPS
+    lossless: bool = False
     implicit: bool | None = None
 
     def run(
@@ -209,23 +245,47 @@ class Plan:
         directions: Directions,
     ) -> Motion:
         # Without an interior mass there are few steps: a margin costs little.
-        margin = 1.0 if len(self.ends) > 1 else 0.1
+        inside = len(self.ends) > 1
         nodes, n, p = (len(heights) if everything else 1), self.time.size, len(directions)
         displacement, stress, log = np.empty((nodes, n)), np.empty(n), np.empty((1024, 5))
-        slopes = Slopes(np.empty((p, nodes, n)), np.empty((p, n)))
+        slopes = Slopes(np.empty((p, nodes, n)), np.empty((p, n))) if p > 0 else NO_SLOPES
+        most = MOST_WORK // len(heights) + 2 * n + 8 * len(heights)
+        max_steps = max(min(self.max_steps, most, MOST_SAMPLED // len(heights)), 1)
+        lost = np.zeros(1)
         method = RADAU if self._is_stiff(rows, heights, drag) else TAYLOR
+        if method == TAYLOR and p == 0 and self._is_one(rows):
+            method = AGGREGATE
+            log = np.empty((4 * len(heights) + 64, 5))
         moved = (self.ends, self.mass, drag, self.top, self.values, self.speed, self.time)
         scene = (rows, heights, *moved)
         outcome, contact_end, steps, switches = taylor.TOO_MANY_STEPS, math.nan, 0, 0
+        if method == AGGREGATE:
+            # One step to a switch: the errors of many add up, and one order more costs little.
+            tolerance = max(1e-4 * rtol / len(heights), 1e-16)
+            outcome, contact_end, steps, switches = aggregate.integrate_aggregate(
+                rows,
+                heights,
+                self.mass[0],
+                drag,
+                self.speed,
+                self.time,
+                tolerance,
+                min(max(round(4.0 - 0.5 * math.log(tolerance)), 6), aggregate.DEGREE),
+                self.max_steps,
+                displacement,
+                stress,
+                log,
+                np.zeros(2, np.int64),
+            )
         if method == TAYLOR:
-            tolerance = max(1e-2 * margin * rtol, 1e-16)
+            tolerance = max((1e-2 if inside else 1e-3 if self.speed > 0.0 else 1e-4) * rtol, 1e-16)
             order = min(max(round(4.0 - 0.5 * math.log(tolerance)), 6), 24)
-            most = MOST_EXPLICIT + 20 * self.time.size
+            most = min(MOST_EXPLICIT, MOST_EXPLICIT_WORK // len(heights)) + 20 * self.time.size
             outcome, contact_end, steps, switches = taylor.integrate(
                 *scene,
                 tolerance,
                 order,
-                min(self.max_steps, most) if self.implicit is None else self.max_steps,
+                min(max_steps, most) if self.implicit is None else max_steps,
                 directions,
                 displacement,
                 stress,
@@ -237,28 +297,46 @@ class Plan:
         if method == RADAU:
             outcome, contact_end, steps, switches = implicit.integrate_implicit(
                 *scene,
-                max(3e-2 * margin * rtol, 1e-14),
-                self.max_steps,
+                max((3e-2 if inside else 3e-4) * rtol, 1e-14),
+                max_steps,
                 displacement,
                 stress,
                 log,
                 np.zeros(2, np.int64),
+                rtol,
+                lost,
             )
         if outcome != taylor.DONE:
             last = log[min(switches, len(log)) - 1, 0] if switches else self.time[0]
             raise SimulationError(_OUTCOMES[outcome].format(steps=steps, time=last))
         return Motion(
             displacement, stress, contact_end, log[:switches], steps, method,
-            slopes if p > 0 and method == TAYLOR else None,
+            slopes if p > 0 and method == TAYLOR else None, float(lost[0]),
         )  # fmt: skip
+
+    def _is_one(self, rows: Array) -> bool:
+        """Tell whether an impact acts on springs so many and so plain that they count as one."""
+        return (
+            len(rows) >= LEAST_AGGREGATE
+            and len(self.ends) == 1
+            and self.top == taylor.FREE
+            and self.speed > 0.0
+            and bool(aggregate.holds(rows))
+        )
+
+    def hurry(self, rows: Array, heights: Array, drag: float) -> tuple[float, float]:
+        """Vibration and relaxation (radians) that explicit steps would have to go through."""
+        return implicit.hurry_of(
+            rows, heights, self.ends, self.mass, drag, self.top, self.speed, self.time
+        )
 
     def _is_stiff(self, rows: Array, heights: Array, drag: float) -> bool:
         """Tell whether explicit steps would have to follow what is long over."""
         if self.implicit is not None:
             return self.implicit
-        vibration, relaxation = implicit.hurry_of(
-            rows, heights, self.ends, self.mass, drag, self.top, self.speed, self.time
-        )
+        if self.lossless and drag == 0.0 and self.speed > 0.0:  # one mass bounces once
+            return False
+        vibration, relaxation = self.hurry(rows, heights, drag)
         return bool(vibration > MOST_VIBRATION or relaxation > MOST_RELAXATION)
 
 
@@ -278,15 +356,15 @@ def _time(t: ArrayLike) -> Array:
     time = as_samples(t, "t")  # a copy of one compiled type: writable
     if time.ndim != 1 or time.size == 0:
         raise ValueError("t must be a one-dimensional array with at least one sample")
-    if not np.all(np.isfinite(time)):
-        raise ValueError(f"t must be finite; sample {int(np.argmin(np.isfinite(time)))} is not")
-    if np.any(np.diff(time) <= 0.0):
-        at = int(np.argmax(np.diff(time) <= 0.0)) + 1
+    at = kernels.fault(time)
+    if at >= 0 and not math.isfinite(time[at]):
+        raise ValueError(f"t must be finite; sample {at} is not")
+    if at >= 0:
         raise ValueError(f"t must increase; sample {at} is not later than the one before it")
     return time
 
 
-def plan(chain: Chain, drive: Drive, t: ArrayLike) -> Plan:
+def plan(chain: Chain, drive: Drive, t: ArrayLike, *, dashpots: bool = False) -> Plan:
     """Find what a scene needs: the nodes that have a state, and the least solver.
 
     Parameters
@@ -297,6 +375,8 @@ def plan(chain: Chain, drive: Drive, t: ArrayLike) -> Plan:
         How it is loaded.
     t : (n_t,) array
         Samples, s, increasing.
+    dashpots : bool
+        Whether to reckon with a dashpot in every spring, also where it is zero.
 
     Raises
     ------
@@ -304,8 +384,8 @@ def plan(chain: Chain, drive: Drive, t: ArrayLike) -> Plan:
         If t does not increase or has not one value per sample of the drive.
     """
     time = _time(t)
-    masses = np.array(chain.masses)
-    speed, values = 0.0, np.zeros(1)
+    masses = chain.arrays.masses.copy()
+    speed, values = 0.0, _NOTHING
     top = taylor.FREE
     if isinstance(drive, Impact):
         masses[-1] += drive.mass
@@ -322,29 +402,203 @@ def plan(chain: Chain, drive: Drive, t: ArrayLike) -> Plan:
             top = taylor.MOTION
         elif masses[-1] == 0.0:
             top = taylor.VISCOUS if chain.site_damping > 0.0 else taylor.STRESS
-    nodes = masses > 0.0
-    nodes[-1] = True
-    damped = any(spring.eta > 0.0 for spring in chain.springs) or top == taylor.VISCOUS
-    if np.any(masses > 0.0):
+    if chain.arrays.heavy:
+        nodes = masses > 0.0
+        nodes[-1] = True
+        ends, masses = np.flatnonzero(nodes) + 1, masses[nodes]
+    else:
+        ends, masses = chain.arrays.top, masses[-1:]
+    damped = dashpots or chain.arrays.damped or top == taylor.VISCOUS
+    if len(masses) > 1 or masses[0] > 0.0:
         solver = SECOND_ORDER
-    elif damped and not (top == taylor.MOTION and len(masses) == 1):
+    elif damped and not (top == taylor.MOTION and len(chain.springs) == 1):
         solver = FIRST_ORDER
     else:
         solver = CLOSED_FORM
     return Plan(
         solver=solver,
         height=chain.height,
-        ends=np.flatnonzero(nodes) + 1,
-        mass=masses[nodes] / chain.area,
+        ends=ends,
+        mass=masses / chain.area,
         drag=chain.site_damping / chain.height,
         top=top,
         values=values,
         time=time,
         speed=speed,
+        lossless=len(ends) == 1 and not damped,
     )
 
 
-def simulate(chain: Chain, drive: Drive, t: ArrayLike, rtol: float = 1e-6) -> Response:
+def _verified(
+    scene: Plan,
+    rows: Array,
+    heights: Array,
+    rtol: float,
+    directions: Directions = NO_DIRECTIONS,
+) -> Motion:
+    """Run a scene; where masses make its errors grow, follow it again by shorter steps and compare.
+
+    Raises
+    ------
+    SimulationError
+        If the scene has no answer within `rtol`; the message says why.
+    """
+    motion = scene.run(rows, heights, rtol, directions=directions)
+    many = _many(motion, FEW_STEPS) or len(scene.ends) > 2 or motion.method == RADAU
+    if scene.speed > 0.0 and not many and not _hard(scene, rows, heights):
+        return motion
+    if motion.unresolved > rtol:
+        scene = replace(scene, implicit=False)
+        try:  # an explicit step goes through two or three radians
+            if max(scene.hurry(rows, heights, scene.drag)) / 3.0 > MOST_WORK / len(heights):
+                raise SimulationError
+            motion = scene.run(rows, heights, rtol, directions=directions)
+        except SimulationError:
+            raise SimulationError(
+                f"masses vibrate too fast to be followed, by up to {motion.unresolved:.1g} of the "
+                "range: ask for no smaller rtol than that, give the springs heavier dashpots, or "
+                "leave the masses out"
+            ) from None
+    room = _room_at_peak(scene, rows, heights, motion, rtol)
+    if 0.3 * rtol * room < 1e-15:
+        raise SimulationError(
+            f"a strain comes within {room:.1g} of the end of its branch, 1 + eps_star: there "
+            f"rounding alone makes errors above rtol = {rtol:g}"
+        )
+    forced = 0 if scene.speed > 0.0 else scene.time.size
+    many = _many(motion, FEW_STEPS + 2 * forced) or len(scene.ends) > 2 or room < CLOSE
+    many = many and scene.solver == SECOND_ORDER
+    if not (many or motion.method == RADAU) or rtol < 1e-12:  # no finer run could tell
+        return motion
+    miss = math.inf
+    for factor in (1e-2, 1e-4, 1e-6):
+        if rtol * factor < 1e-14:
+            break
+        finer = scene.run(rows, heights, rtol * factor, directions=directions)
+        miss = max(
+            _difference(finer.displacement, motion.displacement),
+            _difference(finer.base_stress, motion.base_stress),
+        )
+        if miss <= 0.3 * rtol and min(finer.unresolved, motion.unresolved) <= rtol:
+            return finer if finer.unresolved <= rtol else motion
+        if factor < 1e-2 and miss > LOST:
+            break
+        motion = finer
+    raise SimulationError(
+        "vibrations let the least error grow: two runs with shorter steps each differ by "
+        f"{miss:.1g} of the range; ask for a larger rtol, give the springs heavier dashpots, or "
+        "leave the masses out"
+    )
+
+
+def _many(motion: Motion, few: int) -> bool:
+    """Whether a motion took many steps; those of springs under one stress are but switches."""
+    return motion.steps > few and motion.method != AGGREGATE
+
+
+def _difference(one: Array, other: Array) -> float:
+    """Largest difference of two motions over the range of the first, rest included."""
+    span = max(float(one.max()), 0.0) - min(float(one.min()), 0.0)
+    return float(np.abs(one - other).max()) / span if span > 0.0 else 0.0
+
+
+def _room(rows: Array, heights: Array, displacement: Array) -> float:
+    """Least distance, in strain, of a spring on branch c from its end at 1 + ε_*."""
+    strain = np.diff(displacement, axis=0, prepend=0.0).max(axis=1) / heights
+    bistable = (rows[:, kernels.KIND] == BISTABLE) & (strain > rows[:, kernels.EPS_C])
+    return float(np.where(bistable, 1.0 - (strain - rows[:, kernels.EPS_STAR]), 1.0).min())
+
+
+def _hard(scene: Plan, rows: Array, heights: Array) -> bool:
+    """Whether a blow may bring a spring close to the end of its branch c."""
+    brought = 0.5 * float(scene.mass[-1]) * scene.speed**2
+    return brought >= 6.0 * float(heights @ rows[:, kernels.KC])
+
+
+def _room_at_peak(scene: Plan, rows: Array, heights: Array, motion: Motion, rtol: float) -> float:
+    """Room at the peak of an impact that may come close to the end of a branch.
+
+    The peak of a hard blow is so short that no sample need lie in it: it is closed in on.
+    """
+    room = _room(rows, heights, motion.displacement)
+    bistable = rows[:, kernels.KIND] == BISTABLE
+    if scene.speed == 0.0 or not bistable.any():
+        return room
+    if not _hard(scene, rows, heights):
+        return room
+    low, high = 0.0, float(scene.time[-1])
+    for _ in range(12):
+        grid = np.linspace(low, high, 201)
+        top = replace(scene, time=grid).run(rows, heights, rtol).displacement
+        room = min(room, _room(rows, heights, top))
+        at = int(top[-1].argmax())
+        low, high = float(grid[max(at - 1, 0)]), float(grid[min(at + 1, 200)])
+        if high - low < 1e-15 * high or at == 200:
+            break
+    return room
+
+
+@dataclass(frozen=True, eq=False)
+class Sensitivity:
+    """Derivative of a response by one parameter, in SI, at fixed times.
+
+    Attributes
+    ----------
+    displacement : (n_springs, n_t) array
+        m per unit of the parameter.
+    base_stress : (n_t,) array
+        Pa per unit of the parameter. At a switch of branch its slope jumps, not its value; it jumps
+        where contact ends.
+    """
+
+    displacement: Array
+    base_stress: Array
+
+
+def _direction(chain: Chain, name: str) -> tuple[int, int]:
+    """Spring and own parameter, or height, or onsite damper, that a name like "s1_kc" means."""
+    if name == "site_eta":
+        return -1, series.DRAG
+    prefix, _, short = name.partition("_")
+    known = [f"s{i}" for i in range(1, len(chain.springs) + 1)]
+    if prefix in known:
+        spring = known.index(prefix)
+        own = BISTABLE_NAMES if isinstance(chain.springs[spring], BistableSpring) else LINEAR_NAMES
+        if short == "height":
+            return spring, series.HEIGHT
+        if short in own:
+            return spring, BISTABLE_NAMES.index(short)
+    raise ValueError(
+        f"sensitivities: '{name}' is not a parameter of this chain; give names like s1_k0, "
+        "s2_height or site_eta"
+    )
+
+
+def _sensitivities(
+    chain: Chain, names: Sequence[str], directions: Directions, slopes: Slopes
+) -> dict[str, Sensitivity]:
+    """Name the derivatives of a run; η_site acts through η_site/H, and so does every height."""
+    out = {}
+    drag = chain.site_damping / chain.height
+    for p, name in enumerate(names):
+        moved, pressed = slopes.displacement[p], slopes.base_stress[p]
+        if directions[p, 1] == series.DRAG:
+            moved, pressed = moved / chain.height, pressed / chain.height
+        elif directions[p, 1] == series.HEIGHT and drag > 0.0:
+            moved = moved - drag / chain.height * slopes.displacement[-1]
+            pressed = pressed - drag / chain.height * slopes.base_stress[-1]
+        out[name] = Sensitivity(moved, pressed)
+    return out
+
+
+def simulate(
+    chain: Chain,
+    drive: Drive,
+    t: ArrayLike,
+    rtol: float = 1e-6,
+    *,
+    sensitivities: Sequence[str] = (),
+) -> Response:
     """Simulate a chain under a drive.
 
     Parameters
@@ -358,6 +612,8 @@ def simulate(chain: Chain, drive: Drive, t: ArrayLike, rtol: float = 1e-6) -> Re
         Samples, s, increasing.
     rtol : float
         Wanted error of displacement and base stress relative to their range.
+    sensitivities : sequence of str
+        Parameters by which the response is differentiated: s1_k0 … s2_eta, s1_height, site_eta.
 
     Returns
     -------
@@ -369,14 +625,20 @@ def simulate(chain: Chain, drive: Drive, t: ArrayLike, rtol: float = 1e-6) -> Re
     ValueError
         If something is not admissible; the message names it.
     SimulationError
-        If the scene has no finite answer; the message says why.
+        If the scene has no finite answer, none to the wanted error, or one by implicit steps only
+        where sensitivities are wanted; the message says why.
     """
     check_scene(chain, drive)
     if not 1e-14 <= as_number(rtol, "rtol") <= 1e-1:
         raise ValueError(f"rtol = {rtol:g} is not admissible: it must be between 1e-14 and 0.1")
-    scene = plan(chain, drive, t)
-    rows = np.array([spring.row for spring in chain.springs])
-    motion = scene.run(rows, np.array(chain.heights), rtol)
+    directions = NO_DIRECTIONS
+    if sensitivities:
+        wanted = [_direction(chain, name) for name in sensitivities]
+        directions = np.array([*wanted, (-1, series.DRAG)])
+    scene = plan(chain, drive, t, dashpots=any(name.endswith("_eta") for name in sensitivities))
+    motion = _verified(scene, chain.arrays.rows, chain.arrays.heights, rtol, directions)
+    if len(directions) and motion.slopes is None:
+        raise SimulationError(_NO_SLOPES)
     return Response(
         time=scene.time,
         displacement=motion.displacement,
@@ -387,4 +649,8 @@ def simulate(chain: Chain, drive: Drive, t: ArrayLike, rtol: float = 1e-6) -> Re
         method=motion.method,
         switches=motion.switches,
         steps=motion.steps,
-    )
+        sensitivities=(
+            {} if motion.slopes is None
+            else _sensitivities(chain, sensitivities, directions, motion.slopes)
+        ),
+    )  # fmt: skip

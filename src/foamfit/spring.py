@@ -18,6 +18,10 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+# Parameters of the two kinds of spring, in their order.
+BISTABLE_NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus", "eta")
+LINEAR_NAMES = ("k0", "eta")
+
 
 def _require(holds: bool, name: str, value: float, wanted: str) -> None:
     if not holds:

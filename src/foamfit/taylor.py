@@ -516,10 +516,10 @@ def integrate(
         last = end >= horizon and not leaves and spring < 0
         if last:
             end = horizon
-        enough = order
+        enough = min(order, 2)
         if span > 0.0:
-            enough = _enough(s.eps, order, span, tol, 2)
-            enough = _enough(s.sig, order, span, tol, enough)
+            enough = _enough(s.eps, order, span, 1e-3 * tol, enough)
+            enough = _enough(s.sig, order, span, 1e-3 * tol, enough)
         more = min(enough + 2, order)  # for what is, in time, a derivative of these
         if tangent:
             expand_tangents(links, s, d, more)

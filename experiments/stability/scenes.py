@@ -1,0 +1,230 @@
+"""The scenes of the stability study: a Sobol design over all axes, and a sweep along each.
+
+Everything is made from a seed; all is SI. Springs, histories and durations are synthetic.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import qmc
+
+import foamfit as ff
+
+Array = NDArray[np.float64]
+
+AREA, STRIKER = 1.9635e-5, 7e-3  # m², kg: the specimens and the striker of the paper
+HISTORIES = ("on a", "on d", "on c", "on e", "loops", "all branches")
+KINDS = ("bistable", "linear+bistable", "unilateral+bistable")
+DRIVES = ("impact", "stress", "displacement")
+
+
+@dataclass(frozen=True)
+class Point:
+    """Where a scene lies on the axes of the study; see `AXES` for the ranges."""
+
+    drive: str = "impact"
+    kinds: str = "bistable"  # repeated from the base up
+    history: str = "all branches"  # where the stress or displacement turns round
+    k0: float = 5e6  # Pa
+    kc_ratio: float = 15.0  # k_c/k0
+    dsigma_ratio: float = -0.3  # Δσ/σ_a
+    kh_plus_ratio: float = 2.0  # k_h+/k0
+    kh_minus_ratio: float = 0.4  # k_h-/k0
+    eps_a: float = 0.2
+    eps_c: float = 0.5
+    mass: float = 0.0  # kg, above every spring but the last
+    top_mass: float = 0.0  # kg, on top under a prescribed stress
+    eta: float = 0.0  # Pa·s, of every spring, in parallel
+    site_eta: float = 0.0  # Pa·s, the onsite damper
+    velocity: float = 2.0  # m/s
+    height: float = 1e-3  # m, overall
+    springs: int = 1
+    samples: int = 201
+    duration: float = 1.0  # over the time that the scene takes by itself; see `duration_of`
+
+
+def spring_of(point: Point) -> ff.BistableSpring:
+    """Make the bistable spring of a scene."""
+    sigma_a = point.k0 * point.eps_a / (1.0 - point.eps_a)
+    return ff.BistableSpring(
+        k0=point.k0,
+        kc=point.kc_ratio * point.k0,
+        dsigma=point.dsigma_ratio * sigma_a,
+        eps_a=point.eps_a,
+        eps_c=point.eps_c,
+        kh_plus=point.kh_plus_ratio * point.k0,
+        kh_minus=point.kh_minus_ratio * point.k0,
+        eta=point.eta,
+    )
+
+
+def chain_of(point: Point) -> ff.Chain:
+    """Make the chain of a scene; its springs differ a little in height, so that none is a twin."""
+    bistable = spring_of(point)
+    linear = ff.LinearSpring(10.0 * point.k0, point.eta, point.kinds.startswith("unilateral"))
+    pattern = (bistable,) if point.kinds == "bistable" else (linear, bistable)
+    springs = [pattern[(i + 1) % len(pattern) - 1] for i in range(point.springs)]
+    if point.springs == 1:
+        springs = [bistable]
+    weights = 1.0 + 0.3 * np.sin(1.0 + 2.0 * np.arange(point.springs))
+    heights = point.height * weights / weights.sum()
+    masses = np.full(point.springs, point.mass)
+    masses[-1] = point.top_mass if point.drive == "stress" else 0.0
+    return ff.Chain(springs, list(heights), AREA, list(masses), site_damping=point.site_eta)
+
+
+def duration_of(point: Point) -> float:
+    """Time that a scene takes by itself: a bounce, or what masses and dashpots need to follow."""
+    mass = STRIKER if point.drive == "impact" else point.mass * point.springs + point.top_mass
+    swing = math.pi * math.sqrt(mass * point.height / (AREA * point.k0))
+    relax = (point.eta + point.site_eta) / point.k0
+    if point.drive != "impact":
+        return point.duration * max(20.0 * swing, relax, 1e-6)
+    crossing = 4.0 * point.height / point.velocity
+    stop = mass * point.height / (AREA * (point.eta + point.site_eta + 1e-300))
+    if relax > swing and stop < crossing:  # the dashpots stop the striker, then it creeps back
+        return point.duration * min(relax, 1e6 * swing)
+    return point.duration * min(swing, crossing)
+
+
+def turns_of(point: Point) -> Array:
+    """Strains of the bistable spring between which the history goes to and fro, from rest."""
+    spring = spring_of(point)
+    low, high = spring.eps_a, spring.eps_hat_c
+    back = 0.0 if spring.eps_hat_a is None else max(spring.eps_hat_a, 0.0)
+    on_a, on_d = 0.6 * low, 0.5 * (low + high)
+    on_c = high + 0.3 * (1.0 + spring.eps_star - high)
+    near = high + 0.1 * (1.0 + spring.eps_star - high)
+    on_e = spring.eps_c - 0.4 * (spring.eps_c - back)
+    down = 0.5 * back  # back on a, where a meets e
+    turns = {
+        "on a": [on_a, 0.2 * on_a, on_a, 0.0],
+        "on d": [on_d, on_a, 0.9 * on_d, low, on_d],
+        "on c": [on_c, near, on_c, 0.5 * (near + spring.eps_c)],
+        "on e": [on_c, on_e, 0.5 * (on_e + spring.eps_c), on_e, on_c, 0.9 * on_e],
+        "loops": [on_c, down, on_c, down, near],
+        "all branches": [on_a, 0.5 * on_a, on_d, on_a, on_c, near, on_c, on_e, on_c, down, on_d],
+    }
+    return np.array([0.0, *turns[point.history]])
+
+
+def scene_of(
+    point: Point,
+) -> tuple[ff.Chain, ff.Impact | ff.StressDrive | ff.DisplacementDrive, Array]:
+    """Make the chain, the drive and the samples of a scene."""
+    chain = chain_of(point)
+    time = np.linspace(0.0, duration_of(point), point.samples)
+    if point.drive == "impact":
+        return chain, ff.Impact(STRIKER, point.velocity), time
+    strains = turns_of(point)
+    fine = np.interp(np.linspace(0, len(strains) - 1, 64 * (len(strains) - 1) + 1),
+                     np.arange(len(strains)), strains)  # fmt: skip
+    if point.drive == "stress":
+        levels = spring_of(point).stress(fine)
+        if point.kh_plus_ratio == 0.0 or point.kh_minus_ratio == 0.0:
+            levels = levels * (1.0 - 1e-3)
+        along = np.linspace(0.0, duration_of(point), len(levels))
+        return chain, ff.StressDrive(np.interp(time, along, levels)), time
+    along = np.linspace(0.0, duration_of(point), len(fine))
+    share = 1.0
+    if point.springs > 1 and point.kinds != "bistable":  # what the linear springs do not take
+        bistable = [isinstance(s, ff.BistableSpring) for s in chain.springs]
+        share = math.fsum(h for h, is_b in zip(chain.heights, bistable, strict=True) if is_b)
+        share = share / chain.height
+    motion = np.interp(time, along, fine) * chain.height * share
+    return chain, ff.DisplacementDrive(motion), time
+
+
+# ------------------------------------------------------------------------------------- the design
+
+
+def _log(u: float, low: float, high: float) -> float:
+    return low * (high / low) ** u
+
+
+def _or_zero(u: float, low: float, high: float, share: float) -> float:
+    """Zero for a share of the design, else between low and high on a logarithmic scale."""
+    return 0.0 if u < share else _log((u - share) / (1.0 - share), low, high)
+
+
+def designed(count: int, seed: int = 4) -> list[Point]:
+    """Scenes of a Latin hypercube over all axes at once; most chains are short, some long."""
+    design = qmc.LatinHypercube(19, rng=seed).random(count)
+    points = []
+    for u in design:
+        springs = round(1000.0 ** (u[0] ** 7))
+        samples = round(_log(u[1] ** 2, 5.0, 2e4))
+        drive = DRIVES[min(int(u[2] * 4.0), 3) % 3]  # impacts twice as often
+        eps_a = _log(u[3], 0.01, 0.6)
+        point = Point(
+            drive=drive,
+            kinds=KINDS[int(u[4] * 3)],
+            history=HISTORIES[int(u[5] * len(HISTORIES))],
+            k0=_log(u[6], 1e5, 1e8),
+            kc_ratio=_log(u[7], 1.0, 1e5),
+            dsigma_ratio=-min(max(1.1 * u[8] - 0.1, 0.0), 1.0) * 0.99,
+            kh_plus_ratio=_or_zero(u[9], 1e-3, 100.0, 0.1),
+            kh_minus_ratio=_or_zero(u[10], 1e-3, 100.0, 0.1),
+            eps_a=eps_a,
+            eps_c=eps_a + (0.95 - eps_a) * (0.05 + 0.9 * u[11]),
+            mass=_or_zero(u[12], 1e-12, STRIKER, 0.5),
+            top_mass=_or_zero(u[13], 1e-12, STRIKER, 0.7),
+            eta=_or_zero(u[14], 1e-6, 1e8, 0.4),
+            site_eta=_or_zero(u[15], 1e-6, 1e8, 0.6),
+            velocity=_log(u[16], 1e-3, 100.0),
+            height=_log(u[17], 1e-6, 1.0),
+            springs=springs,
+            samples=max(min(samples, 200_000 // springs), 5),
+            duration=_log(u[18], 0.1, 10.0),
+        )
+        points.append(point)
+    return points
+
+
+BASES = {
+    "impact, 1": Point(velocity=3.0),
+    "impact, 2": Point(kinds="unilateral+bistable", springs=2, eta=10.0, mass=5e-6, velocity=3.0),
+    "stress": Point(drive="stress", springs=2, eta=100.0, duration=100.0, samples=401),
+    "stress, mass": Point(drive="stress", top_mass=5e-6, site_eta=10.0, samples=401),
+    "displacement": Point(drive="displacement", springs=3, eta=10.0, samples=401, duration=100.0),
+    "displacement, mass": Point(drive="displacement", springs=2, mass=1e-6, samples=401),
+}
+SWEEPS: dict[str, list[float]] = {
+    "kc_ratio": [1.0, 10.0, 1e2, 1e3, 1e4, 1e5],
+    "dsigma_ratio": [0.0, -1e-6, -0.5, -0.9, -0.98, -0.99],
+    "kh_plus_ratio": [0.0, 1e-6, 1e-3, 0.1, 10.0, 100.0],
+    "kh_minus_ratio": [0.0, 1e-6, 1e-3, 0.1, 10.0, 100.0],
+    "mass": [0.0, 1e-12, 1e-11, 1e-10, 1e-9, 1e-8, 1e-7, 1e-6, 1e-4, STRIKER],
+    "top_mass": [0.0, 1e-12, 1e-11, 1e-10, 1e-9, 1e-8, 1e-6, STRIKER],
+    "eta": [0.0, 1e-6, 1e-3, 1.0, 1e3, 1e5, 1e6, 1e7, 1e8],
+    "site_eta": [0.0, 1e-6, 1e-3, 1.0, 1e3, 1e5, 1e6, 1e7, 1e8],
+    "velocity": [1e-3, 1e-2, 0.1, 1.0, 10.0, 30.0, 60.0, 100.0],
+    "height": [1e-6, 1e-5, 1e-4, 1e-2, 0.1, 1.0],
+    "springs": [1, 2, 5, 10, 30, 100, 300, 1000],
+    "samples": [5, 17, 100, 1000, 10_000, 100_000, 1_000_000],
+}
+
+
+def swept() -> Iterator[tuple[str, Point]]:
+    """Scenes that leave a usual one along one axis, to its extreme; with the axis."""
+    for name, base in BASES.items():
+        for axis, values in SWEEPS.items():
+            if axis == "velocity" and base.drive != "impact":
+                continue
+            if axis == "top_mass" and base.drive != "stress":
+                continue
+            if axis == "mass" and base.springs == 1:
+                continue
+            for value in values:
+                if axis == "samples" and value > 1e5 and name not in ("impact, 1", "stress"):
+                    continue
+                yield axis, replace(base, **{axis: value})
+    for history in HISTORIES:
+        for name, base in BASES.items():
+            if not name.startswith("impact"):
+                yield "history", replace(base, history=history)

@@ -1,0 +1,311 @@
+"""What the solver does with stiff and extreme scenes: a study of more than two thousand of them.
+
+Each scene must end with an answer inside its tolerance or with a `SimulationError` that says why.
+The judges are in judges.py, the scenes in scenes.py; every scene is synthetic. One command writes
+scenes.csv (a line per scene), table.csv, stability.png and README.md beside itself:
+
+    python experiments/stability/stability.py
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import math
+import platform
+import sys
+import time
+import warnings
+from dataclasses import asdict
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import pandas as pd
+from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.figure import Figure
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE))
+
+from judges import balance_of, explicit_fits, refined  # noqa: E402
+from scenes import SWEEPS, Point, designed, scene_of, swept  # noqa: E402
+
+import foamfit as ff  # noqa: E402
+from foamfit.simulation import MOST_WORK  # noqa: E402
+
+RTOL, DESIGNED, SEED = 1e-6, 1550, 4
+ENERGY_BAR = 10.0 * RTOL  # the energy is made of both displacement and stress, over a whole history
+LONGEST = 300  # s; a scene that takes longer ends the study
+CHEAP = 50_000  # steps times springs up to which the other method is tried too
+REASONS = {
+    "ringing": "masses vibrate too fast",
+    "errors grow": "let the least error grow",
+    "end of a branch": "of the end of its branch",
+    "not finite": "no longer finite",
+    "flat branch under stress": "flat branch",
+    "bound on steps": "the bound of",
+    "step underflow": "shrank to nothing",
+}
+
+
+def judged(point: Point) -> dict[str, Any]:
+    """Simulate one scene and judge what comes of it: a line of the study."""
+    found: dict[str, Any] = {
+        "outcome": "refused", "reason": "", "method": "", "steps": 0, "seconds": 0.0,
+        "refinement": math.nan, "other method": math.nan, "energy": math.nan,
+        "impulse": math.nan, "error": math.nan,
+    }  # fmt: skip
+    scene = scene_of(point)
+    began = time.perf_counter()
+    try:
+        answer = ff.simulate(*scene, rtol=RTOL)
+    except ff.SimulationError as refusal:
+        found["seconds"] = time.perf_counter() - began
+        found["reason"] = next(key for key, part in REASONS.items() if part in str(refusal))
+        return found
+    found |= {
+        "seconds": time.perf_counter() - began, "method": answer.method, "steps": answer.steps,
+    }  # fmt: skip
+    finite = np.isfinite(answer.displacement).all() and np.isfinite(answer.base_stress).all()
+    if not finite:
+        return found | {"outcome": "failure", "reason": "not a number"}
+    work = answer.steps * len(scene[0].springs)
+    balance = balance_of(scene, answer, RTOL) if work < CHEAP else None
+    implicit, most = answer.method == "Radau IIA", 10 * work + CHEAP
+    found["refinement"] = 0.0
+    if answer.steps:
+        found["refinement"] = refined(scene, answer, RTOL, implicit=implicit, most=most)
+        if found["refinement"] is None:
+            found["refinement"] = refined(scene, answer, RTOL, implicit=not implicit, most=most)
+    if answer.steps and work < CHEAP and len(scene[2]) < 20_000 and explicit_fits(scene):
+        other = refined(scene, answer, RTOL, implicit=not implicit, most=CHEAP // 3)
+        found["other method"] = math.nan if other is None else other
+    if balance is not None:
+        found |= {"energy": balance.energy, "impulse": balance.impulse}
+    errors = [found["refinement"], found["other method"]]
+    found["error"] = np.nanmax([math.inf if e is None else e for e in errors])
+    bad = [
+        name
+        for name, bar in (
+            ("refinement", RTOL),
+            ("other method", RTOL),
+            ("energy", ENERGY_BAR),
+            ("impulse", ENERGY_BAR),
+        )
+        if found[name] is None or found[name] > bar
+    ]
+    return found | {"outcome": "failure" if bad else "answer", "reason": ", ".join(bad)}
+
+
+def study(designed_scenes: int = DESIGNED) -> pd.DataFrame:
+    """Judge every scene; one line each."""
+    scenes = [*swept(), *(("design", point) for point in designed(designed_scenes, SEED))]
+    lines: list[dict[str, Any]] = []
+    try:
+        for number, (axis, point) in enumerate(scenes):
+            faulthandler.dump_traceback_later(LONGEST, exit=True)
+            lines.append({"axis": axis, **asdict(point), **judged(point)})
+            faulthandler.cancel_dump_traceback_later()
+            if lines[-1]["outcome"] == "failure" or number % 100 == 0:
+                print(number, lines[-1], file=sys.stderr, flush=True)
+    except KeyboardInterrupt:
+        print(f"stopped after {len(lines)} of {len(scenes)} scenes", file=sys.stderr)
+    return pd.DataFrame(lines)
+
+
+# --------------------------------------------------------------------------------------- the table
+
+EDGES: dict[str, list[float]] = {
+    "kc_ratio": [1, 10, 1e2, 1e3, 1e4, 1e5],
+    "dsigma_ratio": [-0.99, -0.9, -0.5, -0.1, -1e-12, 0],
+    "kh_plus_ratio": [0, 1e-9, 0.01, 0.1, 1, 10, 100],
+    "kh_minus_ratio": [0, 1e-9, 0.01, 0.1, 1, 10, 100],
+    "mass": [0, 1e-13, 1e-10, 1e-8, 1e-6, 1e-4, 7e-3],
+    "top_mass": [0, 1e-13, 1e-10, 1e-8, 1e-6, 1e-4, 7e-3],
+    "eta": [0, 1e-9, 1e-3, 1, 1e3, 1e6, 1e8],
+    "site_eta": [0, 1e-9, 1e-3, 1, 1e3, 1e6, 1e8],
+    "velocity": [1e-3, 1e-2, 0.1, 1, 10, 100],
+    "height": [1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1],
+    "springs": [1, 2, 4, 11, 101, 1001],
+    "samples": [5, 20, 100, 1000, 10_000, 100_000, 1_000_001],
+}
+TITLES = {
+    "kc_ratio": "k_c/k0", "dsigma_ratio": "Δσ/σ_a", "kh_plus_ratio": "k_h+/k0",
+    "kh_minus_ratio": "k_h−/k0", "mass": "interior mass (kg)",
+    "top_mass": "top mass, stress drive (kg)", "eta": "η of the springs (Pa·s)",
+    "site_eta": "η onsite (Pa·s)", "velocity": "velocity (m/s)", "height": "height (m)",
+    "springs": "springs", "samples": "samples", "drive": "drive", "history": "history",
+    "kinds": "springs from the base",
+}  # fmt: skip
+
+
+def parts(axis: str, lines: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
+    """Split the scenes to which an axis means something into its ranges."""
+    if axis == "velocity":
+        lines = lines[lines.drive == "impact"]
+    elif axis == "top_mass":
+        lines = lines[lines.drive == "stress"]
+    elif axis == "mass":
+        lines = lines[lines.springs > 1]
+    elif axis == "history":
+        lines = lines[lines.drive != "impact"]
+    if axis not in EDGES:
+        return [(str(value), group) for value, group in lines.groupby(axis)]
+    edges, found = EDGES[axis], []
+    for low, high in pairwise(edges):
+        zero = low == 0 and 0 < high <= 1e-9
+        last = high == edges[-1]
+        inside = lines[axis].between(low, high, inclusive="both" if last else "left")
+        label = "0" if zero or (last and low == -1e-12) else f"{low:g} … {high:g}"
+        if axis == "springs":
+            label = f"{low:g} … {high - 1:g}" if high - low > 1 else f"{low:g}"
+        found.append((label, lines[inside]))
+    return found
+
+
+def table(lines: pd.DataFrame) -> pd.DataFrame:
+    """Count outcomes, errors, methods and seconds per axis and range."""
+    rows = []
+    for axis in ("all", *TITLES):
+        groups = [("", lines)] if axis == "all" else parts(axis, lines)
+        for label, group in groups:
+            answers = group[group.outcome == "answer"]
+            reasons = group[group.outcome == "refused"].reason.value_counts()
+            methods = answers.method.value_counts()
+            rows.append(
+                {
+                    "axis": TITLES.get(axis, "all scenes"),
+                    "range": label,
+                    "scenes": len(group),
+                    "answers": len(answers),
+                    "refused": int(reasons.sum()),
+                    "reasons": ", ".join(f"{key} {n}" for key, n in reasons.items()),
+                    "failures": int((group.outcome == "failure").sum()),
+                    "median error": answers.error.median(),
+                    "largest error": answers.error.max(),
+                    "largest energy residual": answers.energy.max(),
+                    "closed form": int(methods.get("closed form", 0)),
+                    "Taylor": int(methods.get("Taylor series", 0)),
+                    "Radau": int(methods.get("Radau IIA", 0)),
+                    "median s": group.seconds.median(),
+                    "longest s": group.seconds.max(),
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+# -------------------------------------------------------------------------------------- the picture
+
+
+def heat_map(rows: pd.DataFrame) -> Figure:
+    """Per axis and range: the share of answers, and the largest error of those answers."""
+    axes = [title for key, title in TITLES.items() if key in EDGES]
+    widest = max(len(rows[rows.axis == title]) for title in axes)
+    with matplotlib.rc_context({"font.size": 8, "axes.titlelocation": "left"}):
+        figure = Figure(figsize=(13.0, 5.8), layout="constrained")
+        left, right = figure.subplots(1, 2, sharey=True)
+        share, error = np.full((2, len(axes), widest), np.nan)
+        for i, title in enumerate(axes):
+            for j, (_, row) in enumerate(rows[rows.axis == title].iterrows()):
+                if row.scenes:
+                    share[i, j] = 100.0 * row.answers / row.scenes
+                if row.answers:
+                    error[i, j] = math.log10(max(row["largest error"], 1e-16))
+                for panel in (left, right):
+                    panel.text(j, i + 0.3, row["range"], ha="center", va="center", fontsize=5.5)
+                left.text(
+                    j,
+                    i - 0.12,
+                    f"{row.answers} of {row.scenes}",
+                    ha="center",
+                    va="center",
+                    fontsize=7,
+                )
+                if row.answers:
+                    shown = f"{row['largest error']:.0e}" if row["largest error"] else "0"
+                    right.text(j, i - 0.12, shown, ha="center", va="center")
+        shades = left.imshow(share, vmin=50, vmax=100, cmap="RdYlGn", alpha=0.65, aspect="auto")
+        figure.colorbar(shades, ax=left, label="answers (%)", shrink=0.6)
+        steps = np.arange(-16, -5)
+        colours = matplotlib.colormaps["viridis_r"](np.linspace(0.0, 0.85, len(steps) - 1))
+        norm = BoundaryNorm(steps, len(steps) - 1)
+        shades = right.imshow(
+            error, norm=norm, cmap=ListedColormap(colours), alpha=0.65, aspect="auto"
+        )
+        figure.colorbar(shades, ax=right, label="log10 of the largest error", shrink=0.6)
+        left.set_title("Scenes that end with an answer")
+        right.set_title(f"Largest error of an answer, over the range (wanted: {RTOL:g})")
+        for panel in (left, right):
+            panel.set_yticks(range(len(axes)), axes)
+            panel.set_xticks([])
+            panel.tick_params(length=0)
+            panel.spines[:].set_visible(False)
+    return figure
+
+
+# ----------------------------------------------------------------------------------------- the page
+
+
+def _number(value: float, form: str = ".0e") -> str:
+    return "–" if not math.isfinite(value) else "0" if value == 0.0 else format(value, form)
+
+
+def page(lines: pd.DataFrame, rows: pd.DataFrame) -> str:
+    """Write the README of the study."""
+    answers = lines[lines.outcome == "answer"]
+    text = (HERE / "page.template.md").read_text(encoding="utf-8")
+    head = "| axis | range | scenes | answers | refused | failures | median error | largest error "
+    head += "| closed form / Taylor / Radau | median s | longest s |\n" + "| --- " * 11 + "|"
+    body = []
+    last = ""
+    for _, row in rows.iterrows():
+        axis = row.axis if row.axis != last else ""
+        last = row.axis
+        refused = f"{row.refused} ({row.reasons})" if row.refused else "0"
+        body.append(
+            f"| {axis} | {row['range']} | {row.scenes} | {row.answers} | {refused} | "
+            f"{row.failures} | {_number(row['median error'])} | {_number(row['largest error'])} | "
+            f"{row['closed form']} / {row.Taylor} / {row.Radau} | "
+            f"{_number(row['median s'], '.2g')} | {_number(row['longest s'], '.2g')} |"
+        )
+    return text.format(
+        scenes=len(lines),
+        answers=len(answers),
+        refused=int((lines.outcome == "refused").sum()),
+        failures=int((lines.outcome == "failure").sum()),
+        energy=int(answers.energy.notna().sum()),
+        largest_energy=_number(answers.energy.max()),
+        other=int(answers["other method"].notna().sum()),
+        design=int((lines.axis == "design").sum()),
+        largest=_number(answers.error.max()),
+        longest=format(lines.seconds.max(), ".0f"),
+        median=format(lines.seconds.median() * 1e3, ".1f"),
+        rtol=f"{RTOL:g}",
+        bar=f"{ENERGY_BAR:g}",
+        work=f"{MOST_WORK:,}",
+        sweeps=", ".join(TITLES[key] for key in SWEEPS),
+        machine=f"{platform.machine()}, two shared cores, Python {platform.python_version()}, "
+        f"NumPy {np.__version__}",
+        table="\n".join([head, *body]),
+    )
+
+
+def main() -> None:
+    """Run the study and write its files."""
+    warnings.simplefilter("ignore")
+    lines = study()
+    rows = table(lines)
+    floats = {"seconds": 4, "error": 12}
+    lines.round(floats).to_csv(HERE / "scenes.csv", index=False, float_format="%.6g")
+    rows.to_csv(HERE / "table.csv", index=False, float_format="%.4g")
+    heat_map(rows).savefig(HERE / "stability.png", dpi=150)
+    (HERE / "README.md").write_text(page(lines, rows), encoding="utf-8")
+    print(rows.iloc[0].to_string())
+    if (lines.outcome == "failure").any():
+        sys.exit("some scenes ended with a wrong answer: see scenes.csv")
+
+
+if __name__ == "__main__":
+    main()

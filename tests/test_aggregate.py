@@ -1,0 +1,189 @@
+"""Many springs under one stress as one: the answers of following each, at linear cost."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import foamfit as ff
+from foamfit import aggregate, kernels, simulation
+from foamfit.simulation import AGGREGATE, TAYLOR, Response, plan
+from reference import Bistable, Chain, Impact, Linear, energy_balance
+from test_simulate import AREA, MODEL_1, built
+
+TIME = np.linspace(-0.05e-3, 0.9e-3, 301)
+HEIGHT = 1.19e-3
+STRIKER = 7e-3
+# The first turns back on branch d, the second with some of the springs on c, the others beyond.
+SPEEDS = (1.2, 1.8, 2.1, 3.0)
+
+
+def unlike(spring: Bistable, factor: float) -> Bistable:
+    """A spring whose stresses are all `factor` times as high."""
+    scaled = {
+        name: factor * getattr(spring, name)
+        for name in ("k0", "kc", "dsigma", "kh_plus", "kh_minus")
+    }
+    return dataclasses.replace(spring, **scaled)
+
+
+def chain_of(count: int, spread: float = 0.1, linear: bool = False, drag: float = 0.0) -> Chain:
+    """`count` springs like foam-1's, distinct within ± spread; every fifth linear where wanted.
+
+    Branch e of every other one meets branch a under pressure; the others keep to it to the end.
+    """
+    factors = 1.0 + spread * np.random.default_rng(count).uniform(-1.0, 1.0, count)
+    springs: list[Bistable | Linear] = [unlike(MODEL_1, factor) for factor in factors]
+    springs[1::2] = [dataclasses.replace(s, kh_minus=0.7 * s.kh_minus) for s in springs[1::2]]
+    if linear:
+        springs[::5] = [Linear(60e6 * factor) for factor in factors[::5]]
+    shares = 1.0 + 0.3 * np.cos(np.arange(count))
+    return Chain(tuple(springs), tuple(HEIGHT * shares / shares.sum()), AREA, site_damping=drag)
+
+
+def one_by_one(chain: ff.Chain, speed: float, time: np.ndarray = TIME) -> Response:
+    """The same impact with every spring followed through every step, to eleven digits."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(simulation, "LEAST_AGGREGATE", 10**9)
+        response = ff.simulate(chain, ff.Impact(STRIKER, speed), time, rtol=1e-11)
+    assert response.method == TAYLOR
+    return response
+
+
+def assert_same(got: Response, want: Response, most: float = 1e-9) -> None:
+    """Curves to `most` of their range; the same switches at the same times; the same end."""
+    assert got.method == AGGREGATE
+    for a, b in ((got.displacement, want.displacement), (got.base_stress, want.base_stress)):
+        assert np.abs(a - b).max() <= most * np.ptp(b)
+    assert np.array_equal(got.switches[:, 1:4], want.switches[:, 1:4])
+    assert np.allclose(got.switches[:, 0], want.switches[:, 0], rtol=0.0, atol=1e-12)
+    assert np.allclose(got.switches[:, 4], want.switches[:, 4], rtol=0.0, atol=1e-12)
+    assert (got.contact_end is None) == (want.contact_end is None)
+    if want.contact_end is not None:
+        assert got.contact_end == pytest.approx(want.contact_end, rel=1e-9)
+
+
+@pytest.mark.parametrize("count", [10, 60])
+@pytest.mark.parametrize("drag", [0.0, 2e2, 1e4])
+@pytest.mark.parametrize("linear", [False, True])
+def test_the_springs_as_one_move_as_each_by_itself(count: int, drag: float, linear: bool) -> None:
+    chain = built(chain_of(count, linear=linear, drag=drag))
+    seen = set()
+    for speed in SPEEDS:
+        got = ff.simulate(chain, ff.Impact(STRIKER, speed), TIME)
+        assert_same(got, one_by_one(chain, speed))
+        seen |= {kernels.BRANCH_NAMES[int(branch)] for branch in got.switches[:, 3]}
+    assert seen == (set() if drag == 1e4 else {"a", "d", "c", "e"})
+
+
+def test_every_strain_is_on_the_law_of_its_spring() -> None:
+    chain = chain_of(12)
+    response = ff.simulate(built(chain), ff.Impact(STRIKER, 2.1), TIME)
+    pressed = response.base_stress > 0.0
+    moved = np.diff(response.displacement[:, pressed], axis=0, prepend=0.0)
+    for spring, height, w in zip(built(chain).springs, chain.heights, moved, strict=True):
+        want = response.base_stress[pressed]
+        assert np.abs(spring.stress(w / height) - want).max() <= 1e-9 * want.max()
+
+
+@pytest.mark.parametrize("speed", SPEEDS)
+def test_what_the_striker_loses_stays_in_the_loops(speed: float) -> None:
+    chain, blow = chain_of(30), Impact(STRIKER, speed)
+    response = ff.simulate(built(chain), ff.Impact(STRIKER, speed), TIME)
+    flight = response.time > response.contact_end
+    away = np.diff(response.displacement[-1, -2:])[0] / np.diff(TIME[-2:])[0]
+    still = response.displacement - flight * away * (TIME - response.contact_end)
+    velocity = np.zeros_like(still)
+    velocity[-1] = away
+    energy = energy_balance(chain, blow, still, velocity)
+    end = {name: float(np.broadcast_to(values, TIME.shape)[-1]) for name, values in energy.items()}
+    assert end["brought"] == pytest.approx(0.5 * STRIKER * speed**2, rel=1e-12)
+    assert end["kinetic"] + end["work"] == pytest.approx(end["brought"], rel=1e-8)
+    assert (end["dissipated"] > 0.0) == (speed > 1.5)
+
+
+def effort(count: int, rtol: float = 1e-6) -> tuple[int, int, int, int]:
+    """Steps, switches, sums over all springs and orders of all steps of one closed impact."""
+    chain = built(chain_of(count))
+    scene = plan(chain, ff.Impact(STRIKER, 2.1), TIME)
+    spent = np.zeros(2, np.int64)
+    _, contact_end, steps, switches = aggregate.integrate_aggregate(
+        chain.arrays.rows, chain.arrays.heights, scene.mass[0], 0.0, scene.speed, TIME,
+        1e-4 * rtol / count, aggregate.DEGREE, 10**6, np.empty((1, TIME.size)),
+        np.empty(TIME.size), np.empty((0, 5)), spent,
+    )  # fmt: skip
+    assert contact_end > 0.0
+    return steps, switches, int(spent[0]), int(spent[1])
+
+
+def test_the_work_grows_with_the_number_of_springs_and_no_faster() -> None:
+    few, many = effort(30), effort(1000)
+    assert many[1] == 3500  # each spring: a to d, d to c, c to e; every other one: e to a
+    for steps, switches, sums, orders in (few, many):
+        assert steps <= switches + 25
+        assert orders <= 16 * steps
+        assert sums <= 10
+    assert many[3] / 1000 < few[3] / 30
+    got = ff.simulate(built(chain_of(1000)), ff.Impact(STRIKER, 2.1), TIME)
+    assert got.method == AGGREGATE  # within the bound on steps, and every switch is listed
+    assert len(got.switches) == 3500
+
+
+def test_like_springs_switch_together_and_nearly_like_ones_one_by_one() -> None:
+    same = built(chain_of(9, spread=0.0))
+    got = ff.simulate(same, ff.Impact(STRIKER, 2.1), TIME)
+    assert got.steps < 30
+    assert len(np.unique(got.switches[:, 0])) == 4
+    assert len(got.switches) == 31
+    assert_same(got, one_by_one(same, 2.1))
+    for spread in (1e-15, 1e-13, 1e-10):
+        nearly = built(chain_of(9, spread=spread))
+        got = ff.simulate(nearly, ff.Impact(STRIKER, 2.1), TIME)
+        assert len(got.switches) == 31
+        assert np.abs(got.base_stress - one_by_one(same, 2.1).base_stress).max() <= 1e-8 * np.ptp(
+            got.base_stress
+        )
+
+
+@pytest.mark.parametrize(
+    "time",
+    [[0.1e-3], [-1e-3, -0.5e-3], [0.0, 1e-7], [-1e-4, 0.0, 0.3e-3], [0.0, 5e-3], [2e-3, 3e-3]],
+)
+def test_samples_before_within_and_after_contact(time: list[float]) -> None:
+    chain, at = built(chain_of(10)), np.array(time)
+    got, want = ff.simulate(chain, ff.Impact(STRIKER, 2.1), at), one_by_one(chain, 2.1, at)
+    assert np.allclose(got.displacement, want.displacement, rtol=1e-9, atol=1e-15)
+    assert np.allclose(got.base_stress, want.base_stress, rtol=1e-9, atol=1e-3)
+    assert len(got.switches) == len(want.switches)
+    assert (got.contact_end is None) == (want.contact_end is None)
+
+
+def test_the_top_alone_is_the_top_of_all() -> None:
+    chain = built(chain_of(10))
+    scene = plan(chain, ff.Impact(STRIKER, 2.1), TIME)
+    alone = scene.run(chain.arrays.rows, chain.arrays.heights, everything=False)
+    every = scene.run(chain.arrays.rows, chain.arrays.heights)
+    assert alone.displacement.shape == (1, TIME.size)
+    assert np.allclose(alone.displacement[0], every.displacement[-1], rtol=0.0, atol=1e-15)
+    assert np.array_equal(alone.base_stress, every.base_stress)
+
+
+def test_only_what_one_stress_tells_of_is_taken_as_one() -> None:
+    chain, blow = chain_of(10), ff.Impact(STRIKER, 1.75)
+
+    def method(*others: Bistable | Linear, masses: tuple[float, ...] | None = None) -> str:
+        springs = (*chain.springs[: 10 - len(others)], *others)
+        scene = dataclasses.replace(chain, springs=springs, masses=masses)
+        return ff.simulate(built(scene), blow, TIME[:60]).method
+
+    assert method() == method(Linear(60e6)) == AGGREGATE
+    assert method(masses=(*[0.0] * 9, 1e-3)) == AGGREGATE
+    assert method(dataclasses.replace(MODEL_1, eta=10.0)) == TAYLOR
+    assert method(Linear(60e6, unilateral=True)) == TAYLOR
+    assert method(dataclasses.replace(MODEL_1, kh_plus=0.0)) == TAYLOR
+    assert method(dataclasses.replace(MODEL_1, kh_minus=0.0)) == TAYLOR
+    assert method(masses=(*[0.0] * 4, 1e-3, *[0.0] * 5)) == TAYLOR
+    carried = ff.simulate(built(chain), blow, TIME, sensitivities=["s1_k0"])
+    assert carried.method == TAYLOR
+    few = Chain(chain.springs[:8], chain.heights[:8], AREA)
+    assert ff.simulate(built(few), blow, TIME).method == TAYLOR

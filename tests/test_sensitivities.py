@@ -1,0 +1,181 @@
+"""The sensitivities carried along with a simulation, against central differences of it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import foamfit as ff
+from foamfit.chain import Drive
+from foamfit.problem import make_problem
+from foamfit.spring import BISTABLE_NAMES, LINEAR_NAMES, Spring
+
+AREA = 1.9635e-5
+TIME = np.linspace(0.0, 8e-4, 161)
+BISTABLE = ff.BistableSpring(5.5e6, 82.5e6, -0.17907e6, 0.14, 0.31, 14.3e6, 2.3375e6)
+LINEAR = ff.LinearSpring(60e6)
+SOFT = ff.BistableSpring(2e6, 60e6, -0.3446e6, 0.35, 0.71, 6.8e6, 1.05e6)
+PAIR = [LINEAR, SOFT]
+IMPACT = ff.Impact(7e-3, 2.0)
+PULSE = np.sin(np.pi * TIME / TIME[-1]) ** 2
+MOTION, STRESS = ff.DisplacementDrive(0.5e-3 * PULSE), ff.StressDrive(6e6 * PULSE)
+MOVED = ff.DisplacementDrive(0.5e-3 * PULSE + 1e-5)
+
+
+def damped(springs: list[Spring], *eta: float) -> list[Spring]:
+    return [replace(spring, eta=own) for spring, own in zip(springs, eta, strict=True)]
+
+
+def chain(springs: list[Spring], masses: list[float] | None = None, site: float = 0.0) -> ff.Chain:
+    heights = [1.19e-3] if len(springs) == 1 else [0.7e-3, 0.49e-3, 0.3e-3][: len(springs)]
+    return ff.Chain(springs, heights, AREA, masses, site)
+
+
+SCENES: dict[str, tuple[ff.Chain, Drive]] = {
+    "impact": (chain([BISTABLE]), IMPACT),
+    "impact, dashpot and onsite damper": (chain(damped([BISTABLE], 20.0), site=15.0), IMPACT),
+    "two springs": (chain(PAIR), IMPACT),
+    "two springs, onsite damper": (chain(PAIR, site=30.0), IMPACT),
+    "interior mass": (chain(PAIR, [5e-5, 0.0]), IMPACT),
+    "interior mass, onsite damper": (chain(PAIR, [5e-5, 0.0], 30.0), IMPACT),
+    "all damped": (chain(damped(PAIR, 20.0, 30.0)), IMPACT),
+    "one of three damped": (chain(damped([*PAIR, BISTABLE], 0.0, 30.0, 0.0)), IMPACT),
+    "unilateral": (chain([ff.LinearSpring(60e6, unilateral=True), SOFT], site=30.0), IMPACT),
+    "motion": (chain([BISTABLE]), MOTION),
+    "motion, dashpot": (chain(damped([BISTABLE], 20.0)), MOTION),
+    "motion of two": (chain(PAIR), MOTION),
+    "motion of two, one damped": (chain(damped(PAIR, 0.0, 30.0)), MOTION),
+    "motion of two from a strain, damped": (chain(damped(PAIR, 20.0, 30.0)), MOVED),
+    "motion of two, interior mass": (chain(PAIR, [5e-5, 0.0]), MOTION),
+    "stress": (chain([BISTABLE]), STRESS),
+    "stress, dashpot": (chain(damped([BISTABLE], 20.0)), STRESS),
+    "stress on two": (chain(PAIR), STRESS),
+    "stress on two, one damped": (chain(damped(PAIR, 0.0, 30.0)), STRESS),
+    "stress, viscous top": (chain(damped(PAIR, 0.0, 30.0), site=300.0), STRESS),
+    "stress on a mass": (chain(PAIR, [0.0, 1e-5]), STRESS),
+}
+
+
+def names_of(scene: ff.Chain) -> list[str]:
+    """Parameters of a chain, but for dashpots that are not there."""
+    names = ["site_eta"] if scene.site_damping > 0.0 else []
+    for i, spring in enumerate(scene.springs, start=1):
+        own = BISTABLE_NAMES if isinstance(spring, ff.BistableSpring) else LINEAR_NAMES
+        names += [f"s{i}_{short}" for short in own if short != "eta" or spring.eta > 0.0]
+        names.append(f"s{i}_height")
+    return names
+
+
+def value_of(scene: ff.Chain, name: str) -> float:
+    if name == "site_eta":
+        return scene.site_damping
+    spring, short = int(name[1]) - 1, name[3:]
+    return scene.heights[spring] if short == "height" else getattr(scene.springs[spring], short)
+
+
+def moved(scene: ff.Chain, name: str, by: float) -> ff.Chain:
+    springs, heights, site = list(scene.springs), list(scene.heights), scene.site_damping
+    if name == "site_eta":
+        site += by
+    elif name.endswith("height"):
+        heights[int(name[1]) - 1] += by
+    else:
+        i = int(name[1]) - 1
+        springs[i] = replace(springs[i], **{name[3:]: value_of(scene, name) + by})
+    return ff.Chain(springs, heights, scene.area, scene.masses, site)
+
+
+@pytest.mark.parametrize("label", SCENES)
+def test_sensitivities_against_differences(label: str) -> None:
+    """Within 1e-6 of the response's own range, away from switches of branch."""
+    scene, drive = SCENES[label]
+    names = names_of(scene)
+    got = ff.simulate(scene, drive, TIME, 1e-13, sensitivities=names)
+    assert got.steps == 0 or got.method == "Taylor series"
+    events = [*got.switches[:, 0], *([got.contact_end] if got.contact_end else [])]
+    away = np.all(np.abs(TIME[:, None] - np.array([events])) > 2e-3 * TIME[-1], axis=1)
+    assert away.mean() > 0.8
+    for name in names:
+        size = value_of(scene, name)
+
+        def slope(step: float, name: str = name, size: float = size) -> tuple[np.ndarray, ...]:
+            up, down = (
+                ff.simulate(moved(scene, name, sign * step * size), drive, TIME, 1e-13)
+                for sign in (1.0, -1.0)
+            )
+            return (
+                (up.displacement - down.displacement) / (2.0 * step),
+                (up.base_stress - down.base_stress) / (2.0 * step),
+            )
+
+        short, wide = slope(2e-5), slope(4e-5)
+        own = got.sensitivities[name]
+        ranges = (np.ptp(got.displacement[-1]), np.ptp(got.base_stress))
+        for one, two, exact, scale in zip(
+            short, wide, (own.displacement, own.base_stress), ranges, strict=True
+        ):
+            expected = (4.0 * one - two) / 3.0  # Richardson
+            allowed = 1e-6 * max(float(np.ptp(expected)), scale)
+            assert np.all(np.abs(size * exact - expected)[..., away] <= allowed), name
+
+
+def test_a_dashpot_of_zero_has_a_sensitivity() -> None:
+    """The one-sided derivative at η = 0, in all springs and at the top."""
+    for springs, drive in (([BISTABLE], IMPACT), (PAIR, IMPACT), ([BISTABLE], MOTION)):
+        scene = chain(springs)
+        names = [f"s{i}_eta" for i in range(1, len(springs) + 1)] + ["site_eta"]
+        got = ff.simulate(scene, drive, TIME, 1e-12, sensitivities=names)
+        for i, name in enumerate(names):
+            eta = [0.0] * len(springs)
+            site = 0.0
+            if name == "site_eta":
+                site = 1e-2
+            else:
+                eta[i] = 1e-2
+            other = ff.simulate(chain(damped(springs, *eta), site=site), drive, TIME, 1e-12)
+            events = [*got.switches[:, 0], *([got.contact_end] if got.contact_end else [])]
+            near = np.abs(TIME[:, None] - np.array([events])) < 1e-2 * TIME[-1]
+            away = ~near.any(axis=1)
+            away[0] = False  # a light dashpot has a thin layer at first contact
+            expected = (other.base_stress - got.base_stress) / 1e-2
+            miss = np.abs(got.sensitivities[name].base_stress - expected)[away]
+            assert miss.max() <= 2e-3 * max(np.abs(expected).max(), 1e-300), (name, drive)
+
+
+def test_a_name_that_is_no_parameter_is_refused() -> None:
+    for name in ("s2_k0", "kc", "s1_kx", "s1_kc ", ""):
+        with pytest.raises(ValueError, match="is not a parameter of this chain"):
+            ff.simulate(chain([BISTABLE]), IMPACT, TIME, sensitivities=[name])
+
+
+@pytest.mark.parametrize("model", ["bistable", "linear+bistable"])
+@pytest.mark.parametrize("drive", ["impact", "displacement", "stress"])
+def test_the_jacobian_of_a_fit_against_differences(model: str, drive: str) -> None:
+    """In SI and in the coordinates of the search, with the last height tied to the others."""
+    test = ff.read_test("experiments/foam-1/model-3-2.0mps-reconstruction.csv")
+    problem = make_problem(test, model, drive, None, None, interior_mass=False)
+    problem.objective.rtol = 1e-12
+    space = problem.space()
+    rng = np.random.default_rng(3)
+    point = space.encode(problem.vector()) + 0.02 * rng.random(len(space.coordinates))
+    values = space.decode(point)
+    residual = problem.objective.residual
+    names = problem.free()
+    exact = problem.slopes(values, names)
+    for column, name in enumerate(names):
+        step = 1e-6 * problem.sizes((name,), values)[0]
+        high, low = values.copy(), values.copy()
+        high[problem.model.index[name]] += step
+        low[problem.model.index[name]] -= step
+        differences = (residual(space.complete(high)) - residual(space.complete(low))) / (2 * step)
+        miss = np.linalg.norm(exact[:, column] - differences)
+        assert miss <= 2e-2 * np.linalg.norm(differences) + 1e-9 / step, name
+    along = problem.objective.jacobian_along(
+        values, space.slopes(point, values), np.full(point.size, 1e-5)
+    )
+    for column in range(point.size):
+        move = np.zeros(point.size)
+        move[column] = 1e-6
+        differences = residual(space.decode(point + move)) - residual(space.decode(point - move))
+        miss = np.linalg.norm(along[:, column] - differences / 2e-6)
+        assert miss <= 2e-2 * np.linalg.norm(differences) / 2e-6 + 1e-3, space.coordinates[column]

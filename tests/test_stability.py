@@ -1,0 +1,197 @@
+"""A seeded part of experiments/stability: stiff and extreme scenes, and the judges themselves."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+
+import numpy as np
+import pytest
+
+import foamfit as ff
+from conftest import EXPERIMENTS
+from foamfit import simulation
+from foamfit.simulation import plan
+
+sys.path.insert(0, str(EXPERIMENTS / "stability"))
+import judges
+import scenes
+from scenes import Point, designed, scene_of, swept
+
+RTOL = 1e-6
+
+
+def ended(point: Point) -> tuple[ff.Response | None, str]:
+    """Answer of a scene, or why there is none; an answer holds only what is finite."""
+    try:
+        answer = ff.simulate(*scene_of(point), rtol=RTOL)
+    except ff.SimulationError as refusal:
+        return None, str(refusal)
+    assert np.isfinite(answer.displacement).all()
+    assert np.isfinite(answer.base_stress).all()
+    return answer, ""
+
+
+def judge(point: Point, answer: ff.Response) -> None:
+    """Hold an answer to shorter steps, and to the balance of energy where that is affordable."""
+    scene = scene_of(point)
+    if answer.steps:
+        implicit = answer.method == "Radau IIA"
+        miss = judges.refined(scene, answer, RTOL, implicit=implicit, most=200_000)
+        assert miss is not None
+        assert miss <= RTOL, point
+    balance = judges.balance_of(scene, answer, RTOL)
+    if balance is not None:
+        assert max(balance.energy, balance.impulse) <= 10.0 * RTOL, point
+
+
+def cheap(point: Point) -> bool:
+    """Leave to the study what takes a second or more."""
+    ringing = (point.mass > 0.0 and point.springs > 1) or point.top_mass > 0.0
+    return point.springs <= (1 if ringing else 8) and point.samples <= 300
+
+
+# ------------------------------------------------------------------------------------- the scenes
+
+
+@pytest.mark.parametrize("part", range(4))
+def test_designed_scenes(part: int) -> None:
+    points = [point for point in designed(240, seed=11) if cheap(point)][part::4]
+    assert len(points) >= 25
+    answered = 0
+    for point in points:
+        answer, why = ended(point)
+        assert (answer is None) == bool(why)
+        if answer is not None and answer.steps < 5000:
+            judge(point, answer)
+            answered += 1
+    assert answered >= 0.8 * len(points)
+
+
+AXES = ("kc_ratio", "dsigma_ratio", "kh_plus_ratio", "kh_minus_ratio", "mass", "eta", "site_eta")
+AXES += ("velocity", "height", "springs", "samples", "history")
+
+
+@pytest.mark.parametrize("axis", AXES)
+def test_to_the_end_of_an_axis(axis: str) -> None:
+    points = [point for name, point in swept() if name == axis and cheap(point)]
+    ends = sorted(points, key=lambda p: getattr(p, axis))
+    ends = [*ends[:2], *ends[-3:]]
+    for point in ends:
+        answer, _ = ended(point)
+        if answer is not None and answer.steps < 3000:
+            judge(point, answer)
+
+
+# ----------------------------------------------------------------------------------- the refusals
+
+
+def test_a_strain_at_the_end_of_its_branch_is_refused() -> None:
+    _, why = ended(Point(velocity=100.0))  # a peak of 1e-15 s, between two samples
+    assert "comes within" in why
+    assert "of the end of its branch" in why
+
+
+def test_a_chaotic_motion_is_refused() -> None:
+    point = Point(drive="displacement", springs=8, mass=1e-6, samples=401, kc_ratio=1e3)
+    _, why = ended(point)
+    assert "vibrations let the least error grow" in why
+    calm, _ = ended(dataclasses.replace(point, eta=1e3))
+    assert calm is not None
+
+
+def test_vibrations_that_cannot_be_followed_are_refused_by_size() -> None:
+    point = Point(springs=2, kinds="unilateral+bistable", mass=1e-11, velocity=4.0)
+    chain, drive, time = scene_of(point)
+    rows = np.array([spring.row for spring in chain.springs])
+    motion = plan(chain, drive, time).run(rows, np.array(chain.heights), 1e-9)
+    assert motion.method == "Radau IIA"
+    assert 1e-9 < motion.unresolved < 1e-2
+    few = dataclasses.replace(plan(chain, drive, time), max_steps=20_000)  # explicit: not enough
+    with pytest.raises(ff.SimulationError, match="ask for no smaller rtol") as refusal:
+        simulation._verified(few, rows, np.array(chain.heights), 1e-9)
+    assert f"{motion.unresolved:.1g}" in str(refusal.value)
+    massless = ff.Chain(chain.springs, chain.heights, chain.area)  # without any ringing
+    want = ff.simulate(massless, drive, time, rtol=1e-9)
+    assert judges.difference(motion, want) <= motion.unresolved
+
+
+def test_damped_out_vibrations_are_accounted_for() -> None:
+    """What implicit steps lose is inside what they say they lose."""
+    point = Point(drive="displacement", springs=3, eta=10.0, mass=scenes.STRIKER, samples=101,
+                  duration=25.0)  # fmt: skip
+    right = judges.bare(scene_of(point), 1e-10, implicit=False)
+    got = judges.bare(scene_of(point), RTOL, implicit=True)
+    miss = judges.difference(got, right)
+    assert miss <= got.unresolved + 10.0 * RTOL
+
+
+def test_a_light_onsite_damper_beside_heavy_dashpots() -> None:
+    """Explicit steps lose the velocity of the top to cancellation: implicit ones are chosen."""
+    point = Point(drive="stress", eta=1e6, site_eta=1e-5, height=0.25, samples=21)
+    answer, _ = ended(point)
+    assert answer is not None
+    assert answer.method == "Radau IIA"
+    without = ff.simulate(*scene_of(dataclasses.replace(point, site_eta=0.0)), rtol=RTOL)
+    assert judges.difference(answer, without) <= 1e-9  # the damper carries 1e-11 of the stress
+
+
+def test_the_layer_after_a_jump_of_the_velocity_is_passed() -> None:
+    """Heavy dashpots stop light masses in 1e-20 s at each sample: shorter than a clock can tell."""
+    point = Point(drive="displacement", springs=4, eta=1e7, mass=2e-12, height=5e-6, samples=5)
+    answer, why = ended(point)
+    assert answer is not None, why
+    free = ff.simulate(*scene_of(dataclasses.replace(point, mass=0.0)), rtol=RTOL)
+    # at a sample the massless base stress is the mean of both sides, that of a mass the one before
+    np.testing.assert_allclose(
+        answer.displacement, free.displacement, rtol=0, atol=RTOL * free.displacement.max()
+    )
+
+
+@pytest.mark.parametrize("implicit", [True, False])
+def test_a_single_sample_of_a_stress(implicit: bool) -> None:
+    chain = ff.Chain([scenes.spring_of(Point(eta=10.0))] * 2, [1e-3, 1e-3], 1e-5)
+    scene = (chain, ff.StressDrive([1e5]), np.zeros(1))
+    assert judges.bare(scene, RTOL, implicit).base_stress == pytest.approx([1e5])
+
+
+# ------------------------------------------------------------------------------------- the judges
+
+
+def test_the_judges_see_a_wrong_answer() -> None:
+    """A law that is 0.1 % off, a force that is 0.1 % off and a motion that is 0.1 % off."""
+    point = Point(springs=2, kinds="linear+bistable", eta=100.0, velocity=3.0)
+    scene = scene_of(point)
+    drive = scene[1]
+    assert isinstance(drive, ff.Impact)
+    answer = ff.simulate(*scene, rtol=RTOL)
+    fair = judges.balance_of(scene, answer, RTOL)
+    assert fair is not None
+    assert max(fair.energy, fair.impulse) <= 1e-6
+    stop = float(answer.switches[0, 0])  # so far on first branches
+    ends = np.linspace(0.0, stop * (1.0 - 1e-12), 60)
+    inner = ends[:-1, None] + np.diff(ends)[:, None] * judges.NODES[None, :-1]
+    grid = np.append(inner.ravel(), ends[-1])
+    motion = judges.bare((scene[0], scene[1], grid), RTOL)
+    right = judges._balance(scene[0], scene[1], ends, motion)
+    assert max(right.energy, right.impulse) < 1e-7
+    other = scene_of(dataclasses.replace(point, k0=point.k0 * 1.001))[0]
+    assert judges._balance(other, scene[1], ends, motion).impulse > 5e-4
+    stronger = motion._replace(base_stress=1.001 * motion.base_stress)
+    assert judges._balance(scene[0], scene[1], ends, stronger).impulse > 5e-4
+    quicker = ff.Impact(drive.mass, 1.001 * drive.velocity)
+    assert judges._balance(scene[0], quicker, ends, motion).energy > 1e-6
+    further = motion._replace(displacement=1.1 * motion.displacement)
+    assert judges._balance(scene[0], scene[1], ends, further).energy > 1e-4
+    coarse = dataclasses.replace(answer, base_stress=answer.base_stress * (1.0 + 1e-5))
+    miss = judges.refined(scene, coarse, RTOL, implicit=False, most=200_000)
+    assert miss is not None
+    assert miss > RTOL
+
+
+def test_the_judges_work_is_that_of_the_law() -> None:
+    spring = scenes.spring_of(Point())
+    loop = np.interp(np.linspace(0, 2, 40_001), [0, 1, 2], [0.0, 0.75, 0.0])
+    stress = spring.stress(loop)
+    want = np.concatenate(([0.0], np.cumsum(0.5 * (stress[1:] + stress[:-1]) * np.diff(loop))))
+    np.testing.assert_allclose(judges.work_of(spring, loop), want, atol=1e-7 * want.max())
