@@ -274,7 +274,7 @@ def _by_reason(of: list[tuple[str, str]]) -> str:
         for why, members in groupby(of, key=lambda item: item[1])
     ]
     if len(groups) > REASONS:
-        return f"{', '.join(name for name, _ in of)} (why is said with each parameter)"
+        return f"{', '.join(name for name, _ in of)} (see why of each in the report)"
     return "; ".join(f"{names} ({why})" for why, names in groups)
 
 

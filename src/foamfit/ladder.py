@@ -447,6 +447,8 @@ def _why(i: int, best: int, tried: Sequence[Tried], found: Sequence[Evidence]) -
 
 def signed(value: float) -> str:
     """Write a difference with its sign."""
+    if not math.isfinite(value):  # too few effective samples for the correction of AICc
+        return "not defined"
     return f"{value:+.1f}".replace("-", "−")
 
 
@@ -458,7 +460,7 @@ def p_value(p: float) -> str:
 
 
 def _of(name: str, count: int) -> str:
-    return f"Of {count} rungs {name}" if count > 1 else f"The first rung, {name},"
+    return f"Of {count} rungs {name}" if count > 1 else f"The first rung {name}"
 
 
 def _sentences(
