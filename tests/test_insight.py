@@ -17,10 +17,11 @@ import foamfit as ff
 from conftest import AREA, EXPERIMENTS, HEIGHT, synthetic_impact, synthetic_loop
 from foamfit import planning
 from foamfit.chain import Chain, Impact
-from foamfit.checklist import Check, status_of
+from foamfit.checklist import Check, _by_reason, status_of
 from foamfit.cli import main
 from foamfit.insight import FLIGHT, Insight, Section
 from foamfit.insight_plots import plot_information, plot_plan, plot_sensitivities
+from foamfit.intervals import Intervals
 from foamfit.measurement import Measurement, Noise, Specimen, Striker
 from foamfit.problem import Problem, make_params, make_problem
 from foamfit.report import render_report, summary_text
@@ -260,15 +261,17 @@ def test_the_sections_are_those_of_the_branches_in_time() -> None:
 
 
 def concluded(
-    measurement: Measurement | None = None, record: dict[str, Any] | None = None, **given: Any
+    measurement: Measurement | None = None,
+    record: dict[str, Any] | None = None,
+    intervals: Intervals | None = None,
+    **given: Any,
 ) -> Any:
     """What is said at the true parameters of a synthetic impact."""
     spring, test = synthetic_impact(samples=201)
     problem = problem_of(test if measurement is None else measurement, **given)
     values = values_of(problem, spring)
-    return conclude(
-        problem, values, SearchRecord(0, 8, 0.0, **({"costs": AGREED} | (record or {})))
-    )
+    found = SearchRecord(0, 8, 0.0, **({"costs": AGREED} | (record or {})))
+    return conclude(problem, values, found, intervals)
 
 
 def answers(result: Any) -> dict[str, bool | None]:
@@ -331,6 +334,50 @@ def test_trials_that_fail_and_masses_that_ring_are_asked_after() -> None:
     assert "determined" not in {p.state for p in result.parameters.values()}
 
 
+def test_a_chain_too_short_to_trust_is_warned_of() -> None:
+    told = "The chain is too short."
+    result = concluded(intervals=Intervals(warnings=(told,)))
+    assert answers(result)["intervals"] is False
+    assert (result.status, result.warnings) == ("warnings", (told,))
+
+
+def test_the_standard_error_goes_with_an_interval_that_is_not_local() -> None:
+    local = concluded().parameters["s1_k0"]
+    low, high = local.ci95
+    near, narrow = [
+        concluded(intervals=Intervals({"s1_k0": ends}, {"s1_k0": "profile likelihood"}))
+        for ends in ((low, 1.001 * high), (local.value - 0.1 * (high - low) / 2, local.value))
+    ]
+    assert near.parameters["s1_k0"].stderr == local.stderr
+    found = narrow.parameters["s1_k0"]
+    assert found.stderr == pytest.approx(0.05 * local.stderr)
+    assert narrow.params["s1_k0"].stderr == found.stderr
+    assert "local one does not hold" in found.why
+
+
+def test_many_reasons_are_left_to_the_table() -> None:
+    few = [("s1_k0", "one"), ("s1_kc", "one"), ("s1_eta", "two")]
+    assert _by_reason(few) == "s1_k0, s1_kc (one); s1_eta (two)"
+    many = _by_reason([(f"s{i}_k0", f"reason {i}") for i in range(1, 6)])
+    assert many.startswith("s1_k0, s2_k0, s3_k0, s4_k0, s5_k0 (")
+    assert "reason 1" not in many
+
+
+def test_parameters_that_are_not_determined_count_as_varied() -> None:
+    test = synthetic_impact(samples=201)[1]
+    noisy = replace(test, noise=Noise(1e3 * test.noise.stress, 1e3 * test.noise.displacement))
+    rng = np.random.default_rng(0)
+    wild = replace(
+        noisy,
+        stress=test.stress + 0.5 * np.ptp(test.stress) * rng.standard_normal(test.time.size),
+        displacement=test.displacement
+        + 0.5 * np.ptp(test.displacement) * rng.standard_normal(test.time.size),
+    )
+    result = concluded(wild)
+    assert "not determined" in {p.state for p in result.parameters.values()}
+    assert result.statistics["n_vary"] == sum(p.vary for p in result.parameters.values())
+
+
 def test_what_the_test_does_not_say_is_neither_yes_nor_no() -> None:
     spring, test = synthetic_loop()
     problem = problem_of(test, drive="displacement")
@@ -361,7 +408,7 @@ def test_a_damper_that_may_be_none_is_not_called_determined() -> None:
     # Its limit is known well, which is nothing to be warned of, but it is said.
     assert result.status == "ok"
     told = next(check for check in result.checklist if check.key == "determined")
-    assert told.sentence == "7 of 8 are; small, and not told from zero: s1_eta."
+    assert told.sentence == "7 of 8 are; small for sure, though not told from zero: s1_eta."
     spring, test = synthetic_impact(eta=60.0)
     problem = problem_of(test, damped=True)
     result = conclude(problem, values_of(problem, spring), SearchRecord(0, 8, 0.0, AGREED))

@@ -416,7 +416,7 @@ def test_the_folder_holds_the_ladder(climbed, tmp_path):
 def test_the_report_and_the_summary_show_the_ladder(climbed):
     page = render_report(climbed, fit_png=b"\x89PNG" + bytes(20))
     text = summary_text(climbed)
-    assert "The simplest model that holds" in page
+    assert "Ladder of models" in page
     for rung in climbed.ladder.rungs:
         assert rung.why in page
         assert f"{rung.bic:.1f}".replace("-", "−") in page
@@ -452,7 +452,8 @@ def loop_file(tmp_path, monkeypatch):
 def test_the_command_writes_to_auto(loop_file, tmp_path):
     done = run("fit", loop_file, "--model", "auto", "--starts", 4)
     assert done.exit_code == 0, done.output
-    assert "bistable is the simplest that holds" in done.stdout
+    assert "The first rung bistable is the simplest that holds" in done.stdout
+    assert "no richer rung was tried" in done.stdout
     folder = tmp_path / "fits" / "loop" / "auto"
     content = json.loads((folder / "fit.json").read_text())
     assert content["model"] == "bistable"

@@ -118,6 +118,13 @@ def test_a_point_that_is_passed_twice_is_named_once() -> None:
     assert texts(ax) == ["A1", "C1", "C2", "A2"]
 
 
+def test_springs_that_switch_at_one_place_are_named_to_both_sides() -> None:
+    result = fabricated.chain_result()
+    first = result.switches[0]
+    ax = plot_fit(replace(result, switches=(first, replace(first, spring=1)))).axes[0]
+    assert {text.get_ha() for text in ax.texts} == {"left", "right"}
+
+
 @pytest.mark.parametrize(
     ("missing", "panels"),
     [

@@ -268,7 +268,9 @@ def noise_sentences(measurement: Measurement) -> list[str]:
             share = level.sigma / (float(np.ptp(values)) or 1.0)
             slow = f", each follows the others for {level.time:.1f} samples"
             slow = slow if level.time > 1.0 else ""
-            told.append(f"{channel} {sigma} ({share:.2g} of its range), {level.how}{slow}.")
+            told.append(
+                f"{channel} {sigma} ({100.0 * share:.2g} % of its range), {level.how}{slow}."
+            )
     return told
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import groupby
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from foamfit.audit import EnergyAudit
+    from foamfit.intervals import Intervals
     from foamfit.problem import Problem
     from foamfit.result import ParameterEstimate
     from foamfit.search import SearchRecord
@@ -36,6 +38,8 @@ POOR = 0.05
 STATED, ESTIMATED = 1.1, 1.5
 # Autocorrelation time, samples, from which on residuals count as structured.
 STRUCTURED = 5.0
+# Reasons that one warning gives at most; more of them are read better in the table of parameters.
+REASONS = 3
 BRANCHES = ("a", "d", "c", "e")
 # Parameters that may be zero: their interval tells whether there is anything at all.
 MAY_VANISH = ("dsigma", "kh_plus", "kh_minus", "eta")
@@ -81,6 +85,7 @@ class Evidence:
     spread: Covariance | None
     record: SearchRecord
     balance: EnergyAudit
+    intervals: Intervals
 
     @property
     def values(self) -> NDArray[np.float64]:
@@ -104,8 +109,8 @@ def warnings_of(checklist: Iterable[Check]) -> tuple[str, ...]:
 def make_checklist(evidence: Evidence) -> tuple[Check, ...]:
     """Put all questions, what matters most first."""
     questions: tuple[Callable[[Evidence], Check], ...] = (
-        _ended, _followed, _floor, _determined, _visited, _bounds, _agree, _structure, _ringing,
-        _simulated, _energy, _impulse, _clocks,
+        _ended, _followed, _floor, _determined, _trusted, _visited, _bounds, _agree, _structure,
+        _ringing, _simulated, _energy, _impulse, _clocks,
     )  # fmt: skip
     return tuple(question(evidence) for question in questions)
 
@@ -211,6 +216,8 @@ def _structure(e: Evidence) -> Check:
         return Check("structure", question, None, "There is nothing to judge them by.")
     longest = max(e.spread.tau)
     found = f"Their autocorrelation time is {longest:.2g} samples."
+    if longest < 1.05:
+        found = "They follow each other no more than white noise does."
     if longest <= STRUCTURED:
         return Check("structure", question, True, found)
     warning = (
@@ -237,9 +244,18 @@ def _determined(e: Evidence) -> Check:
     varied = [item.state for item in e.estimates.values() if item.state != "fixed"]
     found = f"{varied.count('determined')} of {len(varied)} are"
     if vanishing:
-        found += f"; small, and not told from zero: {', '.join(vanishing)}"
+        found += f"; small for sure, though not told from zero: {', '.join(vanishing)}"
     question = "Are all parameters determined?"
     return Check("determined", question, not warnings, f"{found}.", tuple(warnings))
+
+
+def _trusted(e: Evidence) -> Check:
+    question, warnings = "Were the intervals made as they should be?", e.intervals.warnings
+    made = Counter(item.ci95_method for item in e.estimates.values() if item.ci95_method)
+    found = ", ".join(f"{n} by {method}" for method, n in made.items()) or "There are none"
+    if warnings:
+        return Check("intervals", question, False, f"{found}; see the warning.", warnings)
+    return Check("intervals", question, True if made else None, f"{found}.")
 
 
 def _vanishes(e: Evidence, name: str) -> bool:
@@ -252,11 +268,13 @@ def _vanishes(e: Evidence, name: str) -> bool:
 
 
 def _by_reason(of: list[tuple[str, str]]) -> str:
-    """Name each with its own reason; neighbours of one reason together."""
+    """Name each with its own reason, neighbours of one reason together; of many, names alone."""
     groups = [
         (why, ", ".join(name for name, _ in members))
         for why, members in groupby(of, key=lambda item: item[1])
     ]
+    if len(groups) > REASONS:
+        return f"{', '.join(name for name, _ in of)} (see why of each in the report)"
     return "; ".join(f"{names} ({why})" for why, names in groups)
 
 

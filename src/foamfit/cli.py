@@ -260,7 +260,10 @@ def _hold_and_vary(
 )
 @click.option("--profile", is_flag=True, help="95 % intervals by profile likelihood.")
 @click.option(
-    "--bootstrap", type=int, metavar="N", help="95 % intervals by N refits to resampled blocks."
+    "--bootstrap",
+    type=int,
+    metavar="N",
+    help="95 % intervals by N >= 40 refits to resampled blocks.",
 )
 @click.option("--mcmc", type=int, metavar="N", help="95 % intervals by N steps of emcee.")
 @click.option("--json", "as_json", is_flag=True, help="Print fit.json on stdout, nothing else.")

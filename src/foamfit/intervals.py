@@ -578,6 +578,8 @@ class Intervals:
         Parameters along which the cost is no parabola and whose interval is local all the same.
     notes : tuple of str
         One sentence each.
+    warnings : tuple of str
+        Why they are not, or hardly, what was asked for; one sentence each.
     better : (n,) array or None
         A point with a lower cost that was met: it should be gone on from.
     """
@@ -587,6 +589,7 @@ class Intervals:
     profiles: tuple[Profile, ...] = ()
     doubtful: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     better: Array | None = None
 
 
@@ -698,7 +701,7 @@ def _by_bootstrap(
         f"{' and '.join(map(str, lengths))} samples."
     )
     if len(drawn) < ENOUGH_DRAWS:
-        return Intervals(notes=(note + " These are too few, so the intervals are local.",))
+        return Intervals(warnings=(note + " These are too few, so the intervals are local.",))
     return _percentiles(vicinity, drawn, "block bootstrap", note)
 
 
@@ -710,8 +713,9 @@ def _by_mcmc(
     tell(f"Markov chain: {count} simulations, about {seconds:.2g} s")
     chain = mcmc(vicinity, choice.draws, choice.seed, tracker)
     if len(chain.samples) < ENOUGH_DRAWS:
-        return Intervals(notes=(chain.sentence() + " The intervals are local.",))
-    return _percentiles(vicinity, chain.samples, "MCMC", chain.sentence())
+        return Intervals(warnings=(chain.sentence() + " The intervals are local.",))
+    found = _percentiles(vicinity, chain.samples, "MCMC", chain.sentence())
+    return found if chain.converged else replace(found, notes=(), warnings=found.notes)
 
 
 def _percentiles(vicinity: Vicinity, drawn: Array, method: str, note: str) -> Intervals:

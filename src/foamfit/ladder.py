@@ -432,6 +432,8 @@ def _why(i: int, best: int, tried: Sequence[Tried], found: Sequence[Evidence]) -
     mine, taken = found[i], found[best]
     if i == best:
         noise = "its residuals are structureless" if tried[i].structureless else "best supported"
+        if best == len(tried) - 1:
+            return f"{noise}, and no richer rung was tried"
         return f"{noise}, and no richer rung lowers AICc and BIC by {MARGIN:g}"
     if i < best:
         return f"BIC {signed(mine.bic - taken.bic)}, AICc {signed(mine.aicc - taken.aicc)}"
@@ -445,6 +447,8 @@ def _why(i: int, best: int, tried: Sequence[Tried], found: Sequence[Evidence]) -
 
 def signed(value: float) -> str:
     """Write a difference with its sign."""
+    if not math.isfinite(value):  # too few effective samples for the correction of AICc
+        return "not defined"
     return f"{value:+.1f}".replace("-", "−")
 
 
@@ -453,6 +457,10 @@ def p_value(p: float) -> str:
     if p < 1e-6:
         return "< 1e-6"
     return f"= {p:.2g}"
+
+
+def _of(name: str, count: int) -> str:
+    return f"Of {count} rungs {name}" if count > 1 else f"The first rung {name}"
 
 
 def _sentences(
@@ -466,7 +474,7 @@ def _sentences(
     one, mine = tried[best], found[best]
     taken = "is the simplest that holds" if one.structureless else "is what the evidence supports"
     said = [
-        f"Of {len(tried)} rungs {one.name} {taken} (runs test p {p_value(one.runs_p)}, neighbours "
+        f"{_of(one.name, len(tried))} {taken} (runs test p {p_value(one.runs_p)}, neighbours "
         f"test p {p_value(one.neighbours_p)}); the climb ended because {ended}."
     ]
     warned = []

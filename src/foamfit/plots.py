@@ -54,7 +54,7 @@ POINTS = {
     ("e", "a"): "A2",
 }  # fmt: skip
 UNITS = {
-    "Pa": ((1e6, "MPa"), (1e3, "kPa"), (1.0, "Pa")),
+    "Pa": ((1e9, "GPa"), (1e6, "MPa"), (1e3, "kPa"), (1.0, "Pa")),
     "s": ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs")),
     "m": ((1.0, "m"), (1e-3, "mm"), (1e-6, "µm")),
 }
@@ -596,9 +596,17 @@ def _mark_switches(ax: Axes, panel: _Panel, result: FitResult) -> None:
         y = switch.displacement if panel.key == "displacement_time" else switch.stress
         if x is not None:
             at.setdefault(name, []).append((x / fx, y / fy))
+    named: list[tuple[Array, float]] = []
     for name, places in at.items():
         ax.plot(*zip(*places, strict=True), "o", ms=3.2, color="black", zorder=5)
         offset = _offset(name[-2:], panel.key)
+        here = np.array(places[0]) / [np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim())]
+        if panel.key != "stress_strain" and any(
+            offset[0] * side > 0.0 and (np.abs(here - there) < (0.2, 0.05)).all()
+            for there, side in named
+        ):  # two springs switch at nearly one place: one name to each side
+            offset = (-offset[0], -offset[1])
+        named.append((here, offset[0]))
         ax.annotate(  # a spring that goes to and fro is named where it first does
             name, places[0], offset, textcoords="offset points", zorder=6,
             ha="left" if offset[0] > 0 else "right", va="center", fontsize=7,

@@ -307,10 +307,17 @@ def state(value: float, half: float, size: float, low: float, high: float) -> tu
         return "not determined", "the data fix only a combination of it with other parameters"
     edge = 1e-6 * size
     if half > NOTHING * size:
-        return "not determined", f"its 95 % interval is ±{half / size:.0%} of its natural size"
+        return "not determined", f"its 95 % interval is {_wide(half / size)} its natural size"
     if value - low <= edge or high - value <= edge:
         limit = low if value - low <= edge else high
         return "weak", f"it lies at its limit {limit:g}; its interval is open on that side"
     if half > WEAK * size:
         return "weak", f"its 95 % interval is ±{half / size:.0%} of its natural size"
     return "determined", f"its 95 % interval is ±{half / size:.1%} of its natural size"
+
+
+def _wide(ratio: float) -> str:
+    """Write the half width of a hopeless interval over the natural size so that it can be read."""
+    if ratio > 100.0:
+        return "more than 100 times"
+    return f"±{ratio:.2g} times" if ratio > 2.0 else f"±{ratio:.0%} of"

@@ -34,6 +34,9 @@ from foamfit.vicinity import Vicinity
 
 Array = NDArray[np.float64]
 
+# Factor between an interval and the local one from which on the local standard error is given up.
+ASTRAY = 2.0
+
 
 def conclude(
     problem: Problem, values: Array, record: SearchRecord, intervals: Intervals | None = None
@@ -58,9 +61,10 @@ def conclude(
         spread=spread,
         record=record,
         balance=balance,
+        intervals=intervals,
     )
     checklist = make_checklist(evidence)
-    n_vary = sum(1 for item in estimates.values() if item.vary and item.stderr is not None)
+    n_vary = 0 if insight is None else len(insight.names)  # determined or not, they follow the data
     return FitResult(
         measurement=measurement,
         model=problem.model.name,
@@ -176,7 +180,7 @@ def _notes(problem: Problem, values: Array, simulated: Simulated) -> tuple[str, 
     except SimulationError as error:
         return (*unused, f"{left_out}; with them the simulation ends: {error}.")
     changes = [
-        f"{name} by {np.sqrt(np.mean((one - two) ** 2)) / np.ptp(one):.2%}"
+        f"{name} by {_share(float(np.sqrt(np.mean((one - two) ** 2)) / np.ptp(one)))}"
         for name, one, two in (
             ("the base stress", simulated.stress_time, other.stress_time),
             ("the displacement", simulated.displacement_time, other.displacement_time),
@@ -189,6 +193,10 @@ def _notes(problem: Problem, values: Array, simulated: Simulated) -> tuple[str, 
         f"{left_out}; the specimen's {specimen.mass * 1e6:.3g} mg between the springs would change "
         f"{' and '.join(changes)} (RMS over range).",
     )
+
+
+def _share(off: float) -> str:
+    return "less than 0.01%" if off < 1e-4 else f"{off:.2%}"
 
 
 def _along_integrated(problem: Problem, simulated: Simulated) -> tuple[str, ...]:
@@ -275,6 +283,10 @@ def _varied(
         why += "; its interval is local, though the cost is no parabola there"
     ci95 = (max(ends[0], low), min(ends[1], high))
     method = intervals.methods.get(name, "local covariance")
+    ratio = 0.5 * (ends[1] - ends[0]) / half if half > 0.0 else math.nan
+    if name in intervals.ends and (ratio < 1.0 / ASTRAY or ASTRAY < ratio < math.inf):
+        stderr *= ratio
+        why += "; its standard error is that of the interval, as the local one does not hold"
     return ParameterEstimate(value, stderr, ci95, unit_of(name), True, verdict, why, method)
 
 
