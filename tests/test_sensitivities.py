@@ -11,7 +11,7 @@ from foamfit.problem import make_problem
 from foamfit.spring import BISTABLE_NAMES, LINEAR_NAMES, Spring
 
 AREA = 1.9635e-5
-TIME = np.linspace(0.0, 8e-4, 161)
+TIME = np.linspace(0.0, 8e-4, 81)
 BISTABLE = ff.BistableSpring(5.5e6, 82.5e6, -0.17907e6, 0.14, 0.31, 14.3e6, 2.3375e6)
 LINEAR = ff.LinearSpring(60e6)
 SOFT = ff.BistableSpring(2e6, 60e6, -0.3446e6, 0.35, 0.71, 6.8e6, 1.05e6)
