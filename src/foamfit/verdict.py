@@ -273,7 +273,12 @@ def _varied(
     column = insight.names.index(name)
     stderr = float(spread.stderr[column])
     half = uncertainty.half_width(stderr, spread.freedom)
-    ends = intervals.ends.get(name, (value - half, value + half))
+    local = (value - half, value + half)
+    ends = intervals.ends.get(name, local)
+    ratio = 0.5 * (ends[1] - ends[0]) / half if half > 0.0 else math.nan
+    # refits that stall in a long valley make a profile narrow: the wider interval is the honest one
+    stalled = ratio < 1.0 / ASTRAY and intervals.methods.get(name) == "profile likelihood"
+    ends = local if stalled else ends
     verdict, why = state_of(name, value, ends, insight, (low, high))
     if verdict == "determined" and problem.objective.interior_mass:
         verdict, why = "weak", "the ringing of the interior mass leaves other valleys; " + why
@@ -283,8 +288,10 @@ def _varied(
         why += "; its interval is local, though the cost is no parabola there"
     ci95 = (max(ends[0], low), min(ends[1], high))
     method = intervals.methods.get(name, "local covariance")
-    ratio = 0.5 * (ends[1] - ends[0]) / half if half > 0.0 else math.nan
-    if name in intervals.ends and (ratio < 1.0 / ASTRAY or ASTRAY < ratio < math.inf):
+    if stalled:
+        method = "local covariance"
+        why += "; its profile is much narrower and was not taken"
+    elif name in intervals.ends and (ratio < 1.0 / ASTRAY or ASTRAY < ratio < math.inf):
         stderr *= ratio
         why += "; its standard error is that of the interval, as the local one does not hold"
     return ParameterEstimate(value, stderr, ci95, unit_of(name), True, verdict, why, method)
