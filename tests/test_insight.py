@@ -344,15 +344,29 @@ def test_a_chain_too_short_to_trust_is_warned_of() -> None:
 def test_the_standard_error_goes_with_an_interval_that_is_not_local() -> None:
     local = concluded().parameters["s1_k0"]
     low, high = local.ci95
-    near, narrow = [
-        concluded(intervals=Intervals({"s1_k0": ends}, {"s1_k0": "profile likelihood"}))
-        for ends in ((low, 1.001 * high), (local.value - 0.1 * (high - low) / 2, local.value))
-    ]
+    half, profiled = (high - low) / 2, {"s1_k0": "profile likelihood"}
+    near = concluded(intervals=Intervals({"s1_k0": (low, 1.001 * high)}, profiled))
     assert near.parameters["s1_k0"].stderr == local.stderr
-    found = narrow.parameters["s1_k0"]
-    assert found.stderr == pytest.approx(0.05 * local.stderr)
-    assert narrow.params["s1_k0"].stderr == found.stderr
-    assert "local one does not hold" in found.why
+    for width, method in ((5.0, "profile likelihood"), (0.1, "mcmc")):
+        ends = (local.value - width * half, local.value)
+        other = concluded(intervals=Intervals({"s1_k0": ends}, {"s1_k0": method}))
+        found = other.parameters["s1_k0"]
+        assert found.stderr == pytest.approx(0.5 * width * local.stderr)
+        assert other.params["s1_k0"].stderr == found.stderr
+        assert "local one does not hold" in found.why
+
+
+def test_a_profile_much_narrower_than_the_local_interval_is_not_taken() -> None:
+    """Refits that stall in a long valley make it so."""
+    local = concluded().parameters["s1_k0"]
+    half = (local.ci95[1] - local.ci95[0]) / 2
+    ends = {"s1_k0": (local.value - 0.1 * half, local.value)}
+    found = concluded(intervals=Intervals(ends, {"s1_k0": "profile likelihood"})).parameters[
+        "s1_k0"
+    ]
+    assert (found.ci95, found.stderr) == (local.ci95, local.stderr)
+    assert found.ci95_method == "local covariance"
+    assert "was not taken" in found.why
 
 
 def test_many_reasons_are_left_to_the_table() -> None:
