@@ -139,8 +139,8 @@ class Plan:
     ----------
     solver : str
         The least solver.
-    area, height : float
-        A in m² and H in m.
+    height : float
+        H, m.
     ends, mass : arrays
         The groups of springs and the areal masses between them; see `foamfit.taylor.integrate`.
     drag : float
@@ -634,7 +634,10 @@ def simulate(
     directions = NO_DIRECTIONS
     if sensitivities:
         wanted = [_direction(chain, name) for name in sensitivities]
-        directions = np.array([*wanted, (-1, series.DRAG)])
+        longer = any(what == series.HEIGHT for _, what in wanted)
+        if longer and chain.site_damping > 0.0:  # the onsite damper acts over the whole height
+            wanted.append((-1, series.DRAG))
+        directions = np.array(wanted)
     scene = plan(chain, drive, t, dashpots=any(name.endswith("_eta") for name in sensitivities))
     motion = _verified(scene, chain.arrays.rows, chain.arrays.heights, rtol, directions)
     if len(directions) and motion.slopes is None:
