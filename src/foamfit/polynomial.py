@@ -3,10 +3,10 @@
 # mypy: disallow-untyped-decorators=False, warn-return-any=False
 from __future__ import annotations
 
-from foamfit.kernels import Array, fused, inner
+from foamfit.kernels import Array, inner
 
 
-@fused
+@inner
 def value_at(c: Array, order: int, tau: float) -> float:
     """Value of a polynomial."""
     total = c[order]
@@ -15,7 +15,7 @@ def value_at(c: Array, order: int, tau: float) -> float:
     return total
 
 
-@fused
+@inner
 def _value_and_slope(c: Array, order: int, tau: float) -> tuple[float, float]:
     """Value and derivative of a polynomial."""
     total, slope = c[order], 0.0
@@ -31,43 +31,53 @@ def slope_at(c: Array, order: int, tau: float) -> float:
     return _value_and_slope(c, order, tau)[1]
 
 
-@fused
+@inner
 def fill_values(
     c: Array, order: int, t: Array, first: int, last: int, now: float, out: Array
 ) -> None:
     """Write the polynomial at the times t[first:last] - now to `out`, a block at a time.
 
-    The loops over a block hold no dependence from sample to sample, so that they are done four
-    samples at once; six coefficients a pass save reading and writing the block.
+    Slices, whose index cannot be negative, and loops without dependence from sample to sample are
+    done four samples at once; six coefficients a pass save reading and writing the block.
     """
     while first < last:
         end = min(first + 512, last)
+        times, block = t[first:end], out[first:end]
         n = order
-        for j in range(first, end):
-            out[j] = c[n]
+        for j in range(times.size):
+            block[j] = c[n]
         while n >= 6:
             c1, c2, c3, c4, c5, c6 = c[n - 1], c[n - 2], c[n - 3], c[n - 4], c[n - 5], c[n - 6]
-            for j in range(first, end):
-                x = t[j] - now
-                out[j] = (((((out[j] * x + c1) * x + c2) * x + c3) * x + c4) * x + c5) * x + c6
+            for j in range(times.size):
+                x = times[j] - now
+                block[j] = (((((block[j] * x + c1) * x + c2) * x + c3) * x + c4) * x + c5) * x + c6
             n -= 6
         while n >= 2:
             c1, c2 = c[n - 1], c[n - 2]
-            for j in range(first, end):
-                x = t[j] - now
-                out[j] = (out[j] * x + c1) * x + c2
+            for j in range(times.size):
+                x = times[j] - now
+                block[j] = (block[j] * x + c1) * x + c2
             n -= 2
         if n == 1:
             c1 = c[0]
-            for j in range(first, end):
-                out[j] = out[j] * (t[j] - now) + c1
+            for j in range(times.size):
+                block[j] = block[j] * (times[j] - now) + c1
         first = end
 
 
 @inner
-def _root(c: Array, order: int, level: float, lo: float, hi: float, rising: bool) -> float:
-    """Root of polynomial - level in [lo, hi], whose ends lie on either side: guarded Newton."""
-    tau = 0.5 * (lo + hi)
+def _root(
+    c: Array, order: int, level: float, lo: float, f_lo: float, hi: float, f_hi: float
+) -> float:
+    """Root of polynomial - level in [lo, hi], where the polynomial goes from f_lo to f_hi.
+
+    Guarded Newton, from where the chord ends; its error is squared in every step, so that one of
+    1e-9 is the last.
+    """
+    rising, close = f_hi > f_lo, 1e-9 * (hi - lo)
+    tau = lo + (level - f_lo) / (f_hi - f_lo) * (hi - lo)
+    if not lo < tau < hi:
+        tau = 0.5 * (lo + hi)
     for _ in range(100):
         f, d = _value_and_slope(c, order, tau)
         f -= level
@@ -78,12 +88,13 @@ def _root(c: Array, order: int, level: float, lo: float, hi: float, rising: bool
         else:
             lo = tau
         trial = tau - f / d if d != 0.0 else lo
-        if not lo < trial < hi:
+        newton = lo < trial < hi
+        if not newton:
             trial = 0.5 * (lo + hi)
-        if abs(trial - tau) <= 4e-16 * abs(tau) or trial in (lo, hi):
-            tau = trial
-            break
+        done = trial in (lo, hi) or abs(trial - tau) <= (close if newton else 4e-16 * abs(tau))
         tau = trial
+        if done:
+            break
     return tau
 
 
@@ -121,7 +132,7 @@ def first_crossing(c: Array, order: int, low: float, high: float, span: float) -
         return span, 0
     low, high = min(low, c[0]), max(high, c[0])
     pieces = 1 if bend < abs(c[1]) * span else 8  # one way all along, or perhaps there and back
-    lo = 0.0
+    lo, value_lo = 0.0, c[0]
     slope_lo = c[1]
     for piece in range(1, pieces + 1):
         hi = span * piece / pieces
@@ -130,14 +141,14 @@ def first_crossing(c: Array, order: int, low: float, high: float, span: float) -
             mid = _turn(c, order, lo, hi)
             turned = value_at(c, order, mid)
             if turned > high:
-                return _root(c, order, high, lo, mid, True), 1
+                return _root(c, order, high, lo, value_lo, mid, turned), 1
             if turned < low:
-                return _root(c, order, low, lo, mid, False), -1
-            lo = mid
+                return _root(c, order, low, lo, value_lo, mid, turned), -1
+            lo, value_lo = mid, turned
         if value > high:
-            return _root(c, order, high, lo, hi, True), 1
+            return _root(c, order, high, lo, value_lo, hi, value), 1
         if value < low:
-            return _root(c, order, low, lo, hi, False), -1
-        lo = hi
+            return _root(c, order, low, lo, value_lo, hi, value), -1
+        lo, value_lo = hi, value
         slope_lo = slope_hi
     return span, 0

@@ -75,8 +75,9 @@ class Links(NamedTuple):
 class Series(NamedTuple):
     """Taylor coefficients of all that moves; order 0 of w, v and eps is the state.
 
-    w, v (groups, order + 2) belong to the nodes above the groups, eps (order + 2) and sig
-    (springs, order + 1) to the springs, group (groups, order + 1) to the common stresses.
+    w, v (groups, order + 2) belong to the nodes above the groups, eps and sig (springs, order + 2)
+    to the springs, group (groups, order + 2) to the common stresses; the last column of sig and
+    group is not used.
     """
 
     w: Array
@@ -165,29 +166,26 @@ def enter_tangents(rows: Array, i: int, branch: int, directions: Branches, d: Ta
 @maker
 def make_series(count: int, groups: int, order: int) -> Series:
     """Make series of zeros."""
-    return Series(
-        np.zeros((groups, order + 2)),
-        np.zeros((groups, order + 2)),
-        np.zeros((count, order + 2)),
-        np.zeros((count, order + 1)),
-        np.zeros((groups, order + 1)),
-    )
+    nodes, springs = np.zeros((3, groups, order + 2)), np.zeros((2, count, order + 2))
+    return Series(nodes[0], nodes[1], springs[0], springs[1], nodes[2])
 
 
 @maker
 def make_tangents(count: int, groups: int, order: int, directions: Branches) -> Tangents:
     """Make derivatives of a chain at rest; those of the branches are still to be entered."""
     p = directions.shape[0]
+    nodes, springs = np.zeros((3, p, groups, order + 2)), np.zeros((2, p, count, order + 2))
+    moves = np.zeros((2, p, count))
     d = Tangents(
         np.zeros((p, count, 3)),
-        np.zeros((p, count)),
-        np.zeros((p, count)),
+        moves[0],
+        moves[1],
         np.zeros(p),
-        np.zeros((p, groups, order + 2)),
-        np.zeros((p, groups, order + 2)),
-        np.zeros((p, count, order + 2)),
-        np.zeros((p, count, order + 1)),
-        np.zeros((p, groups, order + 1)),
+        nodes[0],
+        nodes[1],
+        springs[0],
+        springs[1],
+        nodes[2],
         np.zeros((count if p > 0 else 0, order + 1)),
         np.zeros(p, np.int64),
     )
@@ -216,10 +214,13 @@ def springs_of(ends: Branches, g: int) -> tuple[np.int64, np.int64]:
 @inlined
 def _product(x: Array, y: Array, i: int, n: int, first: int, last: int) -> float:
     """Σ x_j y_{n-j} of spring i for j from first to last."""
-    total = 0.0
-    for j in range(first, last + 1):
-        total += x[i, j] * y[i, n - j]
-    return total
+    even = odd = 0.0  # two sums at once
+    for j in range(first, last, 2):
+        even += x[i, j] * y[i, n - j]
+        odd += x[i, j + 1] * y[i, n - j - 1]
+    if (last - first) % 2 == 0:
+        even += x[i, last] * y[i, n - last]
+    return even + odd
 
 
 @inlined
@@ -229,7 +230,8 @@ def _stress_term(law: Array, i: int, eps: Array, sig: Array, n: int) -> float:
     if n > 0:
         if law[i, CURVED] == 0.0:
             return k * eps[i, n]
-        return (k * eps[i, n] + _product(eps, sig, i, n, 1, n)) * law[i, ROOM]
+        known = _product(eps, sig, i, n, 1, n - 1)
+        return ((k + sig[i, 0]) * eps[i, n] + known) * law[i, ROOM]
     x = eps[i, 0] - law[i, ORIGIN]
     if law[i, CURVED] == 0.0:
         return law[i, OFFSET] + k * x
@@ -338,7 +340,7 @@ def _group_term(
     """Order n of the common stress of a group whose elongation u and its rate are known."""
     if i1 - i0 == 1:
         if n > 0:
-            eps[i0, n] = u_n / heights[i0]
+            eps[i0, n] = u_n * (1.0 / heights[i0])  # the quotient waits for nothing
         sig[i0, n] = _stress_term(law, i0, eps, sig, n)
         if eta[i0] == 0.0:
             return sig[i0, n]
@@ -375,12 +377,52 @@ def _stressed_term(
     return True
 
 
-@inner
+@inlined
+def _is_bare(links: Links) -> bool:
+    """Whether every spring is undamped and alone between two masses."""
+    if links.top != FREE or links.ends.size != links.eta.size:
+        return False
+    damped = 0
+    for i in range(links.eta.size):
+        damped += links.eta[i] > 0.0
+    return damped == 0
+
+
+@inlined
+def _expand_bare(links: Links, s: Series, push: Array, order: int) -> None:
+    """Fill the series of a chain that `_is_bare`, as `expand` does, asking less at each order."""
+    law, _, heights, _, mass, drag, _ = links
+    w, v, eps, sig, _ = s
+    last = heights.size - 1
+    for n in range(order + 1):
+        share = 1.0 / (n + 1)
+        for i in range(last + 1):
+            eps[i, n] = (w[i, n] - (w[i - 1, n] if i > 0 else 0.0)) * (1.0 / heights[i])
+            sig[i, n] = _stress_term(law, i, eps, sig, n)
+        for i in range(last + 1):
+            net = -sig[i, n]
+            if i < last:
+                net += sig[i + 1, n]
+            else:
+                net += push[n] if n < 2 else 0.0
+                if drag > 0.0:
+                    net -= drag * v[i, n]
+            v[i, n + 1] = net * (share / mass[i])
+            w[i, n + 1] = v[i, n] * share
+    for i in range(last + 1):
+        for n in range(order + 1):
+            s.group[i, n] = sig[i, n]
+
+
+@inlined
 def expand(links: Links, s: Series, push: Array, motion: Array, order: int) -> bool:
     """Fill the series up to `order`; false if a prescribed stress meets a flat branch.
 
     `push` (2,) is the stress on the top and its rate, `motion` (2,) its displacement and rate.
     """
+    if _is_bare(links):
+        _expand_bare(links, s, push, order)
+        return True
     law, eta, heights, ends, mass, drag, top = links
     w, v, eps, sig, group = s
     last = ends.size - 1
@@ -416,7 +458,7 @@ def expand(links: Links, s: Series, push: Array, motion: Array, order: int) -> b
                 net = (group[g + 1, n] if g < last else push_n) - group[g, n]
                 if g == last and drag > 0.0:
                     net -= drag * v[g, n]
-                v[g, n + 1] = net * share / mass[g]
+                v[g, n + 1] = net * (share / mass[g])
                 w[g, n + 1] = v[g, n] * share
             elif top == VISCOUS:
                 v[g, n] = (push_n - group[g, n]) / drag
@@ -543,19 +585,6 @@ def _group_tangent(
 
 
 @inner
-def start_tangents(links: Links, s: Series, t: Tangents, no_eta: Array) -> None:
-    """Derivatives of the strains of springs that a prescribed motion finds in equilibrium."""
-    zero = np.int64(0)
-    calm = Links(links.law, no_eta, links.heights, links.ends, links.mass, links.drag, links.top)
-    for i in range(links.eta.size):
-        s.sig[i, 0] = _stress_term(links.law, i, s.eps, s.sig, zero)
-        _fill_slope(links.law, i, s.sig, t.slope)
-    for p in range(t.drag.size):
-        moves, d = direction(t, p)
-        _group_tangent(calm, s, t.slope, moves, d, links.ends.size - 1, zero)
-
-
-@inner
 def _expand_tangent(links: Links, s: Series, slope: Array, m: Moves, d: Series, order: int) -> None:
     """Fill the derivatives in one direction up to `order`."""
     last = links.ends.size - 1
@@ -609,16 +638,21 @@ def _move(c: Array, order: int, span: float) -> None:
 
 
 @inner
-def advance(s: Series, d: Tangents, order: int, d_order: int, span: float) -> None:
-    """Carry the state, and its derivatives (to d_order), over a step of length `span`."""
+def advance(s: Series, order: int, span: float) -> None:
+    """Carry the state over a step of length `span`."""
     _move(s.w, order, span)
     _move(s.v, order, span)
     _move(s.eps, order, span)
+
+
+@inner
+def advance_tangents(d: Tangents, order: int, span: float) -> None:
+    """Carry the derivatives of the state over a step of length `span`."""
     for p in range(d.drag.size):
         if d.live[p] != 0:
-            _move(d.w[p], d_order, span)
-            _move(d.v[p], d_order, span)
-            _move(d.eps[p], d_order, span)
+            _move(d.w[p], order, span)
+            _move(d.v[p], order, span)
+            _move(d.eps[p], order, span)
 
 
 # ---------------------------------------------------------------- without inertia and damping

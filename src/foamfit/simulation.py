@@ -287,6 +287,7 @@ class Plan:
                 order,
                 min(max_steps, most) if self.implicit is None else max_steps,
                 directions,
+                self._start(rows, heights, directions),
                 displacement,
                 stress,
                 *slopes,
@@ -313,6 +314,33 @@ class Plan:
             displacement, stress, contact_end, log[:switches], steps, method,
             slopes if p > 0 and method == TAYLOR else None, float(lost[0]),
         )  # fmt: skip
+
+    def _start(self, rows: Array, heights: Array, directions: Directions) -> Array:
+        """Strains (1 + p, springs) in equilibrium with the first sample, and their derivatives."""
+        start = np.zeros((1 + len(directions), len(heights)))
+        if self.speed > 0.0 or self.top not in (taylor.MOTION, taylor.STRESS):
+            return start
+        first = self.ends[-2] if len(self.ends) > 1 else 0
+        rows, heights = rows[first:], heights[first:]
+        strain = np.empty((len(heights), 1))
+        branches = np.empty(strain.shape, np.int64)
+        stress = self.values[:1].copy()
+        if self.top == taylor.STRESS:  # a dashpot holds its spring where it is
+            kernels.strains_along(rows, stress, strain, branches)
+            free = (rows[:, kernels.ETA] == 0.0) & np.isfinite(strain[:, 0])
+            start[0, first:] = np.where(free, strain[:, 0], 0.0)
+            return start
+        kernels.equilibrium_along(rows, heights, self.values[:1], stress, strain, branches)
+        start[0, first:] = strain[:, 0]
+        own = np.flatnonzero(directions[:, 0] >= first)
+        if len(own):
+            local = directions[own] - np.array([first, 0])
+            moved, _ = equilibrium_tangents(rows, heights, strain, branches, True, local)
+            longer = np.diff(moved[:, :, 0], axis=1, prepend=0.0)
+            for p, (spring, what) in enumerate(local):
+                longer[p, spring] -= strain[spring, 0] if what == series.HEIGHT else 0.0
+            start[1 + own, first:] = longer / heights
+        return start
 
     def _is_one(self, rows: Array) -> bool:
         """Tell whether an impact acts on springs so many and so plain that they count as one."""

@@ -24,8 +24,8 @@ from foamfit.kernels import (
     compiled,
     equilibrate,
     first_branch,
+    inlined,
     inner,
-    maker,
     strain_on,
 )
 from foamfit.polynomial import fill_values, first_crossing, slope_at, value_at
@@ -44,6 +44,7 @@ from foamfit.series import (
     Series,
     Tangents,
     advance,
+    advance_tangents,
     enter,
     enter_tangents,
     expand,
@@ -51,7 +52,6 @@ from foamfit.series import (
     make_series,
     make_tangents,
     springs_of,
-    start_tangents,
 )
 
 __all__ = ["FREE", "MOTION", "STRESS", "VISCOUS", "integrate"]
@@ -79,17 +79,19 @@ class Samples(NamedTuple):
 # ---------------------------------------------------------------- the length of a step
 
 
-@inner
-def _longest(c: Array, order: int, scale: float, tol: float, span: float) -> float:
-    """Step at which the last two terms of a series fall below tol × scale."""
-    for n in (order - 1, order):
-        size = abs(c[n])
-        if size * span**n > tol * scale:
-            span = (tol * scale / size) ** (1.0 / n)
-    return span
+@inlined
+def _tail(links: Links, s: Series, n: int, reach: float, load: float) -> float:
+    """Largest coefficient of order n among strains and stresses, over motion and stress so far."""
+    worst = 0.0
+    for i in range(links.heights.size):
+        if reach > 0.0:
+            worst = max(worst, abs(s.eps[i, n]) * links.heights[i] / reach)
+        if load > 0.0:
+            worst = max(worst, abs(s.sig[i, n]) / load)
+    return worst
 
 
-@inner
+@inlined
 def _step_length(
     links: Links,
     s: Series,
@@ -100,25 +102,20 @@ def _step_length(
     w_scale: float,
     s_scale: float,
 ) -> float:
-    """Longest step within `span` that truncates below `tol` of the motion and stress so far."""
-    reach = w_scale
-    load = max(s_scale, abs(push[0]))
-    count = links.heights.size
+    """Longest step within `span` whose last two terms fall below `tol` of motion and stress."""
+    reach, load = w_scale, max(s_scale, abs(push[0]))
     for _ in range(60):  # at rest the only scale is what the step itself reaches
         tried = span
         if w_scale == 0.0 or s_scale == 0.0:
             reach = max(w_scale, abs(s.w[-1, 1]) * span if links.top != STRESS else 0.0)
             load = max(s_scale, max(abs(push[0]), abs(push[1]) * span))
-            for i in range(count):
+            for i in range(links.heights.size):
                 reach = max(reach, links.heights[i] * abs(s.eps[i, 1]) * span)
                 load = max(load, abs(s.sig[i, 1]) * span)
-        if reach == 0.0 and load == 0.0:
-            return span
-        for i in range(count):
-            if reach > 0.0:
-                span = _longest(s.eps[i], order, reach / links.heights[i], tol, span)
-            if load > 0.0:
-                span = _longest(s.sig[i], order, load, tol, span)
+        for n in (order - 1, order):
+            tail = _tail(links, s, n, reach, load)
+            if tail * span**n > tol:
+                span = (tol / tail) ** (1.0 / n)
         if span >= 0.5 * tried or (w_scale > 0.0 and s_scale > 0.0):
             break
     return span
@@ -136,8 +133,8 @@ def _first_switch(links: Links, s: Series, order: int, span: float) -> tuple[flo
 
 
 @inner
-def _enough(c: Array, order: int, span: float, tol: float, most: int) -> int:
-    """Orders that the series in the rows of c need over a step, if switches made it short."""
+def _least(c: Array, order: int, span: float, tol: float, most: int) -> int:
+    """Orders that the series in the rows of c need over a step."""
     for i in range(c.shape[0]):
         size, power = abs(c[i, 0]), 1.0
         for n in range(1, order + 1):
@@ -152,6 +149,15 @@ def _enough(c: Array, order: int, span: float, tol: float, most: int) -> int:
     return most
 
 
+@inner
+def _enough(s: Series, order: int, span: float, tol: float) -> int:
+    """Orders that are enough over a step, if a switch made it short."""
+    least = min(order, 2)
+    if span == 0.0:
+        return least
+    return _least(s.sig, order, span, tol, _least(s.eps, order, span, tol, least))
+
+
 # ---------------------------------------------------------------- samples
 
 
@@ -160,8 +166,6 @@ def _sample(
     links: Links, s: Series, order: int, out: Samples, first: int, last: int, now: float, c: Array
 ) -> None:
     """Write displacements and base stress at the samples first … last-1 of a step; c is scratch."""
-    if first == last:
-        return
     fill_values(s.group[0], order, out.t, first, last, now, out.s)
     if out.w.shape[0] == 1 and links.top != STRESS:
         fill_values(s.w[links.ends.size - 1], order, out.t, first, last, now, out.w[0])
@@ -221,6 +225,23 @@ def _mend_kink(out: Samples, s: Series, d: Tangents, knot: int) -> None:
         out.ds[p, knot] += share * (d.group[p, 0, 0] - out.ds[p, knot])
 
 
+@inner
+def _fill_before(out: Samples, speed: float) -> int:
+    """Before contact nothing presses and only the striker moves; returns the first sample after."""
+    nodes, done = out.w.shape[0], 0
+    while done < out.t.size and out.t[done] < 0.0:
+        done += 1
+    for j in range(done):
+        out.s[j] = 0.0
+        for i in range(nodes):
+            out.w[i, j] = speed * out.t[j] if i == nodes - 1 else 0.0
+        for p in range(out.ds.shape[0]):
+            out.ds[p, j] = 0.0
+            for i in range(nodes):
+                out.dw[p, i, j] = 0.0
+    return done
+
+
 # ---------------------------------------------------------------- the end of contact
 
 
@@ -246,7 +267,7 @@ def _delay(s: Series, d: Tangents, order: int, span: float, late: Array) -> None
         late[p] = -value_at(d.group[p, 0], order, span) / fall
 
 
-@maker
+@inner
 def _depart(
     links: Links,
     s: Series,
@@ -256,23 +277,24 @@ def _depart(
     span: float,
     now: float,
     late: Array,
+    rate: Array,
+    w_end: Array,
     out: Samples,
     done: int,
 ) -> None:
     """Fill the samples after contact, which ends at the end of this step, at the time `now`.
 
     A later end (`late`) leaves the nodes as they move until then, and the top with the velocity
-    that it has then.
+    that it has then. `rate` and `w_end` (nodes,) are scratch.
     """
     nodes, count, top = out.w.shape[0], links.heights.size, links.ends.size - 1
     pull = slope_at(s.v[top], order, span)
-    rate = np.zeros(nodes)
     speed = 0.0
     for i in range(count):
         speed += links.heights[i] * slope_at(s.eps[i], order, span)
         rate[min(i, nodes - 1)] = speed
-    advance(s, d, order, more, span)
-    w_end = np.zeros(nodes)
+    advance(s, order, span)
+    advance_tangents(d, more, span)
     place = 0.0
     for i in range(count):
         place += links.heights[i] * s.eps[i, 0]
@@ -300,7 +322,9 @@ def _settle(links: Links, s: Series) -> None:
     """Share the elongation of undamped groups anew, so that rounding does not pile up."""
     for g in range(links.ends.size):
         i0, i1 = springs_of(links.ends, g)
-        plain = i1 - i0 > 1 and not (g == links.ends.size - 1 and links.top == STRESS)
+        plain = not (g == links.ends.size - 1 and links.top == STRESS)
+        if i1 - i0 == 1:
+            continue
         compliance = 0.0
         miss = s.w[g, 0] - (s.w[g - 1, 0] if g > 0 else 0.0)
         for i in range(i0, i1):
@@ -392,6 +416,80 @@ def _switch(
     return switches
 
 
+# ---------------------------------------------------------------- from step to step
+
+
+@inner
+def _prescribe(
+    top: int, values: Array, t: Array, knot: int, now: float, push: Array, motion: Array
+) -> float:
+    """Write what the top is given between samples knot and knot + 1; returns when that ends."""
+    horizon, rate = t[t.size - 1], 0.0
+    if t.size > 1:
+        horizon = t[knot + 1]
+        rate = (values[knot + 1] - values[knot]) / (t[knot + 1] - t[knot])
+    driven = motion if top == MOTION else push
+    driven[0], driven[1] = values[knot] + rate * (now - t[knot]), rate
+    return horizon
+
+
+@inner
+def _first_lift(s: Series, order: int, pressed: bool, span: float) -> tuple[float, bool]:
+    """When within `span` the base stress meets zero again, and whether it does."""
+    when, where = first_crossing(s.group[0], order, 0.0, math.inf, span)
+    if pressed and s.group[0, 0] <= 0.0 and s.group[0, 1] <= 0.0:
+        when, where = 0.0, -1  # a unilateral spring has just opened
+    pressed = pressed or s.group[0, 0] > 0.0
+    if where != 0 and when <= span and (pressed or when > 0.0):
+        return when, True
+    return span, False
+
+
+@inner
+def _begin(
+    rows: Array,
+    start: Array,
+    speed: float,
+    directions: Branches,
+    branches: Branches,
+    links: Links,
+    s: Series,
+    d: Tangents,
+) -> None:
+    """Write the state at the first sample: branches, strains and their derivatives."""
+    s.v[-1, 0] = speed
+    for i in range(branches.size):
+        s.eps[i, 0] = start[0, i]
+        branches[i] = branch_at_strain(rows[i], first_branch(rows[i]), start[0, i])
+        links.eta[i] = rows[i, ETA]
+        enter(rows, i, branches[i], links.law)
+        enter_tangents(rows, i, branches[i], directions, d)
+        for p in range(directions.shape[0]):
+            d.eps[p, i, 0] = start[1 + p, i]
+            d.live[p] = d.live[p] or start[1 + p, i] != 0.0
+
+
+@inner
+def _loaded(s: Series, s_scale: float) -> float:
+    """Largest stress so far."""
+    for i in range(s.sig.shape[0]):
+        s_scale = max(s_scale, abs(s.sig[i, 0]))
+    return s_scale
+
+
+@inner
+def _reached(links: Links, s: Series, w_scale: float) -> tuple[float, float]:
+    """Largest displacement so far, and a number that is finite only if the state is."""
+    top = links.ends.size - 1
+    total = s.w[top, 0]
+    if links.top != STRESS:
+        w_scale = max(w_scale, abs(s.w[top, 0]))
+    for i in range(links.heights.size):
+        w_scale = max(w_scale, links.heights[i] * abs(s.eps[i, 0]))
+        total += s.eps[i, 0]
+    return w_scale, total
+
+
 @compiled
 def integrate(
     rows: Array,
@@ -407,13 +505,14 @@ def integrate(
     order: int,
     max_steps: int,
     directions: Branches,
+    start: Array,
     out_w: Array,
     out_s: Array,
     out_dw: Array,
     out_ds: Array,
     log: Array,
 ) -> tuple[int, float, int, int]:
-    """Integrate a chain from rest (or struck) over the samples t.
+    """Integrate a chain over the samples t.
 
     Parameters
     ----------
@@ -439,6 +538,8 @@ def integrate(
         Truncation of a step relative to the motion so far; order of the series; bound on steps.
     directions : (p, 2) array
         What derivatives are carried along: spring and its own parameter, or HEIGHT, or -1 and DRAG.
+    start : (1 + p, springs) array
+        The strains from which the springs start, never loaded before, and their derivatives.
     out_w, out_s, out_dw, out_ds : arrays
         Filled; see `Samples`. The derivatives have p = 0 where none are wanted.
     log : (m, 5) array
@@ -449,77 +550,49 @@ def integrate(
     tuple
         Outcome, end of contact (NaN if none), steps taken, switches (also those past the log).
     """
-    count, groups = rows.shape[0], ends.size
-    out = Samples(t, out_w, out_s, out_dw, out_ds)
+    count, size = rows.shape[0], directions.shape[0]
+    struck, tangent = speed > 0.0, size > 0
     links = Links(np.empty((count, N_LAW)), np.empty(count), heights, ends, mass, drag, top)
-    s = make_series(count, groups, order)
-    d = make_tangents(count, groups, order, directions)
-    tangent = directions.shape[0] > 0
+    s = make_series(count, ends.size, order)
+    d = make_tangents(count, ends.size, order, directions)
+    out = Samples(t, out_w, out_s, out_dw, out_ds)
     branches = np.empty(count, np.int64)
-    push, motion, scratch = np.zeros(2), np.zeros(2), np.zeros(order + 1)
-    late = np.zeros(directions.shape[0])
-    for i in range(count):
-        branches[i] = first_branch(rows[i])
-        links.eta[i] = rows[i, ETA]
-    struck = speed > 0.0
-    now = 0.0 if struck else t[0]
-    done = 0
-    while struck and done < t.size and t[done] < 0.0:  # the striker is still on its way
-        out_w[-1, done] = speed * t[done]
-        done += 1
-    _fill_before(out, done)
-    s.v[groups - 1, 0] = speed
-    if not struck:
-        start(rows, branches, heights, ends, top, values[0], s.w, s.eps)
-    for i in range(count):
-        enter(rows, i, branches[i], links.law)
-        enter_tangents(rows, i, branches[i], directions, d)
-    if tangent and top == MOTION:
-        start_tangents(links, s, d, np.zeros(count))
-    w_scale, s_scale, pressed, knot, switches = 0.0, 0.0, False, 0, 0
-    stalled = 0
-    fresh = False
+    push, motion, scratch, late = np.zeros(2), np.zeros(2), np.zeros(order + 1), np.zeros(size)
+    rate, w_end = np.zeros(out_w.shape[0]), np.zeros(out_w.shape[0])
+    _begin(rows, start, speed, directions, branches, links, s, d)
+    w_scale, s_scale, pressed, knot, switches, stalled = 0.0, 0.0, False, 0, 0, 0
+    now, done = (0.0 if struck else t[0]), 0
+    if struck:
+        done = _fill_before(out, speed)
     for step in range(max_steps):
         if done == t.size:
             return DONE, math.nan, step, switches
-        horizon = t[t.size - 1]
+        fresh, horizon = False, t[t.size - 1]
         if not struck:
-            fresh = False
             while knot < t.size - 2 and now >= t[knot + 1]:
                 knot += 1
                 fresh = True
-            rate = 0.0
-            if t.size > 1:
-                horizon = t[knot + 1]
-                rate = (values[knot + 1] - values[knot]) / (t[knot + 1] - t[knot])
-            driven = motion if top == MOTION else push
-            driven[0], driven[1] = values[knot] + rate * (now - t[knot]), rate
+            horizon = _prescribe(top, values, t, knot, now, push, motion)
         if not expand(links, s, push, motion, order):
             return FLAT_UNDER_STRESS, math.nan, step, switches
-        span = horizon - now
-        span = _step_length(links, s, push, order, tol, span, w_scale, s_scale)
+        if step > 0:
+            s_scale = _loaded(s, s_scale)
+        span = _step_length(links, s, push, order, tol, horizon - now, w_scale, s_scale)
         if not math.isfinite(span) or not math.isfinite(s.group[0, order]):
             return NOT_FINITE, math.nan, step, switches
         span, spring, side = _first_switch(links, s, order, span)
         leaves = False
         if struck:
-            when, where = first_crossing(s.group[0], order, 0.0, math.inf, span)
-            if pressed and s.group[0, 0] <= 0.0 and s.group[0, 1] <= 0.0:
-                when, where = 0.0, -1  # a unilateral spring has just opened
+            span, leaves = _first_lift(s, order, pressed, span)
             pressed = pressed or s.group[0, 0] > 0.0
-            if where != 0 and when <= span and (pressed or when > 0.0):
-                span, leaves, spring = when, True, -1
+            spring = -1 if leaves else spring
         end = now + span
         stalled = stalled + 1 if span == 0.0 else 0
         if (end <= now and span > 0.0) or stalled > 4 * count + 8:
             return STEP_UNDERFLOW, math.nan, step, switches
         last = end >= horizon and not leaves and spring < 0
-        if last:
-            end = horizon
-        enough = min(order, 2)
-        if span > 0.0:
-            enough = _enough(s.eps, order, span, 1e-3 * tol, enough)
-            enough = _enough(s.sig, order, span, 1e-3 * tol, enough)
+        end = horizon if last else end
+        enough = _enough(s, order, span, 1e-3 * tol)
         more = min(enough + 2, order)  # for what is, in time, a derivative of these
         if tangent:
             expand_tangents(links, s, d, more)
@@ -528,24 +601,20 @@ def integrate(
         first = done
         while done < t.size and (t[done] < end or (last and t[done] <= end)):
             done += 1
-        _sample(links, s, enough, out, first, done, now, scratch)
-        if tangent and first < done:
-            _sample_tangents(links, s, d, more, out, first, done, now, scratch)
+        if first < done:
+            _sample(links, s, enough, out, first, done, now, scratch)
         if tangent:
+            _sample_tangents(links, s, d, more, out, first, done, now, scratch)
             _delay(s, d, more, span, late)
         now = end
         if leaves:
-            _depart(links, s, d, order, more, span, now, late, out, done)
+            _depart(links, s, d, order, more, span, now, late, rate, w_end, out, done)
             return DONE, now, step + 1, switches
-        for i in range(count):
-            s_scale = max(s_scale, abs(value_at(s.sig[i], order, span)))
-        advance(s, d, order, more, span)
-        w_scale = max(w_scale, abs(s.w[groups - 1, 0]) if top != STRESS else 0.0)
-        reached = s.w[groups - 1, 0]
-        for i in range(count):
-            w_scale = max(w_scale, heights[i] * abs(s.eps[i, 0]))
-            reached += s.eps[i, 0]
-        if not math.isfinite(reached):
+        advance(s, order, span)
+        if tangent:
+            advance_tangents(d, more, span)
+        w_scale, total = _reached(links, s, w_scale)
+        if not math.isfinite(total):
             return NOT_FINITE, math.nan, step, switches
         _settle(links, s)
         if spring >= 0:
@@ -554,17 +623,3 @@ def integrate(
                 log, switches,
             )  # fmt: skip
     return TOO_MANY_STEPS, math.nan, max_steps, switches
-
-
-@inner
-def _fill_before(out: Samples, done: int) -> None:
-    """Before contact nothing presses, and nothing but the striker moves."""
-    nodes = out.w.shape[0]
-    for j in range(done):
-        out.s[j] = 0.0
-        for i in range(nodes - 1):
-            out.w[i, j] = 0.0
-        for p in range(out.ds.shape[0]):
-            out.ds[p, j] = 0.0
-            for i in range(nodes):
-                out.dw[p, i, j] = 0.0
