@@ -23,9 +23,9 @@ import foamfit as ff
 from foamfit import kernels
 from foamfit.chain import Drive
 from foamfit.measurement import Measurement, Noise, Specimen, Striker
+from foamfit.motion import plan
 from foamfit.problem import make_params, make_problem
 from foamfit.search import Tracker
-from foamfit.simulation import plan
 
 COUNTS: Counter[str] = Counter()
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import foamfit as ff
-from foamfit import aggregate, kernels, simulation
-from foamfit.simulation import AGGREGATE, TAYLOR, Response, plan
+from foamfit import aggregate, kernels, motion
+from foamfit.motion import AGGREGATE, TAYLOR, plan
+from foamfit.simulation import Response
 from reference import Bistable, Chain, Impact, Linear, energy_balance
 from test_simulate import AREA, MODEL_1, built
 
@@ -44,7 +45,7 @@ def chain_of(count: int, spread: float = 0.1, linear: bool = False, drag: float 
 def one_by_one(chain: ff.Chain, speed: float, time: np.ndarray = TIME) -> Response:
     """The same impact with every spring followed through every step, to eleven digits."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(simulation, "LEAST_AGGREGATE", 10**9)
+        patch.setattr(motion, "LEAST_AGGREGATE", 10**9)
         response = ff.simulate(chain, ff.Impact(STRIKER, speed), time, rtol=1e-11)
     assert response.method == TAYLOR
     return response

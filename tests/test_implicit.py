@@ -8,7 +8,7 @@ import pytest
 
 import foamfit as ff
 from foamfit import implicit, taylor
-from foamfit.simulation import RADAU, TAYLOR, Motion, plan
+from foamfit.motion import RADAU, TAYLOR, Motion, plan
 from reference import Bistable, Chain, Impact, Linear, energy_balance
 from test_simulate import (
     AREA,
@@ -252,8 +252,8 @@ def test_the_choice() -> None:
 
 
 def test_explicit_steps_that_fail_are_taken_over(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("foamfit.simulation.MOST_RELAXATION", np.inf)
-    monkeypatch.setattr("foamfit.simulation.MOST_EXPLICIT", 100)
+    monkeypatch.setattr("foamfit.motion.MOST_RELAXATION", np.inf)
+    monkeypatch.setattr("foamfit.motion.MOST_EXPLICIT", 100)
     got = run(*struck("foam-2", 1e-2), 1e-6, implicit=None)
     assert got.method == RADAU
 

@@ -11,7 +11,7 @@ import pytest
 import foamfit as ff
 from conftest import EXPERIMENTS
 from foamfit import simulation
-from foamfit.simulation import plan
+from foamfit.motion import plan
 
 sys.path.insert(0, str(EXPERIMENTS / "stability"))
 import judges

@@ -25,7 +25,7 @@ from scipy.optimize import brentq
 
 import foamfit as ff
 from foamfit.chain import Drive
-from foamfit.simulation import plan
+from foamfit.motion import plan
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 import reference

@@ -12,7 +12,7 @@ import restarted
 
 import foamfit as ff
 from foamfit.chain import Drive
-from foamfit.simulation import Plan, plan
+from foamfit.motion import Plan, plan
 
 Array = np.ndarray
 Answer = tuple[Array, Array]  # displacement of the top (m) and base stress (Pa), (n,) each

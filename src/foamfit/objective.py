@@ -20,9 +20,9 @@ from foamfit.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.errors import InputError, SimulationError
 from foamfit.measurement import INTEGRATED, Measurement, NoiseLevel, interior_channel
 from foamfit.model import Model
+from foamfit.motion import Motion, Plan
+from foamfit.motion import plan as make_plan
 from foamfit.noise import with_noise
-from foamfit.simulation import Motion, Plan
-from foamfit.simulation import plan as make_plan
 from foamfit.spring import LinearSpring
 
 Array = NDArray[np.float64]
@@ -386,7 +386,8 @@ class Objective:
                 )
             masses = [specimen.mass / (count - 1)] * (count - 1) + [0.0]
         chain = Chain(springs, heights, specimen.area, masses)
-        return replace(make_plan(chain, loading, self.time, dashpots=damped), max_steps=MAX_STEPS)
+        plan = make_plan(chain, loading, self.time, dashpots=damped)
+        return plan._replace(max_steps=MAX_STEPS)
 
     def _measured(self) -> dict[str, Array | None]:
         """Measured curves that the drive leaves free."""

@@ -1,0 +1,428 @@
+"""A scene made ready, and its motion by the least solver that it needs."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from foamfit import aggregate, implicit, kernels, series, taylor
+from foamfit.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
+from foamfit.errors import SimulationError
+from foamfit.series import equilibrium_tangents
+from foamfit.spring import as_samples
+
+Array = NDArray[np.float64]
+Directions = NDArray[np.int64]
+
+CLOSED_FORM, FIRST_ORDER, SECOND_ORDER = "closed form", "first order", "second order"
+TAYLOR, RADAU, AGGREGATE = "Taylor series", "Radau IIA", "aggregate"
+MAX_STEPS = 2_000_000
+# Explicit steps are given up where something relaxes, or vibrates, so many times (in radians) while
+# the scene lasts, or after so many steps.
+MOST_RELAXATION, MOST_VIBRATION, MOST_EXPLICIT = 1e4, 1e5, 200_000
+# Bounds on steps times springs (seconds, not hours): for all but the samples of a drive, before
+# explicit steps are given up, and for everything.
+MOST_WORK, MOST_EXPLICIT_WORK, MOST_SAMPLED = 1_500_000, 500_000, 10_000_000
+# From so many springs on, those that carry one stress are integrated as one.
+LEAST_AGGREGATE = 9
+
+_OUTCOMES = {
+    taylor.TOO_MANY_STEPS: "the bound of {steps} steps was reached: something in the scene is "
+    "too fast to be followed (a light mass or a heavy dashpot)",
+    taylor.STEP_UNDERFLOW: "the step shrank to nothing near t = {time:g} s: there the scene "
+    "changes faster than numbers can tell (a strain at the end of its branch, a very light mass, "
+    "or many springs on a flat branch)",
+    taylor.FLAT_UNDER_STRESS: "a prescribed stress acts on a flat branch (kh_plus or kh_minus = 0) "
+    "that nothing slows; give the top a mass or the spring a dashpot",
+    taylor.NOT_FINITE: "a stress or strain is no longer finite: the drive goes past the end of a "
+    "branch (strain 1 on branch a, 1 + eps_star on branch c)",
+}
+
+
+NO_DIRECTIONS: Directions = np.empty((0, 2), np.int64)
+NO_SWITCHES = np.empty((0, 5))
+_NOTHING = np.zeros(1)
+
+
+class Slopes(NamedTuple):
+    """Derivatives of displacement (p, nodes, n_t) and base stress (p, n_t) in p directions."""
+
+    displacement: Array
+    base_stress: Array
+
+
+NO_SLOPES = Slopes(np.empty((0, 0, 0)), np.empty((0, 0)))
+
+
+class Motion(NamedTuple):
+    """The bare outcome of a run; see `Response`. `slopes` is None where none were asked for."""
+
+    displacement: Array
+    base_stress: Array
+    contact_end: float
+    switches: Array
+    steps: int
+    method: str = CLOSED_FORM
+    slopes: Slopes | None = None
+    unresolved: float = 0.0  # vibrations that were damped out, relative to the ranges
+
+
+@lru_cache(maxsize=64)
+def accuracy(tolerance: float, most: int) -> tuple[float, int]:
+    """Truncation of a step and the order of series that fits it, at most `most`."""
+    tolerance = max(tolerance, 1e-16)
+    return tolerance, min(max(round(4.0 - 0.5 * math.log(tolerance)), 6), most)
+
+
+class Plan(NamedTuple):
+    """A scene made ready to run many times with other springs: what does not change between runs.
+
+    Attributes
+    ----------
+    solver : str
+        The least solver.
+    height : float
+        H, m.
+    ends, mass : arrays
+        The groups of springs and the areal masses between them; see `foamfit.taylor.integrate`.
+    drag : float
+        η_site/H, Pa·s/m.
+    top : int
+        What is known of the top; see `foamfit.taylor`.
+    values, time : (n,) arrays
+        The drive and its samples.
+    speed : float
+        Velocity of the striker, m/s; 0 = no impact.
+    max_steps : int
+        Bound on the steps of the integrator.
+    lossless : bool
+        Whether there is neither a dashpot nor a mass inside.
+    implicit : bool or None
+        Whether to take implicit steps; None = where explicit ones are the wrong tool.
+    """
+
+    solver: str
+    height: float
+    ends: NDArray[np.int64]
+    mass: Array
+    drag: float
+    top: int
+    values: Array
+    time: Array
+    speed: float
+    max_steps: int = MAX_STEPS
+    lossless: bool = False
+    implicit: bool | None = None
+
+    def run(
+        self,
+        rows: Array,
+        heights: Array,
+        rtol: float = 1e-6,
+        *,
+        drag: float | None = None,
+        everything: bool = True,
+        directions: Directions = NO_DIRECTIONS,
+    ) -> Motion:
+        """Run the scene with the springs in `rows` (n_springs, columns) and their heights (m).
+
+        `drag` replaces the scene's own. With `everything` false only the base stress and the
+        displacement of the top, shape (1, n_t), are sure to be there. `directions` (p, 2) are those
+        of the derivatives to carry along; see `foamfit.series`.
+
+        Raises
+        ------
+        SimulationError
+            If the scene has no finite answer; the message says why.
+        """
+        drag = self.drag if drag is None else drag
+        if self.solver == CLOSED_FORM:
+            return self._closed_form(rows, heights, everything, directions)
+        return self._integrate(rows, heights, rtol, drag, everything, directions)
+
+    def _closed_form(
+        self, rows: Array, heights: Array, everything: bool, directions: Directions
+    ) -> Motion:
+        """Undamped and massless: one stress in all springs; or one spring under known motion."""
+        moved = self.top == taylor.MOTION
+        strain = np.empty((len(heights), self.time.size))
+        branches = np.empty(strain.shape, np.int64)
+        stress = np.array(self.values)
+        if moved:
+            kernels.equilibrium_along(rows, heights, self.values, stress, strain, branches)
+        else:
+            kernels.strains_along(rows, stress, strain, branches)
+        slopes: Slopes | None = None
+        if len(directions):
+            slopes = Slopes(
+                *equilibrium_tangents(rows, heights, strain, branches, moved, directions)
+            )
+        eta = rows[0, kernels.ETA]
+        if moved and len(heights) == 1 and stress.size > 1 and (eta > 0.0 or slopes is not None):
+            rate = np.gradient(strain[0], self.time)
+            stress = stress + eta * rate
+            for p, (_, what) in enumerate(directions):
+                if slopes is not None and what == series.OWN_ETA:
+                    slopes.base_stress[p] += rate
+                elif slopes is not None and what == series.HEIGHT:
+                    slopes.base_stress[p] -= eta * rate / heights[0]
+        if not math.isfinite(kernels.total(stress) + kernels.total(strain.ravel())):
+            raise SimulationError(_OUTCOMES[taylor.NOT_FINITE])
+        if not everything:
+            if slopes is not None:
+                slopes = Slopes(slopes.displacement[:, -1:], slopes.base_stress)
+            top = (heights @ strain)[None, :]
+            return Motion(top, stress, math.nan, NO_SWITCHES, 0, CLOSED_FORM, slopes)
+        nodes = np.cumsum(heights[:, None] * strain, axis=0)
+        switches = _switches(self.time, strain, branches)
+        return Motion(nodes, stress, math.nan, switches, 0, CLOSED_FORM, slopes)
+
+    def _integrate(
+        self,
+        rows: Array,
+        heights: Array,
+        rtol: float,
+        drag: float,
+        everything: bool,
+        directions: Directions,
+    ) -> Motion:
+        """Integrate in time, by explicit steps where they are not the wrong tool."""
+        if not self._is_stiff(rows, heights, drag):
+            if len(rows) >= LEAST_AGGREGATE and not len(directions) and self._is_one(rows):
+                return self._aggregate(rows, heights, rtol, drag, everything)
+            motion = self._explicit(rows, heights, rtol, drag, everything, directions)
+            if motion is not None:
+                return motion
+        return self._implicit(rows, heights, rtol, drag, everything)
+
+    def _aggregate(
+        self, rows: Array, heights: Array, rtol: float, drag: float, everything: bool
+    ) -> Motion:
+        """Springs under one stress count as one.
+
+        One step to a switch: the errors of many add up, and one order more costs little.
+        """
+        displacement, stress = self._curves(heights, everything)
+        log = np.empty((4 * len(heights) + 64, 5))
+        tolerance, order = accuracy(1e-4 * rtol / len(heights), aggregate.DEGREE)
+        ending = aggregate.integrate_aggregate(
+            rows, heights, self.mass[0], drag, self.speed, self.time, tolerance, order,
+            self.max_steps, displacement, stress, log, np.zeros(2, np.int64),
+        )  # fmt: skip
+        return self._motion(AGGREGATE, ending, displacement, stress, log)
+
+    def _explicit(
+        self,
+        rows: Array,
+        heights: Array,
+        rtol: float,
+        drag: float,
+        everything: bool,
+        directions: Directions,
+    ) -> Motion | None:
+        """Taylor series from switch to switch; None if they turn out to be the wrong tool."""
+        count, n, p = len(heights), self.time.size, len(directions)
+        displacement, stress = self._curves(heights, everything)
+        log, slopes = np.empty((1024, 5)), NO_SLOPES
+        if p > 0:
+            slopes = Slopes(np.empty((p, len(displacement), n)), np.empty((p, n)))
+        # Without an interior mass there are few steps: a margin costs little.
+        margin = 1e-2 if len(self.ends) > 1 else 1e-3 if self.speed > 0.0 else 1e-4
+        tolerance, order = accuracy(margin * rtol, 24)
+        most = self._most_steps(count)
+        if self.implicit is None:
+            most = min(most, min(MOST_EXPLICIT, MOST_EXPLICIT_WORK // count) + 20 * n)
+        ending = taylor.integrate(
+            rows, heights, self.ends, self.mass, drag, self.top, self.values, self.speed, self.time,
+            tolerance, order, most, directions, self._start(rows, heights, directions),
+            displacement, stress, slopes.displacement, slopes.base_stress, log,
+        )  # fmt: skip
+        if self.implicit is None and ending[0] in (taylor.TOO_MANY_STEPS, taylor.STEP_UNDERFLOW):
+            return None
+        return self._motion(TAYLOR, ending, displacement, stress, log, slopes if p > 0 else None)
+
+    def _implicit(
+        self, rows: Array, heights: Array, rtol: float, drag: float, everything: bool
+    ) -> Motion:
+        """Radau's implicit steps, which need not follow what is long over."""
+        displacement, stress = self._curves(heights, everything)
+        log, lost = np.empty((1024, 5)), np.zeros(1)
+        tolerance = max((3e-2 if len(self.ends) > 1 else 3e-4) * rtol, 1e-14)
+        ending = implicit.integrate_implicit(
+            rows, heights, self.ends, self.mass, drag, self.top, self.values, self.speed, self.time,
+            tolerance, self._most_steps(len(heights)), displacement, stress, log,
+            np.zeros(2, np.int64), rtol, lost,
+        )  # fmt: skip
+        return self._motion(RADAU, ending, displacement, stress, log, None, float(lost[0]))
+
+    def _most_steps(self, count: int) -> int:
+        """Bound on the steps of a chain of so many springs."""
+        most = MOST_WORK // count + 2 * self.time.size + 8 * count
+        return max(min(self.max_steps, most, MOST_SAMPLED // count), 1)
+
+    def _curves(self, heights: Array, everything: bool) -> tuple[Array, Array]:
+        """Room for displacements and base stress."""
+        n = self.time.size
+        return np.empty((len(heights) if everything else 1, n)), np.empty(n)
+
+    def _motion(
+        self,
+        method: str,
+        ending: tuple[int, float, int, int],
+        displacement: Array,
+        stress: Array,
+        log: Array,
+        slopes: Slopes | None = None,
+        unresolved: float = 0.0,
+    ) -> Motion:
+        """Gather what an integrator found, or say why it found nothing."""
+        outcome, contact_end, steps, switches = ending
+        if outcome != taylor.DONE:
+            last = log[min(switches, len(log)) - 1, 0] if switches else self.time[0]
+            raise SimulationError(_OUTCOMES[outcome].format(steps=steps, time=last))
+        return Motion(
+            displacement, stress, contact_end, log[:switches], steps, method, slopes, unresolved
+        )
+
+    def _start(self, rows: Array, heights: Array, directions: Directions) -> Array:
+        """Strains (1 + p, springs) in equilibrium with the first sample, and their derivatives."""
+        start = np.zeros((1 + len(directions), len(heights)))
+        if self.speed > 0.0 or self.top in (taylor.FREE, taylor.VISCOUS):
+            return start
+        first = self.ends[-2] if len(self.ends) > 1 else 0
+        rows, heights = rows[first:], heights[first:]
+        strain = np.empty((len(heights), 1))
+        branches = np.empty(strain.shape, np.int64)
+        stress = self.values[:1].copy()
+        if self.top == taylor.STRESS:  # a dashpot holds its spring where it is
+            kernels.strains_along(rows, stress, strain, branches)
+            free = (rows[:, kernels.ETA] == 0.0) & np.isfinite(strain[:, 0])
+            start[0, first:] = np.where(free, strain[:, 0], 0.0)
+            return start
+        kernels.equilibrium_along(rows, heights, self.values[:1], stress, strain, branches)
+        start[0, first:] = strain[:, 0]
+        own = np.flatnonzero(directions[:, 0] >= first)
+        if len(own):
+            local = directions[own] - np.array([first, 0])
+            moved, _ = equilibrium_tangents(rows, heights, strain, branches, True, local)
+            longer = np.diff(moved[:, :, 0], axis=1, prepend=0.0)
+            for p, (spring, what) in enumerate(local):
+                longer[p, spring] -= strain[spring, 0] if what == series.HEIGHT else 0.0
+            start[1 + own, first:] = longer / heights
+        return start
+
+    def _is_one(self, rows: Array) -> bool:
+        """Tell whether an impact acts on springs so many and so plain that they count as one."""
+        return (
+            len(self.ends) == 1
+            and self.top == taylor.FREE
+            and self.speed > 0.0
+            and bool(aggregate.holds(rows))
+        )
+
+    def hurry(self, rows: Array, heights: Array, drag: float) -> tuple[float, float]:
+        """Vibration and relaxation (radians) that explicit steps would have to go through."""
+        return implicit.hurry_of(
+            rows, heights, self.ends, self.mass, drag, self.top, self.speed, self.time
+        )
+
+    def _is_stiff(self, rows: Array, heights: Array, drag: float) -> bool:
+        """Tell whether explicit steps would have to follow what is long over."""
+        if self.implicit is not None:
+            return self.implicit
+        if self.lossless and drag == 0.0 and self.speed > 0.0:  # one mass bounces once
+            return False
+        vibration, relaxation = self.hurry(rows, heights, drag)
+        return bool(vibration > MOST_VIBRATION or relaxation > MOST_RELAXATION)
+
+
+def _switches(time: Array, strain: Array, branches: NDArray[np.int64]) -> Array:
+    """List the changes of branch between samples, at the later sample."""
+    springs, samples = np.nonzero(np.diff(branches, axis=1))
+    order = np.argsort(samples, kind="stable")
+    i, j = springs[order], samples[order] + 1
+    return (
+        np.column_stack((time[j], i, branches[i, j - 1], branches[i, j], strain[i, j]))
+        if i.size
+        else np.empty((0, 5))
+    )
+
+
+def _time(t: ArrayLike) -> Array:
+    time = as_samples(t, "t")  # a copy of one compiled type: writable
+    if time.ndim != 1 or time.size == 0:
+        raise ValueError("t must be a one-dimensional array with at least one sample")
+    at = kernels.fault(time)
+    if at >= 0 and not math.isfinite(time[at]):
+        raise ValueError(f"t must be finite; sample {at} is not")
+    if at >= 0:
+        raise ValueError(f"t must increase; sample {at} is not later than the one before it")
+    return time
+
+
+def plan(chain: Chain, drive: Drive, t: ArrayLike, *, dashpots: bool = False) -> Plan:
+    """Find what a scene needs: the nodes that have a state, and the least solver.
+
+    Parameters
+    ----------
+    chain : Chain
+        Only its heights, area, masses, site damping and which springs have a dashpot count.
+    drive : Impact, StressDrive or DisplacementDrive
+        How it is loaded.
+    t : (n_t,) array
+        Samples, s, increasing.
+    dashpots : bool
+        Whether to reckon with a dashpot in every spring, also where it is zero.
+
+    Raises
+    ------
+    ValueError
+        If t does not increase or has not one value per sample of the drive.
+    """
+    time = _time(t)
+    above = chain.masses[-1]
+    speed, values = 0.0, _NOTHING
+    top = taylor.FREE
+    if isinstance(drive, Impact):
+        above += drive.mass
+        speed = drive.velocity
+    else:
+        name = "stress" if isinstance(drive, StressDrive) else "displacement"
+        values = np.array(drive.stress if isinstance(drive, StressDrive) else drive.displacement)
+        if values.size != time.size:
+            raise ValueError(
+                f"{name} has {values.size} samples and t has {time.size}: give one value per sample"
+            )
+        if isinstance(drive, DisplacementDrive):
+            above = 0.0
+            top = taylor.MOTION
+        elif above == 0.0:
+            top = taylor.VISCOUS if chain.site_damping > 0.0 else taylor.STRESS
+    ends, masses = chain.arrays.top, np.array([above])
+    if chain.arrays.heavy:
+        inside = np.flatnonzero(chain.arrays.masses[:-1] > 0.0)
+        ends = np.append(inside + 1, ends)
+        masses = np.append(chain.arrays.masses[inside], masses)
+    damped = dashpots or chain.arrays.damped or top == taylor.VISCOUS
+    if len(ends) > 1 or above > 0.0:
+        solver = SECOND_ORDER
+    elif damped and not (top == taylor.MOTION and len(chain.springs) == 1):
+        solver = FIRST_ORDER
+    else:
+        solver = CLOSED_FORM
+    return Plan(
+        solver=solver,
+        height=chain.height,
+        ends=ends,
+        mass=masses / chain.area,
+        drag=chain.site_damping / chain.height,
+        top=top,
+        values=values,
+        time=time,
+        speed=speed,
+        lossless=len(ends) == 1 and not damped,
+    )
