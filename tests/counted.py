@@ -8,7 +8,6 @@ every line.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import json
 import re
@@ -141,7 +140,7 @@ def profiler(frame: Any, event: str, _: Any) -> None:
 def run(chain: ff.Chain, drive: Drive, t: np.ndarray) -> dict[str, Any]:
     """Counts of one run, the sizes of what has a state, and the steps taken."""
     made = plan(chain, drive, t)
-    made = dataclasses.replace(made, mass=made.mass.view(Masses))
+    made = made._replace(mass=made.mass.view(Masses))
     rows = np.array([spring.row for spring in chain.springs]).view(Springs)
     COUNTS.clear()
     sys.setprofile(profiler)

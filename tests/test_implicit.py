@@ -1,6 +1,5 @@
 """The implicit integrator: its order, and its answers where others have them, and where not."""
 
-import dataclasses
 from itertools import pairwise
 
 import numpy as np
@@ -41,7 +40,7 @@ def run(
     time: np.ndarray = TIME,
 ) -> Motion:
     """Run a scene with the integrator that is asked for (None: that the scene asks for)."""
-    scene = dataclasses.replace(plan(built(chain), load, time), implicit=implicit)
+    scene = plan(built(chain), load, time)._replace(implicit=implicit)
     rows = np.array([spring.row for spring in built(chain).springs])
     return scene.run(rows, np.array(chain.heights), rtol)
 
@@ -260,7 +259,7 @@ def test_explicit_steps_that_fail_are_taken_over(monkeypatch: pytest.MonkeyPatch
 
 def test_the_bound_on_steps() -> None:
     scene = struck("foam-2", 1e-2)
-    few = dataclasses.replace(plan(built(scene[0]), scene[1], TIME), implicit=True, max_steps=5)
+    few = plan(built(scene[0]), scene[1], TIME)._replace(implicit=True, max_steps=5)
     rows = np.array([spring.row for spring in built(scene[0]).springs])
     with pytest.raises(ff.SimulationError, match="bound of 5 steps"):
         few.run(rows, np.array(scene[0].heights))

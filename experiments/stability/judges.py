@@ -10,7 +10,7 @@ of momentum, so that only the light nodes inside and the dashpots need a derivat
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -166,10 +166,8 @@ def bare(scene: Scene, rtol: float, implicit: bool | None = None, most: int = MO
     `most` bounds steps times springs.
     """
     chain, drive, time = scene
-    made = replace(
-        plan(chain, drive, time),
-        implicit=implicit,
-        max_steps=most // len(chain.springs) + time.size,
+    made = plan(chain, drive, time)._replace(
+        implicit=implicit, max_steps=most // len(chain.springs) + time.size
     )
     rows = np.array([spring.row for spring in chain.springs])
     return made.run(rows, np.array(chain.heights), rtol)
