@@ -377,8 +377,8 @@ def _stressed_term(
     return True
 
 
-@inlined
-def _is_bare(links: Links) -> bool:
+@inner
+def is_bare(links: Links) -> bool:
     """Whether every spring is undamped and alone between two masses."""
     if links.top != FREE or links.ends.size != links.eta.size:
         return False
@@ -389,8 +389,8 @@ def _is_bare(links: Links) -> bool:
 
 
 @inlined
-def _expand_bare(links: Links, s: Series, push: Array, order: int) -> None:
-    """Fill the series of a chain that `_is_bare`, as `expand` does, asking less at each order."""
+def expand_bare(links: Links, s: Series, push: Array, order: int) -> None:
+    """Fill the series of a chain that `is_bare`, as `expand` does, asking less at each order."""
     law, _, heights, _, mass, drag, _ = links
     w, v, eps, sig, _ = s
     last = heights.size - 1
@@ -414,15 +414,12 @@ def _expand_bare(links: Links, s: Series, push: Array, order: int) -> None:
             s.group[i, n] = sig[i, n]
 
 
-@inlined
+@inner
 def expand(links: Links, s: Series, push: Array, motion: Array, order: int) -> bool:
     """Fill the series up to `order`; false if a prescribed stress meets a flat branch.
 
     `push` (2,) is the stress on the top and its rate, `motion` (2,) its displacement and rate.
     """
-    if _is_bare(links):
-        _expand_bare(links, s, push, order)
-        return True
     law, eta, heights, ends, mass, drag, top = links
     w, v, eps, sig, group = s
     last = ends.size - 1

@@ -48,7 +48,9 @@ from foamfit.series import (
     enter,
     enter_tangents,
     expand,
+    expand_bare,
     expand_tangents,
+    is_bare,
     make_series,
     make_tangents,
     springs_of,
@@ -560,6 +562,7 @@ def integrate(
     push, motion, scratch, late = np.zeros(2), np.zeros(2), np.zeros(order + 1), np.zeros(size)
     rate, w_end = np.zeros(out_w.shape[0]), np.zeros(out_w.shape[0])
     _begin(rows, start, speed, directions, branches, links, s, d)
+    bare = is_bare(links)
     w_scale, s_scale, pressed, knot, switches, stalled = 0.0, 0.0, False, 0, 0, 0
     now, done = (0.0 if struck else t[0]), 0
     if struck:
@@ -573,7 +576,9 @@ def integrate(
                 knot += 1
                 fresh = True
             horizon = _prescribe(top, values, t, knot, now, push, motion)
-        if not expand(links, s, push, motion, order):
+        if bare:
+            expand_bare(links, s, push, order)
+        elif not expand(links, s, push, motion, order):
             return FLAT_UNDER_STRESS, math.nan, step, switches
         if step > 0:
             s_scale = _loaded(s, s_scale)
