@@ -8,6 +8,7 @@ import re
 import textwrap
 import warnings
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -47,6 +48,7 @@ STYLE: Any = {  # matplotlib types its keys one by one
     "legend.fontsize": 7.5,
     "pdf.fonttype": 42,
 }
+NO_LAYOUT = {"figure.autolayout": False, "figure.constrained_layout.use": False}
 POINTS = {
     ("a", "d"): "A1", ("d", "a"): "A1",
     ("d", "c"): "C1",
@@ -323,6 +325,45 @@ def plot_comparison(comparison: Comparison, path: str | Path | None = None) -> F
     return figure
 
 
+@contextmanager
+def laid_out(figure: Figure, dpi: int = DPI) -> Iterator[None]:
+    """Keep one layout of a figure for all images that are made of it within.
+
+    Left to itself matplotlib lays a figure out anew for every image, and draws it once more for
+    that, unseen. Within another `laid_out` of the same figure this does nothing.
+
+    Parameters
+    ----------
+    figure : matplotlib.figure.Figure
+        What will be rendered; its engine is put back at the end.
+    dpi : int
+        Resolution at which its texts are measured.
+    """
+    import matplotlib
+
+    engine, own_dpi = figure.get_layout_engine(), figure.dpi
+    if engine is None:
+        yield
+        return
+    with matplotlib.rc_context(STYLE | NO_LAYOUT), _unnamed_letters():
+        figure.dpi = dpi
+        engine.execute(figure)
+        figure.dpi = own_dpi
+        figure.set_layout_engine(None)  # "none" leaves a dummy, for which all is drawn twice
+    try:
+        yield
+    finally:
+        figure.set_layout_engine(engine)
+
+
+@contextmanager
+def _unnamed_letters() -> Iterator[None]:
+    """Let a test be named in letters that the font lacks: the figure is good without them."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing")
+        yield
+
+
 def image(figure: Figure, form: Literal["png", "pdf", "svg"], dpi: int = DPI) -> bytes:
     """Return the figure as the bytes of a file (PDF with embedded TrueType fonts).
 
@@ -340,9 +381,7 @@ def image(figure: Figure, form: Literal["png", "pdf", "svg"], dpi: int = DPI) ->
     buffer = io.BytesIO()
     # Without the date, the same fit gives the same file.
     metadata = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(form)
-    with matplotlib.rc_context(STYLE), warnings.catch_warnings():
-        # A test may be named in letters that the font lacks: the figure is good without them.
-        warnings.filterwarnings("ignore", message="Glyph .* missing")
+    with laid_out(figure, dpi), matplotlib.rc_context(STYLE), _unnamed_letters():
         figure.savefig(buffer, format=form, dpi=dpi, metadata=metadata)
     return buffer.getvalue()
 
