@@ -334,6 +334,18 @@ def test_the_figure_has_a_panel_for_each_reference_and_a_mark_for_each_deviation
     assert low < -5.0 < 5.0 < high
 
 
+def test_a_result_with_nothing_to_compare_has_no_lane(tmp_path: Path) -> None:
+    told, untold = published_fit(off=1.0), published_fit(off=1.0, drive="stress")
+    bare = {name: replace(p, stderr=None) for name, p in untold.parameters.items()}
+    alone = plot_comparison(compare([told]))
+    figure = plot_comparison(compare([told, replace(untold, parameters=bare)]))
+    assert figure.axes[0].get_ylim() == alone.axes[0].get_ylim()
+    assert figure.get_figheight() == alone.get_figheight()
+    (legend,) = figure.legends
+    labels = [text.get_text() for text in legend.get_texts()]
+    assert labels == ["impact drive", "stress drive: nothing to compare"]
+
+
 def test_a_real_fit_recovers_its_spring(tmp_path: Path) -> None:
     result = ff.fit(synthetic_impact()[1], starts=4)
     folder = result.save(tmp_path / "fit")

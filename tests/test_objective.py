@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import savgol_filter
 
 import foamfit as ff
 from conftest import synthetic_impact, synthetic_loop
@@ -19,6 +20,7 @@ from foamfit.objective import (
     check_interior,
     choose_drive,
     default_weights,
+    smoothed,
 )
 
 BISTABLE = Model.parse("bistable")
@@ -63,6 +65,14 @@ def test_tiny_noise_counts_as_a_share_of_the_range():
     expected = (simulated.stress_time - measurement.stress) / unit
     np.testing.assert_allclose(off[:n], expected, rtol=1e-14)
     assert off.size == 2 * n
+
+
+@pytest.mark.parametrize(("n", "window"), [(600, 21), (5000, 201), (9, 9)])
+def test_smoothing_by_parabolas_is_that_of_scipy(n, window):
+    values = np.random.default_rng(n).normal(size=n).cumsum()
+    np.testing.assert_allclose(
+        smoothed(values, window), savgol_filter(values, window, 2), rtol=0.0, atol=1e-12
+    )
 
 
 def test_a_weight_multiplies_squares():

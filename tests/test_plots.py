@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import io
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from foamfit.errors import InputError
 from foamfit.plots import (
     STYLE,
     image,
+    laid_out,
     origin_word,
     plot_fit,
     plot_residuals,
@@ -195,6 +197,20 @@ def test_the_pdf_embeds_truetype_and_no_setting_leaks(tmp_path: Path) -> None:
     assert b"/FontFile2" in content
     assert b"/Type3" not in content
     assert {key: matplotlib.rcParams[key] for key in STYLE} == before
+
+
+def test_one_layout_gives_the_picture_that_matplotlib_gives() -> None:
+    whole, figure = io.BytesIO(), plot_fit(fabricated.result())
+    engine, dpi = figure.get_layout_engine(), figure.dpi
+    with matplotlib.rc_context(STYLE):
+        plot_fit(fabricated.result()).savefig(whole, format="png", dpi=120)
+    with laid_out(figure, 120):
+        places = [ax.get_position().bounds for ax in figure.axes]
+        once, again = image(figure, "png", 120), image(figure, "png", 120)
+        assert image(figure, "pdf")
+        assert [ax.get_position().bounds for ax in figure.axes] == places
+    assert once == again == whole.getvalue()
+    assert (figure.get_layout_engine(), figure.dpi) == (engine, dpi)
 
 
 def test_a_format_that_is_not_made_is_refused(tmp_path: Path) -> None:

@@ -210,3 +210,18 @@ def test_summary_says_what_matters() -> None:
 def test_long_warnings_are_wrapped() -> None:
     text = summary_text(fabricated.result(warnings=("word " * 60,)))
     assert max(map(len, text.splitlines())) <= 100
+
+
+def test_the_terminal_says_why_a_parameter_is_not_determined() -> None:
+    first, second, third = list(fabricated.result().parameters)[:3]
+    parameters = fabricated.result().parameters | {
+        first: fabricated.estimate(first, 1.0, state="weak", why="its interval is wide"),
+        second: fabricated.estimate(
+            second, 1.0, state="determined", why="±5%; its profile stalled"
+        ),
+        third: fabricated.estimate(third, 1.0, state="determined", why="±5% of its size"),
+    }
+    text = summary_text(fabricated.result(parameters=parameters))
+    assert f"\nweak: {first}, its interval is wide\n" in text
+    assert f"\ndetermined: {second}, ±5%; its profile stalled\n" in text
+    assert "±5% of its size" not in text

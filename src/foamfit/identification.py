@@ -7,7 +7,6 @@ from collections.abc import Mapping
 import lmfit
 
 from foamfit.errors import InputError
-from foamfit.ladder import climb
 from foamfit.measurement import Measurement
 from foamfit.modelfit import Options, Progress, Tell, identify, judge
 from foamfit.result import FitResult
@@ -106,5 +105,7 @@ def fit(
     if model == "auto":
         if params is not None:
             raise InputError("params belong to one model; name it instead of 'auto'")
+        from foamfit.ladder import climb  # the one fit that has rungs
+
         return climb(measurement, options, progress, tell)
     return judge(identify(measurement, model, params, options, progress), options.choice, tell)

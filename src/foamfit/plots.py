@@ -8,6 +8,7 @@ import re
 import textwrap
 import warnings
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -47,6 +48,7 @@ STYLE: Any = {  # matplotlib types its keys one by one
     "legend.fontsize": 7.5,
     "pdf.fonttype": 42,
 }
+NO_LAYOUT = {"figure.autolayout": False, "figure.constrained_layout.use": False}
 POINTS = {
     ("a", "d"): "A1", ("d", "a"): "A1",
     ("d", "c"): "C1",
@@ -323,6 +325,45 @@ def plot_comparison(comparison: Comparison, path: str | Path | None = None) -> F
     return figure
 
 
+@contextmanager
+def laid_out(figure: Figure, dpi: int = DPI) -> Iterator[None]:
+    """Keep one layout of a figure for all images that are made of it within.
+
+    Left to itself matplotlib lays a figure out anew for every image, and draws it once more for
+    that, unseen. Within another `laid_out` of the same figure this does nothing.
+
+    Parameters
+    ----------
+    figure : matplotlib.figure.Figure
+        What will be rendered; its engine is put back at the end.
+    dpi : int
+        Resolution at which its texts are measured.
+    """
+    import matplotlib
+
+    engine, own_dpi = figure.get_layout_engine(), figure.dpi
+    if engine is None:
+        yield
+        return
+    with matplotlib.rc_context(STYLE | NO_LAYOUT), _unnamed_letters():
+        figure.dpi = dpi
+        engine.execute(figure)
+        figure.dpi = own_dpi
+        figure.set_layout_engine(None)  # "none" leaves a dummy, for which all is drawn twice
+    try:
+        yield
+    finally:
+        figure.set_layout_engine(engine)
+
+
+@contextmanager
+def _unnamed_letters() -> Iterator[None]:
+    """Let a test be named in letters that the font lacks: the figure is good without them."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing")
+        yield
+
+
 def image(figure: Figure, form: Literal["png", "pdf", "svg"], dpi: int = DPI) -> bytes:
     """Return the figure as the bytes of a file (PDF with embedded TrueType fonts).
 
@@ -340,9 +381,7 @@ def image(figure: Figure, form: Literal["png", "pdf", "svg"], dpi: int = DPI) ->
     buffer = io.BytesIO()
     # Without the date, the same fit gives the same file.
     metadata = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(form)
-    with matplotlib.rc_context(STYLE), warnings.catch_warnings():
-        # A test may be named in letters that the font lacks: the figure is good without them.
-        warnings.filterwarnings("ignore", message="Glyph .* missing")
+    with laid_out(figure, dpi), matplotlib.rc_context(STYLE), _unnamed_letters():
         figure.savefig(buffer, format=form, dpi=dpi, metadata=metadata)
     return buffer.getvalue()
 
@@ -415,15 +454,24 @@ def _panels(result: FitResult) -> Iterator[_Panel]:
             yield _Panel(key, x_name, x_unit, y_name, y_unit, lines)
 
 
+def _is_shown(row: Row) -> bool:
+    return row.standard_errors is not None or row.lost
+
+
 def _shown(sections: list[Section]) -> list[str]:
     """Return the parameters of which some result has something to show, in their order."""
     rows = [row for section in sections for row in section.rows]
-    there = {r.label for r in rows if r.standard_errors is not None or r.lost}
+    there = {row.label for row in rows if _is_shown(row)}
     return list(dict.fromkeys(row.label for row in rows if row.label in there))
 
 
+def _lanes(sections: list[Section]) -> list[int]:
+    """Return the places of the results that have anything to show: each gets a lane."""
+    return [k for k, section in enumerate(sections) if any(map(_is_shown, section.rows))]
+
+
 def _comparison_lines(sections: list[Section]) -> int:
-    return max(len(_shown(sections)), 1) * (len(sections) + 1)
+    return max(len(_shown(sections)), 1) * (len(_lanes(sections)) + 1)
 
 
 def _draw_comparison(ax: Axes, sections: list[Section]) -> None:
@@ -437,13 +485,14 @@ def _draw_comparison(ax: Axes, sections: list[Section]) -> None:
     for half, shade in ((3.0, "0.95"), (1.0, "0.88")):
         ax.axvspan(-half, half, color=shade, lw=0, zorder=0)
     ax.axvline(0.0, color=GREY, lw=0.6, zorder=1)
-    step = len(sections) + 1
-    for k, section in enumerate(sections):
+    lanes = _lanes(sections)
+    step = len(lanes) + 1
+    for lane, k in enumerate(lanes):
         color, mark = MARKS[k % len(MARKS)]
-        for row in section.rows:
+        for row in sections[k].rows:
             if row.label not in labels:
                 continue
-            y = labels.index(row.label) * step + k
+            y = labels.index(row.label) * step + lane
             if row.lost:
                 ax.annotate(
                     "not determined", (0.0, y), ha="center", va="center", fontsize=6.5,
@@ -480,9 +529,11 @@ def _name_results(figure: Figure, groups: list[list[Section]]) -> None:
         names = [f"{s.test}: {s.model}, {s.drive} drive" for s in groups[0]]
     else:
         names = [f"result {k + 1}" for k in range(len(longest))]
+    drawn = {k for sections in groups for k in _lanes(sections)}
     for k, name in enumerate(names):
         color, mark = MARKS[k % len(MARKS)]
-        figure.axes[0].plot([], [], mark, ms=3.4, color=color, label=name)
+        label = name if k in drawn else f"{name}: nothing to compare"
+        figure.axes[0].plot([], [], mark, ms=3.4, color=color, label=label)
     if any(row.state == "weak" for group in groups for section in group for row in section.rows):
         figure.axes[0].plot(
             [], [], "o", ms=3.4, color=GREY, mfc="white", label="hollow: weakly determined"

@@ -186,6 +186,7 @@ def summary_text(result: FitResult) -> str:
     lines += [] if result.ladder is None else ["", *_ladder_lines(result.ladder)]
     lines += ["", *_aligned([row for row in rows if row.state != "fixed"])]
     lines += _wrap("", "fixed: " + ", ".join(fixed)) if fixed else []
+    lines += _reasons(rows)
     lines += list(_checks(result))
     lines += [""] if result.warnings or result.notes else []
     for note in result.notes:
@@ -193,6 +194,16 @@ def summary_text(result: FitResult) -> str:
     for warning in result.warnings:
         lines += _wrap("warning: ", warning)
     return "\n".join(lines)
+
+
+def _reasons(rows: list[Readable]) -> list[str]:
+    """Say why a parameter is not determined or weak, and what is to be known of its interval."""
+    lines = []
+    for row in rows:
+        doubtful = row.state not in ("determined", "fixed")
+        if doubtful or (row.state == "determined" and ";" in row.why):
+            lines += _wrap("", f"{row.state}: {row.name}, {row.why}")
+    return lines
 
 
 def _checks(result: FitResult) -> Iterator[str]:

@@ -285,7 +285,7 @@ def load_result(folder: str | Path) -> dict[str, Any]:
 
 
 def _write(result: FitResult, folder: Path) -> None:
-    from foamfit.plots import image, plot_fit
+    from foamfit.plots import image, laid_out, plot_fit
     from foamfit.report import render_report
 
     text = json.dumps(result.to_json_dict(), indent=2, ensure_ascii=False, allow_nan=False)
@@ -297,9 +297,10 @@ def _write(result: FitResult, folder: Path) -> None:
     if result.ladder is not None:
         _write_table(folder / "ladder.csv", result.ladder.rows())
     figure = plot_fit(result)
-    png = image(figure, "png")
+    with laid_out(figure):
+        png, pdf = image(figure, "png"), image(figure, "pdf")
     (folder / "fit.png").write_bytes(png)
-    (folder / "fit.pdf").write_bytes(image(figure, "pdf"))
+    (folder / "fit.pdf").write_bytes(pdf)
     (folder / "report.html").write_text(render_report(result, fit_png=png), encoding="utf-8")
 
 

@@ -14,11 +14,10 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import savgol_filter
 from scipy.stats import qmc
 
 from foamfit.measurement import Measurement
-from foamfit.objective import Objective
+from foamfit.objective import Objective, smoothed
 from foamfit.space import Scales, Space
 
 Array = NDArray[np.float64]
@@ -113,7 +112,7 @@ def smooth_loop(measurement: Measurement) -> Measurement:
     assert stress is not None
     window = max(motion.size // 60, 1) * 2 + 1
     if window > 3:
-        motion = savgol_filter(motion, window, 2)
+        motion = smoothed(motion, window)
     keep = np.unique(np.linspace(0, motion.size - 1, min(motion.size, LOOP_SAMPLES)).astype(int))
     time = measurement.time
     return replace(
