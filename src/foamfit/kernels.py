@@ -35,6 +35,8 @@ _COUNTLESS: dict[str, Any] = {**_BRIDGELESS, "_nrt": False}
 maker = njit(**_BRIDGELESS)
 inner = njit(**_COUNTLESS)
 inlined = njit(**_COUNTLESS, forceinline=True)
+# A piece of a loop that is compiled apart from it; see `foamfit.warmth`.
+piece = njit(**_COUNTLESS, cache=True)
 
 # Columns of a row.
 KIND, K0, KC, EPS_A, EPS_C, KH_PLUS, KH_MINUS, ETA = range(8)

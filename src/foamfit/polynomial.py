@@ -3,7 +3,7 @@
 # mypy: disallow-untyped-decorators=False, warn-return-any=False
 from __future__ import annotations
 
-from foamfit.kernels import Array, inner
+from foamfit.kernels import Array, inner, piece
 
 
 @inner
@@ -114,7 +114,7 @@ def _turn(c: Array, order: int, lo: float, hi: float) -> float:
     return 0.5 * (lo + hi)
 
 
-@inner
+@piece
 def first_crossing(c: Array, order: int, low: float, high: float, span: float) -> tuple[float, int]:
     """First time in [0, span] at which a polynomial leaves [low, high], and the side (-1, 0, 1).
 
@@ -131,13 +131,13 @@ def first_crossing(c: Array, order: int, low: float, high: float, span: float) -
     if c[0] - reach > low and c[0] + reach < high:
         return span, 0
     low, high = min(low, c[0]), max(high, c[0])
-    pieces = 1 if bend < abs(c[1]) * span else 8  # one way all along, or perhaps there and back
+    parts = 1 if bend < abs(c[1]) * span else 8  # one way all along, or perhaps there and back
     lo, value_lo = 0.0, c[0]
     slope_lo = c[1]
-    for piece in range(1, pieces + 1):
-        hi = span * piece / pieces
+    for part in range(1, parts + 1):
+        hi = span * part / parts
         value, slope_hi = _value_and_slope(c, order, hi)
-        if pieces > 1 and slope_lo * slope_hi < 0.0:  # the turning point may lie beyond both ends
+        if parts > 1 and slope_lo * slope_hi < 0.0:  # the turning point may lie beyond both ends
             mid = _turn(c, order, lo, hi)
             turned = value_at(c, order, mid)
             if turned > high:

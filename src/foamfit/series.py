@@ -39,6 +39,7 @@ from foamfit.kernels import (
     inner,
     interval,
     maker,
+    piece,
 )
 from foamfit.law import BISTABLE
 
@@ -610,7 +611,7 @@ def _expand_tangent(links: Links, s: Series, slope: Array, m: Moves, d: Series, 
                 d.w[g, n + 1] = d.v[g, n] * share
 
 
-@inner
+@piece
 def expand_tangents(links: Links, s: Series, t: Tangents, order: int) -> None:
     """Fill the derivatives up to `order`, after `expand`; those that are still zero stay so."""
     for i in range(links.eta.size):

@@ -26,6 +26,7 @@ from foamfit.kernels import (
     first_branch,
     inlined,
     inner,
+    piece,
     strain_on,
 )
 from foamfit.polynomial import fill_values, first_crossing, slope_at, value_at
@@ -163,8 +164,8 @@ def _enough(s: Series, order: int, span: float, tol: float) -> int:
 # ---------------------------------------------------------------- samples
 
 
-@inner
-def _sample(
+@piece
+def sample(
     links: Links, s: Series, order: int, out: Samples, first: int, last: int, now: float, c: Array
 ) -> None:
     """Write displacements and base stress at the samples first … last-1 of a step; c is scratch."""
@@ -182,8 +183,8 @@ def _sample(
             fill_values(c, order, out.t, first, last, now, out.w[min(i, out.w.shape[0] - 1)])
 
 
-@inner
-def _sample_tangents(
+@piece
+def sample_tangents(
     links: Links,
     s: Series,
     d: Tangents,
@@ -269,8 +270,8 @@ def _delay(s: Series, d: Tangents, order: int, span: float, late: Array) -> None
         late[p] = -value_at(d.group[p, 0], order, span) / fall
 
 
-@inner
-def _depart(
+@piece
+def depart(
     links: Links,
     s: Series,
     d: Tangents,
@@ -441,7 +442,6 @@ def _first_lift(s: Series, order: int, pressed: bool, span: float) -> tuple[floa
     when, where = first_crossing(s.group[0], order, 0.0, math.inf, span)
     if pressed and s.group[0, 0] <= 0.0 and s.group[0, 1] <= 0.0:
         when, where = 0.0, -1  # a unilateral spring has just opened
-    pressed = pressed or s.group[0, 0] > 0.0
     if where != 0 and when <= span and (pressed or when > 0.0):
         return when, True
     return span, False
@@ -559,11 +559,13 @@ def integrate(
     d = make_tangents(count, ends.size, order, directions)
     out = Samples(t, out_w, out_s, out_dw, out_ds)
     branches = np.empty(count, np.int64)
-    push, motion, scratch, late = np.zeros(2), np.zeros(2), np.zeros(order + 1), np.zeros(size)
-    rate, w_end = np.zeros(out_w.shape[0]), np.zeros(out_w.shape[0])
+    scratch, late = np.zeros(order + 1), np.zeros(size)
+    given, places = np.zeros((2, 2)), np.zeros((2, out_w.shape[0]))
+    push, motion, rate, w_end = given[0], given[1], places[0], places[1]
     _begin(rows, start, speed, directions, branches, links, s, d)
     bare = is_bare(links)
-    w_scale, s_scale, pressed, knot, switches, stalled = 0.0, 0.0, False, 0, 0, 0
+    w_scale, s_scale, pressed, knot, stalled = 0.0, 0.0, False, 0, 0
+    switches = count - count  # a whole number, and no constant: one type to compile for
     now, done = (0.0 if struck else t[0]), 0
     if struck:
         done = _fill_before(out, speed)
@@ -588,8 +590,8 @@ def integrate(
         span, spring, side = _first_switch(links, s, order, span)
         leaves = False
         if struck:
-            span, leaves = _first_lift(s, order, pressed, span)
             pressed = pressed or s.group[0, 0] > 0.0
+            span, leaves = _first_lift(s, order, pressed, span)
             spring = -1 if leaves else spring
         end = now + span
         stalled = stalled + 1 if span == 0.0 else 0
@@ -607,13 +609,13 @@ def integrate(
         while done < t.size and (t[done] < end or (last and t[done] <= end)):
             done += 1
         if first < done:
-            _sample(links, s, enough, out, first, done, now, scratch)
+            sample(links, s, enough, out, first, done, now, scratch)
         if tangent:
-            _sample_tangents(links, s, d, more, out, first, done, now, scratch)
+            sample_tangents(links, s, d, more, out, first, done, now, scratch)
             _delay(s, d, more, span, late)
         now = end
         if leaves:
-            _depart(links, s, d, order, more, span, now, late, rate, w_end, out, done)
+            depart(links, s, d, order, more, span, now, late, rate, w_end, out, done)
             return DONE, now, step + 1, switches
         advance(s, order, span)
         if tangent:
