@@ -184,6 +184,8 @@ def check(
         return
     from foamfit.planning import describe_plan, plan_test
 
+    with _compiling(quiet=False) as compile_rest:
+        compile_rest()
     plan = plan_test(test, specimen, model, drive, published_set=published_set, result=params)
     click.echo("" if planned else "\n", nl=False)
     click.echo(describe_plan(plan))
@@ -317,31 +319,26 @@ def fit(
     """
     from foamfit.model import Model
     from foamfit.reading import read_test
-    from foamfit.result import check_target
 
     intervals, draws = _intervals(profile, bootstrap, mcmc)
     auto = model.strip() == "auto"
     model = "auto" if auto else Model.parse(model).name
     if auto and (fix or vary):
         raise InputError("--fix and --vary belong to one model; name it instead of --model auto")
-    measurement = read_test(test, specimen)
-    folder = Path("fits", test.stem, model) if out is None else out
-    check_target(folder)
-    for path in (test, specimen or test.with_suffix(".toml")):
-        if folder.resolve() in path.resolve().parents and folder.is_dir():
-            raise InputError(
-                f"{folder} holds {path.name} and would be replaced as a whole; choose another --out"
-            )
-    from foamfit import identification
-    from foamfit.objective import check_time_shift, choose_drive
-    from foamfit.problem import make_params
+    with _compiling(quiet or as_json) as compile_rest:
+        measurement = read_test(test, specimen)
+        folder = _result_folder(out, test, specimen, model)
+        from foamfit import identification
+        from foamfit.objective import check_time_shift, choose_drive
+        from foamfit.problem import make_params
 
-    if time_shift:
-        check_time_shift(measurement, drive or choose_drive(measurement))
-    params = None
-    if not auto:
-        params = make_params(measurement, model, drive, time_shift=time_shift)
-        _hold_and_vary(params, model, fix, vary)
+        if time_shift:
+            check_time_shift(measurement, drive or choose_drive(measurement))
+        params = None
+        if not auto:
+            params = make_params(measurement, model, drive, time_shift=time_shift)
+            _hold_and_vary(params, model, fix, vary)
+        compile_rest()
     with _progress(quiet or as_json) as progress:
         result = identification.fit(
             measurement,
@@ -376,6 +373,20 @@ def fit(
     return 0
 
 
+def _result_folder(out: Path | None, test: Path, specimen: Path | None, model: str) -> Path:
+    """Return the folder for a result, which must not be one that would be lost."""
+    from foamfit.result import check_target
+
+    folder = Path("fits", test.stem, model) if out is None else out
+    check_target(folder)
+    for path in (test, specimen or test.with_suffix(".toml")):
+        if folder.resolve() in path.resolve().parents and folder.is_dir():
+            raise InputError(
+                f"{folder} holds {path.name} and would be replaced as a whole; choose another --out"
+            )
+    return folder
+
+
 def _intervals(profile: bool, bootstrap: int | None, mcmc: int | None) -> tuple[str, int | None]:
     """Return the method of the intervals and its draws."""
     chosen: list[tuple[str, int | None]] = [
@@ -394,15 +405,25 @@ def _intervals(profile: bool, bootstrap: int | None, mcmc: int | None) -> tuple[
 
 
 @contextmanager
+def _compiling(quiet: bool) -> Iterator[Callable[[], None]]:
+    """Compile at first use, beside what the body prepares; it calls what is given for the rest."""
+    from foamfit import warmth
+
+    if warmth.compiled():
+        yield lambda: None
+        return
+    if not quiet:
+        click.echo("foamfit: compiling the solver, once after installation", err=True)
+    with warmth.side_by_side() as finish:
+        yield finish
+
+
+@contextmanager
 def _progress(quiet: bool) -> Iterator[Callable[[float, str], None]]:
     """Give a progress bar on stderr; silent when stderr is no terminal."""
     if quiet or not sys.stderr.isatty():
         yield lambda fraction, what: None
         return
-    from foamfit.warmth import compiled
-
-    if not compiled():
-        click.echo("compiling the solver: once after installation, some seconds", err=True)
     with click.progressbar(length=1000, label="fit", file=sys.stderr, show_eta=False) as bar:
         done = 0
 
@@ -456,7 +477,9 @@ def simulate(scene: Path, out: Path | None, plot: Path | None, rtol: float) -> N
         from foamfit.plots import figure_format
 
         figure_format(plot)
-    chain, drive, time = read_scene(scene)
+    with _compiling(quiet=False) as compile_rest:
+        chain, drive, time = read_scene(scene)
+        compile_rest()
     response = run(chain, drive, time, rtol)
     write_response(response, target)
     click.echo(f"{response.solver}, {response.time.size} samples, written to {target}")

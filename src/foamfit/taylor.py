@@ -95,7 +95,7 @@ def _tail(links: Links, s: Series, n: int, reach: float, load: float) -> float:
 
 
 @inlined
-def _step_length(
+def step_length(
     links: Links,
     s: Series,
     push: Array,
@@ -321,7 +321,7 @@ def depart(
 
 
 @inner
-def _settle(links: Links, s: Series) -> None:
+def settle(links: Links, s: Series) -> None:
     """Share the elongation of undamped groups anew, so that rounding does not pile up."""
     for g in range(links.ends.size):
         i0, i1 = springs_of(links.ends, g)
@@ -379,7 +379,7 @@ def start(
 
 
 @inner
-def _switch(
+def switch(
     rows: Array,
     branches: Branches,
     links: Links,
@@ -448,7 +448,7 @@ def _first_lift(s: Series, order: int, pressed: bool, span: float) -> tuple[floa
 
 
 @inner
-def _begin(
+def begin(
     rows: Array,
     start: Array,
     speed: float,
@@ -562,7 +562,7 @@ def integrate(
     scratch, late = np.zeros(order + 1), np.zeros(size)
     given, places = np.zeros((2, 2)), np.zeros((2, out_w.shape[0]))
     push, motion, rate, w_end = given[0], given[1], places[0], places[1]
-    _begin(rows, start, speed, directions, branches, links, s, d)
+    begin(rows, start, speed, directions, branches, links, s, d)
     bare = is_bare(links)
     w_scale, s_scale, pressed, knot, stalled = 0.0, 0.0, False, 0, 0
     switches = count - count  # a whole number, and no constant: one type to compile for
@@ -584,7 +584,7 @@ def integrate(
             return FLAT_UNDER_STRESS, math.nan, step, switches
         if step > 0:
             s_scale = _loaded(s, s_scale)
-        span = _step_length(links, s, push, order, tol, horizon - now, w_scale, s_scale)
+        span = step_length(links, s, push, order, tol, horizon - now, w_scale, s_scale)
         if not math.isfinite(span) or not math.isfinite(s.group[0, order]):
             return NOT_FINITE, math.nan, step, switches
         span, spring, side = _first_switch(links, s, order, span)
@@ -623,9 +623,9 @@ def integrate(
         w_scale, total = _reached(links, s, w_scale)
         if not math.isfinite(total):
             return NOT_FINITE, math.nan, step, switches
-        _settle(links, s)
+        settle(links, s)
         if spring >= 0:
-            switches = _switch(
+            switches = switch(
                 rows, branches, links, s, d, directions, order, span, now, spring, side,
                 log, switches,
             )  # fmt: skip

@@ -6,9 +6,12 @@ is compiled where it is first needed.
 
 from __future__ import annotations
 
+import gc
 import os
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -62,6 +65,10 @@ def _calls() -> _Calls:
         own=[
             (series.expand, (links, s, one, one, 0)),
             (series.make_tangents, (1, 1, 0, directions)),
+            (taylor.begin, (flat, flat, 0.0, directions, whole, links, s, d)),
+            (taylor.switch, (flat, whole, links, s, d, directions, 0, 0.0, 0.0, 0, 0, flat, 0)),
+            (taylor.step_length, (links, s, one, 0, 0.0, 0.0, 0.0, 0.0)),
+            (taylor.settle, (links, s)),
         ],
         whole=[
             (
@@ -102,22 +109,36 @@ def compiled() -> bool:
     return any(Path(integrate.stats.cache_path or ".").glob("taylor.integrate-*.nbc"))
 
 
-def compile_side_by_side() -> None:
-    """Compile all that a fit needs, by this process and another one."""
+@contextmanager
+def side_by_side() -> Iterator[Callable[[], None]]:
+    """Let another process compile while the body prepares; then call what is given for the rest.
+
+    At the end all that a fit needs is in the cache. The other process is stopped if the body fails.
+    """
     package = str(Path(__file__).parents[1])
     path = os.pathsep.join([package, *filter(None, [os.environ.get("PYTHONPATH")])])
-    command = [sys.executable, "-m", "foamfit.warmth"]
     with subprocess.Popen(
-        command, stdout=subprocess.PIPE, env=os.environ | {"PYTHONPATH": path}
+        [sys.executable, "-m", "foamfit.warmth"],
+        stdout=subprocess.PIPE,
+        env=os.environ | {"PYTHONPATH": path},
     ) as other:
-        calls = _calls()
-        _compile(calls.own)
-        assert other.stdout is not None
-        other.stdout.readline()  # the pieces are there, or the other process has failed
-        _compile(calls.whole)
+
+        def finish() -> None:
+            calls = _calls()
+            _compile(calls.own)
+            if other.stdout is not None:
+                other.stdout.readline()  # the pieces are there, or the other process has failed
+            _compile(calls.whole)
+
+        try:
+            yield finish
+        except BaseException:
+            other.terminate()
+            raise
 
 
 def _other() -> None:
+    gc.disable()  # what is made here stays
     calls = _calls()
     _compile(calls.pieces)
     print("pieces", flush=True)
