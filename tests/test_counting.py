@@ -97,7 +97,7 @@ def test_a_closed_form_scene_takes_no_step(counts: dict[str, dict[str, Any]], na
     assert scene["solver"] == "closed form"
     assert scene["steps"] == 0
     used = {key for key in scene if key.startswith("calls in ")}
-    assert used == {"calls in simulation", "calls in kernels"}
+    assert used == {"calls in motion", "calls in kernels"}
     assert "masses read" not in scene
 
 

@@ -21,14 +21,14 @@ Row = Array
 Branches = NDArray[np.int64]
 
 # Division by zero gives infinity, as in NumPy; every loop that can meet it says what it does then.
-compiled = njit(cache=True, error_model="numpy")
+_PLAIN: dict[str, Any] = {"error_model": "numpy", "no_cfunc_wrapper": True}
+compiled = njit(**_PLAIN, cache=True)
 # For what only other loops call: without the bridge to Python, which takes long to compile; without
 # counting who holds an array, which takes long to run; with a product and a sum in one rounding,
 # which is faster and no less exact; and with the body put where it is called.
 _BRIDGELESS: dict[str, Any] = {
-    "error_model": "numpy",
+    **_PLAIN,
     "no_cpython_wrapper": True,
-    "no_cfunc_wrapper": True,
     "fastmath": {"contract"},
 }
 _COUNTLESS: dict[str, Any] = {**_BRIDGELESS, "_nrt": False}
@@ -46,8 +46,8 @@ SIGMA_A, SIGMA_C, EPS_STAR, EPS_HAT_A, EPS_HAT_C, SIGMA_HAT_A, SIGMA_HAT_C, N_CO
 A, D, C, E, LINE, OPEN = range(6)
 BRANCH_NAMES = ("a", "d", "c", "e", "line", "open")
 
-_derived_points = compiled(derived_points)
-_admissible = compiled(admissible)
+_derived_points = inner(derived_points)
+_admissible = inner(admissible)
 
 
 @compiled
@@ -125,7 +125,7 @@ def linear_row(k0: float, eta: float, unilateral: bool) -> Row:
 # ---------------------------------------------------------------- the law of one spring
 
 
-@compiled
+@inner
 def branch_shape(row: Row, branch: int) -> tuple[bool, float, float, float]:
     """Return (curved, slope k, strain origin x0, stress origin s0) of a branch of eq. 2.
 
@@ -144,7 +144,7 @@ def branch_shape(row: Row, branch: int) -> tuple[bool, float, float, float]:
     return False, 0.0, 0.0, 0.0
 
 
-@compiled
+@inner
 def stress_on(row: Row, branch: int, eps: float) -> float:
     """Stress on a branch (eq. 2); infinite at or past the pole of a curved one."""
     curved, k, x0, s0 = branch_shape(row, branch)
@@ -154,7 +154,7 @@ def stress_on(row: Row, branch: int, eps: float) -> float:
     return k * x / (1.0 - x) if x < 1.0 else math.inf
 
 
-@compiled
+@inner
 def strain_on(row: Row, branch: int, sigma: float) -> float:
     """Strain on a branch, the inverse of eq. 2; on a flat branch its end where it is entered."""
     curved, k, x0, s0 = branch_shape(row, branch)
@@ -163,14 +163,14 @@ def strain_on(row: Row, branch: int, sigma: float) -> float:
     return x0 + (sigma - s0) / k if k > 0.0 else x0
 
 
-@compiled
+@inner
 def slope_on(row: Row, branch: int, eps: float) -> float:
     """Slope dσ/dε of eq. 2 on a branch."""
     curved, k, x0, _ = branch_shape(row, branch)
     return k / (1.0 - (eps - x0)) ** 2 if curved else k
 
 
-@compiled
+@inner
 def interval(row: Row, branch: int) -> tuple[float, float]:
     """Strains (low, high) at which a spring leaves a branch."""
     if branch == A:
@@ -186,7 +186,7 @@ def interval(row: Row, branch: int) -> tuple[float, float]:
     return -math.inf, 0.0
 
 
-@compiled
+@inner
 def above(branch: int) -> int:
     """Name the branch that a spring enters when it leaves `branch` upwards in strain."""
     if branch == A:
@@ -194,7 +194,7 @@ def above(branch: int) -> int:
     return C if branch in (D, E) else LINE
 
 
-@compiled
+@inner
 def below(branch: int) -> int:
     """Name the branch that a spring enters when it leaves `branch` downwards in strain."""
     if branch == C:
@@ -202,13 +202,13 @@ def below(branch: int) -> int:
     return A if branch in (D, E) else OPEN
 
 
-@compiled
+@inner
 def first_branch(row: Row) -> int:
     """Branch of a spring at rest."""
     return A if row[KIND] == BISTABLE else LINE
 
 
-@compiled
+@inner
 def branch_at_strain(row: Row, branch: int, eps: float) -> int:
     """Branch at strain `eps` of a spring that was last seen on `branch` (eqs. 2 and 3)."""
     if row[KIND] == LINEAR:
@@ -224,7 +224,7 @@ def branch_at_strain(row: Row, branch: int, eps: float) -> int:
     return E if eps >= row[EPS_HAT_A] else A
 
 
-@compiled
+@inner
 def branch_at_stress(row: Row, branch: int, sigma: float) -> int:
     """Branch at stress `sigma` of a spring that was last seen on `branch` (eqs. 2 and 3)."""
     if row[KIND] == LINEAR:
@@ -269,7 +269,7 @@ def tangent_along(row: Row, eps: Array, branches: Branches) -> Array:
 # ---------------------------------------------------------------- springs in series, in equilibrium
 
 
-@compiled
+@inner
 def _series_strain(
     rows: Array, branches: Branches, heights: Array, sigma: float, eps: Array
 ) -> tuple[float, float, float]:
@@ -292,7 +292,7 @@ def _series_strain(
     return total, compliance, size
 
 
-@compiled
+@inner
 def _bracket(
     rows: Array, branches: Branches, heights: Array, elongation: float, sigma: float, eps: Array
 ) -> tuple[float, float]:
@@ -316,7 +316,7 @@ def _bracket(
     return low, high
 
 
-@compiled
+@maker
 def _split_jump(
     rows: Array,
     branches: Branches,
@@ -346,7 +346,7 @@ def _split_jump(
     return 0.5 * (low + high)
 
 
-@compiled
+@maker
 def equilibrate(
     rows: Array, branches: Branches, heights: Array, elongation: float, sigma: float, eps: Array
 ) -> float:

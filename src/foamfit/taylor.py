@@ -248,7 +248,7 @@ def _fill_before(out: Samples, speed: float) -> int:
 # ---------------------------------------------------------------- the end of contact
 
 
-@compiled
+@inner
 def fly(
     out_w: Array, out_s: Array, t: Array, first: int, t_end: float, w_end: Array, speed: float
 ) -> None:
