@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import foamfit as ff
+from foamfit import warmth
 from foamfit.measurement import Measurement, Noise, Specimen, Striker
 
 ROOT = Path(__file__).parent.parent
@@ -21,6 +22,14 @@ HEIGHT, AREA = 1.19e-3, 1.9635e-5
 needs_data = pytest.mark.skipif(
     not DATA.is_dir(), reason="the measurements of others are not beside this checkout"
 )
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compiled() -> None:
+    """Compile once, in two processes, what most tests need; no command then says that it does."""
+    if not warmth.compiled():
+        with warmth.side_by_side() as compile_rest:
+            compile_rest()
 
 
 @functools.cache

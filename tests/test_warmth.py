@@ -1,0 +1,91 @@
+"""First use: what is compiled beside the reading of a test is what a fit then calls."""
+
+from __future__ import annotations
+
+import subprocess
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+import pytest
+from numba import typeof
+
+import foamfit as ff
+from conftest import EXPERIMENTS
+from foamfit import cli, kernels, series, taylor, warmth
+
+RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
+
+
+def signature(arguments: tuple[Any, ...]) -> tuple[Any, ...]:
+    return tuple(typeof(value) for value in arguments)
+
+
+def test_a_fit_calls_what_was_compiled_and_nothing_else() -> None:
+    """Every loop that a fit calls has one set of argument types, that of the example."""
+    ff.fit(ff.read_test(RECONSTRUCTION), starts=2)
+    calls = warmth._calls()
+    of_python = {
+        taylor.integrate, kernels.fill_rows, kernels.equilibrium_along,
+        series.equilibrium_tangents, kernels.fault, kernels.total,
+    }  # fmt: skip
+    examples = {function: signature(arguments) for function, arguments in calls.whole + calls.rest}
+    assert of_python <= set(examples)
+    for function in of_python:
+        assert function.signatures == [examples[function]], function.py_func.__name__
+
+
+def test_the_pieces_are_those_of_the_integrator() -> None:
+    """Where the integrator itself was compiled, it left no piece in other types in the cache."""
+    pieces = [(*call, "own") for call in warmth._calls().own]
+    pieces += [(*call, "cached") for call in warmth._calls().pieces]
+    for function, arguments, where in pieces:
+        assert function.signatures in ([], [signature(arguments)]), function.py_func.__name__
+        assert (function.stats.cache_path is not None) == (where == "cached")
+
+
+def test_the_first_use_says_that_it_compiles(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    done = []
+
+    @contextmanager
+    def quickly() -> Any:
+        yield lambda: done.append("rest")
+
+    monkeypatch.setattr(warmth, "side_by_side", quickly)
+    for ready in (False, True):
+        monkeypatch.setattr(warmth, "compiled", lambda ready=ready: ready)
+        with cli._compiling(quiet=False) as compile_rest:
+            compile_rest()
+        assert ("compiling the solver" in capsys.readouterr().err) == (not ready)
+    assert done == ["rest"]
+
+
+def test_the_other_process_finds_this_package_and_is_stopped(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It is asked for with this package in its path, and stopped where the body fails."""
+    asked: list[Any] = []
+
+    class Other(subprocess.Popen):  # type: ignore[type-arg]
+        def __init__(self, command: list[str], **options: Any) -> None:
+            asked.append(options["env"]["PYTHONPATH"].split(":")[0])
+            assert command[1:] == ["-m", "foamfit.warmth"]
+            super().__init__(["sleep", "60"], stdout=options["stdout"])
+
+        def terminate(self) -> None:
+            asked.append("terminated")
+            super().terminate()
+
+    monkeypatch.setattr(subprocess, "Popen", Other)
+    with pytest.raises(click.UsageError), warmth.side_by_side():
+        raise click.UsageError("no such file")
+    assert asked == [str(Path(ff.__file__).parents[1]), "terminated"]
+
+
+def test_examples_are_small() -> None:
+    for call in warmth._calls().rest:
+        assert all(np.size(value) <= 1 for value in call[1])
