@@ -1,6 +1,7 @@
 """Many springs under one stress as one: the answers of following each, at linear cost."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -188,3 +189,39 @@ def test_only_what_one_stress_tells_of_is_taken_as_one() -> None:
     assert carried.method == TAYLOR
     few = Chain(chain.springs[:8], chain.heights[:8], AREA)
     assert ff.simulate(built(few), blow, TIME).method == TAYLOR
+
+
+# ---------------------------------------------------------------- a prescribed elongation
+
+# To and fro so that springs turn back on every branch, into tension, and past all switches.
+TURNS = [0.0, 0.22, 0.05, 0.3, 0.18, 0.45, 0.38, 0.41, 0.12, 0.24, -0.1, 0.5, 0.0]
+TO_AND_FRO = np.concatenate(
+    [HEIGHT * np.linspace(a, b, 61)[1:] for a, b in itertools.pairwise(TURNS)]
+)
+
+
+@pytest.mark.parametrize("count", [3, 8, 40, 300])
+@pytest.mark.parametrize("linear", [False, True])
+def test_elongated_as_one_or_one_by_one(count: int, linear: bool) -> None:
+    """Stress, strains and branches are those of the search through all springs at every sample."""
+    chain = built(chain_of(count, linear=linear))
+    rows, heights = chain.arrays.rows, chain.arrays.heights
+    assert aggregate.holds(rows)
+    found = []
+    for along in (aggregate.equilibrium_along, kernels.equilibrium_along):
+        stress, strain = np.empty(TO_AND_FRO.size), np.empty((count, TO_AND_FRO.size))
+        branches = np.empty(strain.shape, np.int64)
+        along(rows, heights, TO_AND_FRO, stress, strain, branches)
+        found.append((stress, strain, branches))
+    (stress, strain, branches), (want_stress, want_strain, want_branches) = found
+    assert np.abs(stress - want_stress).max() <= 1e-12 * np.ptp(want_stress)
+    assert np.abs(strain - want_strain).max() <= 1e-12
+    assert np.array_equal(branches, want_branches)
+    assert np.abs(heights @ strain - TO_AND_FRO).max() <= 1e-13 * HEIGHT
+    assert len(np.unique(branches)) == (5 if linear else 4)
+
+
+def test_an_elongation_that_no_stress_gives_is_no_number() -> None:
+    chain = built(chain_of(20))
+    with pytest.raises(ff.SimulationError, match="no longer finite"):
+        ff.simulate(chain, ff.DisplacementDrive(np.linspace(0.0, 1.5 * HEIGHT, 31)), TIME[:31])

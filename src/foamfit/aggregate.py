@@ -31,26 +31,20 @@ from foamfit.kernels import (
     KH_MINUS,
     KH_PLUS,
     KIND,
-    SIGMA_A,
-    SIGMA_C,
-    SIGMA_HAT_A,
-    SIGMA_HAT_C,
-    A,
     Array,
     Branches,
-    C,
-    D,
-    E,
-    Row,
     above,
     below,
     branch_shape,
     compiled,
     first_branch,
     inner,
+    maker,
+    strains_on,
+    stress_interval,
 )
 from foamfit.law import BISTABLE, UNILATERAL
-from foamfit.polynomial import fill_values, first_crossing, value_at
+from foamfit.polynomial import fill_values, first_crossing, value_and_slope, value_at
 from foamfit.taylor import DONE, NOT_FINITE, STEP_UNDERFLOW, TOO_MANY_STEPS, fly
 
 # Degree of the polynomial of the elongation, and how far from its anchor it is used, in distances
@@ -58,6 +52,8 @@ from foamfit.taylor import DONE, NOT_FINITE, STEP_UNDERFLOW, TOO_MANY_STEPS, fly
 DEGREE, REACH = 16, 0.125
 # Springs whose switching stresses differ by less than this share switch together.
 CLOSE = 1e-13
+# Past so many times the least slope, and so many anchors, no room is left on a curved branch.
+FAR, MOST_ANCHORS = 1e30, 1000
 # Orders by which the time of the next event is guessed.
 GUESS = 3
 # Columns of `Group.law` and of `Group.place`.
@@ -84,6 +80,18 @@ class Group(NamedTuple):
     lower: Array
     sum: Array
     place: Array
+
+
+class Runs(NamedTuple):
+    """Histories to fill: stress (n,), strains and branches (springs, n).
+
+    `since` (springs,) is the sample from which each spring has been on its branch.
+    """
+
+    sigma: Array
+    eps: Array
+    history: Branches
+    since: Branches
 
 
 class Step(NamedTuple):
@@ -115,20 +123,6 @@ def holds(rows: Array) -> bool:
 
 
 @inner
-def _stresses(row: Row, branch: int) -> tuple[float, float]:
-    """Stresses (low, high) at which a spring leaves a branch."""
-    if branch == A:
-        return -math.inf, row[SIGMA_A]
-    if branch == D:
-        return row[SIGMA_A], row[SIGMA_HAT_C]
-    if branch == C:
-        return row[SIGMA_C], math.inf
-    if branch == E:
-        return row[SIGMA_HAT_A], row[SIGMA_C]
-    return -math.inf, math.inf
-
-
-@inner
 def _put(tree: Array, i: int, value: float) -> None:
     """Set an entry of a tournament."""
     at = tree.size // 2 + i
@@ -154,7 +148,7 @@ def _enter(group: Group, i: int, branch: int) -> None:
     group.branches[i] = branch
     group.law[i, CURVED] = 1.0 if curved else 0.0
     group.law[i, SLOPE], group.law[i, ORIGIN], group.law[i, OFFSET] = slope, origin, offset
-    low, high = _stresses(group.rows[i], branch)
+    low, high = stress_interval(group.rows[i], branch)
     _put(group.upper, i, high)
     _put(group.lower, i, -low)
 
@@ -190,6 +184,26 @@ def _anchor(group: Group, stress: float, rising: bool) -> None:
         group.sum[m] = 0.0
     for i in range(group.heights.size):
         _add(group, i, 1.0)
+
+
+@inner
+def _swap(group: Group, i: int, branch: int) -> None:
+    """Put a spring on another branch, and its elongation there in the place of that before."""
+    _add(group, i, -1.0)
+    _enter(group, i, branch)
+    _add(group, i, 1.0)
+
+
+@maker
+def _make_group(rows: Array, heights: Array) -> Group:
+    """Make room for springs as one; `_begin` fills it."""
+    count, leaves = heights.size, 1
+    while leaves < count:
+        leaves *= 2
+    return Group(
+        rows, heights, np.zeros(count, np.int64), np.zeros((count, N_LAW)),
+        np.empty(2 * leaves), np.empty(2 * leaves), np.zeros(DEGREE + 1), np.zeros(N_PLACE),
+    )  # fmt: skip
 
 
 @inner
@@ -233,9 +247,7 @@ def _switch(
             log[switches, 2], log[switches, 3] = left, entered
             log[switches, 4] = _strain(group, i, stress)
         switches += 1
-        _add(group, i, -1.0)
-        _enter(group, i, entered)
-        _add(group, i, 1.0)
+        _swap(group, i, entered)
     return switches
 
 
@@ -397,13 +409,7 @@ def integrate_aggregate(
     tuple
         Outcome, end of contact (NaN if none), steps taken, switches (also those past the log).
     """
-    count, leaves = heights.size, 1
-    while leaves < count:
-        leaves *= 2
-    group = Group(
-        rows, heights, np.zeros(count, np.int64), np.zeros((count, N_LAW)),
-        np.empty(2 * leaves), np.empty(2 * leaves), np.zeros(DEGREE + 1), np.zeros(N_PLACE),
-    )  # fmt: skip
+    count, group = heights.size, _make_group(rows, heights)
     now = Step(
         np.zeros(order + 1), np.zeros(order + 1), np.zeros(order + 1),
         np.zeros((order + 1, order + 1)), np.zeros(DEGREE + 1),
@@ -461,3 +467,78 @@ def integrate_aggregate(
                 _anchor(group, stress, side > 0)
                 effort[0] += 1
     return TOO_MANY_STEPS, math.nan, max_steps, switches
+
+
+# ---------------------------------------------------------------- a known elongation
+
+
+@inner
+def _stress_at(group: Group, elongation: float, stress: float) -> float:
+    """Stress at an elongation within the reach of the sum, by Newton's method from another."""
+    x = (stress - group.place[ANCHOR]) / group.place[UNIT]
+    for _ in range(50):
+        value, slope = value_and_slope(group.sum, DEGREE, x)
+        step = (elongation - value) / slope
+        x += step
+        if abs(step) < 1e-10:  # its error is squared in every step
+            break
+    return group.place[ANCHOR] + group.place[UNIT] * x
+
+
+@inner
+def _write(group: Group, i: int, first: int, last: int, runs: Runs) -> None:
+    """Write strains and branch of a spring over the samples that it was on it, if wanted."""
+    if runs.eps.shape[0] == 0:
+        return
+    strains_on(group.rows[i], group.branches[i], runs.sigma[first:last], runs.eps[i, first:last])
+    runs.history[i, first:last] = group.branches[i]
+
+
+@inner
+def _pass(group: Group, stress: float, rising: bool, j: int, runs: Runs) -> None:
+    """Change the branches of all springs that leave theirs at this stress, before sample j."""
+    tree = group.upper if rising else group.lower
+    met = (stress if rising else -stress) + CLOSE * abs(stress)
+    while tree[1] <= met:
+        i = _winner(tree)
+        _write(group, i, runs.since[i], j, runs)
+        runs.since[i] = j
+        _swap(group, i, above(group.branches[i]) if rising else below(group.branches[i]))
+
+
+@compiled
+def equilibrium_along(
+    rows: Array, heights: Array, top: Array, sigma: Array, eps: Array, history: Branches
+) -> None:
+    """Springs in series, as `holds` wants them, along a history of the top's displacement (m).
+
+    Fills the common stress (n,), the strains and the branches (springs or 0, n), as does
+    `foamfit.kernels.equilibrium_along`, which goes through all springs at every trial.
+    """
+    count, group = heights.size, _make_group(rows, heights)
+    runs = Runs(sigma, eps, history, np.zeros(count, np.int64))
+    _begin(group)
+    stress, place = 0.0, 0.0
+    for j in range(top.size):
+        rising, there = top[j] >= place, False
+        for _ in range(4 * count + MOST_ANCHORS):
+            anchor, reach = group.place[ANCHOR], REACH * group.place[UNIT]
+            end = min(group.upper[1], anchor + reach)
+            if not rising:
+                end = max(-group.lower[1], anchor - reach)
+            edge = value_at(group.sum, DEGREE, (end - anchor) / group.place[UNIT])
+            there = top[j] <= edge if rising else top[j] >= edge
+            if there or not abs(end) < FAR * group.place[LEAST]:
+                break
+            stress = end
+            _pass(group, stress, rising, j, runs)
+            if abs(stress - anchor) >= reach * (1.0 - 1e-12):
+                _anchor(group, stress, rising)
+        if not there:  # no stress brings the springs so far
+            sigma[j:] = math.inf
+            eps[:] = math.inf
+            return
+        stress = _stress_at(group, top[j], stress)
+        sigma[j], place = stress, top[j]
+    for i in range(count):
+        _write(group, i, runs.since[i], top.size, runs)

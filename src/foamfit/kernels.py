@@ -21,13 +21,13 @@ Row = Array
 Branches = NDArray[np.int64]
 
 # Division by zero gives infinity, as in NumPy; every loop that can meet it says what it does then.
-_PLAIN: dict[str, Any] = {"error_model": "numpy", "no_cfunc_wrapper": True}
-compiled = njit(**_PLAIN, cache=True)
+compiled = njit(cache=True, error_model="numpy")
 # For what only other loops call: without the bridge to Python, which takes long to compile; without
 # counting who holds an array, which takes long to run; with a product and a sum in one rounding,
 # which is faster and no less exact; and with the body put where it is called.
 _BRIDGELESS: dict[str, Any] = {
-    **_PLAIN,
+    "error_model": "numpy",
+    "no_cfunc_wrapper": True,
     "no_cpython_wrapper": True,
     "fastmath": {"contract"},
 }
@@ -187,6 +187,22 @@ def interval(row: Row, branch: int) -> tuple[float, float]:
 
 
 @inner
+def stress_interval(row: Row, branch: int) -> tuple[float, float]:
+    """Stresses (low, high) at which a spring leaves a branch."""
+    if branch == A:
+        return -math.inf, row[SIGMA_A]
+    if branch == D:
+        return row[SIGMA_A], row[SIGMA_HAT_C]
+    if branch == C:
+        return row[SIGMA_C], math.inf
+    if branch == E:
+        return row[SIGMA_HAT_A], row[SIGMA_C]
+    if branch == LINE:
+        return (0.0 if row[KIND] == UNILATERAL else -math.inf), math.inf
+    return -math.inf, 0.0
+
+
+@inner
 def above(branch: int) -> int:
     """Name the branch that a spring enters when it leaves `branch` upwards in strain."""
     if branch == A:
@@ -244,16 +260,70 @@ def branch_at_stress(row: Row, branch: int, sigma: float) -> int:
     return E if sigma >= row[SIGMA_HAT_A] else A
 
 
+@inner
+def stresses_on(row: Row, branch: int, eps: Array, sigma: Array) -> None:
+    """Fill the stresses at many strains on one branch."""
+    curved, k, x0, s0 = branch_shape(row, branch)
+    if not curved:
+        for j in range(eps.size):
+            sigma[j] = s0 + k * (eps[j] - x0)
+        return
+    for j in range(eps.size):
+        x = eps[j] - x0
+        sigma[j] = k * x / (1.0 - x) if x < 1.0 else math.inf
+
+
+@inner
+def strains_on(row: Row, branch: int, sigma: Array, eps: Array) -> None:
+    """Fill the strains at many stresses on one branch; -inf where a spring cannot have any."""
+    curved, k, x0, s0 = branch_shape(row, branch)
+    if curved:
+        for j in range(sigma.size):
+            eps[j] = x0 + sigma[j] / (k + sigma[j]) if sigma[j] > -k else -math.inf
+    elif k > 0.0:
+        for j in range(sigma.size):
+            eps[j] = x0 + (sigma[j] - s0) * (1.0 / k)
+    else:
+        for j in range(sigma.size):
+            eps[j] = -math.inf if branch == OPEN else x0
+
+
+@inner
+def _follow_strain(row: Row, eps: Array, sigma: Array, history: Branches) -> None:
+    """Fill stress and branch along the strains of one spring from rest, a branch at a time."""
+    branch, first = first_branch(row), 0
+    while first < eps.size:
+        branch = branch_at_strain(row, branch, eps[first])
+        low, high = interval(row, branch)
+        last = first + 1
+        while last < eps.size and low < eps[last] < high:
+            last += 1
+        stresses_on(row, branch, eps[first:last], sigma[first:last])
+        history[first:last] = branch
+        first = last
+
+
+@inner
+def _follow_stress(row: Row, sigma: Array, eps: Array, history: Branches) -> None:
+    """Fill strain and branch along the stresses of one spring from rest, a branch at a time."""
+    branch, first = first_branch(row), 0
+    while first < sigma.size:
+        branch = branch_at_stress(row, branch, sigma[first])
+        low, high = stress_interval(row, branch)
+        last = first + 1
+        while last < sigma.size and low < sigma[last] < high:
+            last += 1
+        strains_on(row, branch, sigma[first:last], eps[first:last])
+        history[first:last] = branch
+        first = last
+
+
 @compiled
 def stress_along(row: Row, eps: Array) -> tuple[Array, Branches]:
     """Stress and branch of one spring along a strain history, from rest."""
     sigma = np.empty(eps.size)
     branches = np.empty(eps.size, np.int64)
-    branch = first_branch(row)
-    for j in range(eps.size):
-        branch = branch_at_strain(row, branch, eps[j])
-        sigma[j] = stress_on(row, branch, eps[j])
-        branches[j] = branch
+    _follow_strain(row, eps, sigma, branches)
     return sigma, branches
 
 
@@ -396,18 +466,18 @@ def equilibrium_along(
     Fills the common stress (n,), the strains and the branches (springs, n).
     """
     count, n = rows.shape[0], top.size
+    if count == 1:
+        for j in range(n):
+            eps[0, j] = top[j] / heights[0]
+        _follow_strain(rows[0], eps[0], sigma, history[0])
+        return
     branches = np.empty(count, np.int64)
     now = np.empty(count)
     for i in range(count):
         branches[i] = first_branch(rows[i])
     last = 0.0
     for j in range(n):
-        if count == 1:
-            now[0] = top[j] / heights[0]
-            branches[0] = branch_at_strain(rows[0], branches[0], now[0])
-            last = stress_on(rows[0], branches[0], now[0])
-        else:
-            last = equilibrate(rows, branches, heights, top[j], last, now)
+        last = equilibrate(rows, branches, heights, top[j], last, now)
         sigma[j] = last
         for i in range(count):
             eps[i, j] = now[i]
@@ -421,12 +491,7 @@ def strains_along(rows: Array, sigma: Array, eps: Array, history: Branches) -> N
     A strain that a spring cannot have is -inf.
     """
     for i in range(rows.shape[0]):
-        row = rows[i]
-        branch = first_branch(row)
-        for j in range(sigma.size):
-            branch = branch_at_stress(row, branch, sigma[j])
-            eps[i, j] = strain_on(row, branch, sigma[j]) if branch != OPEN else -math.inf
-            history[i, j] = branch
+        _follow_stress(rows[i], sigma, eps[i], history[i])
 
 
 @compiled

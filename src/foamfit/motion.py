@@ -27,8 +27,9 @@ MOST_RELAXATION, MOST_VIBRATION, MOST_EXPLICIT = 1e4, 1e5, 200_000
 # Bounds on steps times springs (seconds, not hours): for all but the samples of a drive, before
 # explicit steps are given up, and for everything.
 MOST_WORK, MOST_EXPLICIT_WORK, MOST_SAMPLED = 1_500_000, 500_000, 10_000_000
-# From so many springs on, those that carry one stress are integrated as one.
-LEAST_AGGREGATE = 9
+# From so many springs on, those that carry one stress count as one: in an impact, and where their
+# elongation is prescribed.
+LEAST_AGGREGATE, LEAST_ELONGATED = 9, 3
 
 _OUTCOMES = {
     taylor.TOO_MANY_STEPS: "the bound of {steps} steps was reached: something in the scene is "
@@ -148,11 +149,15 @@ class Plan(NamedTuple):
         self, rows: Array, heights: Array, everything: bool, directions: Directions
     ) -> Motion:
         """Undamped and massless: one stress in all springs; or one spring under known motion."""
-        moved = self.top == taylor.MOTION
-        strain = np.empty((len(heights), self.time.size))
+        moved, count = self.top == taylor.MOTION, len(heights)
+        as_one = moved and count >= LEAST_ELONGATED and bool(aggregate.holds(rows))
+        wanted = everything or not as_one or len(directions) > 0
+        strain = np.empty((count if wanted else 0, self.time.size))
         branches = np.empty(strain.shape, np.int64)
         stress = np.array(self.values)
-        if moved:
+        if as_one:
+            aggregate.equilibrium_along(rows, heights, self.values, stress, strain, branches)
+        elif moved:
             kernels.equilibrium_along(rows, heights, self.values, stress, strain, branches)
         else:
             kernels.strains_along(rows, stress, strain, branches)
@@ -175,7 +180,7 @@ class Plan(NamedTuple):
         if not everything:
             if slopes is not None:
                 slopes = Slopes(slopes.displacement[:, -1:], slopes.base_stress)
-            top = (heights @ strain)[None, :]
+            top = (self.values if moved else heights @ strain)[None, :]
             return Motion(top, stress, math.nan, NO_SWITCHES, 0, CLOSED_FORM, slopes)
         nodes = np.cumsum(heights[:, None] * strain, axis=0)
         switches = _switches(self.time, strain, branches)

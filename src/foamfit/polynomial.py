@@ -16,7 +16,7 @@ def value_at(c: Array, order: int, tau: float) -> float:
 
 
 @inner
-def _value_and_slope(c: Array, order: int, tau: float) -> tuple[float, float]:
+def value_and_slope(c: Array, order: int, tau: float) -> tuple[float, float]:
     """Value and derivative of a polynomial."""
     total, slope = c[order], 0.0
     for n in range(order - 1, -1, -1):
@@ -28,7 +28,7 @@ def _value_and_slope(c: Array, order: int, tau: float) -> tuple[float, float]:
 @inner
 def slope_at(c: Array, order: int, tau: float) -> float:
     """Return the derivative of a polynomial."""
-    return _value_and_slope(c, order, tau)[1]
+    return value_and_slope(c, order, tau)[1]
 
 
 @inner
@@ -79,7 +79,7 @@ def _root(
     if not lo < tau < hi:
         tau = 0.5 * (lo + hi)
     for _ in range(100):
-        f, d = _value_and_slope(c, order, tau)
+        f, d = value_and_slope(c, order, tau)
         f -= level
         if f == 0.0:
             break
@@ -136,7 +136,7 @@ def first_crossing(c: Array, order: int, low: float, high: float, span: float) -
     slope_lo = c[1]
     for part in range(1, parts + 1):
         hi = span * part / parts
-        value, slope_hi = _value_and_slope(c, order, hi)
+        value, slope_hi = value_and_slope(c, order, hi)
         if parts > 1 and slope_lo * slope_hi < 0.0:  # the turning point may lie beyond both ends
             mid = _turn(c, order, lo, hi)
             turned = value_at(c, order, mid)
