@@ -183,7 +183,7 @@ def test_the_profile_of_a_linear_problem_is_the_local_interval(name, rho):
     around = curve(rho=rho)
     found = profile(around, name)
     column = around.names.index(name)
-    half = around.quantile * around.spread.stderr[column]
+    half = around.quantiles[column] * around.spread.stderr[column]
     assert found.ci95 == pytest.approx(
         (around.values[column] - half, around.values[column] + half), abs=1e-3 * half
     )
@@ -208,7 +208,7 @@ def test_the_intervals_of_a_soft_loss_agree_with_each_other(loss):
     around = Vicinity.of(bench, best, ("a", "b"))  # type: ignore[arg-type]
     drawn = np.percentile(bootstrap(around, 400, seed=0), [2.5, 97.5], axis=0)
     for column, name in enumerate("ab"):
-        width = 2.0 * around.quantile * around.spread.stderr[column]
+        width = 2.0 * around.quantiles[column] * around.spread.stderr[column]
         low, high = profile(around, name).ci95
         assert high - low == pytest.approx(width, rel=0.05)
         assert drawn[1, column] - drawn[0, column] == pytest.approx(width, rel=0.2)
@@ -449,7 +449,7 @@ def test_nine_of_ten_intervals_hold():
         found = assess(around, Choice())
         for i, name in enumerate(names):
             if around.knows(name):
-                half = around.quantile * around.spread.stderr[i]
+                half = around.quantiles[i] * around.spread.stderr[i]
                 value = around.values[problem.model.index[name]]
                 low, high = found.ends.get(name, (value - half, value + half))
                 at = truth[problem.model.index[name]]

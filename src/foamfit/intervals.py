@@ -135,7 +135,7 @@ class _Side:
         self.column = best.names.index(self.name)
         self.place = best.index[self.name]
         self.unit = float(best.spread.inflation[self.column])
-        self.quantile = best.quantile
+        self.quantile = float(best.quantiles[self.column])
         self.places = [self.refit.start()]
         low, high = best.limits(self.name)
         self.limit = low if self.sign < 0 else high
@@ -264,7 +264,7 @@ def _assemble(vicinity: Vicinity, name: str, sides: list[_Side], complete: bool)
         values=np.array([low.value(place) for place in places]),
         rises=np.array([low.rise(place) for place in places]),
         points=np.array([place.point for place in places]),
-        cut=vicinity.quantile**2,
+        cut=low.quantile**2,
         ci95=(low.bound, high.bound if high else low.value(low.places[0])),
         open_low=low.is_open,
         open_high=high.is_open if high else True,
@@ -295,7 +295,7 @@ def departures(vicinity: Vicinity) -> Array:
 
         here = least(start.residual)
         stderr = float(vicinity.spread.stderr[i])
-        reach = vicinity.quantile * stderr
+        reach = float(vicinity.quantiles[i]) * stderr
         value = vicinity.values[vicinity.index[name]]
         low, high = vicinity.limits(name)
         for side, room in enumerate((value - low, high - value)):
@@ -645,7 +645,7 @@ def _elsewhere(vicinity: Vicinity, valleys: Sequence[Array], tracker: Tracker) -
         residual = tracker.consider(valley)
         rise = (float(residual @ residual) - vicinity.cost) / vicinity.spread.inflation
         apart = np.abs(valley - vicinity.values)[places] / vicinity.spread.stderr
-        out |= (rise < vicinity.quantile**2) & (apart > vicinity.quantile)
+        out |= (rise < vicinity.quantiles**2) & (apart > vicinity.quantiles)
     return out
 
 
