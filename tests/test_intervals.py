@@ -273,6 +273,39 @@ def test_a_profile_goes_on_beyond_a_valley_that_is_as_good():
     assert both.ci95[1] == pytest.approx(3.0 - alone.ci95[0], rel=1e-2)
 
 
+def test_what_one_profile_meets_counts_for_the_others():
+    """Two valleys a low barrier apart: a = 0, b = 0 and a = 1, b = 3.
+
+    With a held b does not move, since a - (3 - 2u) u², u = b/3, has no slope there: the profile of
+    a alone stays in the first valley. That of b crosses the barrier and meets the second.
+    """
+    noise = np.random.default_rng(1).standard_normal(400)
+    noise[:2] = 0.0
+
+    class Stairs(Curve):
+        def differences(self, values: np.ndarray) -> np.ndarray:
+            out, u = self.data.copy(), values[1] / 3.0
+            out[0] += 1.1 * values[1] * (values[1] - 3.0)
+            out[1] += 30.0 * (values[0] - (3.0 - 2.0 * u) * u**2)
+            return out
+
+    class StairsBench(Bench):
+        def slopes(self, values: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
+            out, u = np.zeros((400, 2)), values[1] / 3.0
+            out[0, 1] = 1.1 * (2.0 * values[1] - 3.0)
+            out[1] = 30.0, -60.0 * (1.0 - u) * u / 3.0
+            return out
+
+    bench = StairsBench(Stairs(np.arange(400.0), noise))
+    around = Vicinity.of(bench, np.zeros(2), ("a", "b"))  # type: ignore[arg-type]
+    alone = profile(around, "a")
+    found = assess(around, Choice("profile"))
+    half = around.quantiles[0] * around.spread.stderr[0]
+    assert alone.ci95[1] == pytest.approx(half, rel=0.05)
+    assert found.ends["a"][0] == pytest.approx(alone.ci95[0])
+    assert 1.0 < found.ends["a"][1] < 1.0 + 1.1 * half + 0.1
+
+
 class _Interrupting(Tracker):
     """Ctrl-C after so many evaluations."""
 

@@ -81,7 +81,7 @@ class NoiseProcess:
 
     def forms(self, columns: Array) -> Array:
         """Variance lᵀΣl of the noise times each column l of an (n, k) array, (k,)."""
-        return np.einsum("ij,ij->j", columns, self.times(columns))
+        return np.asarray(np.einsum("ij,ij->j", columns, self.times(columns)))
 
     def doubt(self, columns: Array) -> Array:
         """Variance of `forms`, as estimated from `samples`, (k,): the delta method.
@@ -307,8 +307,8 @@ def covariance(
     effective = sum(n / process.tau for n, process in zip(sizes, noise, strict=True))
     errors = left @ root.T  # of the estimates, by the noise of each sample
     curves = list(zip(noise, parts(sizes), strict=True))
-    variance = sum(process.forms(errors[part]) for process, part in curves)
-    doubt = sum(process.doubt(errors[part]) for process, part in curves)
+    variance = np.sum([process.forms(errors[part]) for process, part in curves], axis=0)
+    doubt = np.sum([process.doubt(errors[part]) for process, part in curves], axis=0)
     return Covariance(
         matrix * np.outer(sizes_of, sizes_of),
         np.diag(matrix) / np.diag(inverse),
