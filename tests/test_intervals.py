@@ -501,9 +501,24 @@ def test_the_study_counts_as_it_says(monkeypatch):
     assert [row["parameter"] for row in rows] == list(recovery.PARAMETERS)
     import pandas as pd
 
-    frame = pd.DataFrame(rows)
+    frame = recovery.with_linear(pd.DataFrame(rows))
+    assert frame["linear"].notna().all()
     frame["holds"] = [True] * 7 + [False]
     frame["low"], frame["high"] = 0.0, 1.0
     table = recovery.coverage(frame).set_index("parameter")
     assert table.loc["all", "coverage"] == pytest.approx(7 / 8)
+    assert table.loc["all", "coverage, linear"] == pytest.approx(frame["linear"].mean())
     assert table.loc["eta", "coverage"] == 0.0
+
+
+def test_a_linear_problem_with_known_noise_holds_as_often_as_it_says():
+    """Of 30 independent intervals of k_c in correlated noise 23 or less hold with p < 1e-3."""
+    sys.path.insert(0, str(EXPERIMENTS / "recovery"))
+    import recovery
+
+    assert binom.cdf(23, 30, 0.95) < 1e-3
+    rows = [row for seed in range(30) for row in recovery.linear_test(recovery.CLASSES[3], seed)]
+    held = [row["linear"] for row in rows if row["parameter"] == "kc"]
+    assert len(held) == 30
+    assert sum(held) > 23
+    assert not all(row["linear"] for row in rows)
