@@ -700,7 +700,7 @@ def _by_profiles(
             if not _outside(vicinity, name, met):
                 continue
             wanted.append(name)
-        if objective.evaluations >= allowed:
+        if objective.evaluations >= allowed and not begun:
             continue
         walk = walks.setdefault(name, _Walk(vicinity, name, tracker))
         walk.follow(met if begun else [*valleys, *met])

@@ -86,9 +86,9 @@ class NoiseProcess:
     def doubt(self, columns: Array) -> Array:
         """Variance of `forms`, as estimated from `samples`, (k,): the delta method.
 
-        Estimates of the white variance w and of φ are independent for large n, with the variances
-        2w²/n and w Γ⁻¹/n, Γ the autocovariance matrix of p samples (Brockwell & Davis 1991, Time
-        Series: Theory and Methods, theorem 8.1.1 and section 8.8).
+        Estimates of the white variance w and of φ are independent for large n. That of w has the
+        variance 2w²/n of normal noise; those of φ have the covariance w Γ⁻¹/n with Γ that of p
+        successive samples (Brockwell & Davis 1991, Time Series: Theory and Methods, theorem 8.1.1).
         """
         if math.isinf(self.samples):
             return np.zeros(columns.shape[1])
@@ -243,8 +243,10 @@ class Covariance:
         Variance of each parameter over that of a residual of white noise of unit variance: what a
         rise of the sum of squares along a parameter's profile must be divided by to be a χ².
     freedom : (k,) array
-        Degrees of freedom of each variance: that of the χ² distribution which is as uncertain as
-        the estimated noise makes it (Satterthwaite 1946, Biometrics Bull. 2, 110).
+        Degrees of freedom of each variance: those of the χ² distribution that is as uncertain as
+        the estimated noise makes it (Satterthwaite 1946, Biometrics Bull. 2, 110), but no more than
+        the effective samples that the parameters have left: what a model cannot follow is no noise
+        whose spectrum is known.
     effective : float
         Effective number of samples.
     noise : tuple of NoiseProcess
@@ -309,10 +311,11 @@ def covariance(
     curves = list(zip(noise, parts(sizes), strict=True))
     variance = np.sum([process.forms(errors[part]) for process, part in curves], axis=0)
     doubt = np.sum([process.doubt(errors[part]) for process, part in curves], axis=0)
+    known = 2.0 * variance**2 / np.maximum(doubt, 1e-300)
     return Covariance(
         matrix * np.outer(sizes_of, sizes_of),
         np.diag(matrix) / np.diag(inverse),
-        2.0 * variance**2 / doubt,
+        np.minimum(known, max(effective - len(matrix), 1.0)),
         float(effective),
         tuple(noise),
     )
