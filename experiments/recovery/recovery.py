@@ -224,6 +224,11 @@ def picture(table: pd.DataFrame, path: Path, tests: int) -> None:
                 x, percent, error, fmt="o", color=colour, markersize=3, linewidth=0.9,
                 label=f"{samples} samples per curve" if column == 0 else None,
             )  # fmt: skip
+            above.plot(
+                x, 100.0 * own["coverage, linear"], "x", color=colour, markersize=3.5,
+                markeredgewidth=0.7, alpha=0.8,
+                label="linear problem, same noise" if (column, samples) == (0, 5000) else None,
+            )  # fmt: skip
             below.plot(x[:-1], 100.0 * own["half width over truth, median"][:-1], "o",
                        color=colour, markersize=3)  # fmt: skip
         below.set_yscale("log")
@@ -233,7 +238,10 @@ def picture(table: pd.DataFrame, path: Path, tests: int) -> None:
     for panel in axes.flat:
         panel.tick_params(labelsize=8)
         panel.spines[["top", "right"]].set_visible(False)
-    figure.legend(frameon=False, fontsize=8, loc="outside lower center", ncols=3)
+    figure.legend(
+        frameon=False, fontsize=8, loc="outside lower center", ncols=4, columnspacing=1.2,
+        handletextpad=0.4,
+    )  # fmt: skip
     figure.savefig(path, dpi=200)
 
 
