@@ -272,6 +272,16 @@ def test_a_profile_goes_on_beyond_a_valley_that_is_as_good():
     assert both.ci95[0] == pytest.approx(alone.ci95[0])
     assert both.ci95[1] == pytest.approx(3.0 - alone.ci95[0], rel=1e-2)
 
+    class Gap(Two):
+        def residual(self, values: np.ndarray, shift: np.ndarray | float = 0.0) -> np.ndarray:
+            self.failures += 1e-5 < values[1] < 2.99  # nothing can be simulated there
+            return super().residual(values, shift)
+
+    bench = TwoBench(Gap(np.arange(400.0), noise))
+    around = Vicinity.of(bench, np.zeros(2), ("a", "b"))  # type: ignore[arg-type]
+    apart = profile(around, "b", valleys=[np.array([0.0, 3.0])])
+    assert apart.ci95 == pytest.approx(both.ci95, rel=1e-2)
+
 
 def test_what_one_profile_meets_counts_for_the_others():
     """Two valleys a low barrier apart: a = 0, b = 0 and a = 1, b = 3.

@@ -156,7 +156,8 @@ class _Side:
         reach = PLACED * self.quantile * float(self.vicinity.spread.stderr[self.column])
         for valley in sorted(valleys, key=lambda point: -self.sign * float(point[self.place])):
             value = float(valley[self.place])
-            if self.better or self.sign * (value - self.bound) <= reach:
+            edge = self.value(self.places[-1]) if self.is_open else self.bound
+            if self.better or self.sign * (value - edge) <= reach:
                 break
             residual = self.refit.residual(valley)
             if residual is None:
