@@ -43,6 +43,40 @@ def test_the_error_of_a_line_covers_its_scatter(rho):
     assert np.mean(errors) == pytest.approx(np.std(slopes), rel=0.15)
 
 
+@pytest.mark.parametrize("rho", [0.0, 0.5, 7 / 9])
+def test_the_degrees_of_freedom_are_those_of_the_scatter_of_the_variance(rho):
+    """Variances v of a fit over 400 repetitions: χ² of as many degrees as 2 (mean/deviation)².
+
+    An offset sees the noise at low frequencies alone, where it is read off least surely; a fast
+    wave sees it where it is known best.
+    """
+    x = np.linspace(-1, 1, 300)
+    jacobian = np.column_stack([np.ones_like(x), np.sin(60 * x)])
+    variances, freedoms = [], []
+    for seed in range(400):
+        y = ar1(x.size, rho, seed)
+        best = np.linalg.lstsq(jacobian, y, rcond=None)[0]
+        spread = covariance(jacobian, y - jacobian @ best, (x.size,), np.ones(2))
+        variances.append(spread.stderr**2)
+        freedoms.append(spread.freedom)
+    seen = 2.0 * (np.mean(variances, axis=0) / np.std(variances, axis=0)) ** 2
+    left = 300 * (1 - rho) / (1 + rho) - 2  # effective samples less parameters
+    assert np.median(freedoms, axis=0) == pytest.approx(np.minimum(seen, left), rel=0.5)
+    if rho == 0.0:
+        assert np.median(freedoms) == pytest.approx(298.0)
+    else:
+        assert np.median(freedoms, axis=0)[0] < 0.6 * left
+
+
+def test_two_curves_have_the_freedom_of_both():
+    """Satterthwaite in closed form: a mean of two curves of 200 samples and of equal noise."""
+    rng = np.random.default_rng(3)
+    spread = covariance(np.ones((400, 1)), rng.standard_normal(400), (200, 200), np.ones(1))
+    shares = np.array([process.variance for process in spread.noise])
+    expected = 199.5 * shares.sum() ** 2 / np.sum(shares**2)
+    assert spread.freedom[0] == pytest.approx(expected, rel=1e-6)
+
+
 def test_each_curve_has_its_own_noise():
     rng = np.random.default_rng(3)
     jacobian = np.zeros((2000, 2))

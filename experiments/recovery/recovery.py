@@ -7,6 +7,10 @@ to the fit. Each test is fitted from the curves alone with the defaults of `foam
 search, no knowledge of the truth), and every 95 % interval of a parameter that is not called "not
 determined" either holds the truth or does not.
 
+Beside it stands what the same draws of noise would make of a problem that is linear about the truth
+and whose noise is known: there each interval holds in exactly 95 % of cases, so what its count is
+off is the luck of the draw, and the rest is the doing of the fit.
+
     python experiments/recovery/recovery.py                  # 200 tests for each of six classes
     python experiments/recovery/recovery.py --tests 40
     python experiments/recovery/recovery.py --intervals local
@@ -26,9 +30,13 @@ import pandas as pd
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy.signal import lfilter
-from scipy.stats import binomtest
+from scipy.stats import binomtest, norm
 
 import foamfit as ff
+from foamfit.insight import unreached
+from foamfit.problem import make_problem
+from foamfit.uncertainty import NoiseProcess, parts
+from foamfit.vicinity import Vicinity
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent / "noise_floor"))
@@ -56,11 +64,19 @@ class Class:
         """What the noise is called."""
         return "white" if self.tau == 1.0 else "correlated"
 
+    @property
+    def rho(self) -> float:
+        """Autocorrelation from one sample to the next."""
+        return (self.tau - 1.0) / (self.tau + 1.0)
+
+    def rng(self, seed: int) -> np.random.Generator:
+        """Source of a test's spring and noise."""
+        return np.random.default_rng([seed, self.samples, int(self.tau)])
+
     def draw(self, rng: np.random.Generator, samples: int) -> np.ndarray:
         """Noise of unit variance."""
-        rho = (self.tau - 1.0) / (self.tau + 1.0)
         white = rng.standard_normal(samples + 500)
-        return lfilter([np.sqrt(1.0 - rho**2)], [1.0, -rho], white)[500:]
+        return lfilter([np.sqrt(1.0 - self.rho**2)], [1.0, -self.rho], white)[500:]
 
 
 CLASSES = tuple(Class(tau, samples) for tau in (1.0, TAU) for samples in (300, 1000, 5000))
@@ -68,8 +84,7 @@ CLASSES = tuple(Class(tau, samples) for tau in (1.0, TAU) for samples in (300, 1
 
 def run_test(group: Class, seed: int, intervals: str = "auto") -> list[dict[str, object]]:
     """Fit one synthetic test; a row for each parameter."""
-    rng = np.random.default_rng([seed, group.samples, int(group.tau)])
-    spring, measurement = random_case(rng, group.samples, group.draw)
+    spring, measurement = random_case(group.rng(seed), group.samples, group.draw)
     began = time.perf_counter()
     result = ff.fit(measurement, seed=0, intervals=intervals)
     seconds = time.perf_counter() - began
@@ -94,6 +109,48 @@ def run_test(group: Class, seed: int, intervals: str = "auto") -> list[dict[str,
             }
         )
     return rows
+
+
+def linear_test(group: Class, seed: int) -> list[dict[str, object]]:
+    """Intervals of known noise about the truth, to first order in it; a row for each parameter."""
+    drawn: list[np.ndarray] = []
+
+    def draw(rng: np.random.Generator, samples: int) -> np.ndarray:
+        drawn.append(group.draw(rng, samples))
+        return drawn[-1]
+
+    spring, measurement = random_case(group.rng(seed), group.samples, draw)
+    problem = make_problem(measurement, "bistable", "impact", None, None, False)
+    truth = np.array([*spring.seven, spring.eta, 0.0])
+    lost = unreached(problem, truth)
+    names = tuple(name for name in problem.free() if name not in lost)
+    around = Vicinity.of(problem, truth, names)
+    scaled = around.jacobian * around.sizes
+    pull = np.linalg.pinv(scaled.T @ scaled, rcond=1e-14, hermitian=True) @ scaled.T
+    variance = np.zeros(len(names))
+    for part, noise in zip(parts(problem.objective.sizes), drawn, strict=True):
+        level = np.std(around.residual[part]) / np.std(noise)
+        process = NoiseProcess(np.array([group.rho] if group.rho else []), level**2)
+        variance += process.forms(pull[:, part].T)
+    z = pull @ around.residual / np.sqrt(variance)
+    return [
+        {
+            "noise": group.noise,
+            "samples": group.samples,
+            "test": seed,
+            "parameter": name.removeprefix("s1_"),
+            "linear": bool(abs(off) < norm.ppf(0.975)),
+        }
+        for name, off in zip(names, z, strict=True)
+    ]
+
+
+def with_linear(rows: pd.DataFrame) -> pd.DataFrame:
+    """Rows of fits with what a linear problem would make of the same noise."""
+    groups = {(group.noise, group.samples): group for group in CLASSES}
+    tests = rows[["noise", "samples", "test"]].drop_duplicates().itertuples(index=False)
+    linear = [row for noise, size, test in tests for row in linear_test(groups[noise, size], test)]
+    return rows.merge(pd.DataFrame(linear), how="left")
 
 
 def run(tests: int, intervals: str, raw: Path | None) -> pd.DataFrame:
@@ -135,6 +192,7 @@ def coverage(rows: pd.DataFrame) -> pd.DataFrame:
                     "coverage": held / count,
                     "error low": error.low,
                     "error high": error.high,
+                    "coverage, linear": own["linear"].dropna().astype(float).mean(),
                     "half width over truth, median": own["width"].median(),
                     "profiled": (own["method"] == "profile likelihood").mean(),
                 }
@@ -166,6 +224,11 @@ def picture(table: pd.DataFrame, path: Path, tests: int) -> None:
                 x, percent, error, fmt="o", color=colour, markersize=3, linewidth=0.9,
                 label=f"{samples} samples per curve" if column == 0 else None,
             )  # fmt: skip
+            above.plot(
+                x, 100.0 * own["coverage, linear"], "x", color=colour, markersize=3.5,
+                markeredgewidth=0.7, alpha=0.8,
+                label="linear problem, same noise" if (column, samples) == (0, 5000) else None,
+            )  # fmt: skip
             below.plot(x[:-1], 100.0 * own["half width over truth, median"][:-1], "o",
                        color=colour, markersize=3)  # fmt: skip
         below.set_yscale("log")
@@ -175,7 +238,10 @@ def picture(table: pd.DataFrame, path: Path, tests: int) -> None:
     for panel in axes.flat:
         panel.tick_params(labelsize=8)
         panel.spines[["top", "right"]].set_visible(False)
-    figure.legend(frameon=False, fontsize=8, loc="outside lower center", ncols=3)
+    figure.legend(
+        frameon=False, fontsize=8, loc="outside lower center", ncols=4, columnspacing=1.2,
+        handletextpad=0.4,
+    )  # fmt: skip
     figure.savefig(path, dpi=200)
 
 
@@ -188,7 +254,7 @@ def main() -> None:
     options = parser.parse_args()
     began = time.perf_counter()
     run_test(CLASSES[0], 0)  # compiles
-    rows = run(options.tests, options.intervals, options.raw)
+    rows = with_linear(run(options.tests, options.intervals, options.raw))
     table = coverage(rows)
     suffix = "" if options.intervals == "auto" else f"_{options.intervals}"
     table.to_csv(options.out / f"recovery{suffix}.csv", index=False, float_format="%.4g")
@@ -197,6 +263,9 @@ def main() -> None:
         index=["noise", "samples"], columns="parameter", values="coverage", sort=False
     )
     print((100.0 * wide).round(1).to_string())
+    whole = table[table["parameter"] == "all"].set_index(["noise", "samples"])
+    print("of a linear problem, same noise:", end=" ")
+    print(", ".join(f"{100.0 * share:.1f}" for share in whole["coverage, linear"]))
     print(
         f"{options.tests} tests per class in {(time.perf_counter() - began) / 60:.1f} minutes, "
         f"median {rows['seconds'].median():.2f} s per fit "

@@ -108,16 +108,9 @@ def profile(
         Incomplete if the deadline or Ctrl-C ended it: `ci95` is then that of what was done.
     """
     tracker = Tracker(vicinity.problem.objective) if tracker is None else tracker
-    sides: list[_Side] = []
-    complete = True
-    for sign in (-1.0, 1.0):
-        sides.append(_Side(vicinity, name, Refit(vicinity, tracker), sign))
-        try:
-            sides[-1].follow(valleys)
-        except (SearchStoppedError, KeyboardInterrupt):
-            complete = False
-            break
-    return _assemble(vicinity, name, sides, complete)
+    walk = _Walk(vicinity, name, tracker)
+    walk.follow(valleys)
+    return walk.profile
 
 
 @dataclass(eq=False)
@@ -135,7 +128,7 @@ class _Side:
         self.column = best.names.index(self.name)
         self.place = best.index[self.name]
         self.unit = float(best.spread.inflation[self.column])
-        self.quantile = best.quantile
+        self.quantile = float(best.quantiles[self.column])
         self.places = [self.refit.start()]
         low, high = best.limits(self.name)
         self.limit = low if self.sign < 0 else high
@@ -153,20 +146,29 @@ class _Side:
         return math.sqrt(max(self.rise(place), 0.0))
 
     def follow(self, valleys: Sequence[Array]) -> None:
-        """Go outward until well beyond the cut, then place the outermost crossing."""
-        self._outward()
-        for valley in sorted(valleys, key=lambda point: self.sign * float(point[self.place])):
+        """Go outward until well beyond the cut and place the crossing; go on beyond the valleys.
+
+        What was followed before is not followed again.
+        """
+        if len(self.places) == 1:
+            self._outward()
+            self._inward()
+        reach = PLACED * self.quantile * float(self.vicinity.spread.stderr[self.column])
+        for valley in sorted(valleys, key=lambda point: -self.sign * float(point[self.place])):
             value = float(valley[self.place])
-            if self.better or self.sign * (value - self.value(self.places[-1])) <= 0.0:
-                continue
+            edge = self.value(self.places[-1]) if self.is_open else self.bound
+            if self.better or self.sign * (value - edge) <= reach:
+                break
             residual = self.refit.residual(valley)
             if residual is None:
                 continue
             place = self.refit.run(self.refit.fresh(valley, residual), self._others)
             if self.rise(place) < self.quantile**2:
-                self.places.append(place)
+                # Places farther out are of another valley, or of refits that stalled.
+                inside = [p for p in self.places if self.sign * (self.value(p) - value) < 0.0]
+                self.places = [*inside, place]
                 self._outward()
-        self._inward()
+                self._inward()
 
     @property
     def _others(self) -> NDArray[np.bool_]:
@@ -254,22 +256,45 @@ class _Side:
         return self._bracket()[1] is None
 
 
-def _assemble(vicinity: Vicinity, name: str, sides: list[_Side], complete: bool) -> Profile:
-    """Put the sides of a profile together; a side that was not begun ends at the best point."""
-    low = sides[0]
-    high = sides[1] if len(sides) > 1 else None
-    places = low.places[::-1] + (high.places[1:] if high else [])
-    return Profile(
-        name=name,
-        values=np.array([low.value(place) for place in places]),
-        rises=np.array([low.rise(place) for place in places]),
-        points=np.array([place.point for place in places]),
-        cut=vicinity.quantile**2,
-        ci95=(low.bound, high.bound if high else low.value(low.places[0])),
-        open_low=low.is_open,
-        open_high=high.is_open if high else True,
-        complete=complete,
-    )
+class _Walk:
+    """A profile that is being followed; a side that was not begun ends at the best point."""
+
+    def __init__(self, vicinity: Vicinity, name: str, tracker: Tracker) -> None:
+        refit = Refit(vicinity, tracker)
+        self.low, self.high = (_Side(vicinity, name, refit, sign) for sign in (-1.0, 1.0))
+        self.complete, self._turned = True, False
+
+    def follow(self, valleys: Sequence[Array]) -> None:
+        """Follow both sides, or go on beyond further valleys; incomplete if that was ended."""
+        try:
+            self.low.follow(valleys)
+            self._turned = True
+            self.high.follow(valleys)
+        except (SearchStoppedError, KeyboardInterrupt):
+            self.complete = False
+
+    @property
+    def better(self) -> Array | None:
+        """A point that is better than the best."""
+        least = min((*self.low.places, *self.high.places), key=lambda place: place.cost)
+        return least.point if self.low.better or self.high.better else None
+
+    @property
+    def profile(self) -> Profile:
+        """What was found so far."""
+        low, high = self.low, self.high
+        places = low.places[::-1] + high.places[1:]
+        return Profile(
+            name=low.name,
+            values=np.array([low.value(place) for place in places]),
+            rises=np.array([low.rise(place) for place in places]),
+            points=np.array([place.point for place in places]),
+            cut=low.quantile**2,
+            ci95=(low.bound, high.bound if self._turned else high.value(high.places[0])),
+            open_low=low.is_open,
+            open_high=high.is_open or not self._turned,
+            complete=self.complete,
+        )
 
 
 def departures(vicinity: Vicinity) -> Array:
@@ -295,7 +320,7 @@ def departures(vicinity: Vicinity) -> Array:
 
         here = least(start.residual)
         stderr = float(vicinity.spread.stderr[i])
-        reach = vicinity.quantile * stderr
+        reach = float(vicinity.quantiles[i]) * stderr
         value = vicinity.values[vicinity.index[name]]
         low, high = vicinity.limits(name)
         for side, room in enumerate((value - low, high - value)):
@@ -645,7 +670,7 @@ def _elsewhere(vicinity: Vicinity, valleys: Sequence[Array], tracker: Tracker) -
         residual = tracker.consider(valley)
         rise = (float(residual @ residual) - vicinity.cost) / vicinity.spread.inflation
         apart = np.abs(valley - vicinity.values)[places] / vicinity.spread.stderr
-        out |= (rise < vicinity.quantile**2) & (apart > vicinity.quantile)
+        out |= (rise < vicinity.quantiles**2) & (apart > vicinity.quantiles)
     return out
 
 
@@ -656,27 +681,40 @@ def _by_profiles(
     tracker: Tracker,
     budget: float,
 ) -> Intervals:
-    """Profiles of some parameters, until they are done, a better point is met or all ends."""
+    """Profiles of some parameters, until they are done, a better point is met or all ends.
+
+    A point within the cut that the profile of one parameter has met is evidence for the others too:
+    their intervals must hold it. So each profile goes on beyond what the others have met, and a
+    parameter that these put outside of its local interval is profiled as well. Refits with one
+    parameter held end in the nearest of several shallow valleys; those with another one held have
+    been led through the next.
+    """
     objective = tracker.objective
     allowed = objective.evaluations + budget
-    profiles: list[Profile] = []
-    better = None
-    for name in names:
-        if objective.evaluations >= allowed:
+    walks: dict[str, _Walk] = {}
+    wanted, better = list(names), None
+    known = [name for name in vicinity.names if vicinity.knows(name)]
+    for name in (*names, *known):
+        met = _met(vicinity, name, [walk for other, walk in walks.items() if other != name])
+        begun = name in walks
+        if name not in wanted:
+            if not _outside(vicinity, name, met):
+                continue
+            wanted.append(name)
+        if objective.evaluations >= allowed and not begun:
+            continue
+        walk = walks.setdefault(name, _Walk(vicinity, name, tracker))
+        walk.follow(met if begun else [*valleys, *met])
+        better = walk.better
+        if better is not None or not walk.complete:
             break
-        profiles.append(profile(vicinity, name, tracker, valleys))
-        lowest = profiles[-1].rises.argmin()
-        if profiles[-1].rises[lowest] < -BETTER * profiles[-1].cut:
-            better = profiles[-1].points[lowest]
-            break
-        if not profiles[-1].complete:
-            break
+    profiles = [walk.profile for walk in walks.values()]
     whole = {p.name: p for p in profiles if p.complete}
-    left = tuple(name for name in names if name not in whole)
+    left = tuple(name for name in wanted if name not in whole)
     notes: tuple[str, ...] = ()
-    if profiles and not profiles[-1].complete:
+    if len(whole) < len(profiles):
         notes = (
-            f"The profiles were stopped: {len(whole)} of {len(names)} were done, and "
+            f"The profiles were stopped: {len(whole)} of {len(wanted)} were done, and "
             f"the intervals of {', '.join(left)} are local.",
         )
     return Intervals(
@@ -687,6 +725,24 @@ def _by_profiles(
         notes=notes,
         better=better,
     )
+
+
+def _met(vicinity: Vicinity, name: str, walks: Sequence[_Walk]) -> list[Array]:
+    """Lowest and highest of a parameter among the points within its cut that profiles have met."""
+    column, at = vicinity.names.index(name), vicinity.index[name]
+    highest = vicinity.quantiles[column] ** 2 * vicinity.spread.inflation[column]
+    places = [place for walk in walks for place in (*walk.low.places, *walk.high.places)]
+    points = [place.point for place in places if place.cost - vicinity.cost < highest]
+    if not points:
+        return []
+    return [min(points, key=lambda point: point[at]), max(points, key=lambda point: point[at])]
+
+
+def _outside(vicinity: Vicinity, name: str, points: Sequence[Array]) -> bool:
+    """Whether one of the points is outside of a local interval."""
+    column, at = vicinity.names.index(name), vicinity.index[name]
+    half = vicinity.quantiles[column] * vicinity.spread.stderr[column] * (1.0 + PLACED)
+    return any(abs(point[at] - vicinity.values[at]) > half for point in points)
 
 
 def _by_bootstrap(

@@ -9,12 +9,13 @@ them; n/τ is the effective number of samples, τ the autocorrelation time.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
+from scipy.linalg import toeplitz
 
 Array = NDArray[np.float64]
 
@@ -37,10 +38,14 @@ class NoiseProcess:
         φ_1 … φ_p; none for white noise.
     variance : float
         Of the process itself, not of the white noise that drives it.
+    samples : float
+        How many it was read off, less those that the parameters of the fit took; infinite if it is
+        known.
     """
 
     coefficients: Array
     variance: float
+    samples: float = math.inf
 
     def autocovariance(self, n: int) -> Array:
         """Autocovariance at the lags 0 … n-1."""
@@ -73,6 +78,34 @@ class NoiseProcess:
         spectrum = np.fft.rfft(columns, 2 * n, axis=0) * around[:, None]
         product: Array = np.fft.irfft(spectrum, axis=0)[:n]
         return product
+
+    def forms(self, columns: Array) -> Array:
+        """Variance lᵀΣl of the noise times each column l of an (n, k) array, (k,)."""
+        return np.asarray(np.einsum("ij,ij->j", columns, self.times(columns)))
+
+    def doubt(self, columns: Array) -> Array:
+        """Variance of `forms`, as estimated from `samples`, (k,): the delta method.
+
+        Estimates of the white variance w and of φ are independent for large n. That of w has the
+        variance 2w²/n of normal noise; those of φ have the covariance w Γ⁻¹/n with Γ that of p
+        successive samples (Brockwell & Davis 1991, Time Series: Theory and Methods, theorem 8.1.1).
+        """
+        if math.isinf(self.samples):
+            return np.zeros(columns.shape[1])
+        here = self.forms(columns)
+        out = 2.0 * here**2
+        order = self.coefficients.size
+        if order:
+            white = self.variance * self._white_share()
+            step = 1e-4 * (1.0 - np.max(np.abs(np.roots(np.append(1.0, -self.coefficients)))))
+            moved = [
+                NoiseProcess(phi, white / NoiseProcess(phi, 1.0)._white_share())
+                for phi in self.coefficients + step * np.eye(order)
+            ]
+            slopes = np.array([(other.forms(columns) - here) / step for other in moved])
+            gamma = toeplitz(self.autocovariance(order))
+            out += white * np.einsum("ik,ik->k", slopes, np.linalg.solve(gamma, slopes))
+        return np.asarray(out / self.samples)
 
 
 def _levinson(lags: Array) -> list[tuple[Array, float]]:
@@ -131,7 +164,8 @@ def noise_processes(residual: Array, jacobian: Array, sizes: tuple[int, ...]) ->
         scores = [n * math.log(max(white, 1e-300)) + len(f) * math.log(n) for f, white in fits]
         order = int(np.argmin(scores))
         sums[-1] = sums[-1][: order + 1]
-        processes.append(NoiseProcess(_damped(fits[order][0], n), float(sums[-1][0] / n)))
+        left = max(n - float(np.sum(basis[part] ** 2)), 1.0)
+        processes.append(NoiseProcess(_damped(fits[order][0], n), float(sums[-1][0] / n), left))
     if not basis.shape[1]:
         return processes
     for _ in range(CORRECTIONS):
@@ -161,7 +195,9 @@ def _corrected(
     lags *= min(1.0, 4.0 * seen[0] / n / lags[0]) if lags[0] > 0.0 else 1.0
     if lags[0] <= 0.0:
         return process
-    return NoiseProcess(_damped(_levinson(lags)[-1][0], n), float(lags[0]))
+    return replace(
+        process, coefficients=_damped(_levinson(lags)[-1][0], n), variance=float(lags[0])
+    )
 
 
 def _damped(coefficients: Array, n: int) -> Array:
@@ -206,6 +242,11 @@ class Covariance:
     inflation : (k,) array
         Variance of each parameter over that of a residual of white noise of unit variance: what a
         rise of the sum of squares along a parameter's profile must be divided by to be a χ².
+    freedom : (k,) array
+        Degrees of freedom of each variance: those of the χ² distribution that is as uncertain as
+        the estimated noise makes it (Satterthwaite 1946, Biometrics Bull. 2, 110), but no more than
+        the effective samples that the parameters have left: what a model cannot follow is no noise
+        whose spectrum is known.
     effective : float
         Effective number of samples.
     noise : tuple of NoiseProcess
@@ -214,6 +255,7 @@ class Covariance:
 
     matrix: Array
     inflation: Array
+    freedom: Array
     effective: float
     noise: tuple[NoiseProcess, ...]
 
@@ -221,11 +263,6 @@ class Covariance:
     def tau(self) -> tuple[float, ...]:
         """Autocorrelation time of each curve, samples."""
         return tuple(process.tau for process in self.noise)
-
-    @property
-    def freedom(self) -> float:
-        """Degrees of freedom: effective samples that are left after the parameters."""
-        return max(self.effective - len(self.matrix), 1.0)
 
     @property
     def stderr(self) -> Array:
@@ -270,9 +307,15 @@ def covariance(
     matrix[lost, :] = np.nan
     matrix[:, lost] = np.nan
     effective = sum(n / process.tau for n, process in zip(sizes, noise, strict=True))
+    errors = left @ root.T  # of the estimates, by the noise of each sample
+    curves = list(zip(noise, parts(sizes), strict=True))
+    variance = np.sum([process.forms(errors[part]) for process, part in curves], axis=0)
+    doubt = np.sum([process.doubt(errors[part]) for process, part in curves], axis=0)
+    known = 2.0 * variance**2 / np.maximum(doubt, 1e-300)
     return Covariance(
         matrix * np.outer(sizes_of, sizes_of),
         np.diag(matrix) / np.diag(inverse),
+        np.minimum(known, max(effective - len(matrix), 1.0)),
         float(effective),
         tuple(noise),
     )

@@ -272,7 +272,7 @@ def _varied(
     low, high = problem.params[name].min, problem.params[name].max
     column = insight.names.index(name)
     stderr = float(spread.stderr[column])
-    half = uncertainty.half_width(stderr, spread.freedom)
+    half = uncertainty.half_width(stderr, float(spread.freedom[column]))
     local = (value - half, value + half)
     ends = intervals.ends.get(name, local)
     ratio = 0.5 * (ends[1] - ends[0]) / half if half > 0.0 else math.nan

@@ -99,9 +99,9 @@ class Vicinity:
         return self.problem.index
 
     @cached_property
-    def quantile(self) -> float:
-        """Student's t of the 95 % interval."""
-        return uncertainty.half_width(1.0, self.spread.freedom)
+    def quantiles(self) -> Array:
+        """Student's t of the 95 % interval of each parameter, (k,)."""
+        return np.array([uncertainty.half_width(1.0, freedom) for freedom in self.spread.freedom])
 
     def limits(self, name: str) -> tuple[float, float]:
         """Limits of a parameter, SI."""
@@ -111,7 +111,7 @@ class Vicinity:
     def knows(self, name: str) -> bool:
         """Whether the local interval says anything of a parameter."""
         column = self.names.index(name)
-        half = self.quantile * self.spread.stderr[column]
+        half = self.quantiles[column] * self.spread.stderr[column]
         return bool(half <= uncertainty.NOTHING * self.sizes[column])
 
     def along(self, name: str) -> Array:
@@ -174,7 +174,7 @@ class Refit:
             for own in (name.removesuffix("dsigma") for name in best.names if "_dsigma" in name)
         ]
         # Of the cost: less than this is no gain.
-        self.enough = 1e-3 * best.quantile**2 * float(np.nanmin(best.spread.inflation))
+        self.enough = 1e-3 * float(np.nanmin(best.quantiles**2 * best.spread.inflation))
 
     def start(self) -> Place:
         """The best point itself."""
