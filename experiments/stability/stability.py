@@ -29,7 +29,7 @@ from matplotlib.figure import Figure
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
 
-from judges import balance_of, explicit_fits, refined  # noqa: E402
+from judges import balance_of, explicit_fits, refined, ripple_of  # noqa: E402
 from scenes import SWEEPS, Point, designed, scene_of, swept  # noqa: E402
 
 import foamfit as ff  # noqa: E402
@@ -55,7 +55,7 @@ def judged(point: Point) -> dict[str, Any]:
     found: dict[str, Any] = {
         "outcome": "refused", "reason": "", "method": "", "steps": 0, "seconds": 0.0,
         "refinement": math.nan, "other method": math.nan, "energy": math.nan,
-        "impulse": math.nan, "error": math.nan,
+        "impulse": math.nan, "ripple": math.nan, "error": math.nan,
     }  # fmt: skip
     scene = scene_of(point)
     began = time.perf_counter()
@@ -84,6 +84,8 @@ def judged(point: Point) -> dict[str, Any]:
         found["other method"] = math.nan if other is None else other
     if balance is not None:
         found |= {"energy": balance.energy, "impulse": balance.impulse}
+    ripple = ripple_of(scene, answer, RTOL)
+    found["ripple"] = math.nan if ripple is None else ripple
     errors = [found["refinement"], found["other method"]]
     found["error"] = np.nanmax([math.inf if e is None else e for e in errors])
     bad = [
@@ -93,6 +95,7 @@ def judged(point: Point) -> dict[str, Any]:
             ("other method", RTOL),
             ("energy", ENERGY_BAR),
             ("impulse", ENERGY_BAR),
+            ("ripple", RTOL),
         )
         if found[name] is None or found[name] > bar
     ]

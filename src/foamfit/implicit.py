@@ -63,6 +63,12 @@ STAGES = 5
 # more than the wanted error, it is followed for so many steps of one spring all the same.
 SHORT, PATIENCE, LITTLE_PATIENCE, LONGEST_PATIENCE = 5e-4, 600, 60, 10_000
 
+# Behind heavy dashpots contact ends when no more than 1e-12 of the peak of the base stress is left:
+# while the striker presses it is followed with so large an error of what is left, at most.
+FAINT = 1e-7
+# (stopping rate)/(creep rate) from which that is so.
+FAINTLY = 1e3
+
 
 def radau(stages: int) -> tuple[Array, Array]:
     """Nodes c and matrix A of the Radau IIA method of order 2 stages - 1."""
@@ -392,6 +398,7 @@ def _describe(
     total: Array,
     reach: float,
     load: float,
+    faint: float,
     strains: Array,
     base: Array,
     stress: Array,
@@ -400,7 +407,8 @@ def _describe(
     """Fill the polynomials of the strains and the base stress of a step.
 
     `reach` and `load` are the scales of motion and stress before the step. Returns the truncation
-    relative to the scales, and the scales with what the step itself reaches.
+    relative to the scales, and the scales with what the step itself reaches. While the striker
+    presses, `faint` weighs the truncation of the base stress relative to what is left of it.
     """
     count = heights.size
     for i in range(count):
@@ -409,10 +417,17 @@ def _describe(
             stress[i, j] = stress_on(rows[i], branches[i], eps[i, j])
             reach = max(reach, heights[i] * abs(eps[i, j]))
             load = max(load, abs(stress[i, j]))
+    present, parts = abs(base0), 0.0
     for j in range(STAGES):
-        load = max(load, abs(total[0, j]))
+        present = max(present, abs(total[0, j]))
+        parts = max(parts, abs(stress[0, j]))
+    load = max(load, present)
     _polynomial(base0, total[0], base)
-    error = _truncation(base) / load if load > 0.0 else 0.0
+    error = 0.0
+    if load > 0.0:
+        error = _truncation(base) / load
+        if faint > 0.0:  # what is left is known to the rounding of its parts
+            error = max(error, faint * error * load / max(present, FAINT * parts))
     for i in range(count):
         if reach > 0.0:
             error = max(error, _truncation(strains[i]) * heights[i] / reach)
@@ -553,6 +568,22 @@ def hurry_of(
 
 
 @compiled
+def parts_faintly(rows: Array, heights: Array, mass: float) -> bool:
+    """Tell whether dashpots stop a striker long before the springs throw it back.
+
+    With the rates a = k/c of creep and b = c/m of stopping, contact ends where the base stress has
+    fallen to (a/b)² of its peak: explicit steps, whose error is relative to the peak, lose it.
+    """
+    soft, flow = 0.0, 0.0
+    for i in range(heights.size):
+        if rows[i, ETA] == 0.0:
+            return False
+        soft += heights[i] / rows[i, K0]
+        flow += heights[i] / rows[i, ETA]
+    return soft > FAINTLY * flow * flow * mass
+
+
+@compiled
 def _ringing(
     rows: Array, heights: Array, ends: Branches, mass: Array, drag: float, top: int
 ) -> Array:
@@ -590,6 +621,65 @@ def _rings(rates: Array, span: float) -> bool:
         if rates[g, 0] * span > 0.5 and rates[g, 1] * span < 20.0:
             return True
     return False
+
+
+@compiled
+def _passed_over(
+    rows: Array,
+    branches: Branches,
+    heights: Array,
+    ends: Branches,
+    mass: Array,
+    drag: float,
+    top: int,
+    eps0: Array,
+    z: Array,
+    span: float,
+    wait: float,
+    alive: Array,
+    begun: Array,
+    fading: Array,
+) -> tuple[float, float, float, float]:
+    """Vibrations that steps were too long to show: motion, stress; rate and decay of a new one.
+
+    A mass whose velocity differs by δv from that at which the polynomial of the step sets out
+    vibrates from then on by δv/ω, of which the points of the step show no more than δv/ω/(ω span).
+    `begun` is filled with δv/√ω of each mass; that of earlier steps is in `alive`, since a
+    vibration whose stiffness changes slowly keeps its energy over its frequency. `fading` is filled
+    with the rate at which it dies out: the slowest vibration of masses in a row decays last, and
+    moves as far as all of them together. What is left after `wait` is returned.
+    """
+    moved, pressed, rate, decay, worst = 0.0, 0.0, 0.0, 0.0, 0.0
+    below_stiff, below_damp = 0.0, 0.0
+    i0 = 0
+    row = math.sin(0.5 * math.pi / max(ends.size, 2))
+    for g in range(ends.size + 1):
+        stiff, damp = 0.0, 0.0
+        if g < ends.size and not (g == ends.size - 1 and top == STRESS):
+            soft, flow = 0.0, 0.0
+            for i in range(i0, ends[g]):
+                soft += heights[i] / slope_on(rows[i], branches[i], eps0[i])
+                flow += heights[i] / rows[i, ETA] if rows[i, ETA] > 0.0 else math.inf
+            stiff, damp = 1.0 / soft, (0.0 if flow == math.inf else 1.0 / flow)
+            i0 = ends[g]
+        if g > 0 and (g < ends.size or top == FREE) and below_stiff + stiff > 0.0:
+            hold = below_damp + damp + (drag if g == ends.size else 0.0)
+            own = math.sqrt((below_stiff + stiff) / mass[g - 1])
+            fade = 0.5 * hold / mass[g - 1]
+            begun[g - 1], fading[g - 1] = 0.0, 2.0 * row * row * fade
+            if own * span > 2.0 and fade < own:
+                kick = 0.0
+                for j in range(STAGES):
+                    kick += COEFFICIENTS[0, j] * z[ends[g - 1] - 1, j] / span
+                begun[g - 1] = abs(kick) / math.sqrt(own)
+                if begun[g - 1] > worst:
+                    worst, rate, decay = begun[g - 1], own, fading[g - 1]
+            size = (alive[g - 1] + begun[g - 1]) / math.sqrt(own)
+            size *= math.exp(-fading[g - 1] * wait)
+            moved += size
+            pressed = max(pressed, max(below_stiff, stiff) * size)
+        below_stiff, below_damp = stiff, damp
+    return moved, pressed, rate, decay
 
 
 @compiled
@@ -668,7 +758,13 @@ def integrate_implicit(
         pace = min(pace, 5.0 * _bounce(rows, heights, areal, drag))
     short = SHORT * pace * (tol / 3e-8) ** (1.0 / 6.0)
     ringing = _ringing(rows, heights, ends, mass, drag, top)
+    fast = ringing[:, 0].max() > 0.0
+    faint = 0.0
+    if struck and parts_faintly(rows, heights, mass[groups - 1]):
+        faint = min(1.0, tol / FAINT)
     lost[0], burst = 0.0, 0.0
+    alive, begun, fading = np.zeros(groups), np.zeros(groups), np.zeros(groups)
+    seen, passed_w, passed_s = 0.0, 0.0, 0.0  # what lost[0] is made of
     w_scale, s_scale, pressed, knot, switches, rate = 0.0, 0.0, False, -1, 0, 0.0
     contact_end = math.nan
     hurry, shorts, floor, stalled = 0, 0, 0.0, 0
@@ -728,6 +824,12 @@ def integrate_implicit(
         elif struck:
             span = min(span, 0.02 * pace)
         longest = span
+        wait = 0.0  # until the next sample
+        if fast:
+            after = done
+            while after < t.size - 1 and t[after] <= now:
+                after += 1
+            wait = max(t[after] - now, 0.0)
         target, side, level = -1, 0, 0.0  # what the step is to end at: a spring, or `count`: base
         arrived, chased, tries = False, 0, 0
         trial_span, trial_error = math.inf, math.inf  # to see whether shorter steps are better
@@ -754,6 +856,7 @@ def integrate_implicit(
                 continue
             error, reach, load = _describe(
                 rows, branches, heights, eps0, base0, eps, total, w_scale, s_scale,
+                faint if pressed else 0.0,
                 strains, base, residual, some,
             )  # fmt: skip
             if chased == 0:
@@ -773,17 +876,28 @@ def integrate_implicit(
                 rings = error > 1.0 and _rings(ringing, span)
                 if error > 1.0 and not stuck and span <= floor * (1.0 + 1e-9):
                     patient = shorts * count < LONGEST_PATIENCE
-                    if rings and patient and lost[0] - burst + error * tol > 0.3 * wanted:
+                    if rings and patient and seen - burst + error * tol > 0.3 * wanted:
                         floor, hurry = 0.0, -4 * PATIENCE
                 if error > 1.0 and not stuck and span > floor * (1.0 + 1e-9):
                     span = max(span * min(max(factor, 0.1), 0.9), floor)
                     longest = span
                     continue
                 if error > 1.0 and rings and error * tol > burst:
-                    lost[0] += error * tol - burst
+                    seen += error * tol - burst
                     burst = error * tol
                 elif error <= 1.0:
                     burst = 0.0
+                if fast and floor == 0.0 and not stuck:
+                    moved, pressing, vibration, decay = _passed_over(
+                        rows, branches, heights, ends, mass, drag, top, eps0, z, span, wait,
+                        alive, begun, fading,
+                    )  # fmt: skip
+                    size = max(moved / reach, pressing / load) if moved > 0.0 else 0.0
+                    left = LONGEST_PATIENCE // count - shorts
+                    if size > 0.1 * wanted and vibration > 0.0 and decay * left > 10.0 * vibration:
+                        span = 1.0 / vibration  # it dies out soon enough to be followed
+                        longest = span
+                        continue
                 proposal = max(span * min(max(factor, 0.2), 5.0), floor)
                 if error > 1.0:
                     proposal = max(proposal, 2.0 * span)
@@ -836,6 +950,14 @@ def integrate_implicit(
             last = span >= horizon - now or end >= horizon
             if last:
                 end = horizon
+            if fast:
+                moved, pressing, _, _ = _passed_over(
+                    rows, branches, heights, ends, mass, drag, top, eps0, z, span, wait,
+                    alive, begun, fading,
+                )  # fmt: skip
+                passed_w, passed_s = max(passed_w, moved), max(passed_s, pressing)
+                for g in range(groups):
+                    alive[g] = (alive[g] + begun[g]) * math.exp(-fading[g] * span)
             for i in range(count):
                 for j in range(STAGES):
                     residual[i, j] = z[i, j] + NODES[j] * span * v0[i]
@@ -853,6 +975,9 @@ def integrate_implicit(
             if top != STRESS:
                 w_scale = max(w_scale, abs(w[count - 1]))
             s_scale = max(s_scale, abs(total[0, STAGES - 1]))
+            lost[0] = seen
+            if passed_s > 0.0:
+                lost[0] += max(passed_w / w_scale, passed_s / s_scale)
             now = end
             taken = span
             if not leaves_here and total[0, STAGES - 1] > 10.0 * slack[count]:
