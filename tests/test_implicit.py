@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import foamfit as ff
-from foamfit import implicit, taylor
-from foamfit.simulation import RADAU, TAYLOR, Motion, plan
+from foamfit import collocation, implicit, taylor
+from foamfit.simulation import NO_DIRECTIONS, NO_SLOPES, RADAU, TAYLOR, Motion, plan
 from reference import Bistable, Chain, Impact, Linear, energy_balance
 from test_simulate import (
     AREA,
@@ -66,8 +66,8 @@ def struck(name: str, eta: float = 0.0, mass: float = 0.0) -> tuple[Chain, ff.Im
 
 def test_order_conditions() -> None:
     """B(2s - 1), C(s) and D(s - 1) make the order 2s - 1; the last stage is the step's end."""
-    c, a = implicit.radau(implicit.STAGES)
-    s, b = implicit.STAGES, a[-1]
+    c, a = collocation.radau(collocation.STAGES)
+    s, b = collocation.STAGES, a[-1]
     assert c[-1] == 1.0
     assert (np.diff(c) > 0.0).all()
     for k in range(1, 2 * s):
@@ -79,7 +79,7 @@ def test_order_conditions() -> None:
 
 
 def test_two_stages_are_the_known_ones() -> None:
-    c, a = implicit.radau(2)
+    c, a = collocation.radau(2)
     np.testing.assert_allclose(c, [1 / 3, 1])
     np.testing.assert_allclose(a, [[5 / 12, -1 / 12], [3 / 4, 1 / 4]])
 
@@ -230,8 +230,8 @@ def test_contact_with_heavy_dashpots_ends_as_in_closed_form(eta: float) -> None:
     a = k / (m * b)
     end = 2.0 * np.log(b / a) / (b - a)
     chain = Chain((spring,), (height,), AREA)
-    for implicit in (True, None):  # None: also where a short history would do for explicit steps
-        got = run(chain, blow, 1e-6, implicit=implicit, time=np.linspace(0.0, 3.0 * end, 31))
+    for choice in (True, None):  # None: also where a short history would do for explicit steps
+        got = run(chain, blow, 1e-6, implicit=choice, time=np.linspace(0.0, 3.0 * end, 31))
         assert got.contact_end == pytest.approx(end, rel=1e-7)
         assert got.steps < 200
 
@@ -382,8 +382,9 @@ def test_cost_of_a_long_chain_is_linear(kind: str) -> None:
         tally, stress = np.zeros(2, np.int64), np.empty(TIME.size)
         outcome, end, steps, switches = implicit.integrate_implicit(
             rows, np.array(chain.heights), scene.ends, scene.mass, scene.drag, scene.top,
-            scene.values, scene.speed, scene.time, 3e-8, 10_000, np.empty((1, TIME.size)),
-            stress, np.empty((4, 5)), tally, 1e-6, np.zeros(1),
+            scene.values, scene.speed, scene.time, 3e-8, 10_000, NO_DIRECTIONS,
+            np.empty((1, TIME.size)), stress, *NO_SLOPES, np.empty((4, 5)), tally, 1e-6,
+            np.zeros(1),
         )  # fmt: skip
         assert outcome == taylor.DONE
         assert switches == 2 * n

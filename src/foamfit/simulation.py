@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foamfit import aggregate, implicit, kernels, series, taylor
+from foamfit import aggregate, implicit, kernels, ringing, series, taylor
 from foamfit.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive, check_scene
 from foamfit.errors import SimulationError
 from foamfit.law import BISTABLE
@@ -28,10 +28,6 @@ Array = NDArray[np.float64]
 CLOSED_FORM, FIRST_ORDER, SECOND_ORDER = "closed form", "first order", "second order"
 TAYLOR, RADAU, AGGREGATE = "Taylor series", "Radau IIA", "aggregate"
 MAX_STEPS = 2_000_000
-_NO_SLOPES = (
-    "the scene is too stiff for explicit steps, and implicit ones carry no sensitivities along; "
-    "take differences of the response"
-)
 # Explicit steps are given up where something relaxes, or vibrates, so many times (in radians) while
 # the scene lasts, or after so many steps.
 MOST_RELAXATION, MOST_VIBRATION, MOST_EXPLICIT = 1e4, 1e5, 200_000
@@ -302,8 +298,10 @@ class Plan:
                 *scene,
                 max((3e-2 if inside else 3e-4) * rtol, 1e-14),
                 max_steps,
+                directions,
                 displacement,
                 stress,
+                *slopes,
                 log,
                 np.zeros(2, np.int64),
                 rtol,
@@ -314,7 +312,7 @@ class Plan:
             raise SimulationError(_OUTCOMES[outcome].format(steps=steps, time=last))
         return Motion(
             displacement, stress, contact_end, log[:switches], steps, method,
-            slopes if p > 0 and method == TAYLOR else None, float(lost[0]),
+            slopes if p > 0 else None, float(lost[0]),
         )  # fmt: skip
 
     def _is_one(self, rows: Array) -> bool:
@@ -329,7 +327,7 @@ class Plan:
 
     def hurry(self, rows: Array, heights: Array, drag: float) -> tuple[float, float]:
         """Vibration and relaxation (radians) that explicit steps would have to go through."""
-        return implicit.hurry_of(
+        return ringing.hurry_of(
             rows, heights, self.ends, self.mass, drag, self.top, self.speed, self.time
         )
 
@@ -339,7 +337,7 @@ class Plan:
             return self.implicit
         if self.lossless and drag == 0.0 and self.speed > 0.0:  # one mass bounces once
             return False
-        if self.speed > 0.0 and implicit.parts_faintly(rows, heights, self.mass[-1]):
+        if self.speed > 0.0 and ringing.parts_faintly(rows, heights, self.mass[-1]):
             return True
         vibration, relaxation = self.hurry(rows, heights, drag)
         return bool(vibration > MOST_VIBRATION or relaxation > MOST_RELAXATION)
@@ -637,8 +635,7 @@ def simulate(
     ValueError
         If something is not admissible; the message names it.
     SimulationError
-        If the scene has no finite answer, none to the wanted error, or one by implicit steps only
-        where sensitivities are wanted; the message says why.
+        If the scene has no finite answer, or none to the wanted error; the message says why.
     """
     check_scene(chain, drive)
     if not 1e-14 <= as_number(rtol, "rtol") <= 1e-1:
@@ -652,8 +649,6 @@ def simulate(
         directions = np.array(wanted)
     scene = plan(chain, drive, t, dashpots=any(name.endswith("_eta") for name in sensitivities))
     motion = _verified(scene, chain.arrays.rows, chain.arrays.heights, rtol, directions)
-    if len(directions) and motion.slopes is None:
-        raise SimulationError(_NO_SLOPES)
     return Response(
         time=scene.time,
         displacement=motion.displacement,
