@@ -385,6 +385,7 @@ def test_cost_of_a_long_chain_is_linear(kind: str) -> None:
             scene.values, scene.speed, scene.time, 3e-8, 10_000, NO_DIRECTIONS,
             np.empty((1, TIME.size)), stress, *NO_SLOPES, np.empty((4, 5)), tally, 1e-6,
             np.zeros(1),
+            implicit.rest(rows, np.array(chain.heights), scene.ends, scene.top, 0.0, NO_DIRECTIONS),
         )  # fmt: skip
         assert outcome == taylor.DONE
         assert switches == 2 * n

@@ -77,12 +77,26 @@ class Body(NamedTuple):
     moving: int
 
 
+class Work(NamedTuple):
+    """Room for linear systems: residual (springs, points, columns) in, delta (the same) out.
+
+    lift (springs, points, points), stiff and spring (points, points) and m (points, 2 points +
+    columns) are scratch.
+    """
+
+    residual: Array
+    delta: Array
+    lift: Array
+    stiff: Array
+    spring: Array
+    m: Array
+
+
 class Points(NamedTuple):
-    """What a step finds at its points, all (springs, points) but for the last three.
+    """What a step finds at its points, all (springs, points) but for the last.
 
     z is what the nodes move beyond v0 times time, eps the strains, vel the velocities of the nodes,
-    total the stresses with those of the dashpots, slope dσ/dε. residual and delta (springs, points,
-    columns) and lift (springs, points, points) are what the linear systems work on.
+    total the stresses with those of the dashpots, slope dσ/dε; `work` is that of Newton's method.
     """
 
     z: Array
@@ -90,9 +104,7 @@ class Points(NamedTuple):
     vel: Array
     total: Array
     slope: Array
-    residual: Array
-    delta: Array
-    lift: Array
+    work: Work
 
 
 class State(NamedTuple):
@@ -107,20 +119,29 @@ class State(NamedTuple):
 class Tangents(NamedTuple):
     """Derivatives by p parameters of a state and of what a step finds at its points.
 
-    directions (p, 2) are those of `foamfit.series`. w, v0 and eps0 are (springs, p); z, eps and
-    total are (springs, points, p), like residual; base (p,) is the base stress at the last step's
-    end.
+    directions (p, 2) are those of `foamfit.series`. w, v0 and eps0 are (springs, p); eps and total
+    are (springs, points, p), like z, which is `work.delta`; base (p,) is the base stress at the
+    last step's end.
     """
 
     directions: Branches
     w: Array
     v0: Array
     eps0: Array
-    z: Array
     eps: Array
     total: Array
-    residual: Array
     base: Array
+    work: Work
+
+
+@maker
+def _make_work(count: int, columns: int) -> Work:
+    """Make room for linear systems."""
+    n = STAGES
+    return Work(
+        np.zeros((count, n, columns)), np.zeros((count, n, columns)), np.zeros((count, n, n)),
+        np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, 2 * n + columns)),
+    )  # fmt: skip
 
 
 @maker
@@ -128,20 +149,18 @@ def make_points(count: int) -> Points:
     """Make room for the points of a step."""
     s = (count, STAGES)
     return Points(
-        np.zeros(s), np.zeros(s), np.zeros(s), np.zeros(s), np.zeros(s),
-        np.zeros((count, STAGES, 1)), np.zeros((count, STAGES, 1)),
-        np.zeros((count, STAGES, STAGES)),
-    )  # fmt: skip
+        np.zeros(s), np.zeros(s), np.zeros(s), np.zeros(s), np.zeros(s), _make_work(count, 1)
+    )
 
 
 @maker
 def make_tangents(count: int, directions: Branches) -> Tangents:
     """Make derivatives of a chain at rest."""
     p = directions.shape[0]
-    at, all_points = (count, p), (count, STAGES, p)
+    at, points = (count, p), (count, STAGES, p)
     return Tangents(
-        directions, np.zeros(at), np.zeros(at), np.zeros(at), np.zeros(all_points),
-        np.zeros(all_points), np.zeros(all_points), np.zeros(all_points), np.zeros(p),
+        directions, np.zeros(at), np.zeros(at), np.zeros(at), np.zeros(points), np.zeros(points),
+        np.zeros(p), _make_work(count if p > 0 else 0, p),
     )  # fmt: skip
 
 
@@ -207,8 +226,8 @@ def _stiffness(rows: Array, i: int, height: float, span: float, slope: Array, ou
         out[j, j] += max(slope[i, j], soft) / height
 
 
-@maker
-def _correct(body: Body, span: float, at: Points, residual: Array, delta: Array) -> bool:
+@inner
+def _correct(body: Body, span: float, slope: Array, work: Work) -> bool:
     """Displacements `delta` of the first `moving` nodes that balance the forces in `residual`.
 
     Both are (springs, points, columns): every column is a system of its own with the same matrix.
@@ -216,12 +235,9 @@ def _correct(body: Body, span: float, at: Points, residual: Array, delta: Array)
     stiffness K and a force r. Written so that nothing cancels: under a spring of stiffness S,
     (K, r) become (S D⁻¹ K, S D⁻¹ r), D = K + S.
     """
-    s, columns = STAGES, residual.shape[2]
     rows, heights, mass, drag, moving = body
-    slope, lift = at.slope, at.lift
-    stiff = np.zeros((s, s))  # of the chain below the node, as the node feels it
-    spring = np.zeros((s, s))
-    m = np.empty((s, 2 * s + columns))
+    residual, delta, lift, stiff, spring, m = work  # stiff: the chain below, as the node feels it
+    s, columns = STAGES, residual.shape[2]
     for i in range(moving):
         _stiffness(rows, i, heights[i], span, slope, spring)
         if i == 0:
@@ -280,7 +296,7 @@ def _correct(body: Body, span: float, at: Points, residual: Array, delta: Array)
     return True
 
 
-@maker
+@inner
 def collocate(
     body: Body,
     state: State,
@@ -293,7 +309,8 @@ def collocate(
 ) -> bool:
     """Solve one step by Newton's method from the guess in z; false if it does not converge."""
     rows, heights, mass, drag, moving = body
-    z, eps, vel, total, _, residual, delta, _ = at
+    z, eps, vel, total, slope, work = at
+    residual, delta = work.residual, work.delta
     count = heights.size
     if not _fill(body, state, span, at):
         for i in range(moving):
@@ -321,7 +338,7 @@ def collocate(
                 residual[i, j, 0] = force
         tally[0] += 1
         tally[1] += moving
-        if not _correct(body, span, at, residual, delta):
+        if not _correct(body, span, slope, work):
             return False
         part, size, moved = 1.0, 0.0, 0.0
         for i in range(count):
@@ -352,7 +369,7 @@ def collocate(
     return False
 
 
-@maker
+@inner
 def linearise(body: Body, state: State, span: float, at: Points, d: Tangents) -> bool:
     """Derivatives at the points of a step that was found, and at its end; false if singular.
 
@@ -374,13 +391,13 @@ def linearise(body: Body, state: State, span: float, at: Points, d: Tangents) ->
                     net -= body.drag * d.v0[i, c]
                     if d.directions[c, 1] == DRAG:
                         net -= at.vel[i, j]
-                d.residual[i, j, c] = net
-    if moving > 0 and not _correct(body, span, at, d.residual, d.z):
+                d.work.residual[i, j, c] = net
+    if moving > 0 and not _correct(body, span, at.slope, d.work):
         return False
     for i in range(count):
         for j in range(STAGES):
             for c in range(d.base.size):
-                move, stretching = _relative(d.z, i, j, c)
+                move, stretching = _relative(d.work.delta, i, j, c)
                 d.eps[i, j, c] += move / heights[i]
                 damp = body.rows[i, ETA] * stretching / span
                 d.total[i, j, c] += (at.slope[i, j] * move + damp) / heights[i]

@@ -48,7 +48,6 @@ from foamfit.kernels import (
     first_branch,
     inner,
     interval,
-    maker,
     slope_on,
     stress_on,
 )
@@ -120,6 +119,18 @@ class Curves(NamedTuple):
     slack: Array
     stress: Array
     some: Array
+
+
+class Rest(NamedTuple):
+    """What a scene starts from: branches and strains (springs,), and their derivatives.
+
+    d_eps (springs, p) and d_base (p,) are those of the strains and of the base stress.
+    """
+
+    branches: Branches
+    eps: Array
+    d_eps: Array
+    d_base: Array
 
 
 class Ripples(NamedTuple):
@@ -365,7 +376,7 @@ def _aim(
     return AGAIN, when * span, which, where, level
 
 
-@maker
+@inner
 def _step(
     scene: Scene,
     body: Body,
@@ -485,13 +496,11 @@ def _record_tangents(
             for node in range(nodes):
                 i = node if nodes > 1 else count - 1
                 moved = d.w[i, c] + at * span * d.v0[i, c]
-                out.dw[c, node, sample] = moved + _through(d.z[i], c, at)
+                out.dw[c, node, sample] = moved + _through(d.work.delta[i], c, at)
 
 
 @inner
-def _record_rest(
-    first: int, state: State, base: float, d: Tangents, out: Samples
-) -> None:
+def _record_rest(first: int, state: State, base: float, d: Tangents, out: Samples) -> None:
     """Write a single sample, or one that is left where the steps have ended."""
     nodes, count = out.w.shape[0], state.w.size
     for sample in range(first, out.t.size):
@@ -506,9 +515,7 @@ def _record_rest(
 
 
 @inner
-def _mend_kink(
-    scene: Scene, body: Body, knot: int, jump: float, d: Tangents, out: Samples
-) -> None:
+def _mend_kink(scene: Scene, body: Body, knot: int, jump: float, d: Tangents, out: Samples) -> None:
     """Dashpots feel the mean rate where the prescribed motion has a kink of `jump`."""
     flow = 0.0
     for i in range(body.heights.size):
@@ -527,7 +534,7 @@ def _mend_kink(
             out.ds[c, knot] -= share * jump / (flow * flow) * more
 
 
-@maker
+@inner
 def _leave(
     body: Body,
     state: State,
@@ -538,15 +545,15 @@ def _leave(
     done: int,
     d: Tangents,
     out: Samples,
+    w_end: Array,
 ) -> None:
     """Fill the samples after contact, which ended now with the base stress falling at `fall`.
 
     A later end leaves the nodes as they move until then, and the top with the velocity that it has
-    then.
+    then. `w_end` (nodes,) is scratch.
     """
     nodes, count = out.w.shape[0], state.w.size
     top = count - 1
-    w_end = np.zeros(nodes)
     for node in range(nodes):
         w_end[node] = state.w[node if nodes > 1 else top]
     fly(out.w, out.s, out.t, done, now, w_end, v[top])
@@ -565,61 +572,68 @@ def _leave(
 # ---------------------------------------------------------------- the state between steps
 
 
-@maker
-def _begin(
-    scene: Scene, body: Body, speed: float, state: State, v: Array, d: Tangents, out: Samples
-) -> int:
-    """Fill the state at the start, and the samples before it; returns how many these are."""
-    rows, heights, ends, top = body.rows, body.heights, scene.ends, scene.top
-    count, groups, done = heights.size, ends.size, 0
-    if scene.struck:
-        last = out.w.shape[0] - 1
-        while done < out.t.size and out.t[done] < 0.0:  # the striker is still on its way
-            out.s[done] = 0.0
+@inner
+def _before(body: Body, speed: float, state: State, v: Array, d: Tangents, out: Samples) -> int:
+    """Fill the samples at which a striker is still on its way; returns how many these are."""
+    done, last = 0, out.w.shape[0] - 1
+    while done < out.t.size and out.t[done] < 0.0:
+        out.s[done] = 0.0
+        for i in range(last + 1):
+            out.w[i, done] = speed * out.t[done] if i == last else 0.0
+        for c in range(d.base.size):
+            out.ds[c, done] = 0.0
             for i in range(last + 1):
-                out.w[i, done] = speed * out.t[done] if i == last else 0.0
-            for c in range(d.base.size):
-                out.ds[c, done] = 0.0
-                for i in range(last + 1):
-                    out.dw[c, i, done] = 0.0
-            done += 1
-        state.v0[count - 1] = v[count - 1] = speed
-        return done
+                out.dw[c, i, done] = 0.0
+        done += 1
+    state.v0[body.heights.size - 1] = v[body.heights.size - 1] = speed
+    return done
+
+
+def rest(
+    rows: Array, heights: Array, ends: Branches, top: int, value: float, directions: Branches
+) -> Rest:
+    """What a chain is found in by the first sample of a drive, of size `value`.
+
+    The springs under a prescribed motion or stress are in equilibrium with it.
+    """
+    count, groups = len(heights), len(ends)
+    branches = np.array([first_branch(row) for row in rows])
     place, strain = np.zeros((groups, 1)), np.zeros((count, 1))
-    start(rows, state.branches, heights, ends, top, scene.values[0], place, strain)
-    i0 = ends[groups - 2] if groups > 1 else 0
+    d_eps, d_base = np.zeros((count, len(directions))), np.zeros(len(directions))
+    if value != 0.0 and top in (MOTION, STRESS):
+        start(rows, branches, heights, ends, top, value, place, strain)
+        i0 = ends[-2] if groups > 1 else 0
+        if len(directions):
+            own = directions.copy()
+            own[:, 0] = np.maximum(own[:, 0] - i0, -1)
+            dw, ds = equilibrium_tangents(
+                rows[i0:], heights[i0:], strain[i0:], branches[i0:, None].copy(), top == MOTION, own
+            )
+            longer = np.diff(dw[:, :, 0], axis=1, prepend=0.0).T
+            for c, (spring, what) in enumerate(own):
+                if spring >= 0 and what == HEIGHT:
+                    longer[spring, c] -= strain[i0 + spring, 0]
+            d_eps[i0:] = longer / heights[i0:, None]
+            if i0 == 0:
+                d_base[:] = ds[:, 0]
+    return Rest(branches, strain[:, 0].copy(), d_eps, d_base)
+
+
+@inner
+def _begin(i0: int, begin: Rest, body: Body, state: State, d: Tangents) -> None:
+    """Fill the state at the start; the nodes below spring i0 are at rest."""
     node = 0.0
-    for i in range(count):
-        state.eps0[i] = strain[i, 0]
-        node += heights[i] * state.eps0[i]
-        if i >= i0:
-            state.w[i] = node
-    if d.base.size > 0 and top in (MOTION, STRESS):
-        _begin_tangents(body, i0, top == MOTION, strain, state.branches, d)
-    return 0
-
-
-@maker
-def _begin_tangents(
-    body: Body, i0: int, moved: bool, strain: Array, branches: Branches, d: Tangents
-) -> None:
-    """Derivatives of the springs from i0 on, which a drive finds in equilibrium."""
-    own = d.directions.copy()
-    for c in range(own.shape[0]):
-        own[c, 0] = max(own[c, 0] - i0, -1)
-    dw, ds = equilibrium_tangents(
-        body.rows[i0:], body.heights[i0:], strain[i0:], branches[i0:].copy().reshape(-1, 1),
-        moved, own,
-    )  # fmt: skip
-    for c in range(own.shape[0]):
-        if i0 == 0:
-            d.base[c] = ds[c, 0]
-        for i in range(i0, body.heights.size):
-            d.w[i, c] = dw[c, i - i0, 0]
-            longer = d.w[i, c] - (d.w[i - 1, c] if i > i0 else 0.0)
+    for i in range(body.heights.size):
+        state.branches[i], state.eps0[i] = begin.branches[i], begin.eps[i]
+        node += body.heights[i] * begin.eps[i]
+        state.w[i] = node if i >= i0 else 0.0
+        for c in range(d.base.size):
+            d.eps0[i, c] = begin.d_eps[i, c]
+            d.w[i, c] = body.heights[i] * d.eps0[i, c] + (d.w[i - 1, c] if i > i0 else 0.0)
             if d.directions[c, 0] == i and d.directions[c, 1] == HEIGHT:
-                longer -= strain[i, 0]
-            d.eps0[i, c] = longer / body.heights[i]
+                d.w[i, c] += begin.eps[i]
+    for c in range(d.base.size):
+        d.base[c] = begin.d_base[c]
 
 
 @inner
@@ -649,12 +663,12 @@ def _carry_tangents(body: Body, span: float, d: Tangents) -> None:
     end = STAGES - 1
     for i in range(body.heights.size):
         for c in range(d.base.size):
-            d.w[i, c] += d.z[i, end, c] + span * d.v0[i, c]
+            d.w[i, c] += d.work.delta[i, end, c] + span * d.v0[i, c]
             d.eps0[i, c] = d.eps[i, end, c]
             if body.mass[i] > 0.0:
                 rate = 0.0
                 for k in range(STAGES):
-                    rate += RATES[end, k] * d.z[i, k, c]
+                    rate += RATES[end, k] * d.work.delta[i, k, c]
                 d.v0[i, c] += rate / span
     for c in range(d.base.size):
         d.base[c] = d.total[0, end, c]
@@ -747,76 +761,37 @@ def _wait(t: Array, done: int, now: float) -> float:
     return max(t[done] - now, 0.0)
 
 
-@compiled
-def integrate_implicit(
-    rows: Array,
-    heights: Array,
-    ends: Branches,
-    mass: Array,
-    drag: float,
-    top: int,
-    values: Array,
+@inner
+def _follow(
+    scene: Scene,
+    body: Body,
+    state: State,
+    at: Points,
+    curves: Curves,
+    ripples: Ripples,
+    pace: Array,
+    v: Array,
+    now: float,
+    paced: float,
     speed: float,
-    t: Array,
-    tol: float,
+    d: Tangents,
+    out: Samples,
+    w_end: Array,
+    begin: Rest,
     max_steps: int,
-    directions: Branches,
-    out_w: Array,
-    out_s: Array,
-    out_dw: Array,
-    out_ds: Array,
     log: Array,
     tally: Branches,
-    wanted: float,
     lost: Array,
 ) -> tuple[int, float, int, int]:
-    """Integrate a chain from rest (or struck) over the samples t, by implicit steps.
-
-    All but the last arguments are those of `foamfit.taylor.integrate`, as are the outcomes; `tol`
-    is the truncation of a step relative to the motion so far. `tally` (2,) is filled with the
-    linear systems solved and with the blocks eliminated in them; `lost` (1,) with the size,
-    relative to the motion and stress, of the vibrations that were damped out because they could not
-    be followed. Those above `wanted` are followed longer.
-
-    Returns
-    -------
-    tuple
-        Outcome, end of contact (NaN if none), steps taken, switches (also those past the log).
-    """
-    count, groups = rows.shape[0], ends.size
+    """Step from event to event; see `integrate_implicit`. Nothing is allocated from here on."""
+    rows, heights = body.rows, body.heights
+    ends, top, struck, t, values, drag = (
+        scene.ends, scene.top, scene.struck, scene.t, scene.values, scene.drag
+    )  # fmt: skip
+    count, groups, tangent = heights.size, ends.size, d.base.size > 0
     first, i0 = ends[0], (ends[groups - 2] if groups > 1 else 0)
-    areal = np.zeros(count)
-    for g in range(groups):
-        if g < groups - 1 or top == FREE:
-            areal[ends[g] - 1] = mass[g]
-    struck = speed > 0.0
-    now = 0.0 if struck else t[0]
-    paced = t[t.size - 1] - now
-    if struck:
-        paced = min(paced, 5.0 * bounce(rows, heights, areal, drag))
-    ringing = ringing_of(rows, heights, ends, mass, drag, top)
-    faintly = struck and parts_faintly(rows, heights, mass[groups - 1])
-    scene = Scene(
-        ends, mass, drag, top, values, struck, t, tol, wanted,
-        SHORT * paced * (tol / 3e-8) ** (1.0 / 6.0),
-        min(1.0, tol / FAINT) if faintly else 0.0, ringing, ringing[:, 0].max() > 0.0,
-    )  # fmt: skip
-    body = Body(rows, heights, areal, drag, count - 1 if top == MOTION else count)
-    out = Samples(t, out_w, out_s, out_dw, out_ds)
-    at, d = make_points(count), make_tangents(count, directions)
-    tangent = directions.shape[0] > 0
-    shape = (count, STAGES + 1)
-    curves = Curves(
-        np.zeros(shape), np.zeros(shape), np.zeros(STAGES + 1), np.zeros(count + 1),
-        np.zeros((count, STAGES)), np.zeros(STAGES + 1),
-    )  # fmt: skip
-    ripples = Ripples(np.zeros(groups), np.zeros(groups), np.zeros(groups), np.zeros(2))
-    state = State(np.zeros(count), np.zeros(count), np.zeros(count), np.empty(count, np.int64))
-    v, pace = np.zeros(count), np.zeros(N_PACE)
-    pace[WORST], lost[0] = 1.0, 0.0
-    for i in range(count):
-        state.branches[i] = first_branch(rows[i])
-    done = _begin(scene, body, speed, state, v, d, out)
+    _begin(i0, begin, body, state, d)
+    done = _before(body, speed, state, v, d, out) if struck else 0
     for i in range(count):
         stress = stress_on(rows[i], state.branches[i], state.eps0[i])
         pace[LOAD] = max(pace[LOAD], abs(stress))
@@ -912,6 +887,78 @@ def integrate_implicit(
             )
             leaves = opened and struck and pressed
         if leaves:
-            _leave(body, state, at, v, fall, now, done, d, out)
+            _leave(body, state, at, v, fall, now, done, d, out, w_end)
             return DONE, now, step, switches
     return TOO_MANY_STEPS, math.nan, max_steps, switches
+
+
+@compiled
+def integrate_implicit(
+    rows: Array,
+    heights: Array,
+    ends: Branches,
+    mass: Array,
+    drag: float,
+    top: int,
+    values: Array,
+    speed: float,
+    t: Array,
+    tol: float,
+    max_steps: int,
+    directions: Branches,
+    out_w: Array,
+    out_s: Array,
+    out_dw: Array,
+    out_ds: Array,
+    log: Array,
+    tally: Branches,
+    wanted: float,
+    lost: Array,
+    begin: Rest,
+) -> tuple[int, float, int, int]:
+    """Integrate a chain from rest (or struck) over the samples t, by implicit steps.
+
+    All but the last arguments are those of `foamfit.taylor.integrate`, as are the outcomes; `tol`
+    is the truncation of a step relative to the motion so far. `tally` (2,) is filled with the
+    linear systems solved and with the blocks eliminated in them; `lost` (1,) with the size,
+    relative to the motion and stress, of the vibrations that were damped out because they could not
+    be followed. Those above `wanted` are followed longer. `begin` is what `rest` returns.
+
+    Returns
+    -------
+    tuple
+        Outcome, end of contact (NaN if none), steps taken, switches (also those past the log).
+    """
+    count, groups = rows.shape[0], ends.size
+    areal = np.zeros(count)
+    for g in range(groups):
+        if g < groups - 1 or top == FREE:
+            areal[ends[g] - 1] = mass[g]
+    struck = speed > 0.0
+    now = 0.0 if struck else t[0]
+    paced = t[t.size - 1] - now
+    if struck:
+        paced = min(paced, 5.0 * bounce(rows, heights, areal, drag))
+    ringing = ringing_of(rows, heights, ends, mass, drag, top)
+    faintly = struck and parts_faintly(rows, heights, mass[groups - 1])
+    scene = Scene(
+        ends, mass, drag, top, values, struck, t, tol, wanted,
+        SHORT * paced * (tol / 3e-8) ** (1.0 / 6.0),
+        min(1.0, tol / FAINT) if faintly else 0.0, ringing, ringing[:, 0].max() > 0.0,
+    )  # fmt: skip
+    body = Body(rows, heights, areal, drag, count - 1 if top == MOTION else count)
+    out = Samples(t, out_w, out_s, out_dw, out_ds)
+    at, d = make_points(count), make_tangents(count, directions)
+    shape = (count, STAGES + 1)
+    curves = Curves(
+        np.zeros(shape), np.zeros(shape), np.zeros(STAGES + 1), np.zeros(count + 1),
+        np.zeros((count, STAGES)), np.zeros(STAGES + 1),
+    )  # fmt: skip
+    ripples = Ripples(np.zeros(groups), np.zeros(groups), np.zeros(groups), np.zeros(2))
+    state = State(np.zeros(count), np.zeros(count), np.zeros(count), np.empty(count, np.int64))
+    v, pace = np.zeros(count), np.zeros(N_PACE)
+    pace[WORST], lost[0] = 1.0, 0.0
+    return _follow(
+        scene, body, state, at, curves, ripples, pace, v, now, paced, speed, d, out,
+        np.zeros(out_w.shape[0]), begin, max_steps, log, tally, lost,
+    )  # fmt: skip

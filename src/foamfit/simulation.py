@@ -306,6 +306,7 @@ class Plan:
                 np.zeros(2, np.int64),
                 rtol,
                 lost,
+                implicit.rest(rows, heights, self.ends, self.top, self.values[0], directions),
             )
         if outcome != taylor.DONE:
             last = log[min(switches, len(log)) - 1, 0] if switches else self.time[0]
