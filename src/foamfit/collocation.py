@@ -29,6 +29,7 @@ from foamfit.kernels import (
     branch_shape,
     inner,
     maker,
+    once,
     slope_on,
     stress_on,
 )
@@ -78,7 +79,7 @@ class Body(NamedTuple):
 
 
 class Work(NamedTuple):
-    """Room for linear systems: residual (springs, points, columns) in, delta (the same) out.
+    """Room for linear systems: residual (columns, springs, points) in, delta (the same) out.
 
     lift (springs, points, points), stiff and spring (points, points) and m (points, 2 points +
     columns) are scratch.
@@ -120,7 +121,7 @@ class Tangents(NamedTuple):
     """Derivatives by p parameters of a state and of what a step finds at its points.
 
     directions (p, 2) are those of `foamfit.series`. w, v0 and eps0 are (springs, p); eps and total
-    are (springs, points, p), like z, which is `work.delta`; base (p,) is the base stress at the
+    are (p, springs, points), like z, which is `work.delta`; base (p,) is the base stress at the
     last step's end.
     """
 
@@ -139,7 +140,7 @@ def _make_work(count: int, columns: int) -> Work:
     """Make room for linear systems."""
     n = STAGES
     return Work(
-        np.zeros((count, n, columns)), np.zeros((count, n, columns)), np.zeros((count, n, n)),
+        np.zeros((columns, count, n)), np.zeros((columns, count, n)), np.zeros((count, n, n)),
         np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, 2 * n + columns)),
     )  # fmt: skip
 
@@ -157,7 +158,7 @@ def make_points(count: int) -> Points:
 def make_tangents(count: int, directions: Branches) -> Tangents:
     """Make derivatives of a chain at rest."""
     p = directions.shape[0]
-    at, points = (count, p), (count, STAGES, p)
+    at, points = (count, p), (p, count, STAGES)
     return Tangents(
         directions, np.zeros(at), np.zeros(at), np.zeros(at), np.zeros(points), np.zeros(points),
         np.zeros(p), _make_work(count if p > 0 else 0, p),
@@ -227,17 +228,33 @@ def _stiffness(rows: Array, i: int, height: float, span: float, slope: Array, ou
 
 
 @inner
+def _put(delta: Array, i: int, m: Array, first: int) -> None:
+    """Put the columns of node i beside the matrix of a linear system."""
+    for c in range(delta.shape[0]):
+        for j in range(STAGES):
+            m[j, first + c] = delta[c, i, j]
+
+
+@inner
+def _get(delta: Array, i: int, m: Array, first: int) -> None:
+    """Get the columns of node i from where `_put` put them."""
+    for c in range(delta.shape[0]):
+        for j in range(STAGES):
+            delta[c, i, j] = m[j, first + c]
+
+
+@inner
 def _correct(body: Body, span: float, slope: Array, work: Work) -> bool:
     """Displacements `delta` of the first `moving` nodes that balance the forces in `residual`.
 
-    Both are (springs, points, columns): every column is a system of its own with the same matrix.
+    Both are (columns, springs, points): every column is a system of its own with the same matrix.
     False if the equations are singular. Going up, the chain below a node acts on it through a
     stiffness K and a force r. Written so that nothing cancels: under a spring of stiffness S,
     (K, r) become (S D⁻¹ K, S D⁻¹ r), D = K + S.
     """
     rows, heights, mass, drag, moving = body
     residual, delta, lift, stiff, spring, m = work  # stiff: the chain below, as the node feels it
-    s, columns = STAGES, residual.shape[2]
+    s, columns = STAGES, residual.shape[0]
     for i in range(moving):
         _stiffness(rows, i, heights[i], span, slope, spring)
         if i == 0:
@@ -249,15 +266,13 @@ def _correct(body: Body, span: float, slope: Array, work: Work) -> bool:
                 for k in range(s):
                     m[j, k] = stiff[j, k] + spring[j, k]
                     m[j, s + k] = stiff[j, k]
-                for c in range(columns):
-                    m[j, 2 * s + c] = delta[i - 1, j, c]
+            _put(delta, i - 1, m, 2 * s)
             if not _solve(m, s, 2 * s + columns):
                 return False
+            _get(delta, i - 1, m, 2 * s)
             for j in range(s):
                 for k in range(s):
                     lift[i - 1, j, k] = (1.0 if j == k else 0.0) - m[j, s + k]
-                for c in range(columns):
-                    delta[i - 1, j, c] = m[j, 2 * s + c]
             for j in range(s):
                 for k in range(s):
                     stiff[j, k] = 0.0
@@ -265,13 +280,15 @@ def _correct(body: Body, span: float, slope: Array, work: Work) -> bool:
                         stiff[j, k] += spring[j, q] * m[q, s + k]
         resist = drag if i == heights.size - 1 else 0.0
         for j in range(s):
-            for c in range(columns):
-                delta[i, j, c] = residual[i, j, c]
             for k in range(s):
                 stiff[j, k] += mass[i] * RATES_2[j, k] / span**2 + resist * RATES[j, k] / span
+        for c in range(columns):
+            for j in range(s):
+                force = residual[c, i, j]
                 if i > 0:
-                    for c in range(columns):
-                        delta[i, j, c] += spring[j, k] * delta[i - 1, k, c]
+                    for k in range(s):
+                        force += spring[j, k] * delta[c, i - 1, k]
+                delta[c, i, j] = force
     last = moving - 1
     if moving < heights.size:  # the spring above the last free node hangs on the driven top
         _stiffness(rows, moving, heights[moving], span, slope, spring)
@@ -281,22 +298,21 @@ def _correct(body: Body, span: float, slope: Array, work: Work) -> bool:
     for j in range(s):
         for k in range(s):
             m[j, k] = stiff[j, k]
-        for c in range(columns):
-            m[j, s + c] = delta[last, j, c]
+    _put(delta, last, m, s)
     if not _solve(m, s, s + columns):
         return False
-    for j in range(s):
-        for c in range(columns):
-            delta[last, j, c] = m[j, s + c]
-    for i in range(last - 1, -1, -1):
-        for j in range(s):
-            for k in range(s):
-                for c in range(columns):
-                    delta[i, j, c] += lift[i, j, k] * delta[i + 1, k, c]
+    _get(delta, last, m, s)
+    for c in range(columns):
+        for i in range(last - 1, -1, -1):
+            for j in range(s):
+                gain = 0.0
+                for k in range(s):
+                    gain += lift[i, j, k] * delta[c, i + 1, k]
+                delta[c, i, j] += gain
     return True
 
 
-@inner
+@once
 def collocate(
     body: Body,
     state: State,
@@ -335,7 +351,7 @@ def collocate(
                     for k in range(STAGES):
                         pull += RATES_2[j, k] * z[i, k]
                     force -= mass[i] * pull / span**2
-                residual[i, j, 0] = force
+                residual[0, i, j] = force
         tally[0] += 1
         tally[1] += moving
         if not _correct(body, span, slope, work):
@@ -344,19 +360,19 @@ def collocate(
         for i in range(count):
             curved, _, x0, _ = branch_shape(rows[i], state.branches[i])
             for j in range(STAGES):
-                gain = delta[i, j, 0] if i < moving else 0.0
+                gain = delta[0, i, j] if i < moving else 0.0
                 size = max(size, abs(gain))
                 if not math.isfinite(gain):
                     return False
                 moved = max(moved, abs(z[i, j] + NODES[j] * span * state.v0[i]))
                 if i > 0:
-                    gain -= delta[i - 1, j, 0]
+                    gain -= delta[0, i - 1, j]
                 room = 0.9 * (1.0 - (eps[i, j] - x0))
                 if curved and gain / heights[i] > room:
                     part = min(part, room * heights[i] / gain)
         for i in range(moving):
             for j in range(STAGES):
-                z[i, j] += part * delta[i, j, 0]
+                z[i, j] += part * delta[0, i, j]
         if not _fill(body, state, span, at):
             return False
         if part == 1.0:
@@ -369,7 +385,7 @@ def collocate(
     return False
 
 
-@inner
+@once
 def linearise(body: Body, state: State, span: float, at: Points, d: Tangents) -> bool:
     """Derivatives at the points of a step that was found, and at its end; false if singular.
 
@@ -384,36 +400,36 @@ def linearise(body: Body, state: State, span: float, at: Points, d: Tangents) ->
     for i in range(moving):
         for j in range(STAGES):
             for c in range(d.base.size):
-                net = -d.total[i, j, c]
+                net = -d.total[c, i, j]
                 if i < last:
-                    net += d.total[i + 1, j, c]
+                    net += d.total[c, i + 1, j]
                 else:
                     net -= body.drag * d.v0[i, c]
                     if d.directions[c, 1] == DRAG:
                         net -= at.vel[i, j]
-                d.work.residual[i, j, c] = net
+                d.work.residual[c, i, j] = net
     if moving > 0 and not _correct(body, span, at.slope, d.work):
         return False
     for i in range(count):
         for j in range(STAGES):
             for c in range(d.base.size):
                 move, stretching = _relative(d.work.delta, i, j, c)
-                d.eps[i, j, c] += move / heights[i]
+                d.eps[c, i, j] += move / heights[i]
                 damp = body.rows[i, ETA] * stretching / span
-                d.total[i, j, c] += (at.slope[i, j] * move + damp) / heights[i]
+                d.total[c, i, j] += (at.slope[i, j] * move + damp) / heights[i]
     return True
 
 
 @inner
 def _relative(z: Array, i: int, j: int, c: int) -> tuple[float, float]:
     """Elongation of spring i at a point, and its rate times the step, of column c of z."""
-    move, rate = z[i, j, c], 0.0
+    move, rate = z[c, i, j], 0.0
     for k in range(STAGES):
-        rate += RATES[j, k] * z[i, k, c]
+        rate += RATES[j, k] * z[c, i, k]
     if i > 0:
-        move -= z[i - 1, j, c]
+        move -= z[c, i - 1, j]
         for k in range(STAGES):
-            rate -= RATES[j, k] * z[i - 1, k, c]
+            rate -= RATES[j, k] * z[c, i - 1, k]
     return move, rate
 
 
@@ -432,11 +448,11 @@ def _rest(body: Body, state: State, span: float, at: Points, d: Tangents, i: int
         x = at.eps[i, j] - x0
         rate = (at.vel[i, j] - (at.vel[i - 1, j] if i > 0 else 0.0)) / height
         part = NODES[j] * span * dv - (at.eps[i, j] - state.eps0[i]) * longer
-        d.eps[i, j, c] = d.eps0[i, c] + part / height
-        stress = at.slope[i, j] * (d.eps[i, j, c] - dx0) + ds0
+        d.eps[c, i, j] = d.eps0[i, c] + part / height
+        stress = at.slope[i, j] * (d.eps[c, i, j] - dx0) + ds0
         stress += (x / (1.0 - x) if curved else x) * dk
         stress += row[ETA] * (dv - rate * longer) / height
-        d.total[i, j, c] = stress + (rate if own == OWN_ETA else 0.0)
+        d.total[c, i, j] = stress + (rate if own == OWN_ETA else 0.0)
 
 
 @inner

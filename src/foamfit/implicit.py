@@ -48,6 +48,7 @@ from foamfit.kernels import (
     first_branch,
     inner,
     interval,
+    once,
     slope_on,
     stress_on,
 )
@@ -376,7 +377,7 @@ def _aim(
     return AGAIN, when * span, which, where, level
 
 
-@inner
+@once
 def _step(
     scene: Scene,
     body: Body,
@@ -468,8 +469,8 @@ def _record(
 
 
 @inner
-def _through(values: Array, c: int, at: float) -> float:
-    """Value at a place of a step of the polynomial through column c of the values at its points.
+def _through(values: Array, at: float) -> float:
+    """Value at a place of a step of the polynomial through the values at its points.
 
     Where nothing has inertia or a dashpot, the derivatives by a dashpot jump at switches and kinks:
     the polynomial of a step asks nothing of its start.
@@ -478,7 +479,7 @@ def _through(values: Array, c: int, at: float) -> float:
     for k in range(STAGES - 1, -1, -1):
         term = 0.0
         for j in range(STAGES):
-            term += THROUGH[k, j] * values[j, c]
+            term += THROUGH[k, j] * values[j]
         total = total * at + term
     return total
 
@@ -492,11 +493,11 @@ def _record_tangents(
     for c in range(d.base.size):
         for sample in range(first, done):
             at = (out.t[sample] - now) / span
-            out.ds[c, sample] = _through(d.total[0], c, at)
+            out.ds[c, sample] = _through(d.total[c, 0], at)
             for node in range(nodes):
                 i = node if nodes > 1 else count - 1
                 moved = d.w[i, c] + at * span * d.v0[i, c]
-                out.dw[c, node, sample] = moved + _through(d.work.delta[i], c, at)
+                out.dw[c, node, sample] = moved + _through(d.work.delta[c, i], at)
 
 
 @inner
@@ -663,15 +664,15 @@ def _carry_tangents(body: Body, span: float, d: Tangents) -> None:
     end = STAGES - 1
     for i in range(body.heights.size):
         for c in range(d.base.size):
-            d.w[i, c] += d.work.delta[i, end, c] + span * d.v0[i, c]
-            d.eps0[i, c] = d.eps[i, end, c]
+            d.w[i, c] += d.work.delta[c, i, end] + span * d.v0[i, c]
+            d.eps0[i, c] = d.eps[c, i, end]
             if body.mass[i] > 0.0:
                 rate = 0.0
                 for k in range(STAGES):
-                    rate += RATES[end, k] * d.work.delta[i, k, c]
+                    rate += RATES[end, k] * d.work.delta[c, i, k]
                 d.v0[i, c] += rate / span
     for c in range(d.base.size):
-        d.base[c] = d.total[0, end, c]
+        d.base[c] = d.total[c, 0, end]
 
 
 @inner
@@ -761,7 +762,7 @@ def _wait(t: Array, done: int, now: float) -> float:
     return max(t[done] - now, 0.0)
 
 
-@inner
+@once
 def _follow(
     scene: Scene,
     body: Body,

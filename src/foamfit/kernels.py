@@ -31,6 +31,8 @@ _COUNTLESS: dict[str, Any] = {**_BRIDGELESS, "_nrt": False}
 maker = njit(**_BRIDGELESS)
 inner = njit(**_COUNTLESS)
 inlined = njit(**_COUNTLESS, forceinline=True)
+# For long loops that are called from one place: read apart, compiled as a part of the caller.
+once = njit(error_model="numpy", inline="always")
 # A product and a sum in one rounding: faster, and no less exact.
 fused = njit(**_COUNTLESS, fastmath={"contract"})
 
