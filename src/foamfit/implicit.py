@@ -402,7 +402,7 @@ def _step(
     spring (or the base, one past the last) has it, and on which side.
     """
     count = body.heights.size
-    zero = np.int64(0)  # not the literal: every type is compiled on its own
+    zero: int = body.heights.size - count  # not the literal: every type is compiled on its own
     longest, target, side, level, chased = span, zero - 1, zero, 0.0, zero
     pace[TRIAL_SPAN] = pace[TRIAL_ERROR] = math.inf
     faint = scene.faint if pressed else 0.0
@@ -797,7 +797,7 @@ def _follow(
         stress = stress_on(rows[i], state.branches[i], state.eps0[i])
         pace[LOAD] = max(pace[LOAD], abs(stress))
         pace[REACH] = max(pace[REACH], heights[i] * abs(state.eps0[i]))
-    pressed, switches = speed < 0.0, np.int64(0)  # no, and none: not literals, which are types
+    pressed, switches = speed < 0.0, done - done  # no, and none: not literals, which are types
     knot, rate, step, stalled, fall = -1, 0.0, 0, 0, 0.0
     while step < max_steps:
         if done == t.size:
