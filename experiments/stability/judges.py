@@ -450,7 +450,7 @@ def ripple_of(scene: Scene, answer: ff.Response, rtol: float) -> float | None:
     stop = answer.contact_end if answer.contact_end is not None else float(time[-1])
     lasting = np.full(ring.size, stop)
     dies = size > rtol
-    lasting[dies] = np.minimum(stop, np.log(size[dies] / rtol) / np.maximum(decay[dies], 1e-300))
+    lasting[dies] = np.minimum(stop, np.log(size[dies] / rtol) / np.maximum(decay[dies], 1e-99))
     return float(size[fast & (size > 0.0) & (ring * lasting > 6.0 * answer.steps)].sum())
 
 

@@ -40,13 +40,13 @@ ENERGY_BAR = 10.0 * RTOL  # the energy is made of both displacement and stress, 
 LONGEST = 300  # s; a scene that takes longer ends the study
 CHEAP = 50_000  # steps times springs up to which the other method is tried too
 REASONS = {
+    "step underflow": "shrank to nothing",  # first: its message speaks of flat branches too
     "ringing": "masses vibrate too fast",
     "errors grow": "let the least error grow",
     "end of a branch": "of the end of its branch",
     "not finite": "no longer finite",
     "flat branch under stress": "flat branch",
     "bound on steps": "the bound of",
-    "step underflow": "shrank to nothing",
 }
 
 
@@ -280,6 +280,8 @@ def page(lines: pd.DataFrame, rows: pd.DataFrame) -> str:
         failures=int((lines.outcome == "failure").sum()),
         energy=int(answers.energy.notna().sum()),
         largest_energy=_number(answers.energy.max()),
+        ripples=int(answers.ripple.notna().sum()),
+        largest_ripple=_number(answers.ripple.max()),
         other=int(answers["other method"].notna().sum()),
         design=int((lines.axis == "design").sum()),
         largest=_number(answers.error.max()),

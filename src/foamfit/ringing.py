@@ -178,8 +178,9 @@ def passed_over(
     vibrates from then on by δv/ω, of which the points of the step show no more than δv/ω/(ω span).
     `begun` is filled with δv/√ω of each mass; that of earlier steps is in `alive`, since a
     vibration whose stiffness changes slowly keeps its energy over its frequency. `fading` is filled
-    with the rate at which it dies out: the slowest vibration of masses in a row decays last, and
-    moves as far as all of them together. What is left after `wait` is returned.
+    with the rate at which it dies out: of masses in a row the slowest vibration that the step is
+    too long for decays last, and moves as far as all of them together. What is left after `wait` is
+    returned.
     """
     moved, pressed, rate, decay, worst = 0.0, 0.0, 0.0, 0.0, 0.0
     below_stiff, below_damp = 0.0, 0.0
@@ -198,14 +199,18 @@ def passed_over(
             hold = below_damp + damp + (drag if g == ends.size else 0.0)
             own = math.sqrt((below_stiff + stiff) / mass[g - 1])
             fade = 0.5 * hold / mass[g - 1]
-            begun[g - 1], fading[g - 1] = 0.0, 2.0 * row * row * fade
+            begun[g - 1] = 0.0
             if own * span > 2.0 and fade < own:
                 kick = 0.0
                 for j in range(STAGES):
                     kick += COEFFICIENTS[0, j] * z[ends[g - 1] - 1, j] / span
                 begun[g - 1] = abs(kick) / math.sqrt(own)
+                slow = fade * min(max(2.0 * row * row, 4.0 / (own * span) ** 2), 1.0)
+                if alive[g - 1] > 1e-3 * begun[g - 1]:
+                    slow = min(slow, fading[g - 1])
+                fading[g - 1] = slow
                 if begun[g - 1] > worst:
-                    worst, rate, decay = begun[g - 1], own, fading[g - 1]
+                    worst, rate, decay = begun[g - 1], own, slow
             size = (alive[g - 1] + begun[g - 1]) / math.sqrt(own)
             size *= math.exp(-fading[g - 1] * wait)
             moved += size
