@@ -411,7 +411,7 @@ def _balance(
 # ------------------------------------------------------------------------------------------ ringing
 
 
-def ripple_of(scene: Scene, answer: ff.Response, rtol: float) -> float | None:
+def ripple_of(scene: Scene, answer: ff.Response | Motion, rtol: float) -> float | None:
     """Ripple of the base stress that a blow starts and that an answer had too few steps to show.
 
     Closed form: the chain on its first branches at rest, where it is linear, as modes; the blow is
