@@ -189,6 +189,20 @@ def test_the_judges_see_a_wrong_answer() -> None:
     assert miss > RTOL
 
 
+def test_the_ripple_that_long_steps_pass_over_is_seen() -> None:
+    """By the judge in closed form, and by the solver itself; with a light dashpot there is none."""
+    point = Point(springs=2, kinds="unilateral+bistable", mass=1e-12, velocity=3.0)
+    motion = judges.bare(scene_of(point), RTOL, implicit=True)
+    ripple = judges.ripple_of(scene_of(point), motion, RTOL)
+    assert ripple is not None
+    assert RTOL < ripple <= motion.unresolved
+    calm = dataclasses.replace(point, eta=0.1)
+    answer, _ = ended(calm)
+    assert answer is not None
+    assert answer.method == "Radau IIA"
+    assert judges.ripple_of(scene_of(calm), answer, RTOL) == pytest.approx(0.0, abs=1e-12)
+
+
 def test_the_judges_work_is_that_of_the_law() -> None:
     spring = scenes.spring_of(Point())
     loop = np.interp(np.linspace(0, 2, 40_001), [0, 1, 2], [0.0, 0.75, 0.0])

@@ -29,7 +29,7 @@ from matplotlib.figure import Figure
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
 
-from judges import balance_of, explicit_fits, refined  # noqa: E402
+from judges import balance_of, explicit_fits, refined, ripple_of  # noqa: E402
 from scenes import SWEEPS, Point, designed, scene_of, swept  # noqa: E402
 
 import foamfit as ff  # noqa: E402
@@ -40,13 +40,13 @@ ENERGY_BAR = 10.0 * RTOL  # the energy is made of both displacement and stress, 
 LONGEST = 300  # s; a scene that takes longer ends the study
 CHEAP = 50_000  # steps times springs up to which the other method is tried too
 REASONS = {
+    "step underflow": "shrank to nothing",  # first: its message speaks of flat branches too
     "ringing": "masses vibrate too fast",
     "errors grow": "let the least error grow",
     "end of a branch": "of the end of its branch",
     "not finite": "no longer finite",
     "flat branch under stress": "flat branch",
     "bound on steps": "the bound of",
-    "step underflow": "shrank to nothing",
 }
 
 
@@ -55,7 +55,7 @@ def judged(point: Point) -> dict[str, Any]:
     found: dict[str, Any] = {
         "outcome": "refused", "reason": "", "method": "", "steps": 0, "seconds": 0.0,
         "refinement": math.nan, "other method": math.nan, "energy": math.nan,
-        "impulse": math.nan, "error": math.nan,
+        "impulse": math.nan, "ripple": math.nan, "error": math.nan,
     }  # fmt: skip
     scene = scene_of(point)
     began = time.perf_counter()
@@ -84,6 +84,8 @@ def judged(point: Point) -> dict[str, Any]:
         found["other method"] = math.nan if other is None else other
     if balance is not None:
         found |= {"energy": balance.energy, "impulse": balance.impulse}
+    ripple = ripple_of(scene, answer, RTOL)
+    found["ripple"] = math.nan if ripple is None else ripple
     errors = [found["refinement"], found["other method"]]
     found["error"] = np.nanmax([math.inf if e is None else e for e in errors])
     bad = [
@@ -93,6 +95,7 @@ def judged(point: Point) -> dict[str, Any]:
             ("other method", RTOL),
             ("energy", ENERGY_BAR),
             ("impulse", ENERGY_BAR),
+            ("ripple", RTOL),
         )
         if found[name] is None or found[name] > bar
     ]
@@ -277,6 +280,8 @@ def page(lines: pd.DataFrame, rows: pd.DataFrame) -> str:
         failures=int((lines.outcome == "failure").sum()),
         energy=int(answers.energy.notna().sum()),
         largest_energy=_number(answers.energy.max()),
+        ripples=int(answers.ripple.notna().sum()),
+        largest_ripple=_number(answers.ripple.max()),
         other=int(answers["other method"].notna().sum()),
         design=int((lines.axis == "design").sum()),
         largest=_number(answers.error.max()),

@@ -1,19 +1,13 @@
 """The compiled integrator for stiff scenes: implicit collocation from switch to switch.
 
-Light masses and heavy or very light dashpots make rates that explicit steps must follow. Here a
-step is a polynomial in time through five Radau points (Radau IIA, order 9), on which the balance of
-every node holds exactly:
-
-    μ_i d²w_i/dt² + c dw_i/dt + Σ_i - Σ_{i+1} = p,      Σ_i = σ_i(ε_i) + η_i dε_i/dt
-
-A node without mass or a spring without dashpot only lacks its term, so massless, undamped and mixed
-chains are one case. The unknowns are the displacements of all nodes at the points. Newton's method
-with the exact Jacobian finds them; it is block tridiagonal over the nodes, and its elimination goes
-once up the chain and once down: cost grows with the number of springs. The method is L-stable:
-what relaxes or vibrates too fast to be followed dies out.
+Light masses and heavy or very light dashpots make rates that explicit steps must follow. The steps
+of `foamfit.collocation` (Radau IIA, order 9) need not: the method is L-stable, what relaxes or
+vibrates too fast to be followed dies out (and `foamfit.ringing` tells how much that was).
 
 No branch changes inside a step. A switch, or the end of contact, is the first crossing of the
-polynomial; the step is then taken again, shorter, until it ends there.
+polynomial; the step is then taken again, shorter, until it ends there. Derivatives by parameters
+are carried along where they are asked for; the law is continuous at its switches, so they pass
+from branch to branch without a jump.
 """
 
 # mypy: disallow-untyped-decorators=False, warn-return-any=False
@@ -21,320 +15,141 @@ polynomial; the step is then taken again, shorter, until it ends there.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
+from foamfit.collocation import (
+    NODES,
+    RATES,
+    STAGES,
+    THROUGH,
+    Body,
+    Points,
+    State,
+    Tangents,
+    collocate,
+    guess,
+    linearise,
+    make_points,
+    make_tangents,
+    polynomial,
+    truncation,
+)
 from foamfit.kernels import (
     ETA,
-    K0,
-    KC,
-    KH_MINUS,
-    KH_PLUS,
+    KIND,
+    LINE,
     OPEN,
+    A,
     Array,
     Branches,
     above,
     below,
     branch_shape,
     compiled,
-    first_branch,
+    inner,
     interval,
+    once,
     slope_on,
     stress_on,
 )
+from foamfit.law import BISTABLE
 from foamfit.polynomial import first_crossing, slope_at, value_at
+from foamfit.ringing import bounce, parts_faintly, passed_over, ringing_of, rings
+from foamfit.series import FREE, HEIGHT, MOTION, OWN_ETA, STRESS, VISCOUS, equilibrium_tangents
 from foamfit.taylor import (
     DONE,
     FLAT_UNDER_STRESS,
-    FREE,
-    MOTION,
     NOT_FINITE,
     STEP_UNDERFLOW,
-    STRESS,
     TOO_MANY_STEPS,
-    VISCOUS,
+    Samples,
     fly,
     start,
 )
 
-STAGES = 5
 # Steps that the error alone makes short, compared with the motion, before they may grow anyway:
 # then something vibrates too fast to be worth following, and is damped out. Where that would cost
 # more than the wanted error, it is followed for so many steps of one spring all the same.
 SHORT, PATIENCE, LITTLE_PATIENCE, LONGEST_PATIENCE = 5e-4, 600, 60, 10_000
+# Behind heavy dashpots contact ends when no more than 1e-12 of the peak of the base stress is left:
+# while the striker presses it is followed with so large an error of what is left, at most.
+FAINT = 1e-7
+
+# The memory of the step control: length of the last step and of that proposed; the least that the
+# error may ask for; steps in a row, and in all, that the error alone made short; the largest error
+# let pass, over tol; vibrations that were damped out, and that of the last steps; how far anything
+# has moved (m) and the largest stress (Pa); length and error of the first trial of this step.
+TAKEN, PROPOSAL, FLOOR, HURRY, SHORTS, WORST, SEEN, BURST, REACH, LOAD = range(10)
+TRIAL_SPAN, TRIAL_ERROR, N_PACE = range(10, 13)
+# What to do with a step whose end was compared with the first event in it.
+AGAIN, FREELY, ARRIVED, AT_ONCE = range(4)
 
 
-def radau(stages: int) -> tuple[Array, Array]:
-    """Nodes c and matrix A of the Radau IIA method of order 2 stages - 1."""
-    series = np.zeros(stages + 1)
-    series[-2:] = 1.0, -1.0
-    nodes = np.sort(0.5 * (1.0 + np.real(np.polynomial.legendre.legroots(series))))
-    nodes[-1] = 1.0
-    powers = np.arange(1, stages + 1)
-    integrals = nodes[:, None] ** powers / powers
-    values = nodes[:, None] ** (powers - 1)
-    return nodes, np.asarray(np.linalg.solve(values.T, integrals.T).T, dtype=np.float64)
+class Scene(NamedTuple):
+    """What does not change: the arguments of `integrate_implicit`, and what follows from them.
 
-
-NODES, WEIGHTS = radau(STAGES)
-# From increments at the points to their time derivatives (times the step), first and second.
-RATES = np.linalg.inv(WEIGHTS)
-RATES_2 = RATES @ RATES
-# From increments at the points to the coefficients 1 … 5 of the polynomial over the step [0, 1].
-COEFFICIENTS = np.linalg.inv(NODES[:, None] ** np.arange(1, STAGES + 1))
-
-
-@compiled
-def _stages(
-    rows: Array,
-    branches: Branches,
-    heights: Array,
-    eps0: Array,
-    v0: Array,
-    z: Array,
-    span: float,
-    eps: Array,
-    vel: Array,
-    total: Array,
-    slope: Array,
-) -> bool:
-    """Fill strains, velocities, stresses and slopes at the points; false past the end of a branch.
-
-    z (springs, points) is what the nodes move beyond v0 times time.
+    `short` is the length under which steps are short, `faint` weighs the truncation of the base
+    stress relative to what is left of it, ringing (groups, 2) is what `ringing_of` returns and
+    `fast` tells whether anything vibrates at all.
     """
-    for i in range(heights.size):
-        for j in range(STAGES):
-            rate = 0.0
-            for k in range(STAGES):
-                rate += RATES[j, k] * z[i, k]
-            vel[i, j] = v0[i] + rate / span
-            move = z[i, j] + NODES[j] * span * v0[i]
-            stretching = vel[i, j]
-            if i > 0:
-                move -= z[i - 1, j] + NODES[j] * span * v0[i - 1]
-                stretching -= vel[i - 1, j]
-            eps[i, j] = eps0[i] + move / heights[i]
-            slope[i, j] = slope_on(rows[i], branches[i], eps[i, j])
-            stress = stress_on(rows[i], branches[i], eps[i, j])
-            if not math.isfinite(stress):
-                return False
-            total[i, j] = stress + rows[i, ETA] * stretching / heights[i]
-    return True
+
+    ends: Branches
+    mass: Array
+    drag: float
+    top: int
+    values: Array
+    struck: bool
+    t: Array
+    tol: float
+    wanted: float
+    short: float
+    faint: float
+    ringing: Array
+    fast: bool
 
 
-@compiled
-def _solve(m: Array, n: int, columns: int) -> bool:
-    """Solve n equations in place, right-hand sides in the columns past n; false if singular."""
-    for p in range(n):
-        best = p
-        for q in range(p + 1, n):
-            if abs(m[q, p]) > abs(m[best, p]):
-                best = q
-        if not abs(m[best, p]) > 0.0:
-            return False
-        if best != p:
-            for k in range(p, columns):
-                m[p, k], m[best, k] = m[best, k], m[p, k]
-        for q in range(p + 1, n):
-            factor = m[q, p] / m[p, p]
-            if factor != 0.0:
-                for k in range(p + 1, columns):
-                    m[q, k] -= factor * m[p, k]
-    for k in range(n, columns):
-        for p in range(n - 1, -1, -1):
-            rest = m[p, k]
-            for q in range(p + 1, n):
-                rest -= m[p, q] * m[q, k]
-            m[p, k] = rest / m[p, p]
-    return True
+class Curves(NamedTuple):
+    """Polynomials over [0, 1] of a step: moves and strains (springs, 6), base stress (6,).
 
-
-@compiled
-def _correct(
-    rows: Array,
-    heights: Array,
-    mass: Array,
-    drag: float,
-    moving: int,
-    span: float,
-    residual: Array,
-    slope: Array,
-    delta: Array,
-    lift: Array,
-) -> bool:
-    """Newton's correction `delta` of the first `moving` nodes; false if the equations are singular.
-
-    Going up, the chain below a node acts on it through a stiffness K and a force r. Written so that
-    nothing cancels: under a spring of stiffness S, (K, r) become (S D⁻¹ K, S D⁻¹ r), D = K + S.
+    slack (springs + 1,) is what strains and base stress are known to; stress (springs, points) and
+    some (6,) are scratch.
     """
-    s = STAGES
-    stiff = np.zeros((s, s))  # of the chain below the node, as the node feels it
-    spring = np.zeros((s, s))
-    m = np.empty((s, 2 * s + 1))
-    for i in range(moving):
-        soft = 1e-12 * rows[i, K0]  # a flat branch: the step would have no bound, the force has
-        damp = rows[i, ETA] / (heights[i] * span)
-        for j in range(s):
-            for k in range(s):
-                spring[j, k] = damp * RATES[j, k]
-            spring[j, j] += max(slope[i, j], soft) / heights[i]
-        if i == 0:
-            for j in range(s):
-                for k in range(s):
-                    stiff[j, k] = spring[j, k]
-        else:
-            for j in range(s):
-                for k in range(s):
-                    m[j, k] = stiff[j, k] + spring[j, k]
-                    m[j, s + k] = stiff[j, k]
-                m[j, 2 * s] = delta[i - 1, j]
-            if not _solve(m, s, 2 * s + 1):
-                return False
-            for j in range(s):
-                for k in range(s):
-                    lift[i - 1, j, k] = (1.0 if j == k else 0.0) - m[j, s + k]
-                delta[i - 1, j] = m[j, 2 * s]
-            for j in range(s):
-                for k in range(s):
-                    stiff[j, k] = 0.0
-                    for q in range(s):
-                        stiff[j, k] += spring[j, q] * m[q, s + k]
-        resist = drag if i == heights.size - 1 else 0.0
-        for j in range(s):
-            delta[i, j] = residual[i, j]
-            for k in range(s):
-                stiff[j, k] += mass[i] * RATES_2[j, k] / span**2 + resist * RATES[j, k] / span
-                if i > 0:
-                    delta[i, j] += spring[j, k] * delta[i - 1, k]
-    last = moving - 1
-    for j in range(s):
-        for k in range(s):
-            m[j, k] = stiff[j, k]
-        m[j, s] = delta[last, j]
-    if moving < heights.size:  # the spring above the last free node hangs on the driven top
-        i = moving
-        damp = rows[i, ETA] / (heights[i] * span)
-        for j in range(s):
-            for k in range(s):
-                m[j, k] += damp * RATES[j, k]
-            m[j, j] += max(slope[i, j], 1e-12 * rows[i, K0]) / heights[i]
-    if not _solve(m, s, s + 1):
-        return False
-    for j in range(s):
-        delta[last, j] = m[j, s]
-    for i in range(last - 1, -1, -1):
-        for j in range(s):
-            for k in range(s):
-                delta[i, j] += lift[i, j, k] * delta[i + 1, k]
-    return True
+
+    moves: Array
+    strains: Array
+    base: Array
+    slack: Array
+    stress: Array
+    some: Array
 
 
-@compiled
-def _collocate(
-    rows: Array,
-    branches: Branches,
-    heights: Array,
-    mass: Array,
-    drag: float,
-    moving: int,
-    eps0: Array,
-    v0: Array,
-    push: float,
-    push_rate: float,
-    span: float,
-    reach: float,
-    z: Array,
-    eps: Array,
-    vel: Array,
-    total: Array,
-    slope: Array,
-    residual: Array,
-    delta: Array,
-    lift: Array,
-    tally: Branches,
-) -> bool:
-    """Solve one step by Newton's method from the guess in z; false if it does not converge."""
-    count = heights.size
-    if not _stages(rows, branches, heights, eps0, v0, z, span, eps, vel, total, slope):
-        for i in range(moving):
-            for j in range(STAGES):
-                z[i, j] = 0.0
-        if not _stages(rows, branches, heights, eps0, v0, z, span, eps, vel, total, slope):
-            return False
-    before = math.inf
-    slow = 0
-    for _ in range(30):
-        if moving == 0:
-            return True
-        for i in range(moving):
-            for j in range(STAGES):
-                force = -total[i, j]
-                if i < count - 1:
-                    force += total[i + 1, j]
-                else:
-                    force += push + push_rate * NODES[j] * span - drag * vel[i, j]
-                if mass[i] > 0.0:
-                    pull = 0.0
-                    for k in range(STAGES):
-                        pull += RATES_2[j, k] * z[i, k]
-                    force -= mass[i] * pull / span**2
-                residual[i, j] = force
-        tally[0] += 1
-        tally[1] += moving
-        if not _correct(
-            rows, heights, mass, drag, moving, span, residual, slope, delta, lift
-        ):  # fmt: skip
-            return False
-        part, size, moved = 1.0, 0.0, 0.0
-        for i in range(count):
-            curved, _, x0, _ = branch_shape(rows[i], branches[i])
-            for j in range(STAGES):
-                gain = delta[i, j] if i < moving else 0.0
-                size = max(size, abs(gain))
-                if not math.isfinite(gain):
-                    return False
-                moved = max(moved, abs(z[i, j] + NODES[j] * span * v0[i]))
-                if i > 0:
-                    gain -= delta[i - 1, j]
-                room = 0.9 * (1.0 - (eps[i, j] - x0))
-                if curved and gain / heights[i] > room:
-                    part = min(part, room * heights[i] / gain)
-        for i in range(moving):
-            for j in range(STAGES):
-                z[i, j] += part * delta[i, j]
-        if not _stages(rows, branches, heights, eps0, v0, z, span, eps, vel, total, slope):
-            return False
-        if part == 1.0:
-            if size <= 1e-8 * moved + 1e-15 * reach:
-                return True
-            slow = slow + 1 if size > 0.5 * before else 0
-            if slow > 5:  # near a pole corrections double before they halve
-                return False
-            before = size
-    return False
+class Rest(NamedTuple):
+    """What a scene starts from: branches and strains (springs,), and their derivatives.
+
+    d_eps (springs, p) and d_base (p,) are those of the strains and of the base stress.
+    """
+
+    branches: Branches
+    eps: Array
+    d_eps: Array
+    d_base: Array
 
 
-@compiled
-def _polynomial(first: float, points: Array, out: Array) -> None:
-    """Coefficients over [0, 1] of the polynomial through `first` at 0 and the values at points."""
-    out[0] = first
-    for k in range(STAGES):
-        out[k + 1] = 0.0
-        for j in range(STAGES):
-            out[k + 1] += COEFFICIENTS[k, j] * (points[j] - first)
+class Ripples(NamedTuple):
+    """Vibrations that steps passed over, per mass (groups,): see `passed_over`.
+
+    worst (2,) is the largest motion and stress that they had at a sample.
+    """
+
+    alive: Array
+    begun: Array
+    fading: Array
+    worst: Array
 
 
-@compiled
-def _truncation(c: Array) -> float:
-    """Size of the first Legendre term that a step's polynomial leaves out."""
-    fifth = abs(c[5]) / 252.0
-    fourth = abs(c[4] + 2.5 * c[5]) / 70.0
-    if fifth >= fourth:
-        return fifth
-    return fifth * max(fifth / fourth, 0.02)
-
-
-@compiled
+@inner
 def _base_stress(
     rows: Array,
     branches: Branches,
@@ -365,64 +180,45 @@ def _base_stress(
     return rate / flow
 
 
-@compiled
-def _guess(
-    moves: Array, v: Array, v0: Array, moving: int, span: float, taken: float, z: Array
-) -> None:
-    """Fill z with the motion of the last step, of length `taken`, carried on over the next."""
-    for i in range(v.size):
-        ahead = i < moving and 0.0 < span <= 2.0 * taken
-        last = value_at(moves[i], STAGES, 1.0)
-        for j in range(STAGES):
-            time = NODES[j] * span
-            if ahead:
-                z[i, j] = value_at(moves[i], STAGES, 1.0 + time / taken) - last - time * v0[i]
-            else:
-                z[i, j] = time * (v[i] - v0[i]) if i < moving else 0.0
-
-
-@compiled
+@inner
 def _describe(
-    rows: Array,
-    branches: Branches,
-    heights: Array,
-    eps0: Array,
-    base0: float,
-    eps: Array,
-    total: Array,
-    reach: float,
-    load: float,
-    strains: Array,
-    base: Array,
-    stress: Array,
-    some: Array,
+    body: Body, state: State, at: Points, base0: float, faint: float, pace: Array, out: Curves
 ) -> tuple[float, float, float]:
     """Fill the polynomials of the strains and the base stress of a step.
 
-    `reach` and `load` are the scales of motion and stress before the step. Returns the truncation
-    relative to the scales, and the scales with what the step itself reaches.
+    Returns the truncation relative to the scales of motion and stress, and these scales with what
+    the step itself reaches. While the striker presses, `faint` weighs the truncation of the base
+    stress relative to what is left of it.
     """
-    count = heights.size
-    for i in range(count):
-        _polynomial(eps0[i], eps[i], strains[i])
+    rows, heights = body.rows, body.heights
+    reach, load = pace[REACH], pace[LOAD]
+    present, parts = abs(base0), 0.0
+    for i in range(heights.size):
+        polynomial(state.eps0[i], at.eps[i], out.strains[i])
         for j in range(STAGES):
-            stress[i, j] = stress_on(rows[i], branches[i], eps[i, j])
-            reach = max(reach, heights[i] * abs(eps[i, j]))
-            load = max(load, abs(stress[i, j]))
+            out.stress[i, j] = stress_on(rows[i], state.branches[i], at.eps[i, j])
+            reach = max(reach, heights[i] * abs(at.eps[i, j]))
+            load = max(load, abs(out.stress[i, j]))
     for j in range(STAGES):
-        load = max(load, abs(total[0, j]))
-    _polynomial(base0, total[0], base)
-    error = _truncation(base) / load if load > 0.0 else 0.0
-    for i in range(count):
+        present = max(present, abs(at.total[0, j]))
+        parts = max(parts, abs(out.stress[0, j]))
+    load = max(load, present)
+    polynomial(base0, at.total[0], out.base)
+    left_out = truncation(out.base)
+    error = left_out / load if load > 0.0 else 0.0
+    if faint > 0.0 and load > 0.0:  # what is left is known to the rounding of its parts
+        error = max(error, faint * left_out / max(present, FAINT * parts))
+    for i in range(heights.size):
         if reach > 0.0:
-            error = max(error, _truncation(strains[i]) * heights[i] / reach)
+            error = max(error, truncation(out.strains[i]) * heights[i] / reach)
         if load > 0.0:
-            _polynomial(stress_on(rows[i], branches[i], eps0[i]), stress[i], some)
-            error = max(error, _truncation(some) / load)
+            first = stress_on(rows[i], state.branches[i], state.eps0[i])
+            polynomial(first, out.stress[i], out.some)
+            error = max(error, truncation(out.some) / load)
     return error, reach, load
 
 
-@compiled
+@inner
 def _first_event(
     rows: Array,
     branches: Branches,
@@ -458,138 +254,646 @@ def _first_event(
     return when, which, side
 
 
-@compiled
+# ---------------------------------------------------------------- the length of a step
+
+
+@inner
+def _vibrating(
+    scene: Scene, body: Body, state: State, at: Points, span: float, wait: float, r: Ripples
+) -> tuple[float, float, float, float]:
+    """What `passed_over` says of a step."""
+    return passed_over(
+        body.rows, state.branches, body.heights, scene.ends, scene.mass, scene.drag, scene.top,
+        state.eps0, at.z, span, wait, r.alive, r.begun, r.fading,
+    )  # fmt: skip
+
+
+@inner
+def _bearable(
+    scene: Scene,
+    body: Body,
+    state: State,
+    at: Points,
+    now: float,
+    span: float,
+    wait: float,
+    error: float,
+    reach: float,
+    load: float,
+    pace: Array,
+    r: Ripples,
+) -> float:
+    """Length at which to take a step whose truncation is `error`: its own where that may pass."""
+    tol, count = scene.tol, body.heights.size
+    error /= tol
+    if not math.isfinite(error):
+        return 0.3 * span
+    factor = 0.9 * max(error, 1e-12) ** (-1.0 / 6.0)
+    stuck = False  # rounding, or a layer thinner than the clock can tell
+    if error > 1.0 and span <= 1e-6 * pace[TRIAL_SPAN]:
+        stuck = error > 0.3 * pace[TRIAL_ERROR]
+        pace[TRIAL_SPAN], pace[TRIAL_ERROR] = span, error
+    elif pace[TRIAL_SPAN] == math.inf:
+        pace[TRIAL_SPAN], pace[TRIAL_ERROR] = span, error
+    stuck = stuck or now + 0.1 * span <= now
+    vibrates = error > 1.0 and rings(scene.ringing, span)
+    if error > 1.0 and not stuck and span <= pace[FLOOR] * (1.0 + 1e-9):
+        patient = pace[SHORTS] * count < LONGEST_PATIENCE
+        costs = pace[SEEN] - pace[BURST] + error * tol > 0.3 * scene.wanted
+        if vibrates and patient and costs:
+            pace[FLOOR], pace[HURRY] = 0.0, -4 * PATIENCE
+    if error > 1.0 and not stuck and span > pace[FLOOR] * (1.0 + 1e-9):
+        return max(span * min(max(factor, 0.1), 0.9), pace[FLOOR])
+    if scene.fast and pace[FLOOR] == 0.0 and not stuck:
+        moved, pressed, rate, decay = _vibrating(scene, body, state, at, span, wait, r)
+        size = max(moved / reach, pressed / load) if moved > 0.0 else 0.0
+        left = LONGEST_PATIENCE // count - pace[SHORTS]
+        if size > 0.1 * scene.wanted and rate > 0.0 and decay * left > 10.0 * rate:
+            return 1.0 / rate  # it dies out soon enough to be followed
+    if error > 1.0 and vibrates and error * tol > pace[BURST]:
+        pace[SEEN] += error * tol - pace[BURST]
+        pace[BURST] = error * tol
+    elif error <= 1.0:
+        pace[BURST] = 0.0
+    pace[PROPOSAL] = max(span * min(max(factor, 0.2), 5.0), pace[FLOOR])
+    if error > 1.0:
+        pace[PROPOSAL] = max(pace[PROPOSAL], 2.0 * span)
+    pace[WORST] = max(pace[WORST], error)
+    return span
+
+
+@inner
+def _aim(
+    body: Body,
+    state: State,
+    at: Points,
+    out: Curves,
+    struck: bool,
+    pressed: bool,
+    base0: float,
+    now: float,
+    span: float,
+    longest: float,
+    chased: int,
+    target: int,
+    side: int,
+    level: float,
+) -> tuple[int, float, int, int, float]:
+    """What to do with a step, for what length, and what it is to end at.
+
+    `target` is a spring (or, one past the last, the base stress) whose crossing of `level` towards
+    `side` a step of the length before this one has shown; -1 if none.
+    """
+    count = body.heights.size
+    when, which, where = _first_event(
+        body.rows, state.branches, out.strains, out.base, out.slack, struck, pressed
+    )
+    if target >= 0:
+        value = at.total[0, STAGES - 1] if target == count else at.eps[target, STAGES - 1]
+        fine = 1e-13 * (abs(base0) if target == count else max(1.0, abs(level)))
+        same = which < 0 or which == target or when > 1.0 - 1e-9
+        if same and abs(value - level) <= fine:
+            return ARRIVED, span, target, side, level
+        if same and chased > 12:
+            near = abs(value - level) <= 1e5 * fine
+            return ARRIVED if near else FREELY, span, target, side, level
+        if which < 0:  # a little further
+            pace_out = slope_at(out.base if target == count else out.strains[target], STAGES, 1.0)
+            more = (level - value) / pace_out if pace_out * side > 0.0 else math.inf
+            further = (1.0 + more) * span
+            if not further < longest:  # it turned back: nothing was crossed
+                return FREELY, span, target, side, level
+            return AGAIN, further, target, side, level
+    if which < 0:
+        return FREELY, span, target, side, level
+    level = 0.0
+    if which < count:
+        low, high = interval(body.rows[which], state.branches[which])
+        level = high if where > 0 else low
+    ending = out.base if which == count else out.strains[which]
+    beyond = value_at(ending, STAGES, 0.5 * when) - level
+    near = abs(ending[0] - level) <= out.slack[which] and beyond * where >= 0.0
+    if now + when * span <= now or near:
+        return AT_ONCE, 0.0, which, where, level
+    if when >= 1.0 - 1e-15:
+        return ARRIVED, span, which, where, level
+    return AGAIN, when * span, which, where, level
+
+
+@once
+def _step(
+    scene: Scene,
+    body: Body,
+    state: State,
+    at: Points,
+    out: Curves,
+    r: Ripples,
+    pace: Array,
+    v: Array,
+    now: float,
+    span: float,
+    wait: float,
+    push: float,
+    push_rate: float,
+    base0: float,
+    pressed: bool,
+    tally: Branches,
+) -> tuple[int, float, bool, int, int]:
+    """Find the longest step within `span` that is exact enough and ends no later than an event.
+
+    Returns the outcome (DONE if there is one), its length, whether it ends at an event, which
+    spring (or the base, one past the last) has it, and on which side.
+    """
+    count = body.heights.size
+    zero: int = body.heights.size - count  # not the literal: every type is compiled on its own
+    longest, target, side, level, chased = span, zero - 1, zero, 0.0, zero
+    pace[TRIAL_SPAN] = pace[TRIAL_ERROR] = math.inf
+    faint = scene.faint if pressed else 0.0
+    for _ in range(200):
+        if now + span <= now:
+            break
+        guess(out.moves, v, state.v0, body.moving, span, pace[TAKEN], at.z)
+        if not collocate(body, state, push, push_rate, span, pace[REACH], at, tally):
+            if chased > 0:
+                target, side, chased = zero - 1, zero, zero
+            span *= 0.3
+            longest = span
+            continue
+        error, reach, load = _describe(body, state, at, base0, faint, pace, out)
+        if chased == 0:
+            fair = _bearable(
+                scene, body, state, at, now, span, wait, error, reach, load, pace, r
+            )  # fmt: skip
+            if fair < span:
+                longest = span = fair
+                continue
+        for i in range(count):
+            out.slack[i] = max(1e-12, scene.tol * reach / body.heights[i])
+        out.slack[count] = min(pace[WORST] * scene.tol, 1e-3) * load
+        what, span, target, side, level = _aim(
+            body, state, at, out, scene.struck, pressed, base0, now, span, longest, chased,
+            target, side, level,
+        )  # fmt: skip
+        if what != AGAIN:
+            return DONE, span, what != FREELY, target, side
+        chased += 1
+    if chased > 0:  # the crossing is here, within rounding
+        return DONE, 0.0, True, target, side
+    for i in range(count):
+        curved, _, x0, _ = branch_shape(body.rows[i], state.branches[i])
+        if curved and 1.0 - (state.eps0[i] - x0) < 1e-3:
+            return NOT_FINITE, 0.0, False, -1, 0
+    return STEP_UNDERFLOW, 0.0, False, -1, 0
+
+
+# ---------------------------------------------------------------- samples
+
+
+@inner
 def _record(
     now: float,
     span: float,
-    end: float,
-    last: bool,
-    t: Array,
+    first: int,
     done: int,
-    w: Array,
-    moves: Array,
-    base: Array,
-    out_w: Array,
-    out_s: Array,
-) -> int:
-    """Write the samples that a step contains; returns how many samples are done."""
-    top = w.size - 1
-    while done < t.size and (t[done] < end or (last and t[done] <= end)):
-        at = (t[done] - now) / span
-        out_s[done] = value_at(base, STAGES, at)
-        if out_w.shape[0] == 1:
-            out_w[0, done] = w[top] + value_at(moves[top], STAGES, at)
+    state: State,
+    curves: Curves,
+    out: Samples,
+) -> None:
+    """Write the samples first … done-1, which a step contains."""
+    top = state.w.size - 1
+    for sample in range(first, done):
+        at = (out.t[sample] - now) / span
+        out.s[sample] = value_at(curves.base, STAGES, at)
+        if out.w.shape[0] == 1:
+            out.w[0, sample] = state.w[top] + value_at(curves.moves[top], STAGES, at)
         else:
-            for i in range(w.size):
-                out_w[i, done] = w[i] + value_at(moves[i], STAGES, at)
+            for i in range(state.w.size):
+                out.w[i, sample] = state.w[i] + value_at(curves.moves[i], STAGES, at)
+
+
+@inner
+def _through(values: Array, at: float) -> float:
+    """Value at a place of a step of the polynomial through the values at its points.
+
+    Where nothing has inertia or a dashpot, the derivatives by a dashpot jump at switches and kinks:
+    the polynomial of a step asks nothing of its start.
+    """
+    total = 0.0
+    for k in range(STAGES - 1, -1, -1):
+        term = 0.0
+        for j in range(STAGES):
+            term += THROUGH[k, j] * values[j]
+        total = total * at + term
+    return total
+
+
+@inner
+def _record_tangents(
+    now: float, span: float, first: int, done: int, d: Tangents, out: Samples
+) -> None:
+    """Write the derivatives at the samples first … done-1, which a step contains."""
+    nodes, count = out.w.shape[0], d.w.shape[0]
+    for c in range(d.base.size):
+        for sample in range(first, done):
+            at = (out.t[sample] - now) / span
+            out.ds[c, sample] = _through(d.total[c, 0], at)
+            for node in range(nodes):
+                i = node if nodes > 1 else count - 1
+                moved = d.w[i, c] + at * span * d.v0[i, c]
+                out.dw[c, node, sample] = moved + _through(d.work.delta[c, i], at)
+
+
+@inner
+def _record_rest(first: int, state: State, base: float, d: Tangents, out: Samples) -> None:
+    """Write a single sample, or one that is left where the steps have ended."""
+    nodes, count = out.w.shape[0], state.w.size
+    for sample in range(first, out.t.size):
+        out.s[sample] = base
+        for c in range(d.base.size):
+            out.ds[c, sample] = d.base[c]
+        for node in range(nodes):
+            i = node if nodes > 1 else count - 1
+            out.w[node, sample] = state.w[i]
+            for c in range(d.base.size):
+                out.dw[c, node, sample] = d.w[i, c]
+
+
+@inner
+def _mend_kink(scene: Scene, body: Body, knot: int, jump: float, d: Tangents, out: Samples) -> None:
+    """Dashpots feel the mean rate where the prescribed motion has a kink of `jump`."""
+    flow = 0.0
+    for i in range(body.heights.size):
+        eta = body.rows[i, ETA]
+        flow += body.heights[i] / eta if eta > 0.0 else math.inf
+    t = scene.t
+    share = (t[knot] - t[knot - 1]) / (t[knot + 1] - t[knot - 1])
+    out.s[knot] += share * jump / flow
+    if flow == math.inf:
+        return
+    for c in range(d.base.size):
+        i = d.directions[c, 0]
+        if i >= 0 and d.directions[c, 1] in (OWN_ETA, HEIGHT):
+            eta = body.rows[i, ETA]
+            more = 1.0 / eta if d.directions[c, 1] == HEIGHT else -body.heights[i] / (eta * eta)
+            out.ds[c, knot] -= share * jump / (flow * flow) * more
+
+
+@inner
+def _leave(
+    body: Body,
+    state: State,
+    at: Points,
+    v: Array,
+    fall: float,
+    now: float,
+    done: int,
+    d: Tangents,
+    out: Samples,
+    w_end: Array,
+) -> None:
+    """Fill the samples after contact, which ended now with the base stress falling at `fall`.
+
+    A later end leaves the nodes as they move until then, and the top with the velocity that it has
+    then. `w_end` (nodes,) is scratch.
+    """
+    nodes, count = out.w.shape[0], state.w.size
+    top = count - 1
+    for node in range(nodes):
+        w_end[node] = state.w[node if nodes > 1 else top]
+    fly(out.w, out.s, out.t, done, now, w_end, v[top])
+    pull = -(at.total[top, STAGES - 1] + body.drag * v[top]) / body.mass[top]
+    for c in range(d.base.size):
+        late = -d.base[c] / fall if fall != 0.0 else 0.0
+        away = d.v0[top, c] + pull * late
+        for sample in range(done, out.t.size):
+            out.ds[c, sample] = 0.0
+            for node in range(nodes):
+                i = node if nodes > 1 else top
+                there = d.w[i, c] + (v[i] - v[top]) * late
+                out.dw[c, node, sample] = there + away * (out.t[sample] - now)
+
+
+# ---------------------------------------------------------------- the state between steps
+
+
+@inner
+def _before(body: Body, speed: float, state: State, v: Array, d: Tangents, out: Samples) -> int:
+    """Fill the samples at which a striker is still on its way; returns how many these are."""
+    done, last = 0, out.w.shape[0] - 1
+    while done < out.t.size and out.t[done] < 0.0:
+        out.s[done] = 0.0
+        for i in range(last + 1):
+            out.w[i, done] = speed * out.t[done] if i == last else 0.0
+        for c in range(d.base.size):
+            out.ds[c, done] = 0.0
+            for i in range(last + 1):
+                out.dw[c, i, done] = 0.0
         done += 1
+    state.v0[body.heights.size - 1] = v[body.heights.size - 1] = speed
     return done
 
 
-@compiled
-def _bounce(rows: Array, heights: Array, mass: Array, drag: float) -> float:
-    """Time, roughly, for which the mass on top stays on the chain that it strikes."""
-    soft, slow = 0.0, 0.0
-    for i in range(heights.size):
-        soft += heights[i] / rows[i, K0]
-        slow = max(slow, rows[i, ETA] / rows[i, K0])
-    return math.sqrt(mass[-1] * soft) + drag * soft + slow
+def rest(
+    rows: Array, heights: Array, ends: Branches, top: int, value: float, directions: Branches
+) -> Rest:
+    """What a chain is found in by the first sample of a drive, of size `value`.
 
-
-@compiled
-def hurry_of(
-    rows: Array,
-    heights: Array,
-    ends: Branches,
-    mass: Array,
-    drag: float,
-    top: int,
-    speed: float,
-    t: Array,
-) -> tuple[float, float]:
-    """How much faster than the scene its fastest vibration and its fastest relaxation are.
-
-    Both are rates times duration, estimated row by row from the masses, dashpots and slopes of the
-    springs: what steps that must follow every rate have to go through. Arguments as in
-    `integrate_implicit`.
+    The springs under a prescribed motion or stress are in equilibrium with it.
     """
-    vibration, relaxation = 0.0, 0.0
-    below_stiff, below_damp = 0.0, 0.0
-    i0 = 0
-    for g in range(ends.size):
-        soft = 0.0  # compliance of the springs without dashpot; the others start as rigid
-        flow = 0.0
-        for i in range(i0, ends[g]):
-            slope = max(rows[i, K0], rows[i, KC], rows[i, KH_PLUS])
-            if rows[i, ETA] == 0.0:
-                soft += heights[i] / slope
-            flow += heights[i] / rows[i, ETA] if rows[i, ETA] > 0.0 else math.inf
-        stiff = 1.0 / soft if soft > 0.0 else 0.0
-        damp = 0.0 if flow == math.inf else 1.0 / flow
-        for i in range(i0, ends[g]):
-            slope = max(rows[i, K0], rows[i, KC], rows[i, KH_PLUS])
-            if rows[i, ETA] == 0.0 or ends[g] - i0 == 1:
-                if soft == 0.0:
-                    stiff = slope / heights[i]
-                continue
-            rest = heights[i] * stiff
-            relaxation = max(relaxation, (slope + rest) / rows[i, ETA])
-        if g > 0:
-            relaxation = max(relaxation, (below_damp + damp) / mass[g - 1])
-            vibration = max(vibration, math.sqrt((below_stiff + stiff) / mass[g - 1]))
-        below_stiff, below_damp = stiff, damp
-        i0 = ends[g]
-    if top == FREE:
-        relaxation = max(relaxation, (below_damp + drag) / mass[-1])
-        vibration = max(vibration, math.sqrt(below_stiff / mass[-1]))
-    elif top == VISCOUS:
-        relaxation = max(relaxation, below_stiff / drag)
-        if below_damp > 1e4 * drag:  # explicit steps take the velocity from what little is left
-            relaxation = math.inf
-    duration = t[t.size - 1] - (0.0 if speed > 0.0 else t[0])
-    if speed > 0.0:
-        duration = min(duration, _bounce(rows, heights, mass, drag))
-    return vibration * duration, relaxation * duration
+    count, groups = len(heights), len(ends)
+    branches = np.where(rows[:, KIND] == BISTABLE, A, LINE)
+    place, strain = np.zeros((groups, 1)), np.zeros((count, 1))
+    d_eps, d_base = np.zeros((count, len(directions))), np.zeros(len(directions))
+    if value != 0.0 and top in (MOTION, STRESS):
+        start(rows, branches, heights, ends, top, value, place, strain)
+        i0 = ends[-2] if groups > 1 else 0
+        if len(directions):
+            own = directions.copy()
+            own[:, 0] = np.maximum(own[:, 0] - i0, -1)
+            dw, ds = equilibrium_tangents(
+                rows[i0:], heights[i0:], strain[i0:], branches[i0:, None].copy(), top == MOTION, own
+            )
+            longer = np.diff(dw[:, :, 0], axis=1, prepend=0.0).T
+            for c, (spring, what) in enumerate(own):
+                if spring >= 0 and what == HEIGHT:
+                    longer[spring, c] -= strain[i0 + spring, 0]
+            d_eps[i0:] = longer / heights[i0:, None]
+            if i0 == 0:
+                d_base[:] = ds[:, 0]
+    return Rest(branches, strain[:, 0].copy(), d_eps, d_base)
 
 
-@compiled
-def _ringing(
-    rows: Array, heights: Array, ends: Branches, mass: Array, drag: float, top: int
-) -> Array:
-    """Vibration of each mass between fixed neighbours: (masses, 2) rates 1/s, of it and its decay.
+@inner
+def _begin(i0: int, begin: Rest, body: Body, state: State, d: Tangents) -> None:
+    """Fill the state at the start; the nodes below spring i0 are at rest."""
+    node = 0.0
+    for i in range(body.heights.size):
+        state.branches[i], state.eps0[i] = begin.branches[i], begin.eps[i]
+        node += body.heights[i] * begin.eps[i]
+        state.w[i] = node if i >= i0 else 0.0
+        for c in range(d.base.size):
+            d.eps0[i, c] = begin.d_eps[i, c]
+            d.w[i, c] = body.heights[i] * d.eps0[i, c] + (d.w[i - 1, c] if i > i0 else 0.0)
+            if d.directions[c, 0] == i and d.directions[c, 1] == HEIGHT:
+                d.w[i, c] += begin.eps[i]
+    for c in range(d.base.size):
+        d.base[c] = begin.d_base[c]
 
-    Where the dashpots are too heavy for a vibration, (Σ c)² >= 4 μ Σ k, its rate is zero; else it
-    dies out as exp(-Σ c t/(2 μ)).
+
+@inner
+def _carry(
+    body: Body, state: State, at: Points, span: float, v: Array, top: int, pace: Array
+) -> None:
+    """Carry the state over a step, and the scales of motion and stress with it."""
+    end, last = STAGES - 1, body.heights.size - 1
+    for i in range(last + 1):
+        state.w[i] += at.z[i, end] + span * state.v0[i]
+        state.eps0[i] = at.eps[i, end]
+        v[i] = at.vel[i, end]
+        pace[REACH] = max(pace[REACH], body.heights[i] * abs(state.eps0[i]))
+        stress = stress_on(body.rows[i], state.branches[i], state.eps0[i])
+        pace[LOAD] = max(pace[LOAD], abs(stress))
+    for i in range(last + 1):
+        if body.mass[i] > 0.0:
+            state.v0[i] = v[i]
+    if top != STRESS:
+        pace[REACH] = max(pace[REACH], abs(state.w[last]))
+    pace[LOAD] = max(pace[LOAD], abs(at.total[0, end]))
+
+
+@inner
+def _carry_tangents(body: Body, span: float, d: Tangents) -> None:
+    """Carry the derivatives of the state over a step."""
+    end = STAGES - 1
+    for i in range(body.heights.size):
+        for c in range(d.base.size):
+            d.w[i, c] += d.work.delta[c, i, end] + span * d.v0[i, c]
+            d.eps0[i, c] = d.eps[c, i, end]
+            if body.mass[i] > 0.0:
+                rate = 0.0
+                for k in range(STAGES):
+                    rate += RATES[end, k] * d.work.delta[c, i, k]
+                d.v0[i, c] += rate / span
+    for c in range(d.base.size):
+        d.base[c] = d.total[c, 0, end]
+
+
+@inner
+def _hold_back(span: float, last: bool, scene: Scene, pace: Array) -> None:
+    """Let steps grow again that only the error has kept short for long."""
+    pace[TAKEN] = span
+    if pace[PROPOSAL] < scene.short and not last:
+        pace[HURRY] += 1
+        pace[SHORTS] += 1
+        if pace[HURRY] > (PATIENCE if pace[SHORTS] < 3 * PATIENCE else LITTLE_PATIENCE):
+            pace[FLOOR] = min(max(2.0 * pace[FLOOR], 2.0 * span), scene.short)
+            pace[PROPOSAL] = max(pace[PROPOSAL], pace[FLOOR])
+    elif pace[PROPOSAL] >= scene.short:
+        pace[HURRY] = pace[FLOOR] = 0.0
+
+
+@inner
+def _remember(
+    scene: Scene, body: Body, state: State, at: Points, span: float, wait: float, r: Ripples
+) -> None:
+    """Add what a step passed over to the vibrations that the answer lacks."""
+    moved, pressed, _, _ = _vibrating(scene, body, state, at, span, wait, r)
+    r.worst[0], r.worst[1] = max(r.worst[0], moved), max(r.worst[1], pressed)
+    for g in range(r.alive.size):
+        r.alive[g] = (r.alive[g] + r.begun[g]) * math.exp(-r.fading[g] * span)
+
+
+@inner
+def _switch(
+    body: Body,
+    state: State,
+    strains: Array,
+    spring: int,
+    side: int,
+    span: float,
+    now: float,
+    first: int,
+    log: Array,
+    switches: int,
+) -> tuple[int, bool]:
+    """Change the branch of a spring, and of all that end theirs at the same time.
+
+    Returns the switches so far, and whether a spring of the first group without dashpot opened:
+    nothing presses on the base then.
     """
-    rates = np.zeros((ends.size, 2))
-    below_stiff, below_damp = 0.0, 0.0
-    i0 = 0
-    for g in range(ends.size + 1):
-        stiff, damp = 0.0, 0.0
-        if g < ends.size and not (g == ends.size - 1 and top == STRESS):
-            soft, flow = 0.0, 0.0
-            for i in range(i0, ends[g]):
-                slope = max(max(rows[i, K0], rows[i, KC]), max(rows[i, KH_PLUS], rows[i, KH_MINUS]))
-                soft += heights[i] / slope
-                flow += heights[i] / rows[i, ETA] if rows[i, ETA] > 0.0 else math.inf
-            stiff, damp = 1.0 / soft, (0.0 if flow == math.inf else 1.0 / flow)
-            i0 = ends[g]
-        if g > 0 and (g < ends.size or top == FREE):
-            hold = below_damp + damp + (drag if g == ends.size else 0.0)
-            if hold**2 < 4.0 * mass[g - 1] * (below_stiff + stiff):
-                rates[g - 1, 0] = math.sqrt((below_stiff + stiff) / mass[g - 1])
-                rates[g - 1, 1] = 0.5 * hold / mass[g - 1]
-        below_stiff, below_damp = stiff, damp
-    return rates
+    opened = False
+    for i in range(body.heights.size):
+        low, high = interval(body.rows[i], state.branches[i])
+        out = 0
+        if i == spring:
+            out = side
+        elif span > 0.0:
+            tilt = slope_at(strains[i], STAGES, 1.0)
+            if tilt > 0.0 and state.eps0[i] >= high - 1e-12:
+                out = 1
+            elif tilt < 0.0 and state.eps0[i] <= low + 1e-12:
+                out = -1
+        if out == 0:
+            continue
+        left = state.branches[i]
+        entered = above(left) if out > 0 else below(left)
+        opened = opened or (entered == OPEN and i < first and body.rows[i, ETA] == 0.0)
+        if switches < log.shape[0]:
+            log[switches, 0], log[switches, 1] = now, i
+            log[switches, 2], log[switches, 3] = left, entered
+            log[switches, 4] = high if out > 0 else low
+        switches += 1
+        state.branches[i] = entered
+    return switches, opened
 
 
-@compiled
-def _rings(rates: Array, span: float) -> bool:
-    """Tell whether a mass vibrates too fast for a step and goes on vibrating after it."""
-    for g in range(rates.shape[0]):
-        if rates[g, 0] * span > 0.5 and rates[g, 1] * span < 20.0:
+@inner
+def _is_flat(body: Body, state: State, i0: int) -> bool:
+    """Whether a spring from i0 on that nothing slows is on a flat branch."""
+    for i in range(i0, body.heights.size):
+        slope = slope_on(body.rows[i], state.branches[i], state.eps0[i])
+        if body.rows[i, ETA] == 0.0 and slope == 0.0:
             return True
     return False
+
+
+@inner
+def _wait(t: Array, done: int, now: float) -> float:
+    """Time until the next sample."""
+    while done < t.size - 1 and t[done] <= now:
+        done += 1
+    return max(t[done] - now, 0.0)
+
+
+@once
+def _follow(
+    scene: Scene,
+    body: Body,
+    state: State,
+    at: Points,
+    curves: Curves,
+    ripples: Ripples,
+    pace: Array,
+    v: Array,
+    now: float,
+    paced: float,
+    speed: float,
+    d: Tangents,
+    out: Samples,
+    w_end: Array,
+    begin: Rest,
+    max_steps: int,
+    log: Array,
+    tally: Branches,
+    lost: Array,
+) -> tuple[int, float, int, int]:
+    """Step from event to event; see `integrate_implicit`. Nothing is allocated from here on."""
+    rows, heights = body.rows, body.heights
+    ends, top, struck, t, values, drag = (
+        scene.ends, scene.top, scene.struck, scene.t, scene.values, scene.drag
+    )  # fmt: skip
+    count, groups, tangent = heights.size, ends.size, d.base.size > 0
+    first, i0 = ends[0], (ends[groups - 2] if groups > 1 else 0)
+    _begin(i0, begin, body, state, d)
+    done = _before(body, speed, state, v, d, out) if struck else 0
+    for i in range(count):
+        stress = stress_on(rows[i], state.branches[i], state.eps0[i])
+        pace[LOAD] = max(pace[LOAD], abs(stress))
+        pace[REACH] = max(pace[REACH], heights[i] * abs(state.eps0[i]))
+    pressed, switches = speed < 0.0, done - done  # no, and none: not literals, which are types
+    knot, rate, step, stalled, fall = -1, 0.0, 0, 0, 0.0
+    while step < max_steps:
+        if done == t.size:
+            return DONE, math.nan, step, switches
+        horizon, push, push_rate = t[t.size - 1], 0.0, 0.0
+        if not struck:
+            fresh = False
+            while knot < t.size - 2 and (knot < 0 or now >= t[knot + 1]):
+                knot += 1
+                fresh = True
+            new_rate = 0.0
+            if t.size > 1:
+                horizon = t[knot + 1]
+                new_rate = (values[knot + 1] - values[knot]) / (t[knot + 1] - t[knot])
+            else:
+                knot = 0
+            if top == MOTION:
+                state.v0[count - 1] = v[count - 1] = new_rate
+                if fresh:  # rounding does not pile up
+                    state.eps0[count - 1] += (values[knot] - state.w[count - 1]) / heights[-1]
+                    state.w[count - 1] = values[knot]
+                if fresh and knot > 0 and groups == 1:
+                    _mend_kink(scene, body, knot, new_rate - rate, d, out)
+            else:
+                push_rate = new_rate
+                push = values[knot] + new_rate * (now - t[knot])
+            rate = new_rate
+        if top == STRESS and _is_flat(body, state, i0):
+            return FLAT_UNDER_STRESS, math.nan, step, switches
+        base0 = _base_stress(
+            rows, state.branches, heights, state.eps0, first, groups > 1, top,
+            0.0 if groups == 1 and top in (STRESS, VISCOUS) else state.v0[first - 1], drag, push,
+        )  # fmt: skip
+        if horizon <= now:  # a single sample, or the last one
+            _record_rest(done, state, base0, d, out)
+            return DONE, math.nan, step, switches
+        span = horizon - now
+        if pace[PROPOSAL] > 0.0:
+            span = min(span, pace[PROPOSAL])
+        elif struck:
+            span = min(span, 0.02 * paced)
+        wait = _wait(t, done, now) if scene.fast else 0.0
+        outcome, span, arrived, target, side = _step(
+            scene, body, state, at, curves, ripples, pace, v, now, span, wait, push, push_rate,
+            base0, pressed, tally,
+        )  # fmt: skip
+        if outcome != DONE:
+            return outcome, math.nan, step, switches
+        leaves = arrived and target == count
+        stalled += 1
+        if span > 0.0 and now + span > now:
+            step, stalled = step + 1, 0
+            last = span >= horizon - now or now + span >= horizon
+            end = horizon if last else now + span
+            for i in range(count):
+                for j in range(STAGES):
+                    curves.stress[i, j] = at.z[i, j] + NODES[j] * span * state.v0[i]
+                polynomial(0.0, curves.stress[i], curves.moves[i])
+            begun = done
+            while done < t.size and (t[done] < end or (last and t[done] <= end)):
+                done += 1
+            _record(now, span, begun, done, state, curves, out)
+            if tangent:
+                if not linearise(body, state, span, at, d):
+                    return NOT_FINITE, math.nan, step, switches
+                _record_tangents(now, span, begun, done, d, out)
+                _carry_tangents(body, span, d)
+            if scene.fast:
+                _remember(scene, body, state, at, span, wait, ripples)
+            _carry(body, state, at, span, v, top, pace)
+            lost[0] = pace[SEEN]
+            if ripples.worst[1] > 0.0:
+                share = ripples.worst[0] / pace[REACH]
+                lost[0] += max(share, ripples.worst[1] / pace[LOAD])
+            fall = slope_at(curves.base, STAGES, 1.0) / span
+            pressed = pressed or (
+                not leaves and at.total[0, STAGES - 1] > 10.0 * curves.slack[count]
+            )
+            now = end
+            _hold_back(span, last, scene, pace)
+        elif stalled > 4 * count + 8:
+            return STEP_UNDERFLOW, math.nan, step, switches
+        if not arrived:
+            continue
+        if not leaves:
+            switches, opened = _switch(
+                body, state, curves.strains, target, side, span, now, first, log, switches
+            )
+            leaves = opened and struck and pressed
+        if leaves:
+            _leave(body, state, at, v, fall, now, done, d, out, w_end)
+            return DONE, now, step, switches
+    return TOO_MANY_STEPS, math.nan, max_steps, switches
 
 
 @compiled
@@ -605,12 +909,16 @@ def integrate_implicit(
     t: Array,
     tol: float,
     max_steps: int,
+    directions: Branches,
     out_w: Array,
     out_s: Array,
+    out_dw: Array,
+    out_ds: Array,
     log: Array,
     tally: Branches,
     wanted: float,
     lost: Array,
+    begin: Rest,
 ) -> tuple[int, float, int, int]:
     """Integrate a chain from rest (or struck) over the samples t, by implicit steps.
 
@@ -618,7 +926,7 @@ def integrate_implicit(
     is the truncation of a step relative to the motion so far. `tally` (2,) is filled with the
     linear systems solved and with the blocks eliminated in them; `lost` (1,) with the size,
     relative to the motion and stress, of the vibrations that were damped out because they could not
-    be followed. Those above `wanted` are followed longer.
+    be followed. Those above `wanted` are followed longer. `begin` is what `rest` returns.
 
     Returns
     -------
@@ -626,281 +934,35 @@ def integrate_implicit(
         Outcome, end of contact (NaN if none), steps taken, switches (also those past the log).
     """
     count, groups = rows.shape[0], ends.size
-    moving = count - 1 if top == MOTION else count
     areal = np.zeros(count)
     for g in range(groups):
         if g < groups - 1 or top == FREE:
             areal[ends[g] - 1] = mass[g]
-    shape = (count, STAGES)
-    z, eps, vel, total, slope = (
-        np.zeros(shape), np.zeros(shape), np.zeros(shape), np.zeros(shape), np.zeros(shape),
-    )  # fmt: skip
-    slack = np.zeros(count + 1)
-    residual, delta, lift = np.zeros(shape), np.zeros(shape), np.zeros((count, STAGES, STAGES))
-    moves = np.zeros((count, STAGES + 1))  # polynomials of the last step: nodes, strains, base
-    strains = np.zeros((count, STAGES + 1))
-    base, some = np.zeros(STAGES + 1), np.zeros(STAGES + 1)
-    w, v0, v, eps0 = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count)
-    branches = np.empty(count, np.int64)
-    for i in range(count):
-        branches[i] = first_branch(rows[i])
     struck = speed > 0.0
     now = 0.0 if struck else t[0]
-    done = 0
-    while struck and done < t.size and t[done] < 0.0:  # the striker is still on its way
-        out_s[done] = 0.0
-        for i in range(out_w.shape[0]):
-            out_w[i, done] = speed * t[done] if i == out_w.shape[0] - 1 else 0.0
-        done += 1
+    paced = t[t.size - 1] - now
     if struck:
-        v0[count - 1] = v[count - 1] = speed
-    else:
-        state, strain = np.zeros((groups, 1)), np.zeros((count, 1))
-        start(rows, branches, heights, ends, top, values[0], state, strain)
-        node = 0.0
-        for i in range(count):
-            eps0[i] = strain[i, 0]
-            node += heights[i] * eps0[i]
-            if i >= (ends[groups - 2] if groups > 1 else 0):
-                w[i] = node
-    pace = t[t.size - 1] - now
-    if struck:
-        pace = min(pace, 5.0 * _bounce(rows, heights, areal, drag))
-    short = SHORT * pace * (tol / 3e-8) ** (1.0 / 6.0)
-    ringing = _ringing(rows, heights, ends, mass, drag, top)
-    lost[0], burst = 0.0, 0.0
-    w_scale, s_scale, pressed, knot, switches, rate = 0.0, 0.0, False, -1, 0, 0.0
-    contact_end = math.nan
-    hurry, shorts, floor, stalled = 0, 0, 0.0, 0
-    proposal, taken, worst = 0.0, 0.0, 1.0  # worst: the largest error let pass, over tol
-    for i in range(count):
-        s_scale = max(s_scale, abs(stress_on(rows[i], branches[i], eps0[i])))
-        w_scale = max(w_scale, heights[i] * abs(eps0[i]))
-    step = 0
-    while step < max_steps:
-        if done == t.size:
-            return DONE, contact_end, step, switches
-        horizon = t[t.size - 1]
-        push, push_rate = 0.0, 0.0
-        fresh = False
-        if not struck:
-            while knot < t.size - 2 and (knot < 0 or now >= t[knot + 1]):
-                knot += 1
-                fresh = True
-            if t.size > 1:
-                horizon = t[knot + 1]
-                new_rate = (values[knot + 1] - values[knot]) / (t[knot + 1] - t[knot])
-            else:
-                knot, new_rate = 0, 0.0
-            if top == MOTION:
-                v0[count - 1] = v[count - 1] = new_rate
-                if fresh:  # rounding does not pile up
-                    eps0[count - 1] += (values[knot] - w[count - 1]) / heights[count - 1]
-                    w[count - 1] = values[knot]
-            else:
-                push_rate = new_rate
-                push = values[knot] + new_rate * (now - t[knot])
-            if fresh and knot > 0 and top == MOTION and groups == 1:
-                flow = 0.0  # dashpots feel the kink in the motion
-                for i in range(count):
-                    flow += heights[i] / rows[i, ETA] if rows[i, ETA] > 0.0 else math.inf
-                before, after = t[knot] - t[knot - 1], t[knot + 1] - t[knot]
-                out_s[knot] += before / (before + after) * (new_rate - rate) / flow
-            rate = new_rate
-        if top == STRESS:
-            for i in range(ends[groups - 2] if groups > 1 else 0, count):
-                if rows[i, ETA] == 0.0 and slope_on(rows[i], branches[i], eps0[i]) == 0.0:
-                    return FLAT_UNDER_STRESS, contact_end, step, switches
-        first = ends[0]
-        base0 = _base_stress(
-            rows, branches, heights, eps0, first, groups > 1, top,
-            0.0 if groups == 1 and top in (STRESS, VISCOUS) else v0[first - 1], drag, push,
-        )  # fmt: skip
-        if horizon <= now:  # a single sample, or the last one
-            for j in range(done, t.size):
-                out_s[j] = base0
-                for i in range(out_w.shape[0]):
-                    out_w[i, j] = w[i if out_w.shape[0] > 1 else count - 1]
-            return DONE, contact_end, step, switches
-        span = horizon - now
-        if proposal > 0.0:
-            span = min(span, proposal)
-        elif struck:
-            span = min(span, 0.02 * pace)
-        longest = span
-        target, side, level = -1, 0, 0.0  # what the step is to end at: a spring, or `count`: base
-        arrived, chased, tries = False, 0, 0
-        trial_span, trial_error = math.inf, math.inf  # to see whether shorter steps are better
-        while True:
-            tries += 1
-            if now + span <= now or tries > 200:
-                if chased > 0:  # the crossing is here, within rounding
-                    arrived, span = True, 0.0
-                    break
-                for i in range(count):
-                    curved, _, x0, _ = branch_shape(rows[i], branches[i])
-                    if curved and 1.0 - (eps0[i] - x0) < 1e-3:
-                        return NOT_FINITE, contact_end, step, switches
-                return STEP_UNDERFLOW, contact_end, step, switches
-            _guess(moves, v, v0, moving, span, taken, z)
-            if not _collocate(
-                rows, branches, heights, areal, drag, moving, eps0, v0, push, push_rate, span,
-                w_scale, z, eps, vel, total, slope, residual, delta, lift, tally,
-            ):  # fmt: skip
-                if chased > 0:
-                    target, side, chased = -1, 0, 0
-                span *= 0.3
-                longest = span
-                continue
-            error, reach, load = _describe(
-                rows, branches, heights, eps0, base0, eps, total, w_scale, s_scale,
-                strains, base, residual, some,
-            )  # fmt: skip
-            if chased == 0:
-                error /= tol
-                factor = 0.9 * max(error, 1e-12) ** (-1.0 / 6.0)
-                if not math.isfinite(error):
-                    span *= 0.3
-                    longest = span
-                    continue
-                stuck = False  # rounding, or a layer thinner than the clock can tell
-                if error > 1.0 and span <= 1e-6 * trial_span:
-                    stuck = error > 0.3 * trial_error
-                    trial_span, trial_error = span, error
-                elif trial_span == math.inf:
-                    trial_span, trial_error = span, error
-                stuck = stuck or now + 0.1 * span <= now
-                rings = error > 1.0 and _rings(ringing, span)
-                if error > 1.0 and not stuck and span <= floor * (1.0 + 1e-9):
-                    patient = shorts * count < LONGEST_PATIENCE
-                    if rings and patient and lost[0] - burst + error * tol > 0.3 * wanted:
-                        floor, hurry = 0.0, -4 * PATIENCE
-                if error > 1.0 and not stuck and span > floor * (1.0 + 1e-9):
-                    span = max(span * min(max(factor, 0.1), 0.9), floor)
-                    longest = span
-                    continue
-                if error > 1.0 and rings and error * tol > burst:
-                    lost[0] += error * tol - burst
-                    burst = error * tol
-                elif error <= 1.0:
-                    burst = 0.0
-                proposal = max(span * min(max(factor, 0.2), 5.0), floor)
-                if error > 1.0:
-                    proposal = max(proposal, 2.0 * span)
-                worst = max(worst, error)
-            for i in range(count):
-                slack[i] = max(1e-12, tol * reach / heights[i])
-            slack[count] = min(worst * tol, 1e-3) * load
-            when, which, where = _first_event(
-                rows, branches, strains, base, slack, struck, pressed
-            )  # fmt: skip
-            if target >= 0:
-                value = total[0, STAGES - 1] if target == count else eps[target, STAGES - 1]
-                fine = 1e-13 * (abs(base0) if target == count else max(1.0, abs(level)))
-                same = which < 0 or which == target or when > 1.0 - 1e-9
-                if same and abs(value - level) <= fine:
-                    arrived = True
-                    break
-                if same and chased > 12:
-                    arrived = abs(value - level) <= 1e5 * fine
-                    break
-                if which < 0:  # a little further
-                    pace_out = slope_at(base if target == count else strains[target], STAGES, 1.0)
-                    more = (level - value) / pace_out if pace_out * side > 0.0 else math.inf
-                    if not (1.0 + more) * span < longest:
-                        break  # it turned back: nothing was crossed
-                    span *= 1.0 + more
-                    chased += 1
-                    continue
-            if which < 0:
-                break
-            target, side, level = which, where, 0.0
-            if which < count:
-                low, high = interval(rows[which], branches[which])
-                level = high if where > 0 else low
-            ending = base if which == count else strains[which]
-            beyond = value_at(ending, STAGES, 0.5 * when) - level
-            near = abs(ending[0] - level) <= slack[which] and beyond * where >= 0.0
-            if now + when * span <= now or near:
-                arrived, span = True, 0.0
-                break
-            if when >= 1.0 - 1e-15:
-                arrived = True
-                break
-            span *= when
-            chased += 1
-        if span > 0.0 and now + span > now:
-            step += 1
-            stalled = 0
-            end = now + span
-            last = span >= horizon - now or end >= horizon
-            if last:
-                end = horizon
-            for i in range(count):
-                for j in range(STAGES):
-                    residual[i, j] = z[i, j] + NODES[j] * span * v0[i]
-                _polynomial(0.0, residual[i], moves[i])
-            leaves_here = arrived and target == count
-            done = _record(now, span, end, last, t, done, w, moves, base, out_w, out_s)
-            for i in range(count):
-                w[i] += residual[i, STAGES - 1]
-                eps0[i] = eps[i, STAGES - 1]
-                v[i] = vel[i, STAGES - 1]
-                if areal[i] > 0.0:
-                    v0[i] = v[i]
-                w_scale = max(w_scale, heights[i] * abs(eps0[i]))
-                s_scale = max(s_scale, abs(stress_on(rows[i], branches[i], eps0[i])))
-            if top != STRESS:
-                w_scale = max(w_scale, abs(w[count - 1]))
-            s_scale = max(s_scale, abs(total[0, STAGES - 1]))
-            now = end
-            taken = span
-            if not leaves_here and total[0, STAGES - 1] > 10.0 * slack[count]:
-                pressed = True
-            # steps that only the error keeps short
-            if proposal < short and not last:
-                hurry += 1
-                shorts += 1
-                if hurry > (PATIENCE if shorts < 3 * PATIENCE else LITTLE_PATIENCE):
-                    floor = max(2.0 * floor, 2.0 * span)
-                    floor = min(floor, short)
-                    proposal = max(proposal, floor)
-            elif proposal >= short:
-                hurry, floor = 0, 0.0
-        else:
-            stalled += 1
-            if stalled > 4 * count + 8:
-                return STEP_UNDERFLOW, contact_end, step, switches
-        if not arrived:
-            continue
-        leaves = target == count
-        if not leaves:
-            for i in range(count):
-                low, high = interval(rows[i], branches[i])
-                out, level = 0, 0.0
-                if i == target:
-                    out = side
-                elif span > 0.0:
-                    tilt = slope_at(strains[i], STAGES, 1.0)
-                    if tilt > 0.0 and eps0[i] >= high - 1e-12:
-                        out = 1
-                    elif tilt < 0.0 and eps0[i] <= low + 1e-12:
-                        out = -1
-                if out == 0:
-                    continue
-                entered = above(branches[i]) if out > 0 else below(branches[i])
-                if entered == OPEN and i < first and rows[i, ETA] == 0.0:
-                    leaves = leaves or (struck and pressed)  # nothing presses on the base now
-                if switches < log.shape[0]:
-                    log[switches, 0], log[switches, 1] = now, i
-                    log[switches, 2], log[switches, 3] = branches[i], entered
-                    log[switches, 4] = high if out > 0 else low
-                switches += 1
-                branches[i] = entered
-        if leaves:
-            w_end = np.zeros(out_w.shape[0])
-            for i in range(count):
-                w_end[i if out_w.shape[0] > 1 else 0] = w[i]
-            fly(out_w, out_s, t, done, now, w_end, v[count - 1])
-            return DONE, now, step, switches
-    return TOO_MANY_STEPS, contact_end, max_steps, switches
+        paced = min(paced, 5.0 * bounce(rows, heights, areal, drag))
+    ringing = ringing_of(rows, heights, ends, mass, drag, top)
+    faintly = struck and parts_faintly(rows, heights, mass[groups - 1])
+    scene = Scene(
+        ends, mass, drag, top, values, struck, t, tol, wanted,
+        SHORT * paced * (tol / 3e-8) ** (1.0 / 6.0),
+        min(1.0, tol / FAINT) if faintly else 0.0, ringing, ringing[:, 0].max() > 0.0,
+    )  # fmt: skip
+    body = Body(rows, heights, areal, drag, count - 1 if top == MOTION else count)
+    out = Samples(t, out_w, out_s, out_dw, out_ds)
+    at, d = make_points(count), make_tangents(count, directions)
+    shape = (count, STAGES + 1)
+    curves = Curves(
+        np.zeros(shape), np.zeros(shape), np.zeros(STAGES + 1), np.zeros(count + 1),
+        np.zeros((count, STAGES)), np.zeros(STAGES + 1),
+    )  # fmt: skip
+    ripples = Ripples(np.zeros(groups), np.zeros(groups), np.zeros(groups), np.zeros(2))
+    state = State(np.zeros(count), np.zeros(count), np.zeros(count), np.empty(count, np.int64))
+    v, pace = np.zeros(count), np.zeros(N_PACE)
+    pace[WORST], lost[0] = 1.0, 0.0
+    return _follow(
+        scene, body, state, at, curves, ripples, pace, v, now, paced, speed, d, out,
+        np.zeros(out_w.shape[0]), begin, max_steps, log, tally, lost,
+    )  # fmt: skip

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foamfit import aggregate, implicit, kernels, series, taylor
+from foamfit import aggregate, implicit, kernels, ringing, series, taylor
 from foamfit.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.errors import SimulationError
 from foamfit.series import equilibrium_tangents
@@ -202,7 +202,7 @@ class Plan(NamedTuple):
             motion = self._explicit(rows, heights, rtol, drag, everything, directions)
             if motion is not None:
                 return motion
-        return self._implicit(rows, heights, rtol, drag, everything)
+        return self._implicit(rows, heights, rtol, drag, everything, directions)
 
     def _aggregate(
         self, rows: Array, heights: Array, rtol: float, drag: float, everything: bool
@@ -230,17 +230,15 @@ class Plan(NamedTuple):
         directions: Directions,
     ) -> Motion | None:
         """Taylor series from switch to switch; None if they turn out to be the wrong tool."""
-        count, n, p = len(heights), self.time.size, len(directions)
+        count = len(heights)
         displacement, stress = self._curves(heights, everything)
-        log, slopes = np.empty((1024, 5)), NO_SLOPES
-        if p > 0:
-            slopes = Slopes(np.empty((p, len(displacement), n)), np.empty((p, n)))
+        log, slopes = np.empty((1024, 5)), self._slopes(displacement, directions)
         # Without an interior mass there are few steps: a margin costs little.
         margin = 1e-2 if len(self.ends) > 1 else 1e-3 if self.speed > 0.0 else 1e-4
         tolerance, order = accuracy(margin * rtol, 24)
         most = self._most_steps(count)
         if self.implicit is None:
-            most = min(most, min(MOST_EXPLICIT, MOST_EXPLICIT_WORK // count) + 20 * n)
+            most = min(most, min(MOST_EXPLICIT, MOST_EXPLICIT_WORK // count) + 20 * self.time.size)
         ending = taylor.integrate(
             rows, heights, self.ends, self.mass, drag, self.top, self.values, self.speed, self.time,
             tolerance, order, most, directions, self._start(rows, heights, directions),
@@ -248,21 +246,29 @@ class Plan(NamedTuple):
         )  # fmt: skip
         if self.implicit is None and ending[0] in (taylor.TOO_MANY_STEPS, taylor.STEP_UNDERFLOW):
             return None
-        return self._motion(TAYLOR, ending, displacement, stress, log, slopes if p > 0 else None)
+        return self._motion(TAYLOR, ending, displacement, stress, log, slopes)
 
     def _implicit(
-        self, rows: Array, heights: Array, rtol: float, drag: float, everything: bool
+        self,
+        rows: Array,
+        heights: Array,
+        rtol: float,
+        drag: float,
+        everything: bool,
+        directions: Directions,
     ) -> Motion:
         """Radau's implicit steps, which need not follow what is long over."""
         displacement, stress = self._curves(heights, everything)
+        slopes = self._slopes(displacement, directions)
         log, lost = np.empty((1024, 5)), np.zeros(1)
         tolerance = max((3e-2 if len(self.ends) > 1 else 3e-4) * rtol, 1e-14)
         ending = implicit.integrate_implicit(
             rows, heights, self.ends, self.mass, drag, self.top, self.values, self.speed, self.time,
-            tolerance, self._most_steps(len(heights)), displacement, stress, log,
-            np.zeros(2, np.int64), rtol, lost,
+            tolerance, self._most_steps(len(heights)), directions, displacement, stress,
+            slopes.displacement, slopes.base_stress, log, np.zeros(2, np.int64), rtol, lost,
+            implicit.rest(rows, heights, self.ends, self.top, self.values[0], directions),
         )  # fmt: skip
-        return self._motion(RADAU, ending, displacement, stress, log, None, float(lost[0]))
+        return self._motion(RADAU, ending, displacement, stress, log, slopes, float(lost[0]))
 
     def _most_steps(self, count: int) -> int:
         """Bound on the steps of a chain of so many springs."""
@@ -274,6 +280,13 @@ class Plan(NamedTuple):
         n = self.time.size
         return np.empty((len(heights) if everything else 1, n)), np.empty(n)
 
+    def _slopes(self, displacement: Array, directions: Directions) -> Slopes:
+        """Room for derivatives."""
+        p, n = len(directions), self.time.size
+        if p == 0:
+            return NO_SLOPES
+        return Slopes(np.empty((p, len(displacement), n)), np.empty((p, n)))
+
     def _motion(
         self,
         method: str,
@@ -281,7 +294,7 @@ class Plan(NamedTuple):
         displacement: Array,
         stress: Array,
         log: Array,
-        slopes: Slopes | None = None,
+        slopes: Slopes = NO_SLOPES,
         unresolved: float = 0.0,
     ) -> Motion:
         """Gather what an integrator found, or say why it found nothing."""
@@ -290,7 +303,14 @@ class Plan(NamedTuple):
             last = log[min(switches, len(log)) - 1, 0] if switches else self.time[0]
             raise SimulationError(_OUTCOMES[outcome].format(steps=steps, time=last))
         return Motion(
-            displacement, stress, contact_end, log[:switches], steps, method, slopes, unresolved
+            displacement,
+            stress,
+            contact_end,
+            log[:switches],
+            steps,
+            method,
+            None if slopes is NO_SLOPES else slopes,
+            unresolved,
         )
 
     def _start(self, rows: Array, heights: Array, directions: Directions) -> Array:
@@ -331,7 +351,7 @@ class Plan(NamedTuple):
 
     def hurry(self, rows: Array, heights: Array, drag: float) -> tuple[float, float]:
         """Vibration and relaxation (radians) that explicit steps would have to go through."""
-        return implicit.hurry_of(
+        return ringing.hurry_of(
             rows, heights, self.ends, self.mass, drag, self.top, self.speed, self.time
         )
 
@@ -341,6 +361,8 @@ class Plan(NamedTuple):
             return self.implicit
         if self.lossless and drag == 0.0 and self.speed > 0.0:  # one mass bounces once
             return False
+        if self.speed > 0.0 and ringing.parts_faintly(rows, heights, self.mass[-1]):
+            return True
         vibration, relaxation = self.hurry(rows, heights, drag)
         return bool(vibration > MOST_VIBRATION or relaxation > MOST_RELAXATION)
 

@@ -246,8 +246,7 @@ class Simulated:
 
     `stress_strain` is the stress (Pa) along the measured displacement. `motion` is the run itself.
     `interior` holds the displacements (m) of the masses inside that the test has too, `slopes` the
-    derivatives (p, n) of the curves by the parameters that were asked for; None where implicit
-    steps gave none.
+    derivatives (p, n) of the curves by the parameters that were asked for; None where none were.
     """
 
     stress_time: Array | None
@@ -528,12 +527,13 @@ class Objective:
         """
         there = {name: curve for name in self.curves if (curve := curves.curve(name)) is not None}
         slopes: dict[str, Array] | None = None
-        if curves.slopes is not None:
+        if by_shift.size:
             step = float(np.median(np.diff(self.time)))
+            own = curves.slopes or {name: np.empty((0, self.time.size)) for name in there}
             slopes = {}
-            for name in there.keys() & curves.slopes.keys():
+            for name in there.keys() & own.keys():
                 out = np.empty((by_shift.size, self.time.size))
-                rows = [self._shift(name, row, late, 0.0) for row in curves.slopes[name]]
+                rows = [self._shift(name, row, late, 0.0) for row in own[name]]
                 out[~by_shift] = np.reshape(rows, (-1, self.time.size))
                 sides = [self._shift(name, there[name], late + side * step) for side in (-0.5, 0.5)]
                 out[by_shift] = (sides[1] - sides[0]) / step
@@ -611,11 +611,10 @@ class Objective:
         """What makes a curve's difference a residual."""
         return float(self.weights[name] ** 0.5 / self.scale[name])
 
-    def jacobian(self, values: Array, places: NDArray[np.int64], steps: Array) -> Array:
+    def jacobian(self, values: Array, places: NDArray[np.int64]) -> Array:
         """Derivative of the residual by the parameters at `places`, (n_data, n_places), SI.
 
-        Carried along with the simulation. Where implicit steps were taken, central differences over
-        `steps` (n_places,) stand in; zeros where the parameters cannot be simulated.
+        Carried along with the simulation; zeros where the parameters cannot be simulated.
         """
         self.evaluations += 1
         try:
@@ -623,8 +622,8 @@ class Objective:
         except SimulationError:
             self.failures += 1
             return np.zeros((self.n_data, places.size))
-        if curves.slopes is None:
-            return self._differences(values, places, steps)
+        if curves.slopes is None:  # none were asked for
+            return np.zeros((self.n_data, 0))
         parts = [
             curves.slopes[name][:, self._kept[name]] * self._factor(name) for name in self.counted
         ]
@@ -633,37 +632,10 @@ class Objective:
         slopes[np.abs(residual) >= self.penalty] = 0.0
         return slopes if self.loss == "linear" else slopes * softness(residual, self.loss)[:, None]
 
-    def jacobian_along(self, values: Array, moves: Array, steps: Array) -> Array:
-        """Derivative of the residual along moves (n_values, m) of the parameters, (n_data, m).
-
-        `steps` (m,) are those of `jacobian`, in units of the moves.
-        """
+    def jacobian_along(self, values: Array, moves: Array) -> Array:
+        """Derivative of the residual along moves (n_values, m) of the parameters, (n_data, m)."""
         places = np.flatnonzero(moves.any(axis=1))
-        moving = moves[places]
-        return self.jacobian(values, places, np.max(np.abs(moving) * steps, axis=1)) @ moving
-
-    def _differences(self, values: Array, places: NDArray[np.int64], steps: Array) -> Array:
-        """Central differences of the residual, (n_data, n_places).
-
-        Where one side cannot be simulated the other side alone is used.
-        """
-        columns = np.empty((self.n_data, places.size))
-        here: Array | None = None
-        for column, i in enumerate(places):
-            sides = []
-            for sign in (1.0, -1.0):
-                moved = values.copy()
-                moved[i] += sign * steps[column]
-                failures = self.failures
-                value = self.residual(moved)
-                sides.append((moved[i], value if self.failures == failures else None))
-            (up, high), (down, low) = sides
-            if high is None or low is None:
-                here = self.residual(values) if here is None else here
-                up, high = (up, high) if high is not None else (values[i], here)
-                down, low = (down, low) if low is not None else (values[i], here)
-            columns[:, column] = (high - low) / (up - down) if up != down else 0.0
-        return columns
+        return self.jacobian(values, places) @ moves[places]
 
     def kept(self, name: str) -> NDArray[np.intp]:
         """Samples of a curve that stand in the residual, in their order: all but outliers."""

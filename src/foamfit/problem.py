@@ -204,15 +204,15 @@ class Problem:
     def slopes(self, values: Array, names: tuple[str, ...]) -> Array:
         """Derivative of the residual by some parameters at a point, (n_data, n_names), per SI unit.
 
-        Exact but for scenes with implicit steps; see `Objective.jacobian`. Parameters that hang on
-        these by expressions move with them.
+        Exact; see `Objective.jacobian`. Parameters that hang on these by expressions move with
+        them.
         """
         places = np.array([self.index[name] for name in names])
         steps = 1e-5 * self.sizes(names, values)
         moves = np.zeros((values.size, places.size))
         moves[places, np.arange(places.size)] = 1.0
         moves = self.space().follow(values, moves, steps)
-        return self.objective.jacobian_along(values, moves, steps)
+        return self.objective.jacobian_along(values, moves)
 
 
 def _check_held(params: lmfit.Parameters) -> None:

@@ -88,7 +88,7 @@ class Tracker:
         """Derivative of the residual by the coordinates of a point, (n_data, n_free)."""
         values = space.decode(point)
         moves = space.slopes(point, values)
-        return self.objective.jacobian_along(values, moves, np.full(point.size, 1e-5))
+        return self.objective.jacobian_along(values, moves)
 
     def consider(self, values: Array, shift: Array | float = 0.0) -> Array:
         """Residual of the objective, whatever the time; with a shift, that of other data."""

@@ -34,7 +34,7 @@ class _Calls(NamedTuple):
 
 
 def _calls() -> _Calls:
-    from foamfit import implicit, kernels, polynomial, series, taylor
+    from foamfit import kernels, polynomial, ringing, series, taylor
 
     one, flat, cube = np.zeros(1), np.zeros((1, 1)), np.zeros((1, 1, 1))
     whole, table = np.zeros(1, np.int64), np.zeros((1, 1), np.int64)
@@ -57,7 +57,7 @@ def _calls() -> _Calls:
             (kernels.fill_rows, (whole, one, flat)),
             (kernels.equilibrium_along, (flat, one, one, one, flat, table)),
             (series.equilibrium_tangents, (flat, one, flat, table, True, directions)),
-            (implicit.hurry_of, (flat, one, whole, one, 0.0, 0, 0.0, one)),
+            (ringing.hurry_of, (flat, one, whole, one, 0.0, 0, 0.0, one)),
             (kernels.strains_along, (flat, one, flat, table)),
             (kernels.total, (one,)),
             (kernels.fault, (one,)),
