@@ -10,13 +10,17 @@ from typing import Any
 import click
 import numpy as np
 import pytest
-from numba import typeof
+from numba import typeof, types
 
 import foamfit as ff
 from conftest import EXPERIMENTS
 from foamfit import cli, kernels, series, taylor, warmth
 
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
+
+
+def is_literal(kind: Any) -> bool:
+    return isinstance(kind, types.Literal)
 
 
 def signature(arguments: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -38,11 +42,15 @@ def test_a_fit_calls_what_was_compiled_and_nothing_else() -> None:
 
 
 def test_the_pieces_are_those_of_the_integrator() -> None:
-    """Where the integrator itself was compiled, it left no piece in other types in the cache."""
+    """Where the integrator itself was compiled, it left no piece in other types.
+
+    Other loops may call `first_crossing` too, with an order that is known when they are compiled.
+    """
     pieces = [(*call, "own") for call in warmth._calls().own]
     pieces += [(*call, "cached") for call in warmth._calls().pieces]
     for function, arguments, where in pieces:
-        assert function.signatures in ([], [signature(arguments)]), function.py_func.__name__
+        made = [kinds for kinds in function.signatures if not any(map(is_literal, kinds))]
+        assert made in ([], [signature(arguments)]), function.py_func.__name__
         assert (function.stats.cache_path is not None) == (where == "cached")
 
 

@@ -204,7 +204,7 @@ def _room(rows: Array, heights: Array, displacement: Array) -> float:
 def _hard(scene: Plan, rows: Array, heights: Array) -> bool:
     """Whether a blow may bring a spring close to the end of its branch c."""
     brought = 0.5 * float(scene.mass[-1]) * scene.speed**2
-    return brought >= 6.0 * float(heights @ rows[:, kernels.KC])
+    return brought >= 6.0 * float(heights.dot(rows[:, kernels.KC]))
 
 
 def _room_at_peak(scene: Plan, rows: Array, heights: Array, motion: Motion, rtol: float) -> float:
