@@ -51,6 +51,27 @@ TINY = 4 * np.finfo(float).eps
 compiled = njit(cache=True, error_model="numpy")
 
 
+# The project's loops that only other loops call have no bridge to Python; here it is.
+
+
+@compiled
+def at_rest(row):
+    """Branch of a spring at rest."""
+    return first_branch(row)
+
+
+@compiled
+def entered(branch, rising):
+    """Branch that a spring enters when it leaves another."""
+    return above(branch) if rising else below(branch)
+
+
+@compiled
+def answer(row, branch, driven, by_stress):
+    """Strain at a stress, or stress at a strain."""
+    return strain_on(row, branch, driven) if by_stress else stress_on(row, branch, driven)
+
+
 # ---------------------------------------------------------------- a mass above every spring
 
 
@@ -233,7 +254,7 @@ class System:
         """Choose the state: nodes where every spring has a mass above it, else the stress."""
         self.series = self.mass.size == 1 and self.heights.size > 1
         assert self.series or self.mass.size == self.heights.size
-        self.branches = np.array([first_branch(row) for row in self.rows])
+        self.branches = np.array([at_rest(row) for row in self.rows])
         self.pressed = False
         n = self.mass.size
         if self.series:
@@ -298,7 +319,7 @@ def impact(
             out_w[done:] = last_w[0] + system.y[-1] * (t[done:] - now)
             return out_w, out_s
         branch = system.branches[who]
-        system.branches[who] = above(branch) if side > 0 else below(branch)
+        system.branches[who] = entered(branch, side > 0)
     raise RuntimeError(f"{method}: too many switches at rtol = {rtol:g}")
 
 
@@ -405,7 +426,7 @@ def _pieces(row: np.ndarray, driven: np.ndarray, by_stress: bool) -> list[tuple[
         E: (row[SIGMA_HAT_A], row[SIGMA_C]) if by_stress else (row[EPS_HAT_A], row[EPS_C]),
     }
     turns = [0, *(np.flatnonzero(np.diff(np.sign(np.diff(driven)))) + 1), driven.size - 1]
-    out, branch = [], first_branch(row)
+    out, branch = [], at_rest(row)
     for a, b in pairwise(turns):
         here, there = driven[a], driven[b]
         while True:
@@ -415,7 +436,7 @@ def _pieces(row: np.ndarray, driven: np.ndarray, by_stress: bool) -> list[tuple[
                 out.append((branch, here, stop))
             if stop == there:
                 break
-            branch, here = (above if there > here else below)(branch), stop
+            branch, here = entered(branch, there > here), stop
     return out
 
 
@@ -429,9 +450,8 @@ def quasi_static(
     """
     out = np.zeros(driven.size)
     function = along_stress if by_stress else along_strain
-    branch = first_branch(row)
-    y = np.array([strain_on(row, branch, driven[0]) if by_stress else
-                  stress_on(row, branch, driven[0])])  # fmt: skip
+    branch = at_rest(row)
+    y = np.array([answer(row, branch, driven[0], by_stress)])
     atol = rtol * (1e-2 if by_stress else 1e-2 * row[K0])
     out[0], done = y[0], 1
     for branch, start, stop in _pieces(row, driven, by_stress):

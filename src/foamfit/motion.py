@@ -47,6 +47,7 @@ _OUTCOMES = {
 NO_DIRECTIONS: Directions = np.empty((0, 2), np.int64)
 NO_SWITCHES = np.empty((0, 5))
 _NOTHING = np.zeros(1)
+_AT_REST = np.zeros((1, 0))
 
 
 class Slopes(NamedTuple):
@@ -315,9 +316,9 @@ class Plan(NamedTuple):
 
     def _start(self, rows: Array, heights: Array, directions: Directions) -> Array:
         """Strains (1 + p, springs) in equilibrium with the first sample, and their derivatives."""
+        if self.top in (taylor.FREE, taylor.VISCOUS):
+            return _AT_REST
         start = np.zeros((1 + len(directions), len(heights)))
-        if self.speed > 0.0 or self.top in (taylor.FREE, taylor.VISCOUS):
-            return start
         first = self.ends[-2] if len(self.ends) > 1 else 0
         rows, heights = rows[first:], heights[first:]
         strain = np.empty((len(heights), 1))

@@ -461,14 +461,16 @@ def begin(
     """Write the state at the first sample: branches, strains and their derivatives."""
     s.v[-1, 0] = speed
     for i in range(branches.size):
-        s.eps[i, 0] = start[0, i]
-        branches[i] = branch_at_strain(rows[i], first_branch(rows[i]), start[0, i])
+        branches[i] = first_branch(rows[i])
+        if start.shape[1] > 0:
+            s.eps[i, 0] = start[0, i]
+            branches[i] = branch_at_strain(rows[i], branches[i], start[0, i])
+            for p in range(directions.shape[0]):
+                d.eps[p, i, 0] = start[1 + p, i]
+                d.live[p] = d.live[p] or start[1 + p, i] != 0.0
         links.eta[i] = rows[i, ETA]
         enter(rows, i, branches[i], links.law)
         enter_tangents(rows, i, branches[i], directions, d)
-        for p in range(directions.shape[0]):
-            d.eps[p, i, 0] = start[1 + p, i]
-            d.live[p] = d.live[p] or start[1 + p, i] != 0.0
 
 
 @inner
@@ -540,8 +542,9 @@ def integrate(
         Truncation of a step relative to the motion so far; order of the series; bound on steps.
     directions : (p, 2) array
         What derivatives are carried along: spring and its own parameter, or HEIGHT, or -1 and DRAG.
-    start : (1 + p, springs) array
-        The strains from which the springs start, never loaded before, and their derivatives.
+    start : (1 + p, springs or 0) array
+        The strains from which the springs start, never loaded before, and their derivatives; none
+        where they start from rest.
     out_w, out_s, out_dw, out_ds : arrays
         Filled; see `Samples`. The derivatives have p = 0 where none are wanted.
     log : (m, 5) array
