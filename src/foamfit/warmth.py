@@ -48,6 +48,8 @@ def _calls() -> _Calls:
     return _Calls(
         pieces=[
             (series.expand_tangents, (links, s, d, 0)),
+            (series.make_series, (1, 1, 0)),
+            (series.make_tangents, (1, 1, 0, directions)),
             (polynomial.first_crossing, (one, 0, 0.0, 0.0, 0.0)),
             (taylor.sample, (links, s, 0, *samples)),
             (taylor.sample_tangents, (links, s, d, 0, *samples)),
@@ -57,6 +59,7 @@ def _calls() -> _Calls:
             (kernels.fill_rows, (whole, one, flat)),
             (kernels.equilibrium_along, (flat, one, one, one, flat, table)),
             (series.equilibrium_tangents, (flat, one, flat, table, True, directions)),
+            (ringing.parts_faintly, (flat, one, 0.0)),
             (ringing.hurry_of, (flat, one, whole, one, 0.0, 0, 0.0, one)),
             (kernels.strains_along, (flat, one, flat, table)),
             (kernels.total, (one,)),
@@ -64,7 +67,6 @@ def _calls() -> _Calls:
         ],
         own=[
             (series.expand, (links, s, one, one, 0)),
-            (series.make_tangents, (1, 1, 0, directions)),
             (taylor.begin, (flat, flat, 0.0, directions, whole, links, s, d)),
             (taylor.switch, (flat, whole, links, s, d, directions, 0, 0.0, 0.0, 0, 0, flat, 0)),
             (taylor.step_length, (links, s, one, 0, 0.0, 0.0, 0.0, 0.0)),
