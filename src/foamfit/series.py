@@ -495,8 +495,8 @@ def _known_tangent(
         known += m.law[i, 2] if n == 0 else 0.0
     else:
         known += s.sig[i, n] / law[i, SLOPE] * m.law[i, 0]
-        for j in range(n):
-            known += slope[i, n - j] * eps[i, j]
+        if n > 0:
+            known += _product(eps, slope, i, n, 0, n - 1)
     if links.eta[i] == 0.0 and n + 1 < slope.shape[1]:  # a dashpot of zero adds what it would take
         known += (n + 1) * s.eps[i, n + 1] * m.eta[i]
     return known
@@ -566,7 +566,7 @@ def _group_tangent(
         rest -= s.eps[i, n] * m.heights[i]
         known = _known_tangent(links, s, slope, m, d.eps, i, n)
         if single:
-            d.eps[i, n] = rest / links.heights[i]
+            d.eps[i, n] = rest * (1.0 / links.heights[i])
         elif stressed and links.eta[i] == 0.0:
             d.eps[i, n] = -known / slope[i, 0]
         if single or stressed or links.eta[i] > 0.0:
@@ -606,7 +606,7 @@ def _expand_tangent(links: Links, s: Series, slope: Array, m: Moves, d: Series, 
             elif links.drag > 0.0 or m.drag != 0.0:
                 net -= links.drag * d.v[g, n] + s.v[g, n] * m.drag
             if g < last or links.top == FREE:
-                d.v[g, n + 1] = net * share / links.mass[g]
+                d.v[g, n + 1] = net * (share / links.mass[g])
             if g < last or links.top in (FREE, VISCOUS):
                 d.w[g, n + 1] = d.v[g, n] * share
 
