@@ -209,3 +209,17 @@ def test_the_judges_work_is_that_of_the_law() -> None:
     stress = spring.stress(loop)
     want = np.concatenate(([0.0], np.cumsum(0.5 * (stress[1:] + stress[:-1]) * np.diff(loop))))
     np.testing.assert_allclose(judges.work_of(spring, loop), want, atol=1e-7 * want.max())
+
+
+def test_contact_lasts_until_the_blow_has_come_through() -> None:
+    """Before it reaches the base of a long chain, only rounding presses there."""
+    point = next(p for _, p in swept() if p.springs == 300 and p.kinds == "unilateral+bistable"
+                 and p.drive == "impact" and p.mass > 0.0)  # fmt: skip
+    chain, drive, time = scene_of(point)
+    scene = plan(chain, drive, time)
+    arrays = chain.arrays
+    explicit = scene._replace(implicit=False).run(arrays.rows, arrays.heights, 1e-8)
+    implicit = scene._replace(implicit=True).run(arrays.rows, arrays.heights, 1e-5)
+    assert explicit.contact_end == pytest.approx(implicit.contact_end, rel=1e-5)
+    miss = np.abs(explicit.base_stress - implicit.base_stress).max()
+    assert miss <= 1e-4 * explicit.base_stress.max()

@@ -144,7 +144,13 @@ class Plan(NamedTuple):
         drag = self.drag if drag is None else drag
         if self.solver == CLOSED_FORM:
             return self._closed_form(rows, heights, everything, directions)
-        return self._integrate(rows, heights, rtol, drag, everything, directions)
+        if not self._is_stiff(rows, heights, drag):
+            if len(rows) >= LEAST_AGGREGATE and not len(directions) and self._is_one(rows):
+                return self._aggregate(rows, heights, rtol, drag, everything)
+            motion = self._explicit(rows, heights, rtol, drag, everything, directions)
+            if motion is not None:
+                return motion
+        return self._implicit(rows, heights, rtol, drag, everything, directions)
 
     def _closed_form(
         self, rows: Array, heights: Array, everything: bool, directions: Directions
@@ -181,29 +187,11 @@ class Plan(NamedTuple):
         if not everything:
             if slopes is not None:
                 slopes = Slopes(slopes.displacement[:, -1:], slopes.base_stress)
-            top = (self.values if moved else heights @ strain)[None, :]
+            top = np.array((self.values if moved else heights @ strain)[None, :])
             return Motion(top, stress, math.nan, NO_SWITCHES, 0, CLOSED_FORM, slopes)
         nodes = np.cumsum(heights[:, None] * strain, axis=0)
         switches = _switches(self.time, strain, branches)
         return Motion(nodes, stress, math.nan, switches, 0, CLOSED_FORM, slopes)
-
-    def _integrate(
-        self,
-        rows: Array,
-        heights: Array,
-        rtol: float,
-        drag: float,
-        everything: bool,
-        directions: Directions,
-    ) -> Motion:
-        """Integrate in time, by explicit steps where they are not the wrong tool."""
-        if not self._is_stiff(rows, heights, drag):
-            if len(rows) >= LEAST_AGGREGATE and not len(directions) and self._is_one(rows):
-                return self._aggregate(rows, heights, rtol, drag, everything)
-            motion = self._explicit(rows, heights, rtol, drag, everything, directions)
-            if motion is not None:
-                return motion
-        return self._implicit(rows, heights, rtol, drag, everything, directions)
 
     def _aggregate(
         self, rows: Array, heights: Array, rtol: float, drag: float, everything: bool

@@ -437,12 +437,18 @@ def _prescribe(
 
 
 @inner
-def _first_lift(s: Series, order: int, pressed: bool, span: float) -> tuple[float, bool]:
-    """When within `span` the base stress meets zero again, and whether it does."""
+def _first_lift(
+    s: Series, order: int, first: bool, pressed: bool, span: float
+) -> tuple[float, bool]:
+    """When within `span` the base stress meets zero again, and whether it does.
+
+    Before the blow has come through to the base (`pressed`) rounding alone may do so; only in the
+    first step can it come and go.
+    """
     when, where = first_crossing(s.group[0], order, 0.0, math.inf, span)
     if pressed and s.group[0, 0] <= 0.0 and s.group[0, 1] <= 0.0:
         when, where = 0.0, -1  # a unilateral spring has just opened
-    if where != 0 and when <= span and (pressed or when > 0.0):
+    if where != 0 and when <= span and (pressed or (first and when > 0.0)):
         return when, True
     return span, False
 
@@ -593,8 +599,8 @@ def integrate(
         span, spring, side = _first_switch(links, s, order, span)
         leaves = False
         if struck:
-            pressed = pressed or s.group[0, 0] > 0.0
-            span, leaves = _first_lift(s, order, pressed, span)
+            pressed = pressed or s.group[0, 0] > tol * s_scale
+            span, leaves = _first_lift(s, order, step == 0, pressed, span)
             spring = -1 if leaves else spring
         end = now + span
         stalled = stalled + 1 if span == 0.0 else 0
