@@ -214,8 +214,8 @@ def recorded(recorder: Recorder) -> Iterator[None]:
         recorder.note(self, values, out)
         return out
 
-    def jacobian(self: Objective, values: Array, places: NDArray[np.int64], steps: Array) -> Array:
-        out = derivative(self, values, places, steps)
+    def jacobian(self: Objective, values: Array, places: NDArray[np.int64]) -> Array:
+        out = derivative(self, values, places)
         recorder.count()
         return out
 
