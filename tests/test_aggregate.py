@@ -223,5 +223,19 @@ def test_elongated_as_one_or_one_by_one(count: int, linear: bool) -> None:
 
 def test_an_elongation_that_no_stress_gives_is_no_number() -> None:
     chain = built(chain_of(20))
-    with pytest.raises(ff.SimulationError, match="no longer finite"):
-        ff.simulate(chain, ff.DisplacementDrive(np.linspace(0.0, 1.5 * HEIGHT, 31)), TIME[:31])
+    for most in (1.5 * HEIGHT, 1e300, -1e300):
+        with pytest.raises(ff.SimulationError, match=r"end of (a|its) branch"):
+            ff.simulate(chain, ff.DisplacementDrive(np.linspace(0.0, most, 31)), TIME[:31])
+
+
+def test_tension_beyond_the_least_slope_is_borne_on_a_straight_branch() -> None:
+    """The softest spring is on branch e, which has no pole, when the stress passes its -k0."""
+    soft = ff.BistableSpring(1e5, 1e5, 0.0, 0.5, 0.75, 1e5, 4e5)
+    stiff = ff.BistableSpring(1e7, 1e7, 0.0, 0.5, 0.75, 1e7, 1.3e7)
+    chain = ff.Chain([soft, stiff, stiff], [1e-3] * 3, AREA)
+    top = 3e-3 * np.interp(np.arange(121.0), [0, 60, 120], [0.0, 0.5, 0.0625])
+    response = ff.simulate(chain, ff.DisplacementDrive(top), np.arange(121.0))
+    assert response.base_stress.min() < -1e5
+    strain = np.diff(response.displacement, axis=0, prepend=0.0) / 1e-3
+    for spring, own in zip(chain.springs, strain, strict=True):
+        assert np.abs(spring.stress(own) - response.base_stress).max() <= 1e-6

@@ -509,11 +509,13 @@ def _pass(group: Group, stress: float, rising: bool, j: int, runs: Runs) -> None
 @compiled
 def equilibrium_along(
     rows: Array, heights: Array, top: Array, sigma: Array, eps: Array, history: Branches
-) -> None:
+) -> bool:
     """Springs in series, as `holds` wants them, along a history of the top's displacement (m).
 
     Fills the common stress (n,), the strains and the branches (springs or 0, n), as does
-    `foamfit.kernels.equilibrium_along`, which goes through all springs at every trial.
+    `foamfit.kernels.equilibrium_along`, which goes through all springs at every trial. False, and
+    nothing of use filled, where the sum does not reach: past all room on a curved branch, or under
+    a tension beyond the least slope, which a spring on a straight branch may bear.
     """
     count, group = heights.size, _make_group(rows, heights)
     runs = Runs(sigma, eps, history, np.zeros(count, np.int64))
@@ -534,11 +536,10 @@ def equilibrium_along(
             _pass(group, stress, rising, j, runs)
             if abs(stress - anchor) >= reach * (1.0 - 1e-12):
                 _anchor(group, stress, rising)
-        if not there:  # no stress brings the springs so far
-            sigma[j:] = math.inf
-            eps[:] = math.inf
-            return
+        if not there:
+            return False
         stress = _stress_at(group, top[j], stress)
         sigma[j], place = stress, top[j]
     for i in range(count):
         _write(group, i, runs.since[i], top.size, runs)
+    return True

@@ -408,7 +408,7 @@ def _split_jump(
     _series_strain(rows, branches, heights, high, upper)
     rest = elongation - _series_strain(rows, branches, heights, low, eps)[0]
     for i in range(eps.size):
-        if eps[i] == -math.inf:
+        if eps[i] == -math.inf and rows[i, KIND] == UNILATERAL:
             rest = elongation - _series_strain(rows, branches, heights, 0.0, eps)[0]
             eps[i] += rest / heights[i]
             return 0.0

@@ -162,11 +162,17 @@ class Plan(NamedTuple):
         strain = np.empty((count if wanted else 0, self.time.size))
         branches = np.empty(strain.shape, np.int64)
         stress = np.array(self.values)
-        if as_one:
-            aggregate.equilibrium_along(rows, heights, self.values, stress, strain, branches)
-        elif moved:
+        if as_one and not aggregate.equilibrium_along(
+            rows, heights, self.values, stress, strain, branches
+        ):
+            as_one, strain = False, np.empty((count, self.time.size))
+            branches = np.empty(strain.shape, np.int64)
+        if moved and not as_one:
             kernels.equilibrium_along(rows, heights, self.values, stress, strain, branches)
-        else:
+            miss = np.abs(heights @ strain - self.values).max()
+            if not miss <= 1e-9 * (self.height + np.abs(self.values).max()):
+                raise SimulationError(_OUTCOMES[taylor.NOT_FINITE])
+        elif not moved:
             kernels.strains_along(rows, stress, strain, branches)
         slopes: Slopes | None = None
         if len(directions):
