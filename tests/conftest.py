@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import functools
 import os
+import subprocess
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -24,12 +27,26 @@ needs_data = pytest.mark.skipif(
 )
 
 
+STIFF = """
+import foamfit as ff
+chain = ff.Chain([ff.LinearSpring(5e6, eta=1e8)], [1e-3], 2e-5)
+assert ff.simulate(chain, ff.Impact(7e-3, 2.0), [0.0, 1e-3]).method == "Radau IIA"
+"""
+
+
 @pytest.fixture(scope="session", autouse=True)
-def compiled() -> None:
-    """Compile once, in two processes, what most tests need; no command then says that it does."""
-    if not warmth.compiled():
-        with warmth.side_by_side() as compile_rest:
-            compile_rest()
+def compiled() -> Iterator[None]:
+    """Compile once, in two processes, what most tests need; no command then says that it does.
+
+    The loops of implicit steps are compiled beside the first tests.
+    """
+    if warmth.compiled():
+        yield
+        return
+    with warmth.side_by_side() as compile_rest:
+        compile_rest()
+    with subprocess.Popen([sys.executable, "-c", STIFF]):
+        yield
 
 
 @functools.cache
