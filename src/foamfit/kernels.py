@@ -39,7 +39,6 @@ inlined = njit(**_COUNTLESS, forceinline=True)
 once = njit(error_model="numpy", inline="always")
 # A piece of a loop that is compiled apart from it; see `foamfit.warmth`.
 piece = njit(**_COUNTLESS, cache=True)
-kept_maker = njit(**_BRIDGELESS, cache=True)
 
 # Columns of a row.
 KIND, K0, KC, EPS_A, EPS_C, KH_PLUS, KH_MINUS, ETA = range(8)

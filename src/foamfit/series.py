@@ -38,7 +38,7 @@ from foamfit.kernels import (
     inlined,
     inner,
     interval,
-    kept_maker,
+    maker,
     piece,
 )
 from foamfit.law import BISTABLE
@@ -164,14 +164,14 @@ def enter_tangents(rows: Array, i: int, branch: int, directions: Branches, d: Ta
                 d.live[p] = 1
 
 
-@kept_maker
+@maker
 def make_series(count: int, groups: int, order: int) -> Series:
     """Make series of zeros."""
     nodes, springs = np.zeros((3, groups, order + 2)), np.zeros((2, count, order + 2))
     return Series(nodes[0], nodes[1], springs[0], springs[1], nodes[2])
 
 
-@kept_maker
+@maker
 def make_tangents(count: int, groups: int, order: int, directions: Branches) -> Tangents:
     """Make derivatives of a chain at rest; those of the branches are still to be entered."""
     p = directions.shape[0]

@@ -48,8 +48,6 @@ def _calls() -> _Calls:
     return _Calls(
         pieces=[
             (series.expand_tangents, (links, s, d, 0)),
-            (series.make_series, (1, 1, 0)),
-            (series.make_tangents, (1, 1, 0, directions)),
             (polynomial.first_crossing, (one, 0, 0.0, 0.0, 0.0)),
             (taylor.sample, (links, s, 0, *samples)),
             (taylor.sample_tangents, (links, s, d, 0, *samples)),
@@ -67,6 +65,7 @@ def _calls() -> _Calls:
         ],
         own=[
             (series.expand, (links, s, one, one, 0)),
+            (series.make_tangents, (1, 1, 0, directions)),
             (taylor.begin, (flat, flat, 0.0, directions, whole, links, s, d)),
             (taylor.switch, (flat, whole, links, s, d, directions, 0, 0.0, 0.0, 0, 0, flat, 0)),
             (taylor.step_length, (links, s, one, 0, 0.0, 0.0, 0.0, 0.0)),
