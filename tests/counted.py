@@ -99,8 +99,8 @@ class Masses(np.ndarray):
         return super().__getitem__(key)
 
 
-# Where a dashpot is kept in an array of its own, the arithmetic with it is seen by the lines run.
-DASHPOT = re.compile(r"[*/] *\(?[\w.]*(eta\[|rows\[\w+, ETA)|(eta\[\w+\]|, ETA\]) *[*/]")
+# Where a dashpot is kept with the branch of its spring, the arithmetic with it is seen by the lines run.
+DASHPOT = re.compile(r"[*/] *\(?[\w.]*(rows\[\w+, ETA|law\[\w+, DASHPOT)|, (ETA|DASHPOT)\] *[*/]")
 
 
 @functools.cache

@@ -45,7 +45,15 @@ from foamfit.kernels import (
 )
 from foamfit.law import BISTABLE, UNILATERAL
 from foamfit.polynomial import fill_values, first_crossing, value_and_slope, value_at
-from foamfit.taylor import DONE, NOT_FINITE, STEP_UNDERFLOW, TOO_MANY_STEPS, fly
+from foamfit.taylor import (
+    DONE,
+    NOT_FINITE,
+    STEP_UNDERFLOW,
+    TOO_MANY_STEPS,
+    before_contact,
+    first_past,
+    fly,
+)
 
 # Degree of the polynomial of the elongation, and how far from its anchor it is used, in distances
 # to the nearest pole: what it leaves out is below 0.125**17 < 1e-15 of the elongation.
@@ -331,26 +339,26 @@ def _expand(
 @inner
 def _sample(
     group: Group, now: Step, order: int, t: Array, first: int, last: int, begin: float,
-    out_w: Array, out_s: Array,
+    curves: Array,
 ) -> None:  # fmt: skip
-    """Write displacements and base stress at the samples first … last-1 of a step."""
+    """Write base stress and displacements at the samples first … last-1 of a step."""
     if first == last:
         return
-    fill_values(now.s, order, t, first, last, begin, out_s)
-    if out_w.shape[0] == 1:
-        fill_values(now.w, order, t, first, last, begin, out_w[0])
+    fill_values(now.s, order, t, first, last, begin, curves[0])
+    if curves.shape[0] == 2:
+        fill_values(now.w, order, t, first, last, begin, curves[1])
         return
     for j in range(first, last):
-        _shape(group, out_s[j], out_w, j)
+        _shape(group, curves[0, j], curves[1:, j])
 
 
 @inner
-def _shape(group: Group, stress: float, out_w: Array, j: int) -> None:
-    """Write the displacement above each spring, or of the top alone, to a column."""
+def _shape(group: Group, stress: float, nodes: Array) -> None:
+    """Write the displacement above each spring, or of the top alone."""
     place = 0.0
     for i in range(group.heights.size):
         place += group.heights[i] * _strain(group, i, stress)
-        out_w[min(i, out_w.shape[0] - 1), j] = place
+        nodes[min(i, nodes.size - 1)] = place
 
 
 @inner
@@ -375,8 +383,7 @@ def integrate_aggregate(
     tol: float,
     order: int,
     max_steps: int,
-    out_w: Array,
-    out_s: Array,
+    curves: Array,
     log: Array,
     effort: Branches,
 ) -> tuple[int, float, int, int]:
@@ -397,8 +404,9 @@ def integrate_aggregate(
     tol, order, max_steps
         Truncation of a step relative to the motion; most orders of the series, at most DEGREE;
         bound on steps.
-    out_w, out_s : (springs or 1, n), (n,) arrays
-        Filled with the displacements above each spring, or of the top alone, m, and the stress, Pa.
+    curves : (1 + springs or 1, n) array
+        Filled with the base stress, Pa, and the displacements above each spring, or of the top
+        alone, m.
     log : (m, 5) array
         Filled with the switches: time, spring, branch left, branch entered, strain.
     effort : (2,) array
@@ -417,13 +425,7 @@ def integrate_aggregate(
     _begin(group)
     s_scale, w_scale = _scales(group, mass, drag, speed)
     effort[0] += 1
-    done = 0
-    while done < t.size and t[done] < 0.0:  # the striker is still on its way
-        out_s[done] = 0.0
-        for i in range(out_w.shape[0]):
-            out_w[i, done] = 0.0
-        out_w[-1, done] = speed * t[done]
-        done += 1
+    done = before_contact(curves, t, speed)
     begin, switches, stalled, horizon = 0.0, 0, 0, t[t.size - 1]
     now.v[0] = speed
     for step in range(max_steps):
@@ -443,10 +445,9 @@ def integrate_aggregate(
         stalled = stalled + 1 if end <= begin else 0
         if stalled > 4 * count + 8:
             return STEP_UNDERFLOW, math.nan, step, switches
-        first, last = done, end >= horizon and side == 0
-        while done < t.size and (t[done] < end or (last and t[done] <= horizon)):
-            done += 1
-        _sample(group, now, n, t, first, done, begin, out_w, out_s)
+        last = end >= horizon and side == 0
+        first, done = done, first_past(t, done, horizon if last else end, last)
+        _sample(group, now, n, t, first, done, begin, curves)
         begin = end
         stress, velocity = value_at(now.s, n, span), value_at(now.v, n, span)
         if side > 0:
@@ -455,9 +456,9 @@ def integrate_aggregate(
             stress = min(low, now.s[0])
         now.s[0], now.v[0] = stress, velocity
         if side < 0 and stress <= 0.0:
-            w_end = np.zeros((out_w.shape[0], 1))
-            _shape(group, 0.0, w_end, 0)
-            fly(out_w, out_s, t, done, begin, w_end[:, 0].copy(), velocity)
+            w_end = np.zeros(curves.shape[0] - 1)
+            _shape(group, 0.0, w_end)
+            fly(curves, t, done, begin, w_end, velocity)
             return DONE, begin, step + 1, switches
         s_scale = max(s_scale, stress)
         w_scale = max(w_scale, now.w[0])

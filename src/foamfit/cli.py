@@ -339,25 +339,25 @@ def fit(
             params = make_params(measurement, model, drive, time_shift=time_shift)
             _hold_and_vary(params, model, fix, vary)
         compile_rest()
-    with _progress(quiet or as_json) as progress:
-        result = identification.fit(
-            measurement,
-            model=model,
-            drive=drive,
-            seed=seed,
-            starts=starts,
-            max_time=max_time,
-            params=params,
-            interior_mass=interior_mass,
-            time_shift=time_shift,
-            loss=loss,
-            intervals=intervals,
-            draws=draws,
-            progress=progress,
-            tell=None if quiet else lambda told: click.echo(f"foamfit: {told}", err=True),
-        )
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # from here on Ctrl-C could only lose the result
-    result.save(folder)
+        with _progress(quiet or as_json) as progress:
+            result = identification.fit(
+                measurement,
+                model=model,
+                drive=drive,
+                seed=seed,
+                starts=starts,
+                max_time=max_time,
+                params=params,
+                interior_mass=interior_mass,
+                time_shift=time_shift,
+                loss=loss,
+                intervals=intervals,
+                draws=draws,
+                progress=progress,
+                tell=None if quiet else lambda told: click.echo(f"foamfit: {told}", err=True),
+            )
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # now Ctrl-C could only lose the result
+        result.save(folder)
     if as_json:
         import json
 
@@ -406,7 +406,7 @@ def _intervals(profile: bool, bootstrap: int | None, mcmc: int | None) -> tuple[
 
 @contextmanager
 def _compiling(quiet: bool) -> Iterator[Callable[[], None]]:
-    """Compile at first use, beside what the body prepares; it calls what is given for the rest."""
+    """Compile at first use, beside the body; it calls what is given before it simulates."""
     from foamfit import warmth
 
     if warmth.compiled():

@@ -26,6 +26,7 @@ from foamfit.kernels import (
     K0,
     Array,
     Branches,
+    Row,
     branch_shape,
     inner,
     maker,
@@ -34,7 +35,7 @@ from foamfit.kernels import (
     stress_on,
 )
 from foamfit.polynomial import value_at
-from foamfit.series import DRAG, HEIGHT, OWN_ETA, branch_derivative
+from foamfit.series import DRAG, OWN_ETA, OWN_HEIGHT, branch_derivative
 
 STAGES = 5
 
@@ -434,23 +435,29 @@ def _relative(z: Array, i: int, j: int, c: int) -> tuple[float, float]:
 
 
 @inner
+def stress_tangent(row: Row, branch: int, eps: float, d_eps: float, own: int) -> float:
+    """Derivative of a spring's stress by its `own` parameter (or -1), by which eps moves d_eps."""
+    dk = dx0 = ds0 = 0.0
+    if 0 <= own < OWN_ETA:
+        dk, dx0, ds0 = branch_derivative(row, branch, own)
+    curved, _, x0, _ = branch_shape(row, branch)
+    x = eps - x0
+    at_rest = (x / (1.0 - x) if curved else x) * dk + ds0
+    return at_rest + slope_on(row, branch, eps) * (d_eps - dx0)
+
+
+@inner
 def _rest(body: Body, state: State, span: float, at: Points, d: Tangents, i: int, c: int) -> None:
     """Derivatives of strain and stress of spring i at the points in direction c, while z rests."""
     row, branch, height = body.rows[i], state.branches[i], body.heights[i]
     own = d.directions[c, 1] if d.directions[c, 0] == i else -1
-    dk = dx0 = ds0 = 0.0
-    if 0 <= own < OWN_ETA:
-        dk, dx0, ds0 = branch_derivative(row, branch, own)
-    longer = 1.0 if own == HEIGHT else 0.0
-    curved, _, x0, _ = branch_shape(row, branch)
+    longer = 1.0 if own == OWN_HEIGHT else 0.0
     dv = d.v0[i, c] - (d.v0[i - 1, c] if i > 0 else 0.0)
     for j in range(STAGES):
-        x = at.eps[i, j] - x0
         rate = (at.vel[i, j] - (at.vel[i - 1, j] if i > 0 else 0.0)) / height
         part = NODES[j] * span * dv - (at.eps[i, j] - state.eps0[i]) * longer
         d.eps[c, i, j] = d.eps0[i, c] + part / height
-        stress = at.slope[i, j] * (d.eps[c, i, j] - dx0) + ds0
-        stress += (x / (1.0 - x) if curved else x) * dk
+        stress = stress_tangent(row, branch, at.eps[i, j], d.eps[c, i, j], own)
         stress += row[ETA] * (dv - rate * longer) / height
         d.total[c, i, j] = stress + (rate if own == OWN_ETA else 0.0)
 

@@ -34,30 +34,29 @@ from foamfit.collocation import (
     make_points,
     make_tangents,
     polynomial,
+    stress_tangent,
     truncation,
 )
 from foamfit.kernels import (
     ETA,
-    KIND,
-    LINE,
     OPEN,
-    A,
     Array,
     Branches,
     above,
     below,
+    branch_at_strain,
     branch_shape,
     compiled,
+    first_branch,
     inner,
     interval,
     once,
     slope_on,
     stress_on,
 )
-from foamfit.law import BISTABLE
 from foamfit.polynomial import first_crossing, slope_at, value_at
 from foamfit.ringing import bounce, parts_faintly, passed_over, ringing_of, rings
-from foamfit.series import FREE, HEIGHT, MOTION, OWN_ETA, STRESS, VISCOUS, equilibrium_tangents
+from foamfit.series import FREE, MOTION, OWN_ETA, OWN_HEIGHT, STRESS, VISCOUS
 from foamfit.taylor import (
     DONE,
     FLAT_UNDER_STRESS,
@@ -65,8 +64,9 @@ from foamfit.taylor import (
     STEP_UNDERFLOW,
     TOO_MANY_STEPS,
     Samples,
+    before_contact,
+    first_past,
     fly,
-    start,
 )
 
 # Steps that the error alone makes short, compared with the motion, before they may grow anyway:
@@ -123,18 +123,6 @@ class Curves(NamedTuple):
     slack: Array
     stress: Array
     some: Array
-
-
-class Rest(NamedTuple):
-    """What a scene starts from: branches and strains (springs,), and their derivatives.
-
-    d_eps (springs, p) and d_base (p,) are those of the strains and of the base stress.
-    """
-
-    branches: Branches
-    eps: Array
-    d_eps: Array
-    d_base: Array
 
 
 class Ripples(NamedTuple):
@@ -463,12 +451,13 @@ def _record(
     top = state.w.size - 1
     for sample in range(first, done):
         at = (out.t[sample] - now) / span
-        out.s[sample] = value_at(curves.base, STAGES, at)
-        if out.w.shape[0] == 1:
-            out.w[0, sample] = state.w[top] + value_at(curves.moves[top], STAGES, at)
+        out.curves[0, sample] = value_at(curves.base, STAGES, at)
+        if out.curves.shape[0] == 2:
+            out.curves[1, sample] = state.w[top] + value_at(curves.moves[top], STAGES, at)
         else:
             for i in range(state.w.size):
-                out.w[i, sample] = state.w[i] + value_at(curves.moves[i], STAGES, at)
+                moved = value_at(curves.moves[i], STAGES, at)
+                out.curves[1 + i, sample] = state.w[i] + moved
 
 
 @inner
@@ -492,30 +481,30 @@ def _record_tangents(
     now: float, span: float, first: int, done: int, d: Tangents, out: Samples
 ) -> None:
     """Write the derivatives at the samples first … done-1, which a step contains."""
-    nodes, count = out.w.shape[0], d.w.shape[0]
+    nodes, count = out.curves.shape[0] - 1, d.w.shape[0]
     for c in range(d.base.size):
         for sample in range(first, done):
             at = (out.t[sample] - now) / span
-            out.ds[c, sample] = _through(d.total[c, 0], at)
+            out.slopes[c, 0, sample] = _through(d.total[c, 0], at)
             for node in range(nodes):
                 i = node if nodes > 1 else count - 1
                 moved = d.w[i, c] + at * span * d.v0[i, c]
-                out.dw[c, node, sample] = moved + _through(d.work.delta[c, i], at)
+                out.slopes[c, 1 + node, sample] = moved + _through(d.work.delta[c, i], at)
 
 
 @inner
 def _record_rest(first: int, state: State, base: float, d: Tangents, out: Samples) -> None:
     """Write a single sample, or one that is left where the steps have ended."""
-    nodes, count = out.w.shape[0], state.w.size
+    nodes, count = out.curves.shape[0] - 1, state.w.size
     for sample in range(first, out.t.size):
-        out.s[sample] = base
+        out.curves[0, sample] = base
         for c in range(d.base.size):
-            out.ds[c, sample] = d.base[c]
+            out.slopes[c, 0, sample] = d.base[c]
         for node in range(nodes):
             i = node if nodes > 1 else count - 1
-            out.w[node, sample] = state.w[i]
+            out.curves[1 + node, sample] = state.w[i]
             for c in range(d.base.size):
-                out.dw[c, node, sample] = d.w[i, c]
+                out.slopes[c, 1 + node, sample] = d.w[i, c]
 
 
 @inner
@@ -527,15 +516,15 @@ def _mend_kink(scene: Scene, body: Body, knot: int, jump: float, d: Tangents, ou
         flow += body.heights[i] / eta if eta > 0.0 else math.inf
     t = scene.t
     share = (t[knot] - t[knot - 1]) / (t[knot + 1] - t[knot - 1])
-    out.s[knot] += share * jump / flow
+    out.curves[0, knot] += share * jump / flow
     if flow == math.inf:
         return
     for c in range(d.base.size):
         i = d.directions[c, 0]
-        if i >= 0 and d.directions[c, 1] in (OWN_ETA, HEIGHT):
+        if i >= 0 and d.directions[c, 1] in (OWN_ETA, OWN_HEIGHT):
             eta = body.rows[i, ETA]
-            more = 1.0 / eta if d.directions[c, 1] == HEIGHT else -body.heights[i] / (eta * eta)
-            out.ds[c, knot] -= share * jump / (flow * flow) * more
+            more = 1.0 / eta if d.directions[c, 1] == OWN_HEIGHT else -body.heights[i] / (eta * eta)
+            out.slopes[c, 0, knot] -= share * jump / (flow * flow) * more
 
 
 @inner
@@ -556,88 +545,45 @@ def _leave(
     A later end leaves the nodes as they move until then, and the top with the velocity that it has
     then. `w_end` (nodes,) is scratch.
     """
-    nodes, count = out.w.shape[0], state.w.size
-    top = count - 1
+    nodes, top = out.curves.shape[0] - 1, state.w.size - 1
     for node in range(nodes):
         w_end[node] = state.w[node if nodes > 1 else top]
-    fly(out.w, out.s, out.t, done, now, w_end, v[top])
+    fly(out.curves, out.t, done, now, w_end, v[top])
     pull = -(at.total[top, STAGES - 1] + body.drag * v[top]) / body.mass[top]
     for c in range(d.base.size):
         late = -d.base[c] / fall if fall != 0.0 else 0.0
-        away = d.v0[top, c] + pull * late
-        for sample in range(done, out.t.size):
-            out.ds[c, sample] = 0.0
-            for node in range(nodes):
-                i = node if nodes > 1 else top
-                there = d.w[i, c] + (v[i] - v[top]) * late
-                out.dw[c, node, sample] = there + away * (out.t[sample] - now)
+        for node in range(nodes):
+            i = node if nodes > 1 else top
+            w_end[node] = d.w[i, c] + (v[i] - v[top]) * late
+        fly(out.slopes[c], out.t, done, now, w_end, d.v0[top, c] + pull * late)
 
 
 # ---------------------------------------------------------------- the state between steps
 
 
 @inner
-def _before(body: Body, speed: float, state: State, v: Array, d: Tangents, out: Samples) -> int:
-    """Fill the samples at which a striker is still on its way; returns how many these are."""
-    done, last = 0, out.w.shape[0] - 1
-    while done < out.t.size and out.t[done] < 0.0:
-        out.s[done] = 0.0
-        for i in range(last + 1):
-            out.w[i, done] = speed * out.t[done] if i == last else 0.0
-        for c in range(d.base.size):
-            out.ds[c, done] = 0.0
-            for i in range(last + 1):
-                out.dw[c, i, done] = 0.0
-        done += 1
-    state.v0[body.heights.size - 1] = v[body.heights.size - 1] = speed
-    return done
-
-
-def rest(
-    rows: Array, heights: Array, ends: Branches, top: int, value: float, directions: Branches
-) -> Rest:
-    """What a chain is found in by the first sample of a drive, of size `value`.
-
-    The springs under a prescribed motion or stress are in equilibrium with it.
-    """
-    count, groups = len(heights), len(ends)
-    branches = np.where(rows[:, KIND] == BISTABLE, A, LINE)
-    place, strain = np.zeros((groups, 1)), np.zeros((count, 1))
-    d_eps, d_base = np.zeros((count, len(directions))), np.zeros(len(directions))
-    if value != 0.0 and top in (MOTION, STRESS):
-        start(rows, branches, heights, ends, top, value, place, strain)
-        i0 = ends[-2] if groups > 1 else 0
-        if len(directions):
-            own = directions.copy()
-            own[:, 0] = np.maximum(own[:, 0] - i0, -1)
-            dw, ds = equilibrium_tangents(
-                rows[i0:], heights[i0:], strain[i0:], branches[i0:, None].copy(), top == MOTION, own
-            )
-            longer = np.diff(dw[:, :, 0], axis=1, prepend=0.0).T
-            for c, (spring, what) in enumerate(own):
-                if spring >= 0 and what == HEIGHT:
-                    longer[spring, c] -= strain[i0 + spring, 0]
-            d_eps[i0:] = longer / heights[i0:, None]
-            if i0 == 0:
-                d_base[:] = ds[:, 0]
-    return Rest(branches, strain[:, 0].copy(), d_eps, d_base)
-
-
-@inner
-def _begin(i0: int, begin: Rest, body: Body, state: State, d: Tangents) -> None:
+def _begin(i0: int, start: Array, top: int, body: Body, state: State, d: Tangents) -> None:
     """Fill the state at the start; the nodes below spring i0 are at rest."""
     node = 0.0
     for i in range(body.heights.size):
-        state.branches[i], state.eps0[i] = begin.branches[i], begin.eps[i]
-        node += body.heights[i] * begin.eps[i]
+        row = body.rows[i]
+        state.branches[i] = first_branch(row)
+        if start.shape[1] > 0:
+            state.eps0[i] = start[0, i]
+            state.branches[i] = branch_at_strain(row, state.branches[i], start[0, i])
+            node += body.heights[i] * start[0, i]
         state.w[i] = node if i >= i0 else 0.0
         for c in range(d.base.size):
-            d.eps0[i, c] = begin.d_eps[i, c]
+            d.eps0[i, c] = start[1 + c, i] if start.shape[1] > 0 else 0.0
             d.w[i, c] = body.heights[i] * d.eps0[i, c] + (d.w[i - 1, c] if i > i0 else 0.0)
-            if d.directions[c, 0] == i and d.directions[c, 1] == HEIGHT:
-                d.w[i, c] += begin.eps[i]
+            if d.directions[c, 0] == i and d.directions[c, 1] == OWN_HEIGHT:
+                d.w[i, c] += state.eps0[i]
     for c in range(d.base.size):
-        d.base[c] = begin.d_base[c]
+        if top == MOTION and i0 == 0:
+            own = d.directions[c, 1] if d.directions[c, 0] == 0 else -1
+            d.base[c] = stress_tangent(
+                body.rows[0], state.branches[0], state.eps0[0], d.eps0[0, c], own
+            )
 
 
 @inner
@@ -781,7 +727,7 @@ def _follow(
     d: Tangents,
     out: Samples,
     w_end: Array,
-    begin: Rest,
+    start: Array,
     max_steps: int,
     log: Array,
     tally: Branches,
@@ -794,8 +740,13 @@ def _follow(
     )  # fmt: skip
     count, groups, tangent = heights.size, ends.size, d.base.size > 0
     first, i0 = ends[0], (ends[groups - 2] if groups > 1 else 0)
-    _begin(i0, begin, body, state, d)
-    done = _before(body, speed, state, v, d, out) if struck else 0
+    _begin(i0, start, top, body, state, d)
+    done = 0
+    if struck:
+        state.v0[count - 1] = v[count - 1] = speed
+        done = before_contact(out.curves, t, speed)
+        for c in range(d.base.size):
+            before_contact(out.slopes[c], t, 0.0)
     for i in range(count):
         stress = stress_on(rows[i], state.branches[i], state.eps0[i])
         pace[LOAD] = max(pace[LOAD], abs(stress))
@@ -859,9 +810,7 @@ def _follow(
                 for j in range(STAGES):
                     curves.stress[i, j] = at.z[i, j] + NODES[j] * span * state.v0[i]
                 polynomial(0.0, curves.stress[i], curves.moves[i])
-            begun = done
-            while done < t.size and (t[done] < end or (last and t[done] <= end)):
-                done += 1
+            begun, done = done, first_past(t, done, end, last)
             _record(now, span, begun, done, state, curves, out)
             if tangent:
                 if not linearise(body, state, span, at, d):
@@ -910,15 +859,13 @@ def integrate_implicit(
     tol: float,
     max_steps: int,
     directions: Branches,
-    out_w: Array,
-    out_s: Array,
-    out_dw: Array,
-    out_ds: Array,
+    start: Array,
+    curves: Array,
+    slopes: Array,
     log: Array,
     tally: Branches,
     wanted: float,
     lost: Array,
-    begin: Rest,
 ) -> tuple[int, float, int, int]:
     """Integrate a chain from rest (or struck) over the samples t, by implicit steps.
 
@@ -926,7 +873,7 @@ def integrate_implicit(
     is the truncation of a step relative to the motion so far. `tally` (2,) is filled with the
     linear systems solved and with the blocks eliminated in them; `lost` (1,) with the size,
     relative to the motion and stress, of the vibrations that were damped out because they could not
-    be followed. Those above `wanted` are followed longer. `begin` is what `rest` returns.
+    be followed. Those above `wanted` are followed longer.
 
     Returns
     -------
@@ -951,10 +898,10 @@ def integrate_implicit(
         min(1.0, tol / FAINT) if faintly else 0.0, ringing, ringing[:, 0].max() > 0.0,
     )  # fmt: skip
     body = Body(rows, heights, areal, drag, count - 1 if top == MOTION else count)
-    out = Samples(t, out_w, out_s, out_dw, out_ds)
+    out = Samples(t, curves, slopes)
     at, d = make_points(count), make_tangents(count, directions)
     shape = (count, STAGES + 1)
-    curves = Curves(
+    step = Curves(
         np.zeros(shape), np.zeros(shape), np.zeros(STAGES + 1), np.zeros(count + 1),
         np.zeros((count, STAGES)), np.zeros(STAGES + 1),
     )  # fmt: skip
@@ -963,6 +910,6 @@ def integrate_implicit(
     v, pace = np.zeros(count), np.zeros(N_PACE)
     pace[WORST], lost[0] = 1.0, 0.0
     return _follow(
-        scene, body, state, at, curves, ripples, pace, v, now, paced, speed, d, out,
-        np.zeros(out_w.shape[0]), begin, max_steps, log, tally, lost,
+        scene, body, state, at, step, ripples, pace, v, now, paced, speed, d, out,
+        np.zeros(curves.shape[0]), start, max_steps, log, tally, lost,
     )  # fmt: skip

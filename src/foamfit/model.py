@@ -107,7 +107,7 @@ class Model:
         for name in self.names:
             spring, short = split_name(name)
             if short == "height":
-                out.append((spring, series.HEIGHT))
+                out.append((spring, series.OWN_HEIGHT))
             elif spring < 0:
                 out.append((-1, series.DRAG))
             else:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from foamfit import aggregate, implicit, kernels, ringing, series, taylor
 from foamfit.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.errors import SimulationError
+from foamfit.law import BISTABLE
 from foamfit.series import equilibrium_tangents
 from foamfit.spring import as_samples
 
@@ -48,6 +49,7 @@ NO_DIRECTIONS: Directions = np.empty((0, 2), np.int64)
 NO_SWITCHES = np.empty((0, 5))
 _NOTHING = np.zeros(1)
 _AT_REST = np.zeros((1, 0))
+NO_SLOPES = np.empty((0, 0, 0))
 
 
 class Slopes(NamedTuple):
@@ -55,9 +57,6 @@ class Slopes(NamedTuple):
 
     displacement: Array
     base_stress: Array
-
-
-NO_SLOPES = Slopes(np.empty((0, 0, 0)), np.empty((0, 0)))
 
 
 class Motion(NamedTuple):
@@ -144,13 +143,16 @@ class Plan(NamedTuple):
         drag = self.drag if drag is None else drag
         if self.solver == CLOSED_FORM:
             return self._closed_form(rows, heights, everything, directions)
+        p, nodes, n = len(directions), len(heights) if everything else 1, self.time.size
+        curves = np.empty((1 + nodes, n))
+        slopes = np.empty((p, 1 + nodes, n)) if p else NO_SLOPES
         if not self._is_stiff(rows, heights, drag):
-            if len(rows) >= LEAST_AGGREGATE and not len(directions) and self._is_one(rows):
-                return self._aggregate(rows, heights, rtol, drag, everything)
-            motion = self._explicit(rows, heights, rtol, drag, everything, directions)
+            if p == 0 and len(rows) >= LEAST_AGGREGATE and self._is_one(rows):
+                return self._aggregate(rows, heights, rtol, drag, curves)
+            motion = self._explicit(rows, heights, rtol, drag, directions, curves, slopes)
             if motion is not None:
                 return motion
-        return self._implicit(rows, heights, rtol, drag, everything, directions)
+        return self._implicit(rows, heights, rtol, drag, directions, curves, slopes)
 
     def _closed_form(
         self, rows: Array, heights: Array, everything: bool, directions: Directions
@@ -186,7 +188,7 @@ class Plan(NamedTuple):
             for p, (_, what) in enumerate(directions):
                 if slopes is not None and what == series.OWN_ETA:
                     slopes.base_stress[p] += rate
-                elif slopes is not None and what == series.HEIGHT:
+                elif slopes is not None and what == series.OWN_HEIGHT:
                     slopes.base_stress[p] -= eta * rate / heights[0]
         if not math.isfinite(kernels.total(stress) + kernels.total(strain.ravel())):
             raise SimulationError(_OUTCOMES[taylor.NOT_FINITE])
@@ -200,20 +202,19 @@ class Plan(NamedTuple):
         return Motion(nodes, stress, math.nan, switches, 0, CLOSED_FORM, slopes)
 
     def _aggregate(
-        self, rows: Array, heights: Array, rtol: float, drag: float, everything: bool
+        self, rows: Array, heights: Array, rtol: float, drag: float, curves: Array
     ) -> Motion:
         """Springs under one stress count as one.
 
         One step to a switch: the errors of many add up, and one order more costs little.
         """
-        displacement, stress = self._curves(heights, everything)
         log = np.empty((4 * len(heights) + 64, 5))
         tolerance, order = accuracy(1e-4 * rtol / len(heights), aggregate.DEGREE)
         ending = aggregate.integrate_aggregate(
             rows, heights, self.mass[0], drag, self.speed, self.time, tolerance, order,
-            self.max_steps, displacement, stress, log, np.zeros(2, np.int64),
+            self.max_steps, curves, log, np.zeros(2, np.int64),
         )  # fmt: skip
-        return self._motion(AGGREGATE, ending, displacement, stress, log)
+        return self._motion(AGGREGATE, ending, curves, log)
 
     def _explicit(
         self,
@@ -221,27 +222,27 @@ class Plan(NamedTuple):
         heights: Array,
         rtol: float,
         drag: float,
-        everything: bool,
         directions: Directions,
+        curves: Array,
+        slopes: Array,
     ) -> Motion | None:
         """Taylor series from switch to switch; None if they turn out to be the wrong tool."""
-        count = len(heights)
-        displacement, stress = self._curves(heights, everything)
-        log, slopes = np.empty((1024, 5)), self._slopes(displacement, directions)
+        log = np.empty((1024, 5))
         # Without an interior mass there are few steps: a margin costs little.
         margin = 1e-2 if len(self.ends) > 1 else 1e-3 if self.speed > 0.0 else 1e-4
         tolerance, order = accuracy(margin * rtol, 24)
+        count = len(heights)
         most = self._most_steps(count)
         if self.implicit is None:
             most = min(most, min(MOST_EXPLICIT, MOST_EXPLICIT_WORK // count) + 20 * self.time.size)
         ending = taylor.integrate(
             rows, heights, self.ends, self.mass, drag, self.top, self.values, self.speed, self.time,
             tolerance, order, most, directions, self._start(rows, heights, directions),
-            displacement, stress, slopes.displacement, slopes.base_stress, log,
+            curves, slopes, log,
         )  # fmt: skip
         if self.implicit is None and ending[0] in (taylor.TOO_MANY_STEPS, taylor.STEP_UNDERFLOW):
             return None
-        return self._motion(TAYLOR, ending, displacement, stress, log, slopes)
+        return self._motion(TAYLOR, ending, curves, log, slopes)
 
     def _implicit(
         self,
@@ -249,47 +250,33 @@ class Plan(NamedTuple):
         heights: Array,
         rtol: float,
         drag: float,
-        everything: bool,
         directions: Directions,
+        curves: Array,
+        slopes: Array,
     ) -> Motion:
         """Radau's implicit steps, which need not follow what is long over."""
-        displacement, stress = self._curves(heights, everything)
-        slopes = self._slopes(displacement, directions)
         log, lost = np.empty((1024, 5)), np.zeros(1)
         tolerance = max((3e-2 if len(self.ends) > 1 else 3e-4) * rtol, 1e-14)
         ending = implicit.integrate_implicit(
             rows, heights, self.ends, self.mass, drag, self.top, self.values, self.speed, self.time,
-            tolerance, self._most_steps(len(heights)), directions, displacement, stress,
-            slopes.displacement, slopes.base_stress, log, np.zeros(2, np.int64), rtol, lost,
-            implicit.rest(rows, heights, self.ends, self.top, self.values[0], directions),
+            tolerance, self._most_steps(len(heights)), directions,
+            self._start(rows, heights, directions), curves, slopes, log, np.zeros(2, np.int64),
+            rtol, lost,
         )  # fmt: skip
-        return self._motion(RADAU, ending, displacement, stress, log, slopes, float(lost[0]))
+        return self._motion(RADAU, ending, curves, log, slopes, float(lost[0]))
 
     def _most_steps(self, count: int) -> int:
         """Bound on the steps of a chain of so many springs."""
         most = MOST_WORK // count + 2 * self.time.size + 8 * count
         return max(min(self.max_steps, most, MOST_SAMPLED // count), 1)
 
-    def _curves(self, heights: Array, everything: bool) -> tuple[Array, Array]:
-        """Room for displacements and base stress."""
-        n = self.time.size
-        return np.empty((len(heights) if everything else 1, n)), np.empty(n)
-
-    def _slopes(self, displacement: Array, directions: Directions) -> Slopes:
-        """Room for derivatives."""
-        p, n = len(directions), self.time.size
-        if p == 0:
-            return NO_SLOPES
-        return Slopes(np.empty((p, len(displacement), n)), np.empty((p, n)))
-
     def _motion(
         self,
         method: str,
         ending: tuple[int, float, int, int],
-        displacement: Array,
-        stress: Array,
+        curves: Array,
         log: Array,
-        slopes: Slopes = NO_SLOPES,
+        slopes: Array = NO_SLOPES,
         unresolved: float = 0.0,
     ) -> Motion:
         """Gather what an integrator found, or say why it found nothing."""
@@ -297,15 +284,9 @@ class Plan(NamedTuple):
         if outcome != taylor.DONE:
             last = log[min(switches, len(log)) - 1, 0] if switches else self.time[0]
             raise SimulationError(_OUTCOMES[outcome].format(steps=steps, time=last))
+        slope = Slopes(slopes[:, 1:], slopes[:, 0]) if len(slopes) else None
         return Motion(
-            displacement,
-            stress,
-            contact_end,
-            log[:switches],
-            steps,
-            method,
-            None if slopes is NO_SLOPES else slopes,
-            unresolved,
+            curves[1:], curves[0], contact_end, log[:switches], steps, method, slope, unresolved
         )
 
     def _start(self, rows: Array, heights: Array, directions: Directions) -> Array:
@@ -314,24 +295,27 @@ class Plan(NamedTuple):
             return _AT_REST
         start = np.zeros((1 + len(directions), len(heights)))
         first = self.ends[-2] if len(self.ends) > 1 else 0
-        rows, heights = rows[first:], heights[first:]
+        rows, heights, moved = rows[first:], heights[first:], self.top == taylor.MOTION
         strain = np.empty((len(heights), 1))
         branches = np.empty(strain.shape, np.int64)
         stress = self.values[:1].copy()
-        if self.top == taylor.STRESS:  # a dashpot holds its spring where it is
+        if moved:
+            kernels.equilibrium_along(rows, heights, self.values[:1], stress, strain, branches)
+        else:
             kernels.strains_along(rows, stress, strain, branches)
-            free = (rows[:, kernels.ETA] == 0.0) & np.isfinite(strain[:, 0])
-            start[0, first:] = np.where(free, strain[:, 0], 0.0)
-            return start
-        kernels.equilibrium_along(rows, heights, self.values[:1], stress, strain, branches)
+            held = (rows[:, kernels.ETA] > 0.0) | ~np.isfinite(strain[:, 0])
+            strain[held] = 0.0  # a dashpot holds its spring where it is
+            branches[held, 0] = np.where(
+                rows[held, kernels.KIND] == BISTABLE, kernels.A, kernels.LINE
+            )
         start[0, first:] = strain[:, 0]
         own = np.flatnonzero(directions[:, 0] >= first)
         if len(own):
             local = directions[own] - np.array([first, 0])
-            moved, _ = equilibrium_tangents(rows, heights, strain, branches, True, local)
-            longer = np.diff(moved[:, :, 0], axis=1, prepend=0.0)
+            above, _ = equilibrium_tangents(rows, heights, strain, branches, moved, local)
+            longer = np.diff(above[:, :, 0], axis=1, prepend=0.0)
             for p, (spring, what) in enumerate(local):
-                longer[p, spring] -= strain[spring, 0] if what == series.HEIGHT else 0.0
+                longer[p, spring] -= strain[spring, 0] if what == series.OWN_HEIGHT else 0.0
             start[1 + own, first:] = longer / heights
         return start
 

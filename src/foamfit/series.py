@@ -42,88 +42,56 @@ from foamfit.kernels import (
     piece,
 )
 from foamfit.law import BISTABLE
+from foamfit.polynomial import value_at
 
 # What is known of the top node.
 FREE, VISCOUS, STRESS, MOTION = range(4)
-# Columns of `Links.law`: whether the branch is curved, its slope k, its origins x0 and s0, and the
-# strains between which the spring stays on it.
-CURVED, SLOPE, ORIGIN, OFFSET, LOW, HIGH = range(6)
-# What a step keeps of a curved branch: 1/(1 - x) at its start.
-ROOM, N_LAW = 6, 7
+# Rows of the series of a chain: displacement and velocity of the nodes above the groups, strain and
+# stress of the springs, common stress of the groups, slope T = dσ/dε of the springs.
+W, V, EPS, SIG, GROUP, TILT, N_SERIES = range(7)
+# Columns of `Links.law`: slope k of the branch that a spring is on, its origins x0 and s0, the
+# spring's dashpot and height: what parameters move; then whether the branch is curved, the strains
+# between which the spring stays on it, and what a step keeps of a curved one: 1/(1 - x) at its
+# start.
+SLOPE, ORIGIN, OFFSET, DASHPOT, HEIGHT, N_MOVES = range(6)
+CURVED, LOW, HIGH, ROOM, N_LAW = range(N_MOVES, 10)
 # What a direction of derivatives moves, besides a spring's own parameters 0 … 7 (k0 … eta): its
 # height, or (of no spring, -1) the onsite damping of the top.
-OWN_ETA, HEIGHT, DRAG = 7, 8, 9
+OWN_ETA, OWN_HEIGHT, DRAG = 7, 8, 9
 
 
 class Links(NamedTuple):
     """A chain on the branches that its springs are on.
 
-    `law` (springs, N_LAW) is what `enter` writes, `eta` and `heights` (springs,) are in Pa·s and m,
-    `ends` (groups,) is one past the last spring of each group and `mass` (groups,) the areal mass
-    of the node above it, kg/m²; `drag` is the onsite damping of the top, η_site/H in Pa·s/m, `top`
-    what is known of it.
+    `law` (springs, N_LAW) is what `enter` writes, with dashpots in Pa·s and heights in m; `ends`
+    (groups,) is one past the last spring of each group and `mass` (groups,) the areal mass of the
+    node above it, kg/m²; `drag` is the onsite damping of the top, η_site/H in Pa·s/m, `top` what is
+    known of it.
+
+    The series of such a chain are an array (N_SERIES, springs, order + 2) of Taylor coefficients:
+    order 0 of W, V and EPS is the state. W, V and GROUP use a column for each group; the last
+    coefficient of SIG, GROUP and TILT is not used.
     """
 
     law: Array
-    eta: Array
-    heights: Array
     ends: Branches
     mass: Array
     drag: float
     top: int
 
 
-class Series(NamedTuple):
-    """Taylor coefficients of all that moves; order 0 of w, v and eps is the state.
-
-    w, v (groups, order + 2) belong to the nodes above the groups, eps and sig (springs, order + 2)
-    to the springs, group (groups, order + 2) to the common stresses; the last column of sig and
-    group is not used.
-    """
-
-    w: Array
-    v: Array
-    eps: Array
-    sig: Array
-    group: Array
-
-
 class Tangents(NamedTuple):
-    """Derivatives of `Links` and `Series` in p directions: the same shapes with an axis p in front.
+    """Derivatives of a chain and of its series in p directions.
 
-    law (p, springs, 3) holds those of k, x0 and s0; `drag` is (p,). slope (springs, order + 1) is
-    the series T of all directions, `live` (p,) tells which directions have left zero.
+    law (p, springs, N_MOVES) holds those of the first columns of `Links.law`, `drag` (p,) those of
+    the onsite damping, series (p, N_SERIES, springs, order + 2) those of the series but for TILT;
+    `live` (p,) is 1 for those that have left zero.
     """
 
     law: Array
-    eta: Array
-    heights: Array
     drag: Array
-    w: Array
-    v: Array
-    eps: Array
-    sig: Array
-    group: Array
-    slope: Array
-    live: Branches
-
-
-class Moves(NamedTuple):
-    """One direction of derivatives: those of the branches, dashpots, heights and damping."""
-
-    law: Array
-    eta: Array
-    heights: Array
-    drag: float
-
-
-@inner
-def direction(t: Tangents, p: int) -> tuple[Moves, Series]:
-    """What moves in direction p, and its series."""
-    return (
-        Moves(t.law[p], t.eta[p], t.heights[p], t.drag[p]),
-        Series(t.w[p], t.v[p], t.eps[p], t.sig[p], t.group[p]),
-    )
+    live: Array
+    series: Array
 
 
 @inner
@@ -159,47 +127,31 @@ def enter_tangents(rows: Array, i: int, branch: int, directions: Branches, d: Ta
     for p in range(directions.shape[0]):
         if directions[p, 0] == i and directions[p, 1] < OWN_ETA:
             dk, dx0, ds0 = branch_derivative(rows[i], branch, directions[p, 1])
-            d.law[p, i, 0], d.law[p, i, 1], d.law[p, i, 2] = dk, dx0, ds0
+            d.law[p, i, SLOPE], d.law[p, i, ORIGIN], d.law[p, i, OFFSET] = dk, dx0, ds0
             if dk != 0.0 or dx0 != 0.0 or ds0 != 0.0:
-                d.live[p] = 1
+                d.live[p] = 1.0
 
 
 @maker
-def make_series(count: int, groups: int, order: int) -> Series:
-    """Make series of zeros."""
-    nodes, springs = np.zeros((3, groups, order + 2)), np.zeros((2, count, order + 2))
-    return Series(nodes[0], nodes[1], springs[0], springs[1], nodes[2])
+def make_series(count: int, order: int, directions: Branches) -> tuple[Array, Tangents]:
+    """Make the series of a chain at rest, and derivatives, of branches that are yet to be entered.
 
-
-@maker
-def make_tangents(count: int, groups: int, order: int, directions: Branches) -> Tangents:
-    """Make derivatives of a chain at rest; those of the branches are still to be entered."""
+    All is zero but what the directions say.
+    """
     p = directions.shape[0]
-    nodes, springs = np.zeros((3, p, groups, order + 2)), np.zeros((2, p, count, order + 2))
-    moves = np.zeros((2, p, count))
-    d = Tangents(
-        np.zeros((p, count, 3)),
-        moves[0],
-        moves[1],
-        np.zeros(p),
-        nodes[0],
-        nodes[1],
-        springs[0],
-        springs[1],
-        nodes[2],
-        np.zeros((count if p > 0 else 0, order + 1)),
-        np.zeros(p, np.int64),
-    )
+    series, ways = np.zeros((1 + p, N_SERIES, count, order + 2)), np.zeros((2, p))
+    d = Tangents(np.zeros((p, count, N_MOVES)), ways[0], ways[1], series[1:])
     for q in range(p):
         i, what = directions[q, 0], directions[q, 1]
-        d.live[q] = what >= OWN_ETA
+        if what >= OWN_ETA:
+            d.live[q] = 1.0
         if what == OWN_ETA:
-            d.eta[q, i] = 1.0
-        elif what == HEIGHT:
-            d.heights[q, i] = 1.0
+            d.law[q, i, DASHPOT] = 1.0
+        elif what == OWN_HEIGHT:
+            d.law[q, i, HEIGHT] = 1.0
         elif what == DRAG:
             d.drag[q] = 1.0
-    return d
+    return series[0], d
 
 
 # ---------------------------------------------------------------- the motion
@@ -213,14 +165,14 @@ def springs_of(ends: Branches, g: int) -> tuple[np.int64, np.int64]:
 
 
 @inlined
-def _product(x: Array, y: Array, i: int, n: int, first: int, last: int) -> float:
-    """Σ x_j y_{n-j} of spring i for j from first to last."""
+def _product(x: Array, y: Array, i: int, n: int) -> float:
+    """Σ x_j y_{n-j} of spring i for j from 1 to n - 1."""
     even = odd = 0.0  # two sums at once
-    for j in range(first, last, 2):
+    for j in range(1, n - 1, 2):
         even += x[i, j] * y[i, n - j]
         odd += x[i, j + 1] * y[i, n - j - 1]
-    if (last - first) % 2 == 0:
-        even += x[i, last] * y[i, n - last]
+    if n % 2 == 0:
+        even += x[i, n - 1] * y[i, 1]
     return even + odd
 
 
@@ -231,7 +183,7 @@ def _stress_term(law: Array, i: int, eps: Array, sig: Array, n: int) -> float:
     if n > 0:
         if law[i, CURVED] == 0.0:
             return k * eps[i, n]
-        known = _product(eps, sig, i, n, 1, n - 1)
+        known = _product(eps, sig, i, n)
         return ((k + sig[i, 0]) * eps[i, n] + known) * law[i, ROOM]
     x = eps[i, 0] - law[i, ORIGIN]
     if law[i, CURVED] == 0.0:
@@ -250,15 +202,13 @@ def _strain_term(law: Array, i: int, eps: Array, sig: Array, n: int) -> tuple[fl
     if law[i, CURVED] == 0.0:
         return 0.0, (1.0 / k if k > 0.0 else math.inf)
     stiff = k + sig[i, 0]
-    known = _product(eps, sig, i, n, 1, n - 1)
+    known = _product(eps, sig, i, n)
     return -known / stiff, (1.0 - (eps[i, 0] - law[i, ORIGIN])) / stiff
 
 
 @inner
 def _share_elongation(
     law: Array,
-    eta: Array,
-    heights: Array,
     i0: int,
     i1: int,
     eps: Array,
@@ -272,19 +222,19 @@ def _share_elongation(
     """
     compliance, rest, flat = 0.0, u_n, -1
     for i in range(i0, i1):
-        if eta[i] > 0.0:
-            rest -= heights[i] * eps[i, n]
+        if law[i, DASHPOT] > 0.0:
+            rest -= law[i, HEIGHT] * eps[i, n]
             continue
         known, soft = _strain_term(law, i, eps, sig, n)
         eps[i, n] = known  # so far
-        rest -= heights[i] * known
+        rest -= law[i, HEIGHT] * known
         if soft < math.inf:
-            compliance += heights[i] * soft
+            compliance += law[i, HEIGHT] * soft
         elif flat < 0:
             flat = i
     s_n = 0.0 if flat >= 0 else rest / compliance
     for i in range(i0, i1):
-        if eta[i] == 0.0:
+        if law[i, DASHPOT] == 0.0:
             sig[i, n] = s_n
             if law[i, CURVED] != 0.0:
                 x = eps[i, 0] - law[i, ORIGIN]
@@ -292,14 +242,13 @@ def _share_elongation(
             elif law[i, SLOPE] > 0.0:
                 eps[i, n] += s_n / law[i, SLOPE]
     if flat >= 0:
-        eps[flat, n] = rest / heights[flat]
+        eps[flat, n] = rest / law[flat, HEIGHT]
     return s_n
 
 
 @inlined
 def _damped_term(
-    eta: Array,
-    heights: Array,
+    law: Array,
     i0: int,
     i1: int,
     sig: Array,
@@ -315,8 +264,8 @@ def _damped_term(
     """
     total, weight = rate_n, 0.0
     for i in range(i0, i1):
-        total += heights[i] * sig[i, n] / eta[i]
-        weight += heights[i] / eta[i]
+        total += law[i, HEIGHT] * sig[i, n] / law[i, DASHPOT]
+        weight += law[i, HEIGHT] / law[i, DASHPOT]
     if drag > 0.0:
         total += push_n / drag
         weight += 1.0 / drag
@@ -326,8 +275,6 @@ def _damped_term(
 @inlined
 def _group_term(
     law: Array,
-    eta: Array,
-    heights: Array,
     i0: int,
     i1: int,
     eps: Array,
@@ -341,33 +288,33 @@ def _group_term(
     """Order n of the common stress of a group whose elongation u and its rate are known."""
     if i1 - i0 == 1:
         if n > 0:
-            eps[i0, n] = u_n * (1.0 / heights[i0])  # the quotient waits for nothing
+            eps[i0, n] = u_n * (1.0 / law[i0, HEIGHT])  # the quotient waits for nothing
         sig[i0, n] = _stress_term(law, i0, eps, sig, n)
-        if eta[i0] == 0.0:
+        if law[i0, DASHPOT] == 0.0:
             return sig[i0, n]
-        return _damped_term(eta, heights, i0, i1, sig, rate_n, push_n, drag, n)
+        return _damped_term(law, i0, i1, sig, rate_n, push_n, drag, n)
     damped, first = 0, i0
     for i in range(i1 - 1, i0 - 1, -1):
-        if eta[i] > 0.0:
+        if law[i, DASHPOT] > 0.0:
             damped += 1
         else:
             first = i
-        if n == 0 or eta[i] > 0.0:
+        if n == 0 or law[i, DASHPOT] > 0.0:
             sig[i, n] = _stress_term(law, i, eps, sig, n)
     if damped == i1 - i0:
-        return _damped_term(eta, heights, i0, i1, sig, rate_n, push_n, drag, n)
+        return _damped_term(law, i0, i1, sig, rate_n, push_n, drag, n)
     if n == 0:
         return sig[first, 0]
-    return _share_elongation(law, eta, heights, i0, i1, eps, sig, u_n, n)
+    return _share_elongation(law, i0, i1, eps, sig, u_n, n)
 
 
 @inner
 def _stressed_term(
-    law: Array, eta: Array, i0: int, i1: int, eps: Array, sig: Array, s_n: float, n: int
+    law: Array, i0: int, i1: int, eps: Array, sig: Array, s_n: float, n: int
 ) -> bool:
     """Order n of the strains of a group whose stress is prescribed; false if it cannot be."""
     for i in range(i0, i1):
-        if eta[i] > 0.0 or n == 0:
+        if law[i, DASHPOT] > 0.0 or n == 0:
             sig[i, n] = _stress_term(law, i, eps, sig, n)
             continue
         known, soft = _strain_term(law, i, eps, sig, n)
@@ -381,25 +328,25 @@ def _stressed_term(
 @inner
 def is_bare(links: Links) -> bool:
     """Whether every spring is undamped and alone between two masses."""
-    if links.top != FREE or links.ends.size != links.eta.size:
+    if links.top != FREE or links.ends.size != links.law.shape[0]:
         return False
     damped = 0
-    for i in range(links.eta.size):
-        damped += links.eta[i] > 0.0
+    for i in range(links.ends.size):
+        damped += links.law[i, DASHPOT] > 0.0
     return damped == 0
 
 
 @inlined
-def expand_bare(links: Links, s: Series, push: Array, order: int) -> None:
+def expand_bare(links: Links, s: Array, push: Array, order: int) -> None:
     """Fill the series of a chain that `is_bare`, as `expand` does, asking less at each order."""
-    law, _, heights, _, mass, drag, _ = links
-    w, v, eps, sig, _ = s
-    last = heights.size - 1
+    law, _, mass, drag, _ = links
+    w, v, eps, sig, group = s[W], s[V], s[EPS], s[SIG], s[GROUP]
+    last = mass.size - 1
     for n in range(order + 1):
         share = 1.0 / (n + 1)
         for i in range(last + 1):
-            eps[i, n] = (w[i, n] - (w[i - 1, n] if i > 0 else 0.0)) * (1.0 / heights[i])
-            sig[i, n] = _stress_term(law, i, eps, sig, n)
+            eps[i, n] = (w[i, n] - (w[i - 1, n] if i > 0 else 0.0)) * (1.0 / law[i, HEIGHT])
+            sig[i, n] = group[i, n] = _stress_term(law, i, eps, sig, n)
         for i in range(last + 1):
             net = -sig[i, n]
             if i < last:
@@ -410,19 +357,16 @@ def expand_bare(links: Links, s: Series, push: Array, order: int) -> None:
                     net -= drag * v[i, n]
             v[i, n + 1] = net * (share / mass[i])
             w[i, n + 1] = v[i, n] * share
-    for i in range(last + 1):
-        for n in range(order + 1):
-            s.group[i, n] = sig[i, n]
 
 
 @inner
-def expand(links: Links, s: Series, push: Array, motion: Array, order: int) -> bool:
+def expand(links: Links, s: Array, push: Array, motion: Array, order: int) -> bool:
     """Fill the series up to `order`; false if a prescribed stress meets a flat branch.
 
     `push` (2,) is the stress on the top and its rate, `motion` (2,) its displacement and rate.
     """
-    law, eta, heights, ends, mass, drag, top = links
-    w, v, eps, sig, group = s
+    law, ends, mass, drag, top = links
+    w, v, eps, sig, group = s[W], s[V], s[EPS], s[SIG], s[GROUP]
     last = ends.size - 1
     for n in range(order + 1):
         push_n = push[n] if n < 2 else 0.0
@@ -435,7 +379,7 @@ def expand(links: Links, s: Series, push: Array, motion: Array, order: int) -> b
             stressed = g == last and top == STRESS
             if stressed:
                 group[g, n] = push_n
-                if not _stressed_term(law, eta, i0, i1, eps, sig, push_n, n):
+                if not _stressed_term(law, i0, i1, eps, sig, push_n, n):
                     return False
             else:
                 viscous = g == last and top == VISCOUS
@@ -444,13 +388,12 @@ def expand(links: Links, s: Series, push: Array, motion: Array, order: int) -> b
                     u_n -= w[g - 1, n]
                     rate_n -= v[g - 1, n]
                 group[g, n] = _group_term(
-                    law, eta, heights, i0, i1, eps, sig, u_n, rate_n,
-                    push_n, drag if viscous else 0.0, n,
-                )  # fmt: skip
+                    law, i0, i1, eps, sig, u_n, rate_n, push_n, drag if viscous else 0.0, n
+                )
             if i1 - i0 > 1 or stressed:
                 for i in range(i0, i1):
-                    if eta[i] > 0.0:
-                        eps[i, n + 1] = (group[g, n] - sig[i, n]) * share / eta[i]
+                    if law[i, DASHPOT] > 0.0:
+                        eps[i, n + 1] = (group[g, n] - sig[i, n]) * share / law[i, DASHPOT]
         for g in range(last + 1):
             if g < last or top == FREE:
                 net = (group[g + 1, n] if g < last else push_n) - group[g, n]
@@ -468,189 +411,174 @@ def expand(links: Links, s: Series, push: Array, motion: Array, order: int) -> b
 
 
 @inner
-def _fill_slope(law: Array, i: int, sig: Array, slope: Array) -> None:
+def _fill_tilt(law: Array, i: int, sig: Array, tilt: Array, order: int) -> None:
     """Series T of dσ/dε of a spring: k on a straight branch, (k + σ)²/k on a curved one."""
     k = law[i, SLOPE]
-    slope[i, 0] = k
-    order = slope.shape[1] - 1
+    tilt[i, 0] = k
     if law[i, CURVED] == 0.0:
         for n in range(1, order + 1):
-            slope[i, n] = 0.0
+            tilt[i, n] = 0.0
         return
     stiff = k + sig[i, 0]
-    slope[i, 0] = stiff * stiff / k
+    tilt[i, 0] = stiff * stiff / k
     for n in range(1, order + 1):
-        slope[i, n] = (2.0 * stiff * sig[i, n] + _product(sig, sig, i, n, 1, n - 1)) / k
+        tilt[i, n] = (2.0 * stiff * sig[i, n] + _product(sig, sig, i, n)) / k
 
 
 @inlined
-def _known_tangent(
-    links: Links, s: Series, slope: Array, m: Moves, eps: Array, i: int, n: int
-) -> float:
+def _known_tangent(law: Array, s: Array, m: Array, d: Array, i: int, n: int) -> float:
     """Order n of δσ of a spring, but for the term T_0 δε_n."""
-    law = links.law
-    known = -slope[i, n] * m.law[i, 1]
+    eps, sig, tilt = s[EPS], s[SIG], s[TILT]
+    known = -tilt[i, n] * m[i, ORIGIN]
     if law[i, CURVED] == 0.0:
-        known += (s.eps[i, n] - (law[i, ORIGIN] if n == 0 else 0.0)) * m.law[i, 0]
-        known += m.law[i, 2] if n == 0 else 0.0
+        known += (eps[i, n] - (law[i, ORIGIN] if n == 0 else 0.0)) * m[i, SLOPE]
+        known += m[i, OFFSET] if n == 0 else 0.0
     else:
-        known += s.sig[i, n] / law[i, SLOPE] * m.law[i, 0]
+        known += sig[i, n] / law[i, SLOPE] * m[i, SLOPE]
         if n > 0:
-            known += _product(eps, slope, i, n, 0, n - 1)
-    if links.eta[i] == 0.0 and n + 1 < slope.shape[1]:  # a dashpot of zero adds what it would take
-        known += (n + 1) * s.eps[i, n + 1] * m.eta[i]
+            known += d[EPS, i, 0] * tilt[i, n] + _product(d[EPS], tilt, i, n)
+    if law[i, DASHPOT] == 0.0 and n + 2 < tilt.shape[1]:  # a dashpot of zero: what it would take
+        known += (n + 1) * eps[i, n + 1] * m[i, DASHPOT]
     return known
 
 
 @inner
 def _share_tangent(
-    links: Links, slope: Array, d: Series, i0: int, i1: int, rest: float, n: int
+    law: Array, tilt: Array, d: Array, i0: int, i1: int, rest: float, n: int
 ) -> float:
     """Order n of the derivative of a group's stress, where some springs have no dashpot.
 
     `rest` is that of the elongation, but for the moves of the springs. Fills their δε and δσ, whose
-    known parts must be in d.sig.
+    known parts must be in d[SIG].
     """
+    eps, sig = d[EPS], d[SIG]
     compliance, flat = 0.0, -1
     for i in range(i0, i1):
-        if links.eta[i] > 0.0:
-            rest -= links.heights[i] * d.eps[i, n]
-        elif slope[i, 0] > 0.0:
-            compliance += links.heights[i] / slope[i, 0]
-            rest += links.heights[i] / slope[i, 0] * d.sig[i, n]
+        if law[i, DASHPOT] > 0.0:
+            rest -= law[i, HEIGHT] * eps[i, n]
+        elif tilt[i, 0] > 0.0:
+            compliance += law[i, HEIGHT] / tilt[i, 0]
+            rest += law[i, HEIGHT] / tilt[i, 0] * sig[i, n]
         elif flat < 0:
             flat = i
-    common = d.sig[flat, n] if flat >= 0 else rest / compliance
+    common = sig[flat, n] if flat >= 0 else rest / compliance
     for i in range(i0, i1):
-        if links.eta[i] == 0.0 and i != flat:
-            soft = 1.0 / slope[i, 0] if slope[i, 0] > 0.0 else 0.0
-            d.eps[i, n] = (common - d.sig[i, n]) * soft
-            d.sig[i, n] = common
+        if law[i, DASHPOT] == 0.0 and i != flat:
+            soft = 1.0 / tilt[i, 0] if tilt[i, 0] > 0.0 else 0.0
+            eps[i, n] = (common - sig[i, n]) * soft
+            sig[i, n] = common
     if flat >= 0:  # the flat branch takes up all that the others leave
-        d.eps[flat, n] = (rest - common * compliance) / links.heights[flat]
+        eps[flat, n] = (rest - common * compliance) / law[flat, HEIGHT]
     return common
 
 
 @inner
 def _damped_tangent(
-    links: Links, s: Series, m: Moves, d: Series, g: int, i0: int, i1: int, n: int
+    links: Links, s: Array, m: Array, drag: float, d: Array, g: int, i0: int, i1: int, n: int
 ) -> float:
     """Order n of the derivative of `_damped_term`."""
-    viscous = g == links.ends.size - 1 and links.top == VISCOUS
-    total, weight = (0.0 if viscous else d.v[g, n]), 0.0
+    law, viscous = links.law, g == links.ends.size - 1 and links.top == VISCOUS
+    total, weight = (0.0 if viscous else d[V, g, n]), 0.0
     if g > 0:
-        total -= d.v[g - 1, n]
+        total -= d[V, g - 1, n]
     if viscous:  # v of the top is (push - Σ)/drag
-        total -= s.v[g, n] / links.drag * m.drag
+        total -= s[V, g, n] / links.drag * drag
         weight = 1.0 / links.drag
     for i in range(i0, i1):
-        share = links.heights[i] / links.eta[i]
-        change = (m.heights[i] - share * m.eta[i]) / links.eta[i]
-        total += share * d.sig[i, n] + change * (s.sig[i, n] - s.group[g, n])
+        share = law[i, HEIGHT] / law[i, DASHPOT]
+        change = (m[i, HEIGHT] - share * m[i, DASHPOT]) / law[i, DASHPOT]
+        total += share * d[SIG, i, n] + change * (s[SIG, i, n] - s[GROUP, g, n])
         weight += share
     return total / weight
 
 
 @inlined
-def _group_tangent(
-    links: Links, s: Series, slope: Array, m: Moves, d: Series, g: int, n: int
-) -> None:
+def _group_tangent(links: Links, s: Array, m: Array, drag: float, d: Array, g: int, n: int) -> None:
     """Order n of the derivative of a group's stress and of its strains that are no state."""
+    law, tilt = links.law, s[TILT]
     i0, i1 = springs_of(links.ends, g)
     stressed = g == links.ends.size - 1 and links.top == STRESS
-    rest = d.w[g, n] - (d.w[g - 1, n] if g > 0 else 0.0)
+    rest = d[W, g, n] - (d[W, g - 1, n] if g > 0 else 0.0)
     single = i1 - i0 == 1 and not stressed
     damped = 0
     for i in range(i0, i1):
-        damped += links.eta[i] > 0.0
-        rest -= s.eps[i, n] * m.heights[i]
-        known = _known_tangent(links, s, slope, m, d.eps, i, n)
+        damped += law[i, DASHPOT] > 0.0
+        rest -= s[EPS, i, n] * m[i, HEIGHT]
+        known = _known_tangent(law, s, m, d, i, n)
         if single:
-            d.eps[i, n] = rest * (1.0 / links.heights[i])
-        elif stressed and links.eta[i] == 0.0:
-            d.eps[i, n] = -known / slope[i, 0]
-        if single or stressed or links.eta[i] > 0.0:
-            known += slope[i, 0] * d.eps[i, n]
-        d.sig[i, n] = known
+            d[EPS, i, n] = rest * (1.0 / law[i, HEIGHT])
+        elif stressed and law[i, DASHPOT] == 0.0:
+            d[EPS, i, n] = -known / tilt[i, 0]
+        if single or stressed or law[i, DASHPOT] > 0.0:
+            known += tilt[i, 0] * d[EPS, i, n]
+        d[SIG, i, n] = known
     if stressed:
-        d.group[g, n] = 0.0
+        d[GROUP, g, n] = 0.0
     elif damped == i1 - i0:
-        d.group[g, n] = _damped_tangent(links, s, m, d, g, i0, i1, n)
+        d[GROUP, g, n] = _damped_tangent(links, s, m, drag, d, g, i0, i1, n)
     elif single:
-        d.group[g, n] = d.sig[i0, n]
+        d[GROUP, g, n] = d[SIG, i0, n]
     else:
-        d.group[g, n] = _share_tangent(links, slope, d, i0, i1, rest, n)
+        d[GROUP, g, n] = _share_tangent(law, tilt, d, i0, i1, rest, n)
 
 
 @inner
-def _expand_tangent(links: Links, s: Series, slope: Array, m: Moves, d: Series, order: int) -> None:
-    """Fill the derivatives in one direction up to `order`."""
-    last = links.ends.size - 1
+def _expand_tangent(links: Links, s: Array, m: Array, drag: float, d: Array, order: int) -> None:
+    """Fill the derivatives in one direction, that moves `m` and `drag`, up to `order`."""
+    law, last = links.law, links.ends.size - 1
+    w, v = d[W], d[V]
     for n in range(order + 1):
         share = 1.0 / (n + 1)
         for g in range(last + 1):
-            _group_tangent(links, s, slope, m, d, g, n)
+            _group_tangent(links, s, m, drag, d, g, n)
             i0, i1 = springs_of(links.ends, g)
             if i1 - i0 > 1 or (g == last and links.top == STRESS):
                 for i in range(i0, i1):
-                    if links.eta[i] > 0.0:
-                        flow = (s.group[g, n] - s.sig[i, n]) / links.eta[i]
-                        net = d.group[g, n] - d.sig[i, n] - flow * m.eta[i]
-                        d.eps[i, n + 1] = net * share / links.eta[i]
+                    if law[i, DASHPOT] > 0.0:
+                        flow = (s[GROUP, g, n] - s[SIG, i, n]) / law[i, DASHPOT]
+                        net = d[GROUP, g, n] - d[SIG, i, n] - flow * m[i, DASHPOT]
+                        d[EPS, i, n + 1] = net * share / law[i, DASHPOT]
         for g in range(last + 1):
-            net = -d.group[g, n]
+            net = -d[GROUP, g, n]
             if g < last:
-                net += d.group[g + 1, n]
+                net += d[GROUP, g + 1, n]
             elif links.top == VISCOUS:
-                d.v[g, n] = (net - s.v[g, n] * m.drag) / links.drag
-            elif links.drag > 0.0 or m.drag != 0.0:
-                net -= links.drag * d.v[g, n] + s.v[g, n] * m.drag
+                v[g, n] = (net - s[V, g, n] * drag) / links.drag
+            elif links.drag > 0.0 or drag != 0.0:
+                net -= links.drag * v[g, n] + s[V, g, n] * drag
             if g < last or links.top == FREE:
-                d.v[g, n + 1] = net * (share / links.mass[g])
+                v[g, n + 1] = net * (share / links.mass[g])
             if g < last or links.top in (FREE, VISCOUS):
-                d.w[g, n + 1] = d.v[g, n] * share
+                w[g, n + 1] = v[g, n] * share
 
 
 @piece
-def expand_tangents(links: Links, s: Series, t: Tangents, order: int) -> None:
+def expand_tangents(links: Links, s: Array, d: Tangents, order: int) -> None:
     """Fill the derivatives up to `order`, after `expand`; those that are still zero stay so."""
-    for i in range(links.eta.size):
-        _fill_slope(links.law, i, s.sig, t.slope)
-    for p in range(t.drag.size):
-        if t.live[p] != 0:
-            moves, d = direction(t, p)
-            _expand_tangent(links, s, t.slope, moves, d, order)
+    for i in range(links.law.shape[0]):
+        _fill_tilt(links.law, i, s[SIG], s[TILT], order)
+    for p in range(d.drag.size):
+        if d.live[p] > 0.0:
+            _expand_tangent(links, s, d.law[p], d.drag[p], d.series[p], order)
 
 
 # ---------------------------------------------------------------- the end of a step
 
 
 @inner
-def _move(c: Array, order: int, span: float) -> None:
-    """Carry order 0 of polynomials c (m, …) over a step."""
-    for i in range(c.shape[0]):
-        total = c[i, order]
-        for n in range(order - 1, -1, -1):
-            total = total * span + c[i, n]
-        c[i, 0] = total
+def advance(s: Array, groups: int, order: int, span: float) -> None:
+    """Carry the state, order 0 of W, V and EPS, over a step of length `span`."""
+    for row in range(W, EPS + 1):
+        for i in range(s.shape[1] if row == EPS else groups):
+            s[row, i, 0] = value_at(s[row, i], order, span)
 
 
 @inner
-def advance(s: Series, order: int, span: float) -> None:
-    """Carry the state over a step of length `span`."""
-    _move(s.w, order, span)
-    _move(s.v, order, span)
-    _move(s.eps, order, span)
-
-
-@inner
-def advance_tangents(d: Tangents, order: int, span: float) -> None:
+def advance_tangents(d: Tangents, groups: int, order: int, span: float) -> None:
     """Carry the derivatives of the state over a step of length `span`."""
     for p in range(d.drag.size):
-        if d.live[p] != 0:
-            _move(d.w[p], order, span)
-            _move(d.v[p], order, span)
-            _move(d.eps[p], order, span)
+        if d.live[p] > 0.0:
+            advance(d.series[p], groups, order, span)
 
 
 # ---------------------------------------------------------------- without inertia and damping
@@ -714,7 +642,7 @@ def equilibrium_tangents(
         for p in range(size):
             i = directions[p, 0]
             known = longer = 0.0  # δσ at fixed strain, δ of the elongation at fixed stress
-            if i >= 0 and directions[p, 1] == HEIGHT:
+            if i >= 0 and directions[p, 1] == OWN_HEIGHT:
                 longer = eps[i, j]
             elif i >= 0:
                 x = eps[i, j] - law[i, ORIGIN]

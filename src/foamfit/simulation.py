@@ -257,7 +257,7 @@ def _direction(chain: Chain, name: str) -> tuple[int, int]:
         spring = known.index(prefix)
         own = BISTABLE_NAMES if isinstance(chain.springs[spring], BistableSpring) else LINEAR_NAMES
         if short == "height":
-            return spring, series.HEIGHT
+            return spring, series.OWN_HEIGHT
         if short in own:
             return spring, BISTABLE_NAMES.index(short)
     raise ValueError(
@@ -276,7 +276,7 @@ def _sensitivities(
         moved, pressed = slopes.displacement[p], slopes.base_stress[p]
         if directions[p, 1] == series.DRAG:
             moved, pressed = moved / chain.height, pressed / chain.height
-        elif directions[p, 1] == series.HEIGHT and drag > 0.0:
+        elif directions[p, 1] == series.OWN_HEIGHT and drag > 0.0:
             moved = moved - drag / chain.height * slopes.displacement[-1]
             pressed = pressed - drag / chain.height * slopes.base_stress[-1]
         out[name] = Sensitivity(moved, pressed)
@@ -325,7 +325,7 @@ def simulate(
     directions = NO_DIRECTIONS
     if sensitivities:
         wanted = [_direction(chain, name) for name in sensitivities]
-        longer = any(what == series.HEIGHT for _, what in wanted)
+        longer = any(what == series.OWN_HEIGHT for _, what in wanted)
         if longer and chain.site_damping > 0.0:  # the onsite damper acts over the whole height
             wanted.append((-1, series.DRAG))
         directions = np.array(wanted)

@@ -20,30 +20,33 @@ from foamfit.kernels import (
     above,
     below,
     branch_at_strain,
-    branch_at_stress,
     compiled,
-    equilibrate,
     first_branch,
     inlined,
     inner,
     piece,
-    strain_on,
 )
 from foamfit.polynomial import fill_values, first_crossing, slope_at, value_at
 from foamfit.series import (
     CURVED,
+    DASHPOT,
+    EPS,
     FREE,
+    GROUP,
+    HEIGHT,
     HIGH,
     LOW,
     MOTION,
     N_LAW,
     ORIGIN,
+    SIG,
     SLOPE,
     STRESS,
     VISCOUS,
     Links,
-    Series,
     Tangents,
+    V,
+    W,
     advance,
     advance_tangents,
     enter,
@@ -53,7 +56,6 @@ from foamfit.series import (
     expand_tangents,
     is_bare,
     make_series,
-    make_tangents,
     springs_of,
 )
 
@@ -68,36 +70,32 @@ CLOSE = 1e-13
 class Samples(NamedTuple):
     """The curves to fill, over the samples t (n,).
 
-    w (springs or 1, n) holds the displacements above each spring, or of the top alone, m; s (n,)
-    the base stress, Pa; dw (p, springs or 1, n) and ds (p, n) their derivatives in p directions.
+    curves (1 + springs or 1, n) holds the base stress, Pa, then the displacements above each spring
+    or of the top alone, m; slopes (p, …) are their derivatives in p directions.
     """
 
     t: Array
-    w: Array
-    s: Array
-    dw: Array
-    ds: Array
+    curves: Array
+    slopes: Array
 
 
 # ---------------------------------------------------------------- the length of a step
 
 
 @inlined
-def _tail(links: Links, s: Series, n: int, reach: float, load: float) -> float:
+def _tail(law: Array, s: Array, n: int, per_reach: float, per_load: float) -> float:
     """Largest coefficient of order n among strains and stresses, over motion and stress so far."""
     worst = 0.0
-    for i in range(links.heights.size):
-        if reach > 0.0:
-            worst = max(worst, abs(s.eps[i, n]) * links.heights[i] / reach)
-        if load > 0.0:
-            worst = max(worst, abs(s.sig[i, n]) / load)
+    for i in range(law.shape[0]):
+        worst = max(worst, abs(s[EPS, i, n]) * law[i, HEIGHT] * per_reach)
+        worst = max(worst, abs(s[SIG, i, n]) * per_load)
     return worst
 
 
 @inlined
 def step_length(
     links: Links,
-    s: Series,
+    s: Array,
     push: Array,
     order: int,
     tol: float,
@@ -110,13 +108,16 @@ def step_length(
     for _ in range(60):  # at rest the only scale is what the step itself reaches
         tried = span
         if w_scale == 0.0 or s_scale == 0.0:
-            reach = max(w_scale, abs(s.w[-1, 1]) * span if links.top != STRESS else 0.0)
+            top = links.ends.size - 1
+            reach = max(w_scale, abs(s[W, top, 1]) * span if links.top != STRESS else 0.0)
             load = max(s_scale, max(abs(push[0]), abs(push[1]) * span))
-            for i in range(links.heights.size):
-                reach = max(reach, links.heights[i] * abs(s.eps[i, 1]) * span)
-                load = max(load, abs(s.sig[i, 1]) * span)
+            for i in range(links.law.shape[0]):
+                reach = max(reach, links.law[i, HEIGHT] * abs(s[EPS, i, 1]) * span)
+                load = max(load, abs(s[SIG, i, 1]) * span)
+        per_reach = 1.0 / reach if reach > 0.0 else 0.0
+        per_load = 1.0 / load if load > 0.0 else 0.0
         for n in (order - 1, order):
-            tail = _tail(links, s, n, reach, load)
+            tail = _tail(links.law, s, n, per_reach, per_load)
             if tail * span**n > tol:
                 span = (tol / tail) ** (1.0 / n)
         if span >= 0.5 * tried or (w_scale > 0.0 and s_scale > 0.0):
@@ -124,69 +125,85 @@ def step_length(
     return span
 
 
-@inner
-def _first_switch(links: Links, s: Series, order: int, span: float) -> tuple[float, int, int]:
+@piece
+def first_switch(law: Array, s: Array, order: int, span: float) -> tuple[float, int, int]:
     """First switch of branch within `span`: when, which spring (-1: none), on which side."""
     spring, side = -1, 0
-    for i in range(links.heights.size):
-        when, where = first_crossing(s.eps[i], order, links.law[i, LOW], links.law[i, HIGH], span)
+    for i in range(law.shape[0]):
+        when, where = first_crossing(s[EPS, i], order, law[i, LOW], law[i, HIGH], span)
         if where != 0 and (spring < 0 or when < span):
             span, spring, side = when, i, where
     return span, spring, side
 
 
 @inner
-def _least(c: Array, order: int, span: float, tol: float, most: int) -> int:
-    """Orders that the series in the rows of c need over a step."""
-    for i in range(c.shape[0]):
-        size, power = abs(c[i, 0]), 1.0
-        for n in range(1, order + 1):
-            power *= span
-            size += abs(c[i, n]) * power
-        tail, n = 0.0, order
-        while n > most and tail + abs(c[i, n]) * power <= tol * size:
-            tail += abs(c[i, n]) * power
-            power /= span
-            n -= 1
-        most = n
-    return most
-
-
-@inner
-def _enough(s: Series, order: int, span: float, tol: float) -> int:
-    """Orders that are enough over a step, if a switch made it short."""
-    least = min(order, 2)
-    if span == 0.0:
-        return least
-    return _least(s.sig, order, span, tol, _least(s.eps, order, span, tol, least))
+def _enough(
+    law: Array, s: Array, order: int, span: float, tol: float, w_scale: float, s_scale: float
+) -> int:
+    """Orders that are enough over a step that a switch made short."""
+    if w_scale == 0.0 or s_scale == 0.0 or span == 0.0:
+        return order
+    tail, power, per_span = 0.0, span**order, 1.0 / span
+    while order > 2:
+        tail += _tail(law, s, order, 1.0 / w_scale, 1.0 / s_scale) * power
+        if tail > tol:
+            break
+        power *= per_span
+        order -= 1
+    return order
 
 
 # ---------------------------------------------------------------- samples
 
 
+@inner
+def first_past(t: Array, first: int, end: float, last: bool) -> int:
+    """First sample from `first` on at the time `end` or later; where it is the `last`, later."""
+    low, high, step = first, first, 1
+    while high < t.size and (t[high] < end or (last and t[high] == end)):
+        low, high = high + 1, high + step
+        step *= 2
+    high = min(high, t.size)
+    while low < high:
+        mid = (low + high) // 2
+        if t[mid] < end or (last and t[mid] == end):
+            low = mid + 1
+        else:
+            high = mid
+    return low
+
+
+@inner
+def fill_line(at: float, rate: float, t: Array, now: float, out: Array) -> None:
+    """Write at + rate (t - now) to `out`."""
+    for j in range(t.size):
+        out[j] = at + rate * (t[j] - now)
+
+
 @piece
 def sample(
-    links: Links, s: Series, order: int, out: Samples, first: int, last: int, now: float, c: Array
+    links: Links, s: Array, order: int, out: Samples, first: int, last: int, now: float, c: Array
 ) -> None:
-    """Write displacements and base stress at the samples first … last-1 of a step; c is scratch."""
-    fill_values(s.group[0], order, out.t, first, last, now, out.s)
-    if out.w.shape[0] == 1 and links.top != STRESS:
-        fill_values(s.w[links.ends.size - 1], order, out.t, first, last, now, out.w[0])
+    """Write base stress and displacements at the samples first … last-1 of a step; c is scratch."""
+    law, nodes = links.law, out.curves.shape[0] - 1
+    fill_values(s[GROUP, 0], order, out.t, first, last, now, out.curves[0])
+    if nodes == 1 and links.top != STRESS:
+        fill_values(s[W, links.ends.size - 1], order, out.t, first, last, now, out.curves[1])
         return
     for n in range(order + 1):
         c[n] = 0.0
-    count = links.heights.size
+    count = law.shape[0]
     for i in range(count):
         for n in range(order + 1):
-            c[n] += links.heights[i] * s.eps[i, n]
-        if out.w.shape[0] > 1 or i == count - 1:
-            fill_values(c, order, out.t, first, last, now, out.w[min(i, out.w.shape[0] - 1)])
+            c[n] += law[i, HEIGHT] * s[EPS, i, n]
+        if nodes > 1 or i == count - 1:
+            fill_values(c, order, out.t, first, last, now, out.curves[min(1 + i, nodes)])
 
 
 @piece
 def sample_tangents(
     links: Links,
-    s: Series,
+    s: Array,
     d: Tangents,
     order: int,
     out: Samples,
@@ -195,53 +212,49 @@ def sample_tangents(
     now: float,
     c: Array,
 ) -> None:
-    """Write the derivatives of displacements and base stress at some samples of a step."""
-    nodes, count = out.w.shape[0], links.heights.size
-    top = links.ends.size - 1
+    """Write the derivatives of base stress and displacements at some samples of a step."""
+    law, nodes, top = links.law, out.curves.shape[0] - 1, links.ends.size - 1
+    count = law.shape[0]
     for p in range(d.drag.size):
-        if d.live[p] == 0:
-            for j in range(first, last):
-                out.ds[p, j] = 0.0
-                for i in range(nodes):
-                    out.dw[p, i, j] = 0.0
+        slopes = out.slopes[p]
+        if d.live[p] == 0.0:
+            for i in range(nodes + 1):
+                fill_line(0.0, 0.0, out.t[first:last], now, slopes[i, first:last])
             continue
-        fill_values(d.group[p, 0], order, out.t, first, last, now, out.ds[p])
+        fill_values(d.series[p, GROUP, 0], order, out.t, first, last, now, slopes[0])
         if nodes == 1 and links.top != STRESS:
-            fill_values(d.w[p, top], order, out.t, first, last, now, out.dw[p, 0])
+            fill_values(d.series[p, W, top], order, out.t, first, last, now, slopes[1])
             continue
         for n in range(order + 1):
             c[n] = 0.0
         for i in range(count):
             for n in range(order + 1):
-                c[n] += links.heights[i] * d.eps[p, i, n] + d.heights[p, i] * s.eps[i, n]
+                c[n] += law[i, HEIGHT] * d.series[p, EPS, i, n] + d.law[p, i, HEIGHT] * s[EPS, i, n]
             if nodes > 1 or i == count - 1:
-                fill_values(c, order, out.t, first, last, now, out.dw[p, min(i, nodes - 1)])
+                fill_values(c, order, out.t, first, last, now, slopes[min(1 + i, nodes)])
 
 
 @inner
-def _mend_kink(out: Samples, s: Series, d: Tangents, knot: int) -> None:
+def _mend_kink(out: Samples, s: Array, d: Tangents, knot: int) -> None:
     """A dashpot feels the mean rate where the prescribed motion has a kink."""
     before, after = out.t[knot] - out.t[knot - 1], out.t[knot + 1] - out.t[knot]
     share = before / (before + after)
-    out.s[knot] += share * (s.group[0, 0] - out.s[knot])
+    out.curves[0, knot] += share * (s[GROUP, 0, 0] - out.curves[0, knot])
     for p in range(d.drag.size):
-        out.ds[p, knot] += share * (d.group[p, 0, 0] - out.ds[p, knot])
+        out.slopes[p, 0, knot] += share * (d.series[p, GROUP, 0, 0] - out.slopes[p, 0, knot])
 
 
-@inner
-def _fill_before(out: Samples, speed: float) -> int:
-    """Before contact nothing presses and only the striker moves; returns the first sample after."""
-    nodes, done = out.w.shape[0], 0
-    while done < out.t.size and out.t[done] < 0.0:
-        done += 1
-    for j in range(done):
-        out.s[j] = 0.0
-        for i in range(nodes):
-            out.w[i, j] = speed * out.t[j] if i == nodes - 1 else 0.0
-        for p in range(out.ds.shape[0]):
-            out.ds[p, j] = 0.0
-            for i in range(nodes):
-                out.dw[p, i, j] = 0.0
+@piece
+def before_contact(curves: Array, t: Array, speed: float) -> int:
+    """Fill the samples before contact, at time 0, and return how many these are.
+
+    Nothing presses and only the striker moves.
+    """
+    rows = curves.shape[0]
+    none = rows - rows  # not the literals, which are types: compiled anew
+    done = first_past(t, none, 0.0, none > 0)
+    for i in range(rows):
+        fill_line(0.0, speed if i == rows - 1 else 0.0, t[:done], 0.0, curves[i, :done])
     return done
 
 
@@ -249,95 +262,90 @@ def _fill_before(out: Samples, speed: float) -> int:
 
 
 @inner
-def fly(
-    out_w: Array, out_s: Array, t: Array, first: int, t_end: float, w_end: Array, speed: float
-) -> None:
+def fly(curves: Array, t: Array, first: int, t_end: float, w_end: Array, speed: float) -> None:
     """After contact the chain keeps its shape and moves with the striker; nothing presses."""
-    for i in range(out_w.shape[0]):
-        for j in range(first, t.size):
-            out_w[i, j] = w_end[i] + speed * (t[j] - t_end)
-    for j in range(first, t.size):
-        out_s[j] = 0.0
+    fill_line(0.0, 0.0, t[first:], t_end, curves[0, first:])
+    for i in range(curves.shape[0] - 1):
+        fill_line(w_end[i], speed, t[first:], t_end, curves[1 + i, first:])
 
 
 @inner
-def _delay(s: Series, d: Tangents, order: int, span: float, late: Array) -> None:
+def _delay(s: Array, d: Tangents, order: int, span: float, late: Array) -> None:
     """Derivative of the time at which the base stress meets zero at the end of a step."""
-    fall = slope_at(s.group[0], order, span)
-    if fall == 0.0:
-        return
-    for p in range(late.size):
-        late[p] = -value_at(d.group[p, 0], order, span) / fall
+    fall = slope_at(s[GROUP, 0], order, span)
+    for p in range(d.drag.size):
+        late[p] = 0.0
+        if fall != 0.0:
+            late[p] = -value_at(d.series[p, GROUP, 0], order, span) / fall
 
 
 @piece
 def depart(
     links: Links,
-    s: Series,
+    s: Array,
     d: Tangents,
     order: int,
     more: int,
     span: float,
     now: float,
-    late: Array,
-    rate: Array,
-    w_end: Array,
     out: Samples,
     done: int,
+    room: Array,
 ) -> None:
     """Fill the samples after contact, which ends at the end of this step, at the time `now`.
 
-    A later end (`late`) leaves the nodes as they move until then, and the top with the velocity
-    that it has then. `rate` and `w_end` (nodes,) are scratch.
+    A later end leaves the nodes as they move until then, and the top with the velocity that it has
+    then. `room` (3, …) is scratch.
     """
-    nodes, count, top = out.w.shape[0], links.heights.size, links.ends.size - 1
-    pull = slope_at(s.v[top], order, span)
-    speed = 0.0
+    late, rate, place = room[0], room[1], room[2]
+    law, nodes, groups = links.law, out.curves.shape[0] - 1, links.ends.size
+    count, top = law.shape[0], groups - 1
+    _delay(s, d, more, span, late)
+    pull = slope_at(s[V, top], order, span)
+    speed = moved = 0.0
     for i in range(count):
-        speed += links.heights[i] * slope_at(s.eps[i], order, span)
+        speed += law[i, HEIGHT] * slope_at(s[EPS, i], order, span)
         rate[min(i, nodes - 1)] = speed
-    advance(s, order, span)
-    advance_tangents(d, more, span)
-    place = 0.0
+    advance(s, groups, order, span)
+    advance_tangents(d, groups, more, span)
     for i in range(count):
-        place += links.heights[i] * s.eps[i, 0]
-        w_end[min(i, nodes - 1)] = place
-    fly(out.w, out.s, out.t, done, now, w_end, s.v[top, 0])
-    for p in range(late.size):
-        away = d.v[p, top, 0] + pull * late[p]
+        moved += law[i, HEIGHT] * s[EPS, i, 0]
+        place[min(i, nodes - 1)] = moved
+    away = s[V, top, 0]
+    fly(out.curves, out.t, done, now, place, away)
+    for p in range(d.drag.size):
         moved = 0.0
         for i in range(count):
-            moved += links.heights[i] * d.eps[p, i, 0] + d.heights[p, i] * s.eps[i, 0]
-            if nodes > 1 or i == count - 1:
-                node = min(i, nodes - 1)
-                there = moved + (rate[node] - s.v[top, 0]) * late[p]
-                for j in range(done, out.t.size):
-                    out.dw[p, node, j] = there + away * (out.t[j] - now)
-        for j in range(done, out.t.size):
-            out.ds[p, j] = 0.0
+            moved += law[i, HEIGHT] * d.series[p, EPS, i, 0] + d.law[p, i, HEIGHT] * s[EPS, i, 0]
+            place[min(i, nodes - 1)] = moved
+        for node in range(nodes):
+            place[node] += (rate[node] - away) * late[p]
+        faster = d.series[p, V, top, 0] + pull * late[p]
+        fly(out.slopes[p], out.t, done, now, place, faster)
 
 
 # ---------------------------------------------------------------- the state between steps
 
 
 @inner
-def settle(links: Links, s: Series) -> None:
+def settle(links: Links, s: Array) -> None:
     """Share the elongation of undamped groups anew, so that rounding does not pile up."""
+    law = links.law
     for g in range(links.ends.size):
         i0, i1 = springs_of(links.ends, g)
         plain = not (g == links.ends.size - 1 and links.top == STRESS)
         if i1 - i0 == 1:
             continue
         compliance = 0.0
-        miss = s.w[g, 0] - (s.w[g - 1, 0] if g > 0 else 0.0)
+        miss = s[W, g, 0] - (s[W, g - 1, 0] if g > 0 else 0.0)
         for i in range(i0, i1):
-            slope = _slope_now(links.law, i, s.eps[i, 0])
-            plain = plain and links.eta[i] == 0.0 and slope > 0.0
-            compliance += links.heights[i] / slope
-            miss -= links.heights[i] * s.eps[i, 0]
+            slope = _slope_now(law, i, s[EPS, i, 0])
+            plain = plain and law[i, DASHPOT] == 0.0 and slope > 0.0
+            compliance += law[i, HEIGHT] / slope
+            miss -= law[i, HEIGHT] * s[EPS, i, 0]
         if plain:
             for i in range(i0, i1):
-                s.eps[i, 0] += miss / compliance / _slope_now(links.law, i, s.eps[i, 0])
+                s[EPS, i, 0] += miss / compliance / _slope_now(law, i, s[EPS, i, 0])
 
 
 @inner
@@ -347,43 +355,12 @@ def _slope_now(law: Array, i: int, eps: float) -> float:
     return k / (y * y) if law[i, CURVED] != 0.0 else k
 
 
-@compiled
-def start(
-    rows: Array,
-    branches: Branches,
-    heights: Array,
-    ends: Branches,
-    top: int,
-    value: float,
-    w: Array,
-    eps: Array,
-) -> None:
-    """At the first sample the springs under a prescribed motion or stress are in equilibrium."""
-    last = ends.size - 1
-    i0, i1 = (ends[last - 1] if last > 0 else 0), ends[last]
-    if top == MOTION:
-        w[last, 0] = value
-        now = np.zeros(i1 - i0)
-        if i1 - i0 == 1:
-            now[0] = value / heights[i0]
-            branches[i0] = branch_at_strain(rows[i0], branches[i0], now[0])
-        else:
-            equilibrate(rows[i0:i1], branches[i0:i1], heights[i0:i1], value, 0.0, now)
-        for i in range(i0, i1):
-            eps[i, 0] = now[i - i0]
-    elif top == STRESS:
-        for i in range(i0, i1):
-            if rows[i, ETA] == 0.0:
-                branches[i] = branch_at_stress(rows[i], branches[i], value)
-                eps[i, 0] = strain_on(rows[i], branches[i], value)
-
-
-@inner
+@piece
 def switch(
     rows: Array,
     branches: Branches,
-    links: Links,
-    s: Series,
+    law: Array,
+    s: Array,
     d: Tangents,
     directions: Branches,
     order: int,
@@ -396,25 +373,25 @@ def switch(
 ) -> int:
     """Change the branch of a spring, and of all that end theirs at the same time; counts them."""
     for i in range(branches.size):
-        low, high = links.law[i, LOW], links.law[i, HIGH]
+        low, high, eps = law[i, LOW], law[i, HIGH], s[EPS, i, 0]
         out = 0
         if i == spring:
             out = side
-        elif s.eps[i, 0] >= high - CLOSE and slope_at(s.eps[i], order, span) > 0.0:
+        elif eps >= high - CLOSE and slope_at(s[EPS, i], order, span) > 0.0:
             out = 1
-        elif s.eps[i, 0] <= low + CLOSE and slope_at(s.eps[i], order, span) < 0.0:
+        elif eps <= low + CLOSE and slope_at(s[EPS, i], order, span) < 0.0:
             out = -1
         if out == 0:
             continue
         entered = above(branches[i]) if out > 0 else below(branches[i])
-        s.eps[i, 0] = high if out > 0 else low
+        s[EPS, i, 0] = high if out > 0 else low
         if switches < log.shape[0]:
             log[switches, 0], log[switches, 1] = now, i
             log[switches, 2], log[switches, 3] = branches[i], entered
-            log[switches, 4] = s.eps[i, 0]
+            log[switches, 4] = s[EPS, i, 0]
         switches += 1
         branches[i] = entered
-        enter(rows, i, entered, links.law)
+        enter(rows, i, entered, law)
         enter_tangents(rows, i, entered, directions, d)
     return switches
 
@@ -436,17 +413,16 @@ def _prescribe(
     return horizon
 
 
-@inner
-def _first_lift(
-    s: Series, order: int, first: bool, pressed: bool, span: float
-) -> tuple[float, bool]:
+@piece
+def first_lift(s: Array, order: int, first: bool, pressed: bool, span: float) -> tuple[float, bool]:
     """When within `span` the base stress meets zero again, and whether it does.
 
     Before the blow has come through to the base (`pressed`) rounding alone may do so; only in the
     first step can it come and go.
     """
-    when, where = first_crossing(s.group[0], order, 0.0, math.inf, span)
-    if pressed and s.group[0, 0] <= 0.0 and s.group[0, 1] <= 0.0:
+    base = s[GROUP, 0]
+    when, where = first_crossing(base, order, 0.0, math.inf, span)
+    if pressed and base[0] <= 0.0 and base[1] <= 0.0:
         when, where = 0.0, -1  # a unilateral spring has just opened
     if where != 0 and when <= span and (pressed or (first and when > 0.0)):
         return when, True
@@ -456,47 +432,47 @@ def _first_lift(
 @inner
 def begin(
     rows: Array,
+    heights: Array,
     start: Array,
-    speed: float,
     directions: Branches,
     branches: Branches,
-    links: Links,
-    s: Series,
+    law: Array,
+    s: Array,
     d: Tangents,
 ) -> None:
     """Write the state at the first sample: branches, strains and their derivatives."""
-    s.v[-1, 0] = speed
     for i in range(branches.size):
         branches[i] = first_branch(rows[i])
         if start.shape[1] > 0:
-            s.eps[i, 0] = start[0, i]
+            s[EPS, i, 0] = start[0, i]
             branches[i] = branch_at_strain(rows[i], branches[i], start[0, i])
             for p in range(directions.shape[0]):
-                d.eps[p, i, 0] = start[1 + p, i]
-                d.live[p] = d.live[p] or start[1 + p, i] != 0.0
-        links.eta[i] = rows[i, ETA]
-        enter(rows, i, branches[i], links.law)
+                d.series[p, EPS, i, 0] = start[1 + p, i]
+                if start[1 + p, i] != 0.0:
+                    d.live[p] = 1.0
+        law[i, DASHPOT], law[i, HEIGHT] = rows[i, ETA], heights[i]
+        enter(rows, i, branches[i], law)
         enter_tangents(rows, i, branches[i], directions, d)
 
 
 @inner
-def _loaded(s: Series, s_scale: float) -> float:
+def _loaded(s: Array, s_scale: float) -> float:
     """Largest stress so far."""
-    for i in range(s.sig.shape[0]):
-        s_scale = max(s_scale, abs(s.sig[i, 0]))
+    for i in range(s.shape[1]):
+        s_scale = max(s_scale, abs(s[SIG, i, 0]))
     return s_scale
 
 
 @inner
-def _reached(links: Links, s: Series, w_scale: float) -> tuple[float, float]:
+def _reached(links: Links, s: Array, w_scale: float) -> tuple[float, float]:
     """Largest displacement so far, and a number that is finite only if the state is."""
     top = links.ends.size - 1
-    total = s.w[top, 0]
+    total = s[W, top, 0]
     if links.top != STRESS:
-        w_scale = max(w_scale, abs(s.w[top, 0]))
-    for i in range(links.heights.size):
-        w_scale = max(w_scale, links.heights[i] * abs(s.eps[i, 0]))
-        total += s.eps[i, 0]
+        w_scale = max(w_scale, abs(s[W, top, 0]))
+    for i in range(links.law.shape[0]):
+        w_scale = max(w_scale, links.law[i, HEIGHT] * abs(s[EPS, i, 0]))
+        total += s[EPS, i, 0]
     return w_scale, total
 
 
@@ -516,10 +492,8 @@ def integrate(
     max_steps: int,
     directions: Branches,
     start: Array,
-    out_w: Array,
-    out_s: Array,
-    out_dw: Array,
-    out_ds: Array,
+    curves: Array,
+    slopes: Array,
     log: Array,
 ) -> tuple[int, float, int, int]:
     """Integrate a chain over the samples t.
@@ -547,11 +521,12 @@ def integrate(
     tol, order, max_steps
         Truncation of a step relative to the motion so far; order of the series; bound on steps.
     directions : (p, 2) array
-        What derivatives are carried along: spring and its own parameter, or HEIGHT, or -1 and DRAG.
+        What derivatives are carried along: spring and its own parameter, or OWN_HEIGHT, or -1 and
+        DRAG.
     start : (1 + p, springs or 0) array
         The strains from which the springs start, never loaded before, and their derivatives; none
         where they start from rest.
-    out_w, out_s, out_dw, out_ds : arrays
+    curves, slopes : arrays
         Filled; see `Samples`. The derivatives have p = 0 where none are wanted.
     log : (m, 5) array
         Filled with the switches: time, spring, branch left, branch entered, strain.
@@ -561,23 +536,25 @@ def integrate(
     tuple
         Outcome, end of contact (NaN if none), steps taken, switches (also those past the log).
     """
-    count, size = rows.shape[0], directions.shape[0]
+    count, groups, size = rows.shape[0], ends.size, directions.shape[0]
     struck, tangent = speed > 0.0, size > 0
-    links = Links(np.empty((count, N_LAW)), np.empty(count), heights, ends, mass, drag, top)
-    s = make_series(count, ends.size, order)
-    d = make_tangents(count, ends.size, order, directions)
-    out = Samples(t, out_w, out_s, out_dw, out_ds)
+    links = Links(np.empty((count, N_LAW)), ends, mass, drag, top)
+    law, out = links.law, Samples(t, curves, slopes)
+    s, d = make_series(count, order, directions)
     branches = np.empty(count, np.int64)
-    scratch, late = np.zeros(order + 1), np.zeros(size)
-    given, places = np.zeros((2, 2)), np.zeros((2, out_w.shape[0]))
-    push, motion, rate, w_end = given[0], given[1], places[0], places[1]
-    begin(rows, start, speed, directions, branches, links, s, d)
+    room = np.empty((6, max(order + 1, max(size, curves.shape[0]))))
+    c, push, motion = room[3], room[4], room[5]
+    push[0] = push[1] = 0.0
+    begin(rows, heights, start, directions, branches, law, s, d)
     bare = is_bare(links)
     w_scale, s_scale, pressed, knot, stalled = 0.0, 0.0, False, 0, 0
     switches = count - count  # a whole number, and no constant: one type to compile for
     now, done = (0.0 if struck else t[0]), 0
     if struck:
-        done = _fill_before(out, speed)
+        s[V, groups - 1, 0] = speed
+        done = before_contact(curves, t, speed)
+        for p in range(size):
+            before_contact(slopes[p], t, 0.0)
     for step in range(max_steps):
         if done == t.size:
             return DONE, math.nan, step, switches
@@ -593,14 +570,14 @@ def integrate(
             return FLAT_UNDER_STRESS, math.nan, step, switches
         if step > 0:
             s_scale = _loaded(s, s_scale)
-        span = step_length(links, s, push, order, tol, horizon - now, w_scale, s_scale)
-        if not math.isfinite(span) or not math.isfinite(s.group[0, order]):
+        free = step_length(links, s, push, order, tol, horizon - now, w_scale, s_scale)
+        if not math.isfinite(free) or not math.isfinite(s[GROUP, 0, order]):
             return NOT_FINITE, math.nan, step, switches
-        span, spring, side = _first_switch(links, s, order, span)
+        span, spring, side = first_switch(law, s, order, free)
         leaves = False
         if struck:
-            pressed = pressed or s.group[0, 0] > tol * s_scale
-            span, leaves = _first_lift(s, order, step == 0, pressed, span)
+            pressed = pressed or s[GROUP, 0, 0] > tol * s_scale
+            span, leaves = first_lift(s, order, step == 0, pressed, span)
             spring = -1 if leaves else spring
         end = now + span
         stalled = stalled + 1 if span == 0.0 else 0
@@ -608,34 +585,33 @@ def integrate(
             return STEP_UNDERFLOW, math.nan, step, switches
         last = end >= horizon and not leaves and spring < 0
         end = horizon if last else end
-        enough = _enough(s, order, span, 1e-3 * tol)
-        more = min(enough + 2, order)  # for what is, in time, a derivative of these
+        least = order
+        if span < free:
+            least = _enough(law, s, order, span, 1e-3 * tol, w_scale, s_scale)
+        more = min(least + 2, order)  # for what is, in time, a derivative of these
         if tangent:
             expand_tangents(links, s, d, more)
         if top == MOTION and knot > 0 and fresh:
             _mend_kink(out, s, d, knot)
-        first = done
-        while done < t.size and (t[done] < end or (last and t[done] <= end)):
-            done += 1
+        first, done = done, first_past(t, done, end, last)
         if first < done:
-            sample(links, s, enough, out, first, done, now, scratch)
+            sample(links, s, least, out, first, done, now, c)
         if tangent:
-            sample_tangents(links, s, d, more, out, first, done, now, scratch)
-            _delay(s, d, more, span, late)
-        now = end
+            sample_tangents(links, s, d, more, out, first, done, now, c)
         if leaves:
-            depart(links, s, d, order, more, span, now, late, rate, w_end, out, done)
-            return DONE, now, step + 1, switches
-        advance(s, order, span)
+            depart(links, s, d, order, more, span, end, out, done, room)
+            return DONE, end, step + 1, switches
+        now = end
+        advance(s, groups, order, span)
         if tangent:
-            advance_tangents(d, more, span)
+            advance_tangents(d, groups, more, span)
         w_scale, total = _reached(links, s, w_scale)
         if not math.isfinite(total):
             return NOT_FINITE, math.nan, step, switches
         settle(links, s)
         if spring >= 0:
             switches = switch(
-                rows, branches, links, s, d, directions, order, span, now, spring, side,
+                rows, branches, law, s, d, directions, order, span, now, spring, side,
                 log, switches,
             )  # fmt: skip
     return TOO_MANY_STEPS, math.nan, max_steps, switches

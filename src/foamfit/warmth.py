@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -23,8 +24,8 @@ Call = tuple[Any, tuple[Any, ...]]
 class _Calls(NamedTuple):
     """Functions to compile, with examples of their arguments.
 
-    `pieces` of the integrator and the `rest` are made by the other process; `own` pieces and the
-    integrator itself, `whole`, by this one.
+    `pieces` of the integrator are made by the other process, and then the `rest`, those first that
+    an impact needs; `own` pieces and the integrator itself, `whole`, by this one.
     """
 
     pieces: list[Call]
@@ -39,60 +40,42 @@ def _calls() -> _Calls:
     one, flat, cube = np.zeros(1), np.zeros((1, 1)), np.zeros((1, 1, 1))
     whole, table = np.zeros(1, np.int64), np.zeros((1, 1), np.int64)
     directions = np.zeros((0, 2), np.int64)
-    links = series.Links(flat, one, one, whole, one, 0.0, taylor.FREE)
-    s = series.make_series.py_func(1, 1, 6)
-    d = series.make_tangents.py_func(1, 1, 6, directions)
-    out = taylor.Samples(one, flat, one, cube, flat)
-    samples = (out, 0, 0, 0.0, one)
-    curves = (flat, one, cube, flat, flat)
+    links = series.Links(flat, whole, one, 0.0, taylor.FREE)
+    _, d = series.make_series.py_func(1, 6, directions)
+    out = taylor.Samples(one, flat, cube)
+    scene = (flat, one, whole, one, 0.0, 0, one, 0.0, one, 0.0, 0, 0, directions, flat)
     return _Calls(
         pieces=[
-            (series.expand_tangents, (links, s, d, 0)),
+            (series.expand_tangents, (links, cube, d, 0)),
             (polynomial.first_crossing, (one, 0, 0.0, 0.0, 0.0)),
-            (taylor.sample, (links, s, 0, *samples)),
-            (taylor.sample_tangents, (links, s, d, 0, *samples)),
-            (taylor.depart, (links, s, d, 0, 0, 0.0, 0.0, one, one, one, out, 0)),
+            (taylor.sample, (links, cube, 0, out, 0, 0, 0.0, one)),
+            (taylor.sample_tangents, (links, cube, d, 0, out, 0, 0, 0.0, one)),
+            (taylor.depart, (links, cube, d, 0, 0, 0.0, 0.0, out, 0, flat)),
+            (taylor.first_switch, (flat, cube, 0, 0.0)),
+            (taylor.first_lift, (cube, 0, True, True, 0.0)),
+            (taylor.switch, (flat, whole, flat, cube, d, directions, 0, 0.0, 0.0, 0, 0, flat, 0)),
+            (taylor.before_contact, (flat, one, 0.0)),
         ],
         rest=[
+            (kernels.fault, (one,)),
             (kernels.fill_rows, (whole, one, flat)),
-            (kernels.equilibrium_along, (flat, one, one, one, flat, table)),
-            (series.equilibrium_tangents, (flat, one, flat, table, True, directions)),
             (ringing.parts_faintly, (flat, one, 0.0)),
             (ringing.hurry_of, (flat, one, whole, one, 0.0, 0, 0.0, one)),
-            (kernels.strains_along, (flat, one, flat, table)),
             (kernels.total, (one,)),
-            (kernels.fault, (one,)),
+            (kernels.strains_along, (flat, one, flat, table)),
+            (kernels.equilibrium_along, (flat, one, one, one, flat, table)),
+            (series.equilibrium_tangents, (flat, one, flat, table, True, directions)),
         ],
         own=[
-            (series.expand, (links, s, one, one, 0)),
-            (series.make_tangents, (1, 1, 0, directions)),
-            (taylor.begin, (flat, flat, 0.0, directions, whole, links, s, d)),
-            (taylor.switch, (flat, whole, links, s, d, directions, 0, 0.0, 0.0, 0, 0, flat, 0)),
-            (taylor.step_length, (links, s, one, 0, 0.0, 0.0, 0.0, 0.0)),
-            (taylor.settle, (links, s)),
+            (series.expand, (links, cube, one, one, 0)),
+            (series.make_series, (1, 0, directions)),
+            (taylor.begin, (flat, one, flat, directions, whole, flat, cube, d)),
+            (series.expand_bare, (links, cube, one, 0)),
+            (series.advance_tangents, (d, 0, 0, 0.0)),
+            (taylor.step_length, (links, cube, one, 0, 0.0, 0.0, 0.0, 0.0)),
+            (taylor.settle, (links, cube)),
         ],
-        whole=[
-            (
-                taylor.integrate,
-                (
-                    flat,
-                    one,
-                    whole,
-                    one,
-                    0.0,
-                    0,
-                    one,
-                    0.0,
-                    one,
-                    0.0,
-                    0,
-                    0,
-                    directions,
-                    flat,
-                    *curves,
-                ),
-            )
-        ],
+        whole=[(taylor.integrate, (*scene, flat, cube, flat))],
     )
 
 
@@ -112,7 +95,7 @@ def compiled() -> bool:
 
 @contextmanager
 def side_by_side() -> Iterator[Callable[[], None]]:
-    """Let another process compile while the body prepares; then call what is given for the rest.
+    """Let another process compile beside the body, which calls what is given before it simulates.
 
     At the end all that a fit needs is in the cache. The other process is stopped if the body fails.
     """
@@ -139,6 +122,7 @@ def side_by_side() -> Iterator[Callable[[], None]]:
 
 
 def _other() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that started this one
     gc.disable()  # what is made here stays
     calls = _calls()
     _compile(calls.pieces)
