@@ -99,7 +99,7 @@ class Masses(np.ndarray):
         return super().__getitem__(key)
 
 
-# Where a dashpot is kept with the branch of its spring, the arithmetic with it is seen by the lines run.
+# Dashpots are kept with the branches of their springs: the lines that reckon with them are seen.
 DASHPOT = re.compile(r"[*/] *\(?[\w.]*(rows\[\w+, ETA|law\[\w+, DASHPOT)|, (ETA|DASHPOT)\] *[*/]")
 
 
