@@ -32,7 +32,7 @@ def test_a_fit_calls_what_was_compiled_and_nothing_else() -> None:
     ff.fit(ff.read_test(RECONSTRUCTION), starts=2)
     calls = warmth._calls()
     of_python = {
-        taylor.integrate, kernels.fill_rows, kernels.equilibrium_along,
+        taylor.integrate, kernels.fill_rows, kernels.stress_along,
         series.equilibrium_tangents, kernels.fault, kernels.total,
     }  # fmt: skip
     examples = {function: signature(arguments) for function, arguments in calls.whole + calls.rest}

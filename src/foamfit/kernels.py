@@ -468,11 +468,6 @@ def equilibrium_along(
     Fills the common stress (n,), the strains and the branches (springs, n).
     """
     count, n = rows.shape[0], top.size
-    if count == 1:
-        for j in range(n):
-            eps[0, j] = top[j] / heights[0]
-        _follow_strain(rows[0], eps[0], sigma, history[0])
-        return
     branches = np.empty(count, np.int64)
     now = np.empty(count)
     for i in range(count):

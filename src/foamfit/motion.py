@@ -158,23 +158,13 @@ class Plan(NamedTuple):
         self, rows: Array, heights: Array, everything: bool, directions: Directions
     ) -> Motion:
         """Undamped and massless: one stress in all springs; or one spring under known motion."""
-        moved, count = self.top == taylor.MOTION, len(heights)
-        as_one = moved and count >= LEAST_ELONGATED and bool(aggregate.holds(rows))
-        wanted = everything or not as_one or len(directions) > 0
-        strain = np.empty((count if wanted else 0, self.time.size))
-        branches = np.empty(strain.shape, np.int64)
-        stress = np.array(self.values)
-        if as_one and not aggregate.equilibrium_along(
-            rows, heights, self.values, stress, strain, branches
-        ):
-            as_one, strain = False, np.empty((count, self.time.size))
-            branches = np.empty(strain.shape, np.int64)
-        if moved and not as_one:
-            kernels.equilibrium_along(rows, heights, self.values, stress, strain, branches)
-            miss = np.abs(heights @ strain - self.values).max()
-            if not miss <= 1e-9 * (self.height + np.abs(self.values).max()):
-                raise SimulationError(_OUTCOMES[taylor.NOT_FINITE])
-        elif not moved:
+        moved = self.top == taylor.MOTION
+        if moved:
+            wanted = everything or len(directions) > 0
+            stress, strain, branches = self._stretched(rows, heights, wanted)
+        else:
+            stress = np.array(self.values)
+            strain, branches = _room(len(heights), self.time.size)
             kernels.strains_along(rows, stress, strain, branches)
         slopes: Slopes | None = None
         if len(directions):
@@ -200,6 +190,27 @@ class Plan(NamedTuple):
         nodes = np.cumsum(heights[:, None] * strain, axis=0)
         switches = _switches(self.time, strain, branches)
         return Motion(nodes, stress, math.nan, switches, 0, CLOSED_FORM, slopes)
+
+    def _stretched(
+        self, rows: Array, heights: Array, wanted: bool
+    ) -> tuple[Array, Array, NDArray[np.int64]]:
+        """Stress, strains and branches (the last two if `wanted`) under a known motion."""
+        count, n = len(heights), self.time.size
+        if count == 1:
+            strain = self.values / heights
+            stress, history = kernels.stress_along(rows[0], strain)
+            return stress, strain[None, :], history[None, :]
+        stress = np.empty(n)
+        if count >= LEAST_ELONGATED and aggregate.holds(rows):
+            strain, branches = _room(count if wanted else 0, n)
+            if aggregate.equilibrium_along(rows, heights, self.values, stress, strain, branches):
+                return stress, strain, branches
+        strain, branches = _room(count, n)
+        kernels.equilibrium_along(rows, heights, self.values, stress, strain, branches)
+        miss = np.abs(heights @ strain - self.values).max()
+        if not miss <= 1e-9 * (self.height + np.abs(self.values).max()):
+            raise SimulationError(_OUTCOMES[taylor.NOT_FINITE])
+        return stress, strain, branches
 
     def _aggregate(
         self, rows: Array, heights: Array, rtol: float, drag: float, curves: Array
@@ -296,9 +307,7 @@ class Plan(NamedTuple):
         start = np.zeros((1 + len(directions), len(heights)))
         first = self.ends[-2] if len(self.ends) > 1 else 0
         rows, heights, moved = rows[first:], heights[first:], self.top == taylor.MOTION
-        strain = np.empty((len(heights), 1))
-        branches = np.empty(strain.shape, np.int64)
-        stress = self.values[:1].copy()
+        stress, (strain, branches) = self.values[:1].copy(), _room(len(heights), 1)
         if moved:
             kernels.equilibrium_along(rows, heights, self.values[:1], stress, strain, branches)
         else:
@@ -346,7 +355,12 @@ class Plan(NamedTuple):
         return bool(vibration > MOST_VIBRATION or relaxation > MOST_RELAXATION)
 
 
-def _switches(time: Array, strain: Array, branches: NDArray[np.int64]) -> Array:
+def _room(count: int, n: int) -> tuple[Array, NDArray[np.int64]]:
+    """Room for the strains and branches of springs along a history."""
+    return np.empty((count, n)), np.empty((count, n), np.int64)
+
+
+def _switches(time: Array, strain: Array, branches: Directions) -> Array:
     """List the changes of branch between samples, at the later sample."""
     springs, samples = np.nonzero(np.diff(branches, axis=1))
     order = np.argsort(samples, kind="stable")

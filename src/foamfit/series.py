@@ -39,6 +39,7 @@ from foamfit.kernels import (
     inner,
     interval,
     maker,
+    once,
     piece,
 )
 from foamfit.law import BISTABLE
@@ -522,7 +523,7 @@ def _group_tangent(links: Links, s: Array, m: Array, drag: float, d: Array, g: i
         d[GROUP, g, n] = _share_tangent(law, tilt, d, i0, i1, rest, n)
 
 
-@inner
+@once
 def _expand_tangent(links: Links, s: Array, m: Array, drag: float, d: Array, order: int) -> None:
     """Fill the derivatives in one direction, that moves `m` and `drag`, up to `order`."""
     law, last = links.law, links.ends.size - 1

@@ -355,7 +355,7 @@ def _slope_now(law: Array, i: int, eps: float) -> float:
     return k / (y * y) if law[i, CURVED] != 0.0 else k
 
 
-@piece
+@inner
 def switch(
     rows: Array,
     branches: Branches,

@@ -24,8 +24,8 @@ Call = tuple[Any, tuple[Any, ...]]
 class _Calls(NamedTuple):
     """Functions to compile, with examples of their arguments.
 
-    `pieces` of the integrator are made by the other process, and then the `rest`, those first that
-    an impact needs; `own` pieces and the integrator itself, `whole`, by this one.
+    `pieces` of the integrator are made by the other process, and then the `rest`, those last that
+    an impact on one spring does not need; `own` pieces and the integrator itself, `whole`, by this.
     """
 
     pieces: list[Call]
@@ -53,23 +53,24 @@ def _calls() -> _Calls:
             (taylor.depart, (links, cube, d, 0, 0, 0.0, 0.0, out, 0, flat)),
             (taylor.first_switch, (flat, cube, 0, 0.0)),
             (taylor.first_lift, (cube, 0, True, True, 0.0)),
-            (taylor.switch, (flat, whole, flat, cube, d, directions, 0, 0.0, 0.0, 0, 0, flat, 0)),
             (taylor.before_contact, (flat, one, 0.0)),
         ],
         rest=[
             (kernels.fault, (one,)),
             (kernels.fill_rows, (whole, one, flat)),
+            (kernels.total, (one,)),
+            (kernels.stress_along, (one, one)),
+            (series.equilibrium_tangents, (flat, one, flat, table, True, directions)),
             (ringing.parts_faintly, (flat, one, 0.0)),
             (ringing.hurry_of, (flat, one, whole, one, 0.0, 0, 0.0, one)),
-            (kernels.total, (one,)),
             (kernels.strains_along, (flat, one, flat, table)),
             (kernels.equilibrium_along, (flat, one, one, one, flat, table)),
-            (series.equilibrium_tangents, (flat, one, flat, table, True, directions)),
         ],
         own=[
             (series.expand, (links, cube, one, one, 0)),
             (series.make_series, (1, 0, directions)),
             (taylor.begin, (flat, one, flat, directions, whole, flat, cube, d)),
+            (taylor.switch, (flat, whole, flat, cube, d, directions, 0, 0.0, 0.0, 0, 0, flat, 0)),
             (series.expand_bare, (links, cube, one, 0)),
             (series.advance_tangents, (d, 0, 0, 0.0)),
             (taylor.step_length, (links, cube, one, 0, 0.0, 0.0, 0.0, 0.0)),
