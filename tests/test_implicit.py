@@ -312,7 +312,7 @@ def test_explicit_steps_that_fail_are_taken_over(monkeypatch: pytest.MonkeyPatch
 
 def test_the_bound_on_steps() -> None:
     scene = struck("foam-2", 1e-2)
-    few = plan(built(scene[0]), scene[1], TIME)._replace(implicit=True, max_steps=5)
+    few = plan(built(scene[0]), scene[1], TIME, max_steps=5)._replace(implicit=True)
     rows = np.array([spring.row for spring in built(scene[0]).springs])
     with pytest.raises(ff.SimulationError, match="bound of 5 steps"):
         few.run(rows, np.array(scene[0].heights))

@@ -107,7 +107,7 @@ def test_vibrations_that_cannot_be_followed_are_refused_by_size() -> None:
     motion = plan(chain, drive, time).run(rows, np.array(chain.heights), 1e-9)
     assert motion.method == "Radau IIA"
     assert 1e-9 < motion.unresolved < 1e-2
-    few = plan(chain, drive, time)._replace(max_steps=20_000)  # explicit: not enough
+    few = plan(chain, drive, time, max_steps=20_000)  # explicit: not enough
     with pytest.raises(ff.SimulationError, match="ask for no smaller rtol") as refusal:
         simulation._verified(few, rows, np.array(chain.heights), 1e-9)
     assert f"{motion.unresolved:.1g}" in str(refusal.value)

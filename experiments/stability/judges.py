@@ -168,9 +168,8 @@ def bare(scene: Scene, rtol: float, implicit: bool | None = None, most: int = MO
     `most` bounds steps times springs.
     """
     chain, drive, time = scene
-    made = plan(chain, drive, time)._replace(
-        implicit=implicit, max_steps=most // len(chain.springs) + time.size
-    )
+    max_steps = most // len(chain.springs) + time.size
+    made = plan(chain, drive, time, max_steps=max_steps)._replace(implicit=implicit)
     rows = np.array([spring.row for spring in chain.springs])
     return made.run(rows, np.array(chain.heights), rtol)
 

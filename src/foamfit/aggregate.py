@@ -44,7 +44,14 @@ from foamfit.kernels import (
     stress_interval,
 )
 from foamfit.law import BISTABLE, UNILATERAL
-from foamfit.polynomial import fill_values, first_crossing, value_and_slope, value_at
+from foamfit.polynomial import (
+    LEAST_TRUNCATION,
+    fill_values,
+    first_crossing,
+    order_for,
+    value_and_slope,
+    value_at,
+)
 from foamfit.taylor import (
     DONE,
     NOT_FINITE,
@@ -381,7 +388,6 @@ def integrate_aggregate(
     speed: float,
     t: Array,
     tol: float,
-    order: int,
     max_steps: int,
     curves: Array,
     log: Array,
@@ -401,9 +407,8 @@ def integrate_aggregate(
         Velocity of the striker at contact, at the time 0, m/s.
     t : (n,) array
         Samples, s.
-    tol, order, max_steps
-        Truncation of a step relative to the motion; most orders of the series, at most DEGREE;
-        bound on steps.
+    tol, max_steps
+        Truncation of a step relative to the motion; bound on steps.
     curves : (1 + springs or 1, n) array
         Filled with the base stress, Pa, and the displacements above each spring, or of the top
         alone, m.
@@ -415,9 +420,11 @@ def integrate_aggregate(
     Returns
     -------
     tuple
-        Outcome, end of contact (NaN if none), steps taken, switches (also those past the log).
+        Outcome, end of contact (NaN if none; where there is no answer, how far it came), steps
+        taken, switches (also those past the log).
     """
-    count, group = heights.size, _make_group(rows, heights)
+    tol = max(tol, LEAST_TRUNCATION)
+    count, group, order = heights.size, _make_group(rows, heights), order_for(tol, DEGREE)
     now = Step(
         np.zeros(order + 1), np.zeros(order + 1), np.zeros(order + 1),
         np.zeros((order + 1, order + 1)), np.zeros(DEGREE + 1),
@@ -439,12 +446,12 @@ def integrate_aggregate(
         )
         effort[1] += n
         if not math.isfinite(span) or not math.isfinite(now.s[n]):
-            return NOT_FINITE, math.nan, step, switches
+            return NOT_FINITE, begin, step, switches
         span, side = first_crossing(now.s, n, low, high, span)
         end = begin + span
         stalled = stalled + 1 if end <= begin else 0
         if stalled > 4 * count + 8:
-            return STEP_UNDERFLOW, math.nan, step, switches
+            return STEP_UNDERFLOW, begin, step, switches
         last = end >= horizon and side == 0
         first, done = done, first_past(t, done, horizon if last else end, last)
         _sample(group, now, n, t, first, done, begin, curves)
@@ -467,7 +474,7 @@ def integrate_aggregate(
             if abs(stress - group.place[ANCHOR]) >= reach * (1.0 - 1e-12):
                 _anchor(group, stress, side > 0)
                 effort[0] += 1
-    return TOO_MANY_STEPS, math.nan, max_steps, switches
+    return TOO_MANY_STEPS, begin, max_steps, switches
 
 
 # ---------------------------------------------------------------- a known elongation

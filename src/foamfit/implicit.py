@@ -780,7 +780,7 @@ def _follow(
                 push = values[knot] + new_rate * (now - t[knot])
             rate = new_rate
         if top == STRESS and _is_flat(body, state, i0):
-            return FLAT_UNDER_STRESS, math.nan, step, switches
+            return FLAT_UNDER_STRESS, now, step, switches
         base0 = _base_stress(
             rows, state.branches, heights, state.eps0, first, groups > 1, top,
             0.0 if groups == 1 and top in (STRESS, VISCOUS) else state.v0[first - 1], drag, push,
@@ -799,7 +799,7 @@ def _follow(
             base0, pressed, tally,
         )  # fmt: skip
         if outcome != DONE:
-            return outcome, math.nan, step, switches
+            return outcome, now, step, switches
         leaves = arrived and target == count
         stalled += 1
         if span > 0.0 and now + span > now:
@@ -814,7 +814,7 @@ def _follow(
             _record(now, span, begun, done, state, curves, out)
             if tangent:
                 if not linearise(body, state, span, at, d):
-                    return NOT_FINITE, math.nan, step, switches
+                    return NOT_FINITE, now, step, switches
                 _record_tangents(now, span, begun, done, d, out)
                 _carry_tangents(body, span, d)
             if scene.fast:
@@ -831,7 +831,7 @@ def _follow(
             now = end
             _hold_back(span, last, scene, pace)
         elif stalled > 4 * count + 8:
-            return STEP_UNDERFLOW, math.nan, step, switches
+            return STEP_UNDERFLOW, now, step, switches
         if not arrived:
             continue
         if not leaves:
@@ -842,7 +842,7 @@ def _follow(
         if leaves:
             _leave(body, state, at, v, fall, now, done, d, out, w_end)
             return DONE, now, step, switches
-    return TOO_MANY_STEPS, math.nan, max_steps, switches
+    return TOO_MANY_STEPS, now, max_steps, switches
 
 
 @compiled
@@ -878,7 +878,8 @@ def integrate_implicit(
     Returns
     -------
     tuple
-        Outcome, end of contact (NaN if none), steps taken, switches (also those past the log).
+        Outcome, end of contact (NaN if none; where there is no answer, how far it came), steps
+        taken, switches (also those past the log).
     """
     count, groups = rows.shape[0], ends.size
     areal = np.zeros(count)

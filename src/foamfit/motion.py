@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -28,9 +27,18 @@ MOST_RELAXATION, MOST_VIBRATION, MOST_EXPLICIT = 1e4, 1e5, 200_000
 # Bounds on steps times springs (seconds, not hours): for all but the samples of a drive, before
 # explicit steps are given up, and for everything.
 MOST_WORK, MOST_EXPLICIT_WORK, MOST_SAMPLED = 1_500_000, 500_000, 10_000_000
+# Truncation of a step over the wanted error: of explicit steps with masses inside, in any other
+# impact and along a drive, where there are few and a margin costs little; of implicit steps with
+# masses inside and without; of springs that count as one, whose errors add up.
+OF_MASSES, OF_IMPACT, ALONG_DRIVE = 1e-2, 1e-3, 1e-4
+OF_MASSES_IMPLICIT, IMPLICIT, AS_ONE = 3e-2, 3e-4, 1e-4
+# Truncation of implicit steps that rounding leaves room for.
+LEAST_IMPLICIT = 1e-14
 # From so many springs on, those that carry one stress count as one: in an impact, and where their
 # elongation is prescribed.
 LEAST_AGGREGATE, LEAST_ELONGATED = 9, 3
+# Switches that are kept, of springs that do not count as one.
+LOGGED = 1024
 
 _OUTCOMES = {
     taylor.TOO_MANY_STEPS: "the bound of {steps} steps was reached: something in the scene is "
@@ -48,7 +56,10 @@ _OUTCOMES = {
 NO_DIRECTIONS: Directions = np.empty((0, 2), np.int64)
 NO_SWITCHES = np.empty((0, 5))
 _NOTHING = np.zeros(1)
-_AT_REST = np.zeros((1, 0))
+# Tops under which springs start from rest, and what they start from.
+_RESTING, _AT_REST = (taylor.FREE, taylor.VISCOUS), np.zeros((1, 0))
+# Outcomes of explicit steps after which implicit ones are tried.
+_WRONG_TOOL = (taylor.TOO_MANY_STEPS, taylor.STEP_UNDERFLOW)
 NO_SLOPES = np.empty((0, 0, 0))
 
 
@@ -72,13 +83,6 @@ class Motion(NamedTuple):
     unresolved: float = 0.0  # vibrations that were damped out, relative to the ranges
 
 
-@lru_cache(maxsize=64)
-def accuracy(tolerance: float, most: int) -> tuple[float, int]:
-    """Truncation of a step and the order of series that fits it, at most `most`."""
-    tolerance = max(tolerance, 1e-16)
-    return tolerance, min(max(round(4.0 - 0.5 * math.log(tolerance)), 6), most)
-
-
 class Plan(NamedTuple):
     """A scene made ready to run many times with other springs: what does not change between runs.
 
@@ -98,10 +102,12 @@ class Plan(NamedTuple):
         The drive and its samples.
     speed : float
         Velocity of the striker, m/s; 0 = no impact.
-    max_steps : int
-        Bound on the steps of the integrator.
-    lossless : bool
-        Whether there is neither a dashpot nor a mass inside.
+    margin : float
+        Truncation of an explicit step over the wanted error.
+    max_steps, max_explicit : int
+        Bounds on steps, and on explicit ones that implicit ones may take over from.
+    plain : bool
+        Whether one mass bounces once: it has neither dashpot nor damper, nor a mass inside.
     implicit : bool or None
         Whether to take implicit steps; None = where explicit ones are the wrong tool.
     """
@@ -115,8 +121,10 @@ class Plan(NamedTuple):
     values: Array
     time: Array
     speed: float
-    max_steps: int = MAX_STEPS
-    lossless: bool = False
+    margin: float
+    max_steps: int
+    max_explicit: int
+    plain: bool = False
     implicit: bool | None = None
 
     def run(
@@ -132,27 +140,42 @@ class Plan(NamedTuple):
         """Run the scene with the springs in `rows` (n_springs, columns) and their heights (m).
 
         `drag` replaces the scene's own. With `everything` false only the base stress and the
-        displacement of the top, shape (1, n_t), are sure to be there. `directions` (p, 2) are those
-        of the derivatives to carry along; see `foamfit.series`.
+        displacement of the top, shape (1, n_t), are sure to be there, and no switches. `directions`
+        (p, 2) are those of the derivatives to carry along; see `foamfit.series`.
 
         Raises
         ------
         SimulationError
             If the scene has no finite answer; the message says why.
         """
-        drag = self.drag if drag is None else drag
         if self.solver == CLOSED_FORM:
             return self._closed_form(rows, heights, everything, directions)
-        p, nodes, n = len(directions), len(heights) if everything else 1, self.time.size
-        curves = np.empty((1 + nodes, n))
-        slopes = np.empty((p, 1 + nodes, n)) if p else NO_SLOPES
-        if not self._is_stiff(rows, heights, drag):
-            if p == 0 and len(rows) >= LEAST_AGGREGATE and self._is_one(rows):
-                return self._aggregate(rows, heights, rtol, drag, curves)
-            motion = self._explicit(rows, heights, rtol, drag, directions, curves, slopes)
-            if motion is not None:
-                return motion
-        return self._implicit(rows, heights, rtol, drag, directions, curves, slopes)
+        p, time = len(directions), self.time
+        curves = np.empty((1 + len(heights) if everything else 2, time.size))
+        slopes = np.empty((p, *curves.shape)) if p else NO_SLOPES
+        bounces = self.plain and not drag and self.implicit is None
+        stiff = not bounces and self._is_stiff(rows, heights, drag)
+        drag = self.drag if drag is None else drag
+        if p == 0 and not stiff and len(heights) >= LEAST_AGGREGATE and self._is_one(rows):
+            return self._aggregate(rows, heights, rtol, drag, curves)
+        start = _AT_REST if self.top in _RESTING else self._start(rows, heights, directions)
+        log = np.empty((LOGGED, 5)) if everything else NO_SWITCHES
+        if not stiff:
+            ending = taylor.integrate(
+                rows, heights, self.ends, self.mass, drag, self.top, self.values, self.speed, time,
+                self.margin * rtol, self.max_explicit if self.implicit is None else self.max_steps,
+                directions, start, curves, slopes, log,
+            )  # fmt: skip
+            if self.implicit is False or ending[0] not in _WRONG_TOOL:
+                return _motion(TAYLOR, ending, curves, slopes, log)
+        margin = OF_MASSES_IMPLICIT if len(self.ends) > 1 else IMPLICIT
+        lost = np.zeros(1)
+        ending = implicit.integrate_implicit(
+            rows, heights, self.ends, self.mass, drag, self.top, self.values, self.speed, time,
+            max(margin * rtol, LEAST_IMPLICIT), self.max_steps, directions, start, curves, slopes,
+            log, np.zeros(2, np.int64), rtol, lost,
+        )  # fmt: skip
+        return _motion(RADAU, ending, curves, slopes, log, float(lost[0]))
 
     def _closed_form(
         self, rows: Array, heights: Array, everything: bool, directions: Directions
@@ -215,95 +238,16 @@ class Plan(NamedTuple):
     def _aggregate(
         self, rows: Array, heights: Array, rtol: float, drag: float, curves: Array
     ) -> Motion:
-        """Springs under one stress count as one.
-
-        One step to a switch: the errors of many add up, and one order more costs little.
-        """
-        log = np.empty((4 * len(heights) + 64, 5))
-        tolerance, order = accuracy(1e-4 * rtol / len(heights), aggregate.DEGREE)
+        """Springs under one stress count as one: one step to a switch."""
+        log, tolerance = np.empty((4 * len(heights) + 64, 5)), AS_ONE * rtol / len(heights)
         ending = aggregate.integrate_aggregate(
-            rows, heights, self.mass[0], drag, self.speed, self.time, tolerance, order,
-            self.max_steps, curves, log, np.zeros(2, np.int64),
+            rows, heights, self.mass[0], drag, self.speed, self.time, tolerance, self.max_steps,
+            curves, log, np.zeros(2, np.int64),
         )  # fmt: skip
-        return self._motion(AGGREGATE, ending, curves, log)
-
-    def _explicit(
-        self,
-        rows: Array,
-        heights: Array,
-        rtol: float,
-        drag: float,
-        directions: Directions,
-        curves: Array,
-        slopes: Array,
-    ) -> Motion | None:
-        """Taylor series from switch to switch; None if they turn out to be the wrong tool."""
-        log = np.empty((1024, 5))
-        # Without an interior mass there are few steps: a margin costs little.
-        margin = 1e-2 if len(self.ends) > 1 else 1e-3 if self.speed > 0.0 else 1e-4
-        tolerance, order = accuracy(margin * rtol, 24)
-        count = len(heights)
-        most = self._most_steps(count)
-        if self.implicit is None:
-            most = min(most, min(MOST_EXPLICIT, MOST_EXPLICIT_WORK // count) + 20 * self.time.size)
-        ending = taylor.integrate(
-            rows, heights, self.ends, self.mass, drag, self.top, self.values, self.speed, self.time,
-            tolerance, order, most, directions, self._start(rows, heights, directions),
-            curves, slopes, log,
-        )  # fmt: skip
-        if self.implicit is None and ending[0] in (taylor.TOO_MANY_STEPS, taylor.STEP_UNDERFLOW):
-            return None
-        return self._motion(TAYLOR, ending, curves, log, slopes)
-
-    def _implicit(
-        self,
-        rows: Array,
-        heights: Array,
-        rtol: float,
-        drag: float,
-        directions: Directions,
-        curves: Array,
-        slopes: Array,
-    ) -> Motion:
-        """Radau's implicit steps, which need not follow what is long over."""
-        log, lost = np.empty((1024, 5)), np.zeros(1)
-        tolerance = max((3e-2 if len(self.ends) > 1 else 3e-4) * rtol, 1e-14)
-        ending = implicit.integrate_implicit(
-            rows, heights, self.ends, self.mass, drag, self.top, self.values, self.speed, self.time,
-            tolerance, self._most_steps(len(heights)), directions,
-            self._start(rows, heights, directions), curves, slopes, log, np.zeros(2, np.int64),
-            rtol, lost,
-        )  # fmt: skip
-        return self._motion(RADAU, ending, curves, log, slopes, float(lost[0]))
-
-    def _most_steps(self, count: int) -> int:
-        """Bound on the steps of a chain of so many springs."""
-        most = MOST_WORK // count + 2 * self.time.size + 8 * count
-        return max(min(self.max_steps, most, MOST_SAMPLED // count), 1)
-
-    def _motion(
-        self,
-        method: str,
-        ending: tuple[int, float, int, int],
-        curves: Array,
-        log: Array,
-        slopes: Array = NO_SLOPES,
-        unresolved: float = 0.0,
-    ) -> Motion:
-        """Gather what an integrator found, or say why it found nothing."""
-        outcome, contact_end, steps, switches = ending
-        if outcome != taylor.DONE:
-            last = log[min(switches, len(log)) - 1, 0] if switches else self.time[0]
-            raise SimulationError(_OUTCOMES[outcome].format(steps=steps, time=last))
-        slope = Slopes(slopes[:, 1:], slopes[:, 0]) if len(slopes) else None
-        return Motion(
-            curves[1:], curves[0], contact_end, log[:switches], steps, method, slope, unresolved
-        )
+        return _motion(AGGREGATE, ending, curves, NO_SLOPES, log)
 
     def _start(self, rows: Array, heights: Array, directions: Directions) -> Array:
         """Strains (1 + p, springs) in equilibrium with the first sample, and their derivatives."""
-        if self.top in (taylor.FREE, taylor.VISCOUS):
-            return _AT_REST
         start = np.zeros((1 + len(directions), len(heights)))
         first = self.ends[-2] if len(self.ends) > 1 else 0
         rows, heights, moved = rows[first:], heights[first:], self.top == taylor.MOTION
@@ -343,16 +287,30 @@ class Plan(NamedTuple):
             rows, heights, self.ends, self.mass, drag, self.top, self.speed, self.time
         )
 
-    def _is_stiff(self, rows: Array, heights: Array, drag: float) -> bool:
+    def _is_stiff(self, rows: Array, heights: Array, drag: float | None) -> bool:
         """Tell whether explicit steps would have to follow what is long over."""
         if self.implicit is not None:
             return self.implicit
-        if self.lossless and drag == 0.0 and self.speed > 0.0:  # one mass bounces once
-            return False
         if self.speed > 0.0 and ringing.parts_faintly(rows, heights, self.mass[-1]):
             return True
-        vibration, relaxation = self.hurry(rows, heights, drag)
+        vibration, relaxation = self.hurry(rows, heights, self.drag if drag is None else drag)
         return bool(vibration > MOST_VIBRATION or relaxation > MOST_RELAXATION)
+
+
+def _motion(
+    method: str,
+    ending: tuple[int, float, int, int],
+    curves: Array,
+    slopes: Array,
+    log: Array,
+    unresolved: float = 0.0,
+) -> Motion:
+    """Gather what an integrator found, or say why it found nothing."""
+    outcome, time, steps, switches = ending
+    if outcome != taylor.DONE:
+        raise SimulationError(_OUTCOMES[outcome].format(steps=steps, time=time))
+    slope = None if slopes is NO_SLOPES else Slopes(slopes[:, 1:], slopes[:, 0])
+    return Motion(curves[1:], curves[0], time, log[:switches], steps, method, slope, unresolved)
 
 
 def _room(count: int, n: int) -> tuple[Array, NDArray[np.int64]]:
@@ -384,7 +342,14 @@ def _time(t: ArrayLike) -> Array:
     return time
 
 
-def plan(chain: Chain, drive: Drive, t: ArrayLike, *, dashpots: bool = False) -> Plan:
+def plan(
+    chain: Chain,
+    drive: Drive,
+    t: ArrayLike,
+    *,
+    dashpots: bool = False,
+    max_steps: int = MAX_STEPS,
+) -> Plan:
     """Find what a scene needs: the nodes that have a state, and the least solver.
 
     Parameters
@@ -397,6 +362,8 @@ def plan(chain: Chain, drive: Drive, t: ArrayLike, *, dashpots: bool = False) ->
         Samples, s, increasing.
     dashpots : bool
         Whether to reckon with a dashpot in every spring, also where it is zero.
+    max_steps : int
+        Bound on steps; there are others on steps times springs.
 
     Raises
     ------
@@ -434,6 +401,10 @@ def plan(chain: Chain, drive: Drive, t: ArrayLike, *, dashpots: bool = False) ->
         solver = FIRST_ORDER
     else:
         solver = CLOSED_FORM
+    count = len(chain.springs)
+    most = min(MOST_WORK // count + 2 * time.size + 8 * count, MOST_SAMPLED // count)
+    most = max(min(max_steps, most), 1)
+    explicit = min(MOST_EXPLICIT, MOST_EXPLICIT_WORK // count) + 20 * time.size
     return Plan(
         solver=solver,
         height=chain.height,
@@ -444,5 +415,8 @@ def plan(chain: Chain, drive: Drive, t: ArrayLike, *, dashpots: bool = False) ->
         values=values,
         time=time,
         speed=speed,
-        lossless=len(ends) == 1 and not damped,
+        margin=OF_MASSES if len(ends) > 1 else OF_IMPACT if speed > 0.0 else ALONG_DRIVE,
+        max_steps=most,
+        max_explicit=min(most, explicit),
+        plain=speed > 0.0 and len(ends) == 1 and not damped and chain.site_damping == 0.0,
     )

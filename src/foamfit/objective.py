@@ -407,8 +407,7 @@ class Objective:
                 )
             masses = [specimen.mass / (count - 1)] * (count - 1) + [0.0]
         chain = Chain(springs, heights, specimen.area, masses)
-        plan = make_plan(chain, loading, self.time, dashpots=damped)
-        return plan._replace(max_steps=MAX_STEPS)
+        return make_plan(chain, loading, self.time, dashpots=damped, max_steps=MAX_STEPS)
 
     def _measured(self) -> dict[str, Array | None]:
         """Measured curves that the drive leaves free."""

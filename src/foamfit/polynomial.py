@@ -3,7 +3,18 @@
 # mypy: disallow-untyped-decorators=False, warn-return-any=False
 from __future__ import annotations
 
+import math
+
 from foamfit.kernels import Array, inner, piece
+
+# Truncation of a step that rounding leaves room for.
+LEAST_TRUNCATION = 1e-16
+
+
+@inner
+def order_for(tol: float, most: int) -> int:
+    """Order at which the series of steps of truncation `tol` costs least; from 6 to `most`."""
+    return min(max(round(4.0 - 0.5 * math.log(tol)), 6), most)
 
 
 @inner

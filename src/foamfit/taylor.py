@@ -26,7 +26,14 @@ from foamfit.kernels import (
     inner,
     piece,
 )
-from foamfit.polynomial import fill_values, first_crossing, slope_at, value_at
+from foamfit.polynomial import (
+    LEAST_TRUNCATION,
+    fill_values,
+    first_crossing,
+    order_for,
+    slope_at,
+    value_at,
+)
 from foamfit.series import (
     CURVED,
     DASHPOT,
@@ -65,6 +72,7 @@ __all__ = ["FREE", "MOTION", "STRESS", "VISCOUS", "integrate"]
 DONE, TOO_MANY_STEPS, STEP_UNDERFLOW, FLAT_UNDER_STRESS, NOT_FINITE = range(5)
 # Strains closer than this to the end of a branch are at it.
 CLOSE = 1e-13
+MOST_ORDERS = 24
 
 
 class Samples(NamedTuple):
@@ -488,7 +496,6 @@ def integrate(
     speed: float,
     t: Array,
     tol: float,
-    order: int,
     max_steps: int,
     directions: Branches,
     start: Array,
@@ -518,8 +525,8 @@ def integrate(
         Velocity of the striker at contact, m/s; 0 = no impact. Contact then ends with base stress.
     t : (n,) array
         Samples, s; an impact starts at 0, every other drive at t[0].
-    tol, order, max_steps
-        Truncation of a step relative to the motion so far; order of the series; bound on steps.
+    tol, max_steps
+        Truncation of a step relative to the motion so far; bound on steps.
     directions : (p, 2) array
         What derivatives are carried along: spring and its own parameter, or OWN_HEIGHT, or -1 and
         DRAG.
@@ -534,10 +541,12 @@ def integrate(
     Returns
     -------
     tuple
-        Outcome, end of contact (NaN if none), steps taken, switches (also those past the log).
+        Outcome, end of contact (NaN if none; where there is no answer, how far it came), steps
+        taken, switches (also those past the log).
     """
+    tol = max(tol, LEAST_TRUNCATION)
     count, groups, size = rows.shape[0], ends.size, directions.shape[0]
-    struck, tangent = speed > 0.0, size > 0
+    struck, tangent, order = speed > 0.0, size > 0, order_for(tol, MOST_ORDERS)
     links = Links(np.empty((count, N_LAW)), ends, mass, drag, top)
     law, out = links.law, Samples(t, curves, slopes)
     s, d = make_series(count, order, directions)
@@ -567,12 +576,12 @@ def integrate(
         if bare:
             expand_bare(links, s, push, order)
         elif not expand(links, s, push, motion, order):
-            return FLAT_UNDER_STRESS, math.nan, step, switches
+            return FLAT_UNDER_STRESS, now, step, switches
         if step > 0:
             s_scale = _loaded(s, s_scale)
         free = step_length(links, s, push, order, tol, horizon - now, w_scale, s_scale)
         if not math.isfinite(free) or not math.isfinite(s[GROUP, 0, order]):
-            return NOT_FINITE, math.nan, step, switches
+            return NOT_FINITE, now, step, switches
         span, spring, side = first_switch(law, s, order, free)
         leaves = False
         if struck:
@@ -582,7 +591,7 @@ def integrate(
         end = now + span
         stalled = stalled + 1 if span == 0.0 else 0
         if (end <= now and span > 0.0) or stalled > 4 * count + 8:
-            return STEP_UNDERFLOW, math.nan, step, switches
+            return STEP_UNDERFLOW, now, step, switches
         last = end >= horizon and not leaves and spring < 0
         end = horizon if last else end
         least = order
@@ -607,11 +616,11 @@ def integrate(
             advance_tangents(d, groups, more, span)
         w_scale, total = _reached(links, s, w_scale)
         if not math.isfinite(total):
-            return NOT_FINITE, math.nan, step, switches
+            return NOT_FINITE, now, step, switches
         settle(links, s)
         if spring >= 0:
             switches = switch(
                 rows, branches, law, s, d, directions, order, span, now, spring, side,
                 log, switches,
             )  # fmt: skip
-    return TOO_MANY_STEPS, math.nan, max_steps, switches
+    return TOO_MANY_STEPS, now, max_steps, switches

@@ -43,7 +43,7 @@ def _calls() -> _Calls:
     links = series.Links(flat, whole, one, 0.0, taylor.FREE)
     _, d = series.make_series.py_func(1, 6, directions)
     out = taylor.Samples(one, flat, cube)
-    scene = (flat, one, whole, one, 0.0, 0, one, 0.0, one, 0.0, 0, 0, directions, flat)
+    scene = (flat, one, whole, one, 0.0, 0, one, 0.0, one, 0.0, 0, directions, flat)
     return _Calls(
         pieces=[
             (series.expand_tangents, (links, cube, d, 0)),
