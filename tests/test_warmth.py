@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 import subprocess
 from contextlib import contextmanager
 from pathlib import Path
@@ -92,6 +94,30 @@ def test_the_other_process_finds_this_package_and_is_stopped(
     with pytest.raises(click.UsageError), warmth.side_by_side():
         raise click.UsageError("no such file")
     assert asked == [str(Path(ff.__file__).parents[1]), "terminated"]
+
+
+def test_what_was_compiled_of_another_source_is_no_use(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(warmth, "_cache", lambda: tmp_path)
+    assert not warmth.compiled()
+    made = [tmp_path / f"taylor.integrate-30.py311.{end}" for end in ("nbi", "1.nbc")]
+    for path in made:
+        path.touch()
+    assert warmth.compiled()
+    os.utime(made[1], (0.0, 0.0))
+    assert not warmth.compiled()
+    assert [path.exists() for path in made] == [True, False]
+
+
+def test_every_module_with_compiled_loops_is_known() -> None:
+    package = Path(warmth.__file__).parent
+    written = {
+        path.stem
+        for path in package.glob("*.py")
+        if re.search(r"^@(compiled|inner|inlined|piece|maker|once)$", path.read_text(), re.M)
+    }
+    assert set(warmth.COMPILED) == written | {"law"}
 
 
 def test_examples_are_small() -> None:

@@ -12,13 +12,19 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 Call = tuple[Any, tuple[Any, ...]]
+
+# The modules that compiled loops are written in.
+COMPILED = (
+    "aggregate", "collocation", "implicit", "kernels", "law", "polynomial", "ringing", "series",
+    "taylor",
+)  # fmt: skip
 
 
 class _Calls(NamedTuple):
@@ -87,11 +93,28 @@ def _compile(calls: list[Call]) -> None:
         function.compile(tuple(typeof(value) for value in arguments))  # type: ignore[no-untyped-call]
 
 
-def compiled() -> bool:
-    """Tell whether an earlier run left the compiled integrator in the cache."""
+def _cache() -> Path:
+    """Folder in which numba keeps what it compiled of this package."""
     from foamfit.taylor import integrate
 
-    return any(Path(integrate.stats.cache_path or ".").glob("taylor.integrate-*.nbc"))
+    return Path(integrate.stats.cache_path or ".")
+
+
+def compiled() -> bool:
+    """Tell whether an earlier run left the integrator, compiled of this very source, in the cache.
+
+    What is older than any module that compiled loops are written in is removed: numba itself
+    compares it with the module of the outermost loop alone.
+    """
+    written = [Path(__file__).with_name(f"{name}.py").stat().st_mtime for name in COMPILED]
+    fresh = False
+    for made in _cache().glob("*.nb[ci]"):
+        if made.stat().st_mtime < max(written):
+            with suppress(OSError):  # not ours to remove
+                made.unlink(missing_ok=True)
+        elif made.name.startswith("taylor.integrate-"):
+            fresh = fresh or made.suffix == ".nbc"
+    return fresh
 
 
 @contextmanager
