@@ -493,6 +493,33 @@ def _record_tangents(
 
 
 @inner
+def _record_step(
+    body: Body,
+    state: State,
+    at: Points,
+    curves: Curves,
+    now: float,
+    span: float,
+    first: int,
+    done: int,
+    d: Tangents,
+    out: Samples,
+) -> bool:
+    """Write the samples of a step and carry its derivatives; false if these are not finite."""
+    for i in range(body.heights.size):
+        for j in range(STAGES):
+            curves.stress[i, j] = at.z[i, j] + NODES[j] * span * state.v0[i]
+        polynomial(0.0, curves.stress[i], curves.moves[i])
+    _record(now, span, first, done, state, curves, out)
+    if d.base.size > 0:
+        if not linearise(body, state, span, at, d):
+            return False
+        _record_tangents(now, span, first, done, d, out)
+        _carry_tangents(body, span, d)
+    return True
+
+
+@inner
 def _record_rest(first: int, state: State, base: float, d: Tangents, out: Samples) -> None:
     """Write a single sample, or one that is left where the steps have ended."""
     nodes, count = out.curves.shape[0] - 1, state.w.size
@@ -562,8 +589,10 @@ def _leave(
 
 
 @inner
-def _begin(i0: int, start: Array, top: int, body: Body, state: State, d: Tangents) -> None:
-    """Fill the state at the start; the nodes below spring i0 are at rest."""
+def _begin(
+    i0: int, start: Array, top: int, body: Body, state: State, d: Tangents, pace: Array
+) -> None:
+    """Fill the state at the start and its scales; the nodes below spring i0 are at rest."""
     node = 0.0
     for i in range(body.heights.size):
         row = body.rows[i]
@@ -573,6 +602,8 @@ def _begin(i0: int, start: Array, top: int, body: Body, state: State, d: Tangent
             state.branches[i] = branch_at_strain(row, state.branches[i], start[0, i])
             node += body.heights[i] * start[0, i]
         state.w[i] = node if i >= i0 else 0.0
+        pace[LOAD] = max(pace[LOAD], abs(stress_on(row, state.branches[i], state.eps0[i])))
+        pace[REACH] = max(pace[REACH], body.heights[i] * abs(state.eps0[i]))
         for c in range(d.base.size):
             d.eps0[i, c] = start[1 + c, i] if start.shape[1] > 0 else 0.0
             d.w[i, c] = body.heights[i] * d.eps0[i, c] + (d.w[i - 1, c] if i > i0 else 0.0)
@@ -584,6 +615,38 @@ def _begin(i0: int, start: Array, top: int, body: Body, state: State, d: Tangent
             d.base[c] = stress_tangent(
                 body.rows[0], state.branches[0], state.eps0[0], d.eps0[0, c], own
             )
+
+
+@inner
+def _drive(
+    scene: Scene,
+    body: Body,
+    state: State,
+    v: Array,
+    knot: int,
+    fresh: bool,
+    now: float,
+    d: Tangents,
+    out: Samples,
+) -> tuple[float, float, float]:
+    """Prescribe motion or stress from sample `knot` on, which may be reached just now (`fresh`).
+
+    Returns when that ends, and the stress on the top with its rate.
+    """
+    t, values, top = scene.t, scene.values, body.heights.size - 1
+    horizon, rate = t[t.size - 1], 0.0
+    if t.size > 1:
+        horizon = t[knot + 1]
+        rate = (values[knot + 1] - values[knot]) / (t[knot + 1] - t[knot])
+    if scene.top != MOTION:
+        return horizon, values[knot] + rate * (now - t[knot]), rate
+    if fresh:
+        if knot > 0 and scene.ends.size == 1:
+            _mend_kink(scene, body, knot, rate - state.v0[top], d, out)
+        state.eps0[top] += (values[knot] - state.w[top]) / body.heights[top]  # without rounding
+        state.w[top] = values[knot]
+    state.v0[top] = v[top] = rate
+    return horizon, 0.0, 0.0
 
 
 @inner
@@ -647,6 +710,14 @@ def _remember(
     r.worst[0], r.worst[1] = max(r.worst[0], moved), max(r.worst[1], pressed)
     for g in range(r.alive.size):
         r.alive[g] = (r.alive[g] + r.begun[g]) * math.exp(-r.fading[g] * span)
+
+
+@inner
+def _lost(pace: Array, r: Ripples) -> float:
+    """Size of all vibrations that were damped out, relative to motion and stress."""
+    if r.worst[1] > 0.0:
+        return pace[SEEN] + max(r.worst[0] / pace[REACH], r.worst[1] / pace[LOAD])
+    return pace[SEEN]
 
 
 @inner
@@ -734,56 +805,34 @@ def _follow(
     lost: Array,
 ) -> tuple[int, float, int, int]:
     """Step from event to event; see `integrate_implicit`. Nothing is allocated from here on."""
-    rows, heights = body.rows, body.heights
-    ends, top, struck, t, values, drag = (
-        scene.ends, scene.top, scene.struck, scene.t, scene.values, scene.drag
-    )  # fmt: skip
-    count, groups, tangent = heights.size, ends.size, d.base.size > 0
-    first, i0 = ends[0], (ends[groups - 2] if groups > 1 else 0)
-    _begin(i0, start, top, body, state, d)
+    rows, heights, t, top, struck = body.rows, body.heights, scene.t, scene.top, scene.struck
+    count, groups, first = heights.size, scene.ends.size, scene.ends[0]
+    i0 = scene.ends[groups - 2] if groups > 1 else 0
+    _begin(i0, start, top, body, state, d, pace)
     done = 0
     if struck:
         state.v0[count - 1] = v[count - 1] = speed
         done = before_contact(out.curves, t, speed)
         for c in range(d.base.size):
             before_contact(out.slopes[c], t, 0.0)
-    for i in range(count):
-        stress = stress_on(rows[i], state.branches[i], state.eps0[i])
-        pace[LOAD] = max(pace[LOAD], abs(stress))
-        pace[REACH] = max(pace[REACH], heights[i] * abs(state.eps0[i]))
     pressed, switches = speed < 0.0, done - done  # no, and none: not literals, which are types
-    knot, rate, step, stalled, fall = -1, 0.0, 0, 0, 0.0
+    knot, step, stalled, fall = done - done, 0, 0, 0.0
     while step < max_steps:
         if done == t.size:
             return DONE, math.nan, step, switches
         horizon, push, push_rate = t[t.size - 1], 0.0, 0.0
         if not struck:
-            fresh = False
-            while knot < t.size - 2 and (knot < 0 or now >= t[knot + 1]):
+            fresh = step == 0 and stalled == 0
+            while knot < t.size - 2 and now >= t[knot + 1]:
                 knot += 1
                 fresh = True
-            new_rate = 0.0
-            if t.size > 1:
-                horizon = t[knot + 1]
-                new_rate = (values[knot + 1] - values[knot]) / (t[knot + 1] - t[knot])
-            else:
-                knot = 0
-            if top == MOTION:
-                state.v0[count - 1] = v[count - 1] = new_rate
-                if fresh:  # rounding does not pile up
-                    state.eps0[count - 1] += (values[knot] - state.w[count - 1]) / heights[-1]
-                    state.w[count - 1] = values[knot]
-                if fresh and knot > 0 and groups == 1:
-                    _mend_kink(scene, body, knot, new_rate - rate, d, out)
-            else:
-                push_rate = new_rate
-                push = values[knot] + new_rate * (now - t[knot])
-            rate = new_rate
+            horizon, push, push_rate = _drive(scene, body, state, v, knot, fresh, now, d, out)
         if top == STRESS and _is_flat(body, state, i0):
             return FLAT_UNDER_STRESS, now, step, switches
+        v_first = 0.0 if groups == 1 and top in (STRESS, VISCOUS) else state.v0[first - 1]
         base0 = _base_stress(
-            rows, state.branches, heights, state.eps0, first, groups > 1, top,
-            0.0 if groups == 1 and top in (STRESS, VISCOUS) else state.v0[first - 1], drag, push,
+            rows, state.branches, heights, state.eps0, first, groups > 1, top, v_first, scene.drag,
+            push,
         )  # fmt: skip
         if horizon <= now:  # a single sample, or the last one
             _record_rest(done, state, base0, d, out)
@@ -806,24 +855,13 @@ def _follow(
             step, stalled = step + 1, 0
             last = span >= horizon - now or now + span >= horizon
             end = horizon if last else now + span
-            for i in range(count):
-                for j in range(STAGES):
-                    curves.stress[i, j] = at.z[i, j] + NODES[j] * span * state.v0[i]
-                polynomial(0.0, curves.stress[i], curves.moves[i])
             begun, done = done, first_past(t, done, end, last)
-            _record(now, span, begun, done, state, curves, out)
-            if tangent:
-                if not linearise(body, state, span, at, d):
-                    return NOT_FINITE, now, step, switches
-                _record_tangents(now, span, begun, done, d, out)
-                _carry_tangents(body, span, d)
+            if not _record_step(body, state, at, curves, now, span, begun, done, d, out):
+                return NOT_FINITE, now, step, switches
             if scene.fast:
                 _remember(scene, body, state, at, span, wait, ripples)
             _carry(body, state, at, span, v, top, pace)
-            lost[0] = pace[SEEN]
-            if ripples.worst[1] > 0.0:
-                share = ripples.worst[0] / pace[REACH]
-                lost[0] += max(share, ripples.worst[1] / pace[LOAD])
+            lost[0] = _lost(pace, ripples)
             fall = slope_at(curves.base, STAGES, 1.0) / span
             pressed = pressed or (
                 not leaves and at.total[0, STAGES - 1] > 10.0 * curves.slack[count]
