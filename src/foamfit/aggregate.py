@@ -62,6 +62,9 @@ from foamfit.taylor import (
     fly,
 )
 
+# A step of Newton's method so small, in distances to the nearest pole, is the last: what it leaves
+# is about its square.
+NEAR = 3e-8
 # Degree of the polynomial of the elongation, and how far from its anchor it is used, in distances
 # to the nearest pole: what it leaves out is below 0.125**17 < 1e-15 of the elongation.
 DEGREE, REACH = 16, 0.125
@@ -481,16 +484,17 @@ def integrate_aggregate(
 
 
 @inner
-def _stress_at(group: Group, elongation: float, stress: float) -> float:
-    """Stress at an elongation within the reach of the sum, by Newton's method from another."""
-    x = (stress - group.place[ANCHOR]) / group.place[UNIT]
+def _stress_at(group: Group, elongation: float, guess: float) -> tuple[float, float]:
+    """Stress at an elongation within the reach of the sum, by Newton's method, and its slope."""
+    unit, slope = group.place[UNIT], 1.0
+    x = (guess - group.place[ANCHOR]) / unit
     for _ in range(50):
         value, slope = value_and_slope(group.sum, DEGREE, x)
         step = (elongation - value) / slope
         x += step
-        if abs(step) < 1e-10:  # its error is squared in every step
+        if abs(step) < NEAR:
             break
-    return group.place[ANCHOR] + group.place[UNIT] * x
+    return group.place[ANCHOR] + unit * x, unit / slope
 
 
 @inner
@@ -528,16 +532,20 @@ def equilibrium_along(
     count, group = heights.size, _make_group(rows, heights)
     runs = Runs(sigma, eps, history, np.zeros(count, np.int64))
     _begin(group)
-    stress, place = 0.0, 0.0
+    stress, place, slope, end, edge = 0.0, 0.0, 0.0, 0.0, 0.0
+    rose, stale = True, True
     for j in range(top.size):
         rising, there = top[j] >= place, False
+        stale, rose = stale or rising != rose, rising
         for _ in range(4 * count + MOST_ANCHORS):
             anchor, reach = group.place[ANCHOR], REACH * group.place[UNIT]
-            end = min(group.upper[1], anchor + reach)
-            if not rising:
-                end = max(-group.lower[1], anchor - reach)
-            edge = value_at(group.sum, DEGREE, (end - anchor) / group.place[UNIT])
+            if stale:
+                end = min(group.upper[1], anchor + reach)
+                if not rising:
+                    end = max(-group.lower[1], anchor - reach)
+                edge = value_at(group.sum, DEGREE, (end - anchor) / group.place[UNIT])
             there = top[j] <= edge if rising else top[j] >= edge
+            stale = not there
             if there or not abs(end) < FAR * group.place[LEAST]:
                 break
             stress = end
@@ -546,7 +554,8 @@ def equilibrium_along(
                 _anchor(group, stress, rising)
         if not there:
             return False
-        stress = _stress_at(group, top[j], stress)
+        guess = stress + slope * (top[j] - place)
+        stress, slope = _stress_at(group, top[j], min(guess, end) if rising else max(guess, end))
         sigma[j], place = stress, top[j]
     for i in range(count):
         _write(group, i, runs.since[i], top.size, runs)

@@ -482,13 +482,29 @@ def equilibrium_along(
 
 
 @compiled
-def strains_along(rows: Array, sigma: Array, eps: Array, history: Branches) -> None:
-    """Springs in series along a history of their stress: fills strains and branches (springs, n).
+def strains_along(
+    rows: Array, heights: Array, sigma: Array, top: Array, eps: Array, history: Branches
+) -> bool:
+    """Springs in series along a history of their stress.
 
-    A strain that a spring cannot have is -inf.
+    Fills the displacement of the top (n,), m, and strains and branches (springs or 0, n). False if
+    a spring cannot have its stress; its strain is -inf then.
     """
+    n, kept, total = sigma.size, eps.shape[0] > 0, 0.0
+    strain, branches = np.empty(n), np.empty(n, np.int64)
     for i in range(rows.shape[0]):
-        _follow_stress(rows[i], sigma, eps[i], history[i])
+        if kept:
+            strain, branches = eps[i], history[i]
+        _follow_stress(rows[i], sigma, strain, branches)
+        if i == 0:
+            for j in range(n):
+                top[j] = heights[i] * strain[j]
+        else:
+            for j in range(n):
+                top[j] += heights[i] * strain[j]
+    for j in range(n):
+        total += top[j]
+    return math.isfinite(total)
 
 
 @compiled

@@ -181,14 +181,17 @@ class Plan(NamedTuple):
         self, rows: Array, heights: Array, everything: bool, directions: Directions
     ) -> Motion:
         """Undamped and massless: one stress in all springs; or one spring under known motion."""
-        moved = self.top == taylor.MOTION
+        moved, wanted = self.top == taylor.MOTION, everything or len(directions) > 0
         if moved:
-            wanted = everything or len(directions) > 0
+            top = np.array(self.values)
             stress, strain, branches = self._stretched(rows, heights, wanted)
+            fine = math.isfinite(kernels.total(stress))
         else:
-            stress = np.array(self.values)
-            strain, branches = _room(len(heights), self.time.size)
-            kernels.strains_along(rows, stress, strain, branches)
+            stress, top = np.array(self.values), np.empty(self.time.size)
+            strain, branches = _room(len(heights) if wanted else 0, self.time.size)
+            fine = kernels.strains_along(rows, heights, stress, top, strain, branches)
+        if not fine:
+            raise SimulationError(_OUTCOMES[taylor.NOT_FINITE])
         slopes: Slopes | None = None
         if len(directions):
             slopes = Slopes(
@@ -203,14 +206,12 @@ class Plan(NamedTuple):
                     slopes.base_stress[p] += rate
                 elif slopes is not None and what == series.OWN_HEIGHT:
                     slopes.base_stress[p] -= eta * rate / heights[0]
-        if not math.isfinite(kernels.total(stress) + kernels.total(strain.ravel())):
-            raise SimulationError(_OUTCOMES[taylor.NOT_FINITE])
         if not everything:
             if slopes is not None:
                 slopes = Slopes(slopes.displacement[:, -1:], slopes.base_stress)
-            top = np.array((self.values if moved else heights @ strain)[None, :])
-            return Motion(top, stress, math.nan, NO_SWITCHES, 0, CLOSED_FORM, slopes)
-        nodes = np.cumsum(heights[:, None] * strain, axis=0)
+            return Motion(top[None, :], stress, math.nan, NO_SWITCHES, 0, CLOSED_FORM, slopes)
+        nodes = heights[:, None] * strain
+        np.cumsum(nodes, axis=0, out=nodes)
         switches = _switches(self.time, strain, branches)
         return Motion(nodes, stress, math.nan, switches, 0, CLOSED_FORM, slopes)
 
@@ -255,7 +256,7 @@ class Plan(NamedTuple):
         if moved:
             kernels.equilibrium_along(rows, heights, self.values[:1], stress, strain, branches)
         else:
-            kernels.strains_along(rows, stress, strain, branches)
+            kernels.strains_along(rows, heights, stress, np.empty(1), strain, branches)
             held = (rows[:, kernels.ETA] > 0.0) | ~np.isfinite(strain[:, 0])
             strain[held] = 0.0  # a dashpot holds its spring where it is
             branches[held, 0] = np.where(
@@ -318,16 +319,13 @@ def _room(count: int, n: int) -> tuple[Array, NDArray[np.int64]]:
     return np.empty((count, n)), np.empty((count, n), np.int64)
 
 
-def _switches(time: Array, strain: Array, branches: Directions) -> Array:
+def _switches(time: Array, strain: Array, branches: NDArray[np.int64]) -> Array:
     """List the changes of branch between samples, at the later sample."""
-    springs, samples = np.nonzero(np.diff(branches, axis=1))
-    order = np.argsort(samples, kind="stable")
-    i, j = springs[order], samples[order] + 1
-    return (
-        np.column_stack((time[j], i, branches[i, j - 1], branches[i, j], strain[i, j]))
-        if i.size
-        else np.empty((0, 5))
-    )
+    samples, springs = np.nonzero((branches[:, 1:] != branches[:, :-1]).T)
+    out, later = np.empty((samples.size, 5)), samples + 1
+    out[:, 0], out[:, 1], out[:, 4] = time[later], springs, strain[springs, later]
+    out[:, 2], out[:, 3] = branches[springs, samples], branches[springs, later]
+    return out
 
 
 def _time(t: ArrayLike) -> Array:

@@ -325,10 +325,9 @@ def _along_stress(spring: Spring, stress: ArrayLike) -> Array:
     from foamfit import kernels
 
     history = _as_history(stress, "stress")
-    strain = np.empty(history.size)
-    branches = np.empty((1, history.size), np.int64)
-    kernels.strains_along(spring.row[None, :], history, strain[None, :], branches)
-    if not np.all(np.isfinite(strain)):
+    strain, none = np.empty(history.size), np.empty((0, history.size))
+    row = spring.row[None, :]  # of height 1: its elongation is its strain
+    if not kernels.strains_along(row, np.ones(1), history, strain, none, none.astype(np.int64)):
         at = _first(~np.isfinite(strain))
         raise SimulationError(
             f"stress {history[at]:g} Pa (sample {at}) is a tension that the spring cannot carry"

@@ -69,7 +69,7 @@ def _calls() -> _Calls:
             (series.equilibrium_tangents, (flat, one, flat, table, True, directions)),
             (ringing.parts_faintly, (flat, one, 0.0)),
             (ringing.hurry_of, (flat, one, whole, one, 0.0, 0, 0.0, one)),
-            (kernels.strains_along, (flat, one, flat, table)),
+            (kernels.strains_along, (flat, one, one, one, flat, table)),
             (kernels.equilibrium_along, (flat, one, one, one, flat, table)),
         ],
         own=[
