@@ -211,7 +211,8 @@ class Plan(NamedTuple):
                 slopes = Slopes(slopes.displacement[:, -1:], slopes.base_stress)
             return Motion(top[None, :], stress, math.nan, NO_SWITCHES, 0, CLOSED_FORM, slopes)
         nodes = heights[:, None] * strain
-        np.cumsum(nodes, axis=0, out=nodes)
+        for i in range(1, len(nodes)):  # np.cumsum takes six times as long
+            nodes[i] += nodes[i - 1]
         switches = _switches(self.time, strain, branches)
         return Motion(nodes, stress, math.nan, switches, 0, CLOSED_FORM, slopes)
 
