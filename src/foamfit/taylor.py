@@ -148,7 +148,7 @@ def first_switch(law: Array, s: Array, order: int, span: float) -> tuple[float, 
 def _enough(
     law: Array, s: Array, order: int, span: float, tol: float, w_scale: float, s_scale: float
 ) -> int:
-    """Orders that are enough over a step that a switch made short."""
+    """Orders that are enough over a step that a switch or a sample made short."""
     if w_scale == 0.0 or s_scale == 0.0 or span == 0.0:
         return order
     tail, power, per_span = 0.0, span**order, 1.0 / span
@@ -579,10 +579,10 @@ def integrate(
             return FLAT_UNDER_STRESS, now, step, switches
         if step > 0:
             s_scale = _loaded(s, s_scale)
-        free = step_length(links, s, push, order, tol, horizon - now, w_scale, s_scale)
-        if not math.isfinite(free) or not math.isfinite(s[GROUP, 0, order]):
+        span = step_length(links, s, push, order, tol, horizon - now, w_scale, s_scale)
+        if not math.isfinite(span) or not math.isfinite(s[GROUP, 0, order]):
             return NOT_FINITE, now, step, switches
-        span, spring, side = first_switch(law, s, order, free)
+        span, spring, side = first_switch(law, s, order, span)
         leaves = False
         if struck:
             pressed = pressed or s[GROUP, 0, 0] > tol * s_scale
@@ -595,7 +595,7 @@ def integrate(
         last = end >= horizon and not leaves and spring < 0
         end = horizon if last else end
         least = order
-        if span < free:
+        if spring >= 0 or leaves or last:  # it was not its own error that ended the step
             least = _enough(law, s, order, span, 1e-3 * tol, w_scale, s_scale)
         more = min(least + 2, order)  # for what is, in time, a derivative of these
         if tangent:
