@@ -41,6 +41,10 @@ SCENES: dict[str, tuple[ff.Chain, Drive]] = {
     "all damped": (chain(damped(PAIR, 20.0, 30.0)), IMPACT),
     "one of three damped": (chain(damped([*PAIR, BISTABLE], 0.0, 30.0, 0.0)), IMPACT),
     "unilateral": (chain([ff.LinearSpring(60e6, unilateral=True), SOFT], site=30.0), IMPACT),
+    "unilateral, mass": (
+        chain([ff.LinearSpring(60e6, unilateral=True), BISTABLE], [5e-6, 0.0]),
+        ff.Impact(7e-3, 0.7),
+    ),
     "motion": (chain([BISTABLE]), MOTION),
     "motion, dashpot": (chain(damped([BISTABLE], 20.0)), MOTION),
     "motion of two": (chain(PAIR), MOTION),

@@ -530,3 +530,40 @@ def test_an_extreme_scene_is_finite_or_refused(name: str, load: ff.Impact) -> No
     assert np.isfinite(got.displacement).all()
     assert np.isfinite(got.base_stress).all()
     assert np.isfinite(got.strain).all()
+
+
+@pytest.mark.parametrize("speed", [0.5, 0.8, 1.1, 1.4, 1.9])
+def test_contact_ends_wherever_in_the_chain_a_gap_opens(speed: float) -> None:
+    """Massless springs in series are one spring, in whatever order: so is the end of contact."""
+    foam = ff.BistableSpring(5.5e6, 82e6, -0.18e6, 0.14, 0.31, 14e6, 2.4e6)
+    loose = ff.LinearSpring(6e7, unilateral=True)
+    time = np.linspace(0.0, 3e-3, 301)
+    one, other = (
+        ff.simulate(ff.Chain(springs, heights, 2e-5), ff.Impact(7e-3, speed), time)
+        for springs, heights in (((loose, foam), (7e-4, 5e-4)), ((foam, loose), (5e-4, 7e-4)))
+    )
+    assert one.contact_end is not None
+    assert other.contact_end == pytest.approx(one.contact_end, rel=1e-8)
+    for a, b in (
+        (one.base_stress, other.base_stress),
+        (one.displacement[-1], other.displacement[-1]),
+    ):
+        np.testing.assert_allclose(b, a, rtol=0, atol=1e-8 * np.ptp(a))
+
+
+@pytest.mark.parametrize("eta", [0.0, 20.0])
+def test_a_stress_that_a_spring_cannot_carry_is_refused(eta: float) -> None:
+    """Also at the first sample, where another spring's dashpot holds that one."""
+    springs = [
+        ff.LinearSpring(6e7, unilateral=True),
+        ff.BistableSpring(5.5e6, 82e6, -0.18e6, 0.14, 0.31, 14e6, 2.4e6, eta),
+    ]
+    chain = ff.Chain(springs, [7e-4, 5e-4], 2e-5)
+    with pytest.raises(ff.SimulationError, match="no longer finite"):
+        ff.simulate(chain, ff.StressDrive([-1e6, -1e6]), [0.0, 1e-4])
+
+
+def test_a_motion_too_fast_for_a_dashpot_is_refused() -> None:
+    chain = ff.Chain([ff.LinearSpring(6e7, 1e4)], [1e-3], 2e-5)
+    with pytest.raises(ff.SimulationError), np.errstate(all="ignore"):
+        ff.simulate(chain, ff.DisplacementDrive([0.0, 1e-4, 1e-4]), [0.0, 1e-310, 1.0])

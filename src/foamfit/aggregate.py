@@ -101,7 +101,7 @@ class Group(NamedTuple):
 
 
 class Runs(NamedTuple):
-    """Histories to fill: stress (n,), strains and branches (springs, n).
+    """Histories to fill: stress (n,), strains and branches (springs or 0, n).
 
     `since` (springs,) is the sample from which each spring has been on its branch.
     """

@@ -950,5 +950,5 @@ def integrate_implicit(
     pace[WORST], lost[0] = 1.0, 0.0
     return _follow(
         scene, body, state, at, step, ripples, pace, v, now, paced, speed, d, out,
-        np.zeros(curves.shape[0]), start, max_steps, log, tally, lost,
+        np.zeros(curves.shape[0] - 1), start, max_steps, log, tally, lost,
     )  # fmt: skip

@@ -140,8 +140,8 @@ class Plan(NamedTuple):
         """Run the scene with the springs in `rows` (n_springs, columns) and their heights (m).
 
         `drag` replaces the scene's own. With `everything` false only the base stress and the
-        displacement of the top, shape (1, n_t), are sure to be there, and no switches. `directions`
-        (p, 2) are those of the derivatives to carry along; see `foamfit.series`.
+        displacement of the top, shape (1, n_t), are sure to be there. `directions` (p, 2) are those
+        of the derivatives to carry along; see `foamfit.series`.
 
         Raises
         ------
@@ -185,13 +185,11 @@ class Plan(NamedTuple):
         if moved:
             top = np.array(self.values)
             stress, strain, branches = self._stretched(rows, heights, wanted)
-            fine = math.isfinite(kernels.total(stress))
+            fine = True
         else:
             stress, top = np.array(self.values), np.empty(self.time.size)
             strain, branches = _room(len(heights) if wanted else 0, self.time.size)
             fine = kernels.strains_along(rows, heights, stress, top, strain, branches)
-        if not fine:
-            raise SimulationError(_OUTCOMES[taylor.NOT_FINITE])
         slopes: Slopes | None = None
         if len(directions):
             slopes = Slopes(
@@ -206,6 +204,8 @@ class Plan(NamedTuple):
                     slopes.base_stress[p] += rate
                 elif slopes is not None and what == series.OWN_HEIGHT:
                     slopes.base_stress[p] -= eta * rate / heights[0]
+        if not (fine and math.isfinite(kernels.total(stress))):
+            raise SimulationError(_OUTCOMES[taylor.NOT_FINITE])
         if not everything:
             if slopes is not None:
                 slopes = Slopes(slopes.displacement[:, -1:], slopes.base_stress)
@@ -249,7 +249,10 @@ class Plan(NamedTuple):
         return _motion(AGGREGATE, ending, curves, NO_SLOPES, log)
 
     def _start(self, rows: Array, heights: Array, directions: Directions) -> Array:
-        """Strains (1 + p, springs) in equilibrium with the first sample, and their derivatives."""
+        """Strains (1 + p, springs) in equilibrium with the first sample, and their derivatives.
+
+        Under a stress, a spring that a dashpot holds starts from rest.
+        """
         start = np.zeros((1 + len(directions), len(heights)))
         first = self.ends[-2] if len(self.ends) > 1 else 0
         rows, heights, moved = rows[first:], heights[first:], self.top == taylor.MOTION
@@ -258,8 +261,10 @@ class Plan(NamedTuple):
             kernels.equilibrium_along(rows, heights, self.values[:1], stress, strain, branches)
         else:
             kernels.strains_along(rows, heights, stress, np.empty(1), strain, branches)
-            held = (rows[:, kernels.ETA] > 0.0) | ~np.isfinite(strain[:, 0])
+            held = rows[:, kernels.ETA] > 0.0
             strain[held] = 0.0  # a dashpot holds its spring where it is
+            if not np.isfinite(strain).all():
+                raise SimulationError(_OUTCOMES[taylor.NOT_FINITE])
             branches[held, 0] = np.where(
                 rows[held, kernels.KIND] == BISTABLE, kernels.A, kernels.LINE
             )
@@ -312,7 +317,8 @@ def _motion(
     if outcome != taylor.DONE:
         raise SimulationError(_OUTCOMES[outcome].format(steps=steps, time=time))
     slope = None if slopes is NO_SLOPES else Slopes(slopes[:, 1:], slopes[:, 0])
-    return Motion(curves[1:], curves[0], time, log[:switches], steps, method, slope, unresolved)
+    seen = log if log is NO_SWITCHES else log[:switches]
+    return Motion(curves[1:], curves[0], time, seen, steps, method, slope, unresolved)
 
 
 def _room(count: int, n: int) -> tuple[Array, NDArray[np.int64]]:
@@ -388,11 +394,11 @@ def plan(
             top = taylor.MOTION
         elif above == 0.0:
             top = taylor.VISCOUS if chain.site_damping > 0.0 else taylor.STRESS
-    ends, masses = chain.arrays.top, np.array([above])
+    ends, masses = chain.arrays.top, np.array([above / chain.area])
     if chain.arrays.heavy:
         inside = np.flatnonzero(chain.arrays.masses[:-1] > 0.0)
         ends = np.append(inside + 1, ends)
-        masses = np.append(chain.arrays.masses[inside], masses)
+        masses = np.append(chain.arrays.masses[inside] / chain.area, masses)
     damped = dashpots or chain.arrays.damped or top == taylor.VISCOUS
     if len(ends) > 1 or above > 0.0:
         solver = SECOND_ORDER
@@ -408,7 +414,7 @@ def plan(
         solver=solver,
         height=chain.height,
         ends=ends,
-        mass=masses / chain.area,
+        mass=masses,
         drag=chain.site_damping / chain.height,
         top=top,
         values=values,

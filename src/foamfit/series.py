@@ -294,12 +294,12 @@ def _group_term(
         if law[i0, DASHPOT] == 0.0:
             return sig[i0, n]
         return _damped_term(law, i0, i1, sig, rate_n, push_n, drag, n)
-    damped, first = 0, i0
-    for i in range(i1 - 1, i0 - 1, -1):
+    damped, first = 0, -1
+    for i in range(i0, i1):
         if law[i, DASHPOT] > 0.0:
             damped += 1
-        else:
-            first = i
+        elif first < 0 or (law[i, CURVED] == 0.0 and law[i, SLOPE] == 0.0):
+            first = i  # a flat branch knows the common stress without rounding (0 in an open gap)
         if n == 0 or law[i, DASHPOT] > 0.0:
             sig[i, n] = _stress_term(law, i, eps, sig, n)
     if damped == i1 - i0:

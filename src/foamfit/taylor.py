@@ -279,12 +279,15 @@ def fly(curves: Array, t: Array, first: int, t_end: float, w_end: Array, speed: 
 
 @inner
 def _delay(s: Array, d: Tangents, order: int, span: float, late: Array) -> None:
-    """Derivative of the time at which the base stress meets zero at the end of a step."""
+    """Derivative of the time at which the base stress meets zero at the end of a step.
+
+    Where a unilateral spring has just opened it is that of the step before, which brought it there.
+    """
     fall = slope_at(s[GROUP, 0], order, span)
+    if fall == 0.0:
+        return
     for p in range(d.drag.size):
-        late[p] = 0.0
-        if fall != 0.0:
-            late[p] = -value_at(d.series[p, GROUP, 0], order, span) / fall
+        late[p] = -value_at(d.series[p, GROUP, 0], order, span) / fall
 
 
 @piece
@@ -302,13 +305,12 @@ def depart(
 ) -> None:
     """Fill the samples after contact, which ends at the end of this step, at the time `now`.
 
-    A later end leaves the nodes as they move until then, and the top with the velocity that it has
-    then. `room` (3, …) is scratch.
+    A later end (room[0], by direction) leaves the nodes as they move until then, and the top with
+    the velocity that it has then. The rest of `room` (3, …) is scratch.
     """
     late, rate, place = room[0], room[1], room[2]
     law, nodes, groups = links.law, out.curves.shape[0] - 1, links.ends.size
     count, top = law.shape[0], groups - 1
-    _delay(s, d, more, span, late)
     pull = slope_at(s[V, top], order, span)
     speed = moved = 0.0
     for i in range(count):
@@ -552,8 +554,10 @@ def integrate(
     s, d = make_series(count, order, directions)
     branches = np.empty(count, np.int64)
     room = np.empty((6, max(order + 1, max(size, curves.shape[0]))))
-    c, push, motion = room[3], room[4], room[5]
+    late, c, push, motion = room[0], room[3], room[4], room[5]
     push[0] = push[1] = 0.0
+    for p in range(size):
+        late[p] = 0.0
     begin(rows, heights, start, directions, branches, law, s, d)
     bare = is_bare(links)
     w_scale, s_scale, pressed, knot, stalled = 0.0, 0.0, False, 0, 0
@@ -607,6 +611,7 @@ def integrate(
             sample(links, s, least, out, first, done, now, c)
         if tangent:
             sample_tangents(links, s, d, more, out, first, done, now, c)
+            _delay(s, d, more, span, late)
         if leaves:
             depart(links, s, d, order, more, span, end, out, done, room)
             return DONE, end, step + 1, switches

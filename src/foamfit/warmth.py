@@ -11,6 +11,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -106,10 +107,11 @@ def compiled() -> bool:
     What is older than any module that compiled loops are written in is removed: numba itself
     compares it with the module of the outermost loop alone.
     """
-    written = [Path(__file__).with_name(f"{name}.py").stat().st_mtime for name in COMPILED]
+    times = [Path(__file__).with_name(f"{name}.py").stat().st_mtime for name in COMPILED]
+    written = max((at for at in times if at <= time.time()), default=0.0)  # some clocks are wrong
     fresh = False
     for made in _cache().glob("*.nb[ci]"):
-        if made.stat().st_mtime < max(written):
+        if made.stat().st_mtime < written:
             with suppress(OSError):  # not ours to remove
                 made.unlink(missing_ok=True)
         elif made.name.startswith("taylor.integrate-"):
