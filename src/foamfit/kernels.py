@@ -32,12 +32,13 @@ _BRIDGELESS: dict[str, Any] = {
     "fastmath": {"contract"},
 }
 _COUNTLESS: dict[str, Any] = {**_BRIDGELESS, "_nrt": False}
-maker = njit(**_BRIDGELESS)
+maker = njit(**_BRIDGELESS, cache=True)
 inner = njit(**_COUNTLESS)
 inlined = njit(**_COUNTLESS, forceinline=True)
 # For long loops that are called from one place: read apart, compiled as a part of the caller.
 once = njit(error_model="numpy", inline="always")
-# A piece of a loop that is compiled apart from it; see `foamfit.warmth`.
+# A piece of a loop (as is what makes its arrays) that is compiled apart from it; see
+# `foamfit.warmth`.
 piece = njit(**_COUNTLESS, cache=True)
 
 # Columns of a row.

@@ -574,7 +574,7 @@ def advance(s: Array, groups: int, order: int, span: float) -> None:
             s[row, i, 0] = value_at(s[row, i], order, span)
 
 
-@inner
+@piece
 def advance_tangents(d: Tangents, groups: int, order: int, span: float) -> None:
     """Carry the derivatives of the state over a step of length `span`."""
     for p in range(d.drag.size):

@@ -252,7 +252,7 @@ def _mend_kink(out: Samples, s: Array, d: Tangents, knot: int) -> None:
         out.slopes[p, 0, knot] += share * (d.series[p, GROUP, 0, 0] - out.slopes[p, 0, knot])
 
 
-@piece
+@inner
 def before_contact(curves: Array, t: Array, speed: float) -> int:
     """Fill the samples before contact, at time 0, and return how many these are.
 

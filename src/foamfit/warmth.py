@@ -57,10 +57,11 @@ def _calls() -> _Calls:
             (polynomial.first_crossing, (one, 0, 0.0, 0.0, 0.0)),
             (taylor.sample, (links, cube, 0, out, 0, 0, 0.0, one)),
             (taylor.sample_tangents, (links, cube, d, 0, out, 0, 0, 0.0, one)),
+            (series.make_series, (1, 0, directions)),
+            (series.advance_tangents, (d, 0, 0, 0.0)),
             (taylor.depart, (links, cube, d, 0, 0, 0.0, 0.0, out, 0, flat)),
             (taylor.first_switch, (flat, cube, 0, 0.0)),
             (taylor.first_lift, (cube, 0, True, True, 0.0)),
-            (taylor.before_contact, (flat, one, 0.0)),
         ],
         rest=[
             (kernels.fault, (one,)),
@@ -75,11 +76,11 @@ def _calls() -> _Calls:
         ],
         own=[
             (series.expand, (links, cube, one, one, 0)),
-            (series.make_series, (1, 0, directions)),
             (taylor.begin, (flat, one, flat, directions, whole, flat, cube, d)),
             (taylor.switch, (flat, whole, flat, cube, d, directions, 0, 0.0, 0.0, 0, 0, flat, 0)),
             (series.expand_bare, (links, cube, one, 0)),
-            (series.advance_tangents, (d, 0, 0, 0.0)),
+            (series.advance, (cube, 0, 0, 0.0)),
+            (taylor.before_contact, (flat, one, 0.0)),
             (taylor.step_length, (links, cube, one, 0, 0.0, 0.0, 0.0, 0.0)),
             (taylor.settle, (links, cube)),
         ],
@@ -90,8 +91,12 @@ def _calls() -> _Calls:
 def _compile(calls: list[Call]) -> None:
     from numba import typeof
 
-    for function, arguments in calls:
-        function.compile(tuple(typeof(value) for value in arguments))  # type: ignore[no-untyped-call]
+    gc.disable()  # what compiling makes stays
+    try:
+        for function, arguments in calls:
+            function.compile(tuple(typeof(value) for value in arguments))  # type: ignore[no-untyped-call]
+    finally:
+        gc.enable()
 
 
 def _cache() -> Path:
@@ -149,7 +154,6 @@ def side_by_side() -> Iterator[Callable[[], None]]:
 
 def _other() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that started this one
-    gc.disable()  # what is made here stays
     calls = _calls()
     _compile(calls.pieces)
     print("pieces", flush=True)
