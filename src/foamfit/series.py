@@ -207,7 +207,7 @@ def _strain_term(law: Array, i: int, eps: Array, sig: Array, n: int) -> tuple[fl
     return -known / stiff, (1.0 - (eps[i, 0] - law[i, ORIGIN])) / stiff
 
 
-@inner
+@once
 def _share_elongation(
     law: Array,
     i0: int,
@@ -309,7 +309,7 @@ def _group_term(
     return _share_elongation(law, i0, i1, eps, sig, u_n, n)
 
 
-@inner
+@once
 def _stressed_term(
     law: Array, i0: int, i1: int, eps: Array, sig: Array, s_n: float, n: int
 ) -> bool:

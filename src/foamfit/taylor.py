@@ -611,7 +611,8 @@ def integrate(
             sample(links, s, least, out, first, done, now, c)
         if tangent:
             sample_tangents(links, s, d, more, out, first, done, now, c)
-            _delay(s, d, more, span, late)
+            if leaves or spring >= 0:  # the base stress may end with this step
+                _delay(s, d, more, span, late)
         if leaves:
             depart(links, s, d, order, more, span, end, out, done, room)
             return DONE, end, step + 1, switches
