@@ -60,6 +60,7 @@ from foamfit.series import FREE, MOTION, OWN_ETA, OWN_HEIGHT, STRESS, VISCOUS
 from foamfit.taylor import (
     DONE,
     FLAT_UNDER_STRESS,
+    LEAST_BASE,
     NOT_FINITE,
     STEP_UNDERFLOW,
     TOO_MANY_STEPS,
@@ -80,9 +81,10 @@ FAINT = 1e-7
 # The memory of the step control: length of the last step and of that proposed; the least that the
 # error may ask for; steps in a row, and in all, that the error alone made short; the largest error
 # let pass, over tol; vibrations that were damped out, and that of the last steps; how far anything
-# has moved (m) and the largest stress (Pa); length and error of the first trial of this step.
+# has moved (m) and the largest stress (Pa); length and error of the first trial of this step; the
+# largest base stress (Pa).
 TAKEN, PROPOSAL, FLOOR, HURRY, SHORTS, WORST, SEEN, BURST, REACH, LOAD = range(10)
-TRIAL_SPAN, TRIAL_ERROR, N_PACE = range(10, 13)
+TRIAL_SPAN, TRIAL_ERROR, BASE, N_PACE = range(10, 14)
 # What to do with a step whose end was compared with the first event in it.
 AGAIN, FREELY, ARRIVED, AT_ONCE = range(4)
 
@@ -193,7 +195,7 @@ def _describe(
     load = max(load, present)
     polynomial(base0, at.total[0], out.base)
     left_out = truncation(out.base)
-    error = left_out / load if load > 0.0 else 0.0
+    error = left_out / max(pace[BASE], present, LEAST_BASE * load) if load > 0.0 else 0.0
     if faint > 0.0 and load > 0.0:  # what is left is known to the rounding of its parts
         error = max(error, faint * left_out / max(present, FAINT * parts))
     for i in range(heights.size):
@@ -667,7 +669,8 @@ def _carry(
             state.v0[i] = v[i]
     if top != STRESS:
         pace[REACH] = max(pace[REACH], abs(state.w[last]))
-    pace[LOAD] = max(pace[LOAD], abs(at.total[0, end]))
+    pace[BASE] = max(pace[BASE], abs(at.total[0, end]))
+    pace[LOAD] = max(pace[LOAD], pace[BASE])
 
 
 @inner

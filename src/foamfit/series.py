@@ -26,6 +26,7 @@ from foamfit.kernels import (
     K0,
     KC,
     KIND,
+    OPEN,
     SIGMA_C,
     A,
     Array,
@@ -105,7 +106,12 @@ def enter(rows: Array, i: int, branch: int, law: Array) -> None:
 
 @inner
 def branch_derivative(row: Row, branch: int, own: int) -> tuple[float, float, float]:
-    """Derivatives of (k, x0, s0) of a branch of eq. 2 by a spring's own parameter k0 … kh_minus."""
+    """Derivatives of (k, x0, s0) of a branch of eq. 2 by a spring's own parameter k0 … kh_minus.
+
+    Across an open gap nothing acts, whatever the spring is.
+    """
+    if branch == OPEN:
+        return 0.0, 0.0, 0.0
     if row[KIND] != BISTABLE or branch == A:
         return (1.0 if own == 0 else 0.0), 0.0, 0.0
     eps_a, v = row[EPS_A], 1.0 - row[EPS_A]

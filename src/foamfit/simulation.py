@@ -39,8 +39,9 @@ _RINGING = (
     "masses vibrate too fast to be followed, by up to {size:.1g} of the range: ask for no smaller "
     "rtol than that, give the springs heavier dashpots, or leave the masses out"
 )
-# From so many steps on, and where steps are implicit or several masses are inside, a motion is run
-# again to check it; so it is where a strain comes so close to the end of its branch.
+# From so many steps on, and where steps are implicit, several masses are inside, or dashpots below a
+# mass, a motion is run again to check it; so it is where a strain comes so close to the end of its
+# branch.
 FEW_STEPS, CLOSE = 1000, 1e-3
 LOST = 0.03  # so large a difference is not mended by still shorter steps
 
@@ -109,7 +110,8 @@ def _verified(
         If the scene has no answer within `rtol`; the message says why.
     """
     motion = scene.run(rows, heights, rtol, directions=directions)
-    many = _many(motion, FEW_STEPS) or len(scene.ends) > 2 or motion.method == RADAU
+    inside = len(scene.ends) > 2 or _damped_below_a_mass(scene, rows)
+    many = _many(motion, FEW_STEPS) or inside or motion.method == RADAU
     if scene.speed > 0.0 and not many and not _hard(scene, rows, heights):
         return motion
     motion = _resolved(scene, rows, heights, rtol, directions, motion)
@@ -127,7 +129,7 @@ def _verified(
             f"rounding alone makes errors above rtol = {rtol:g}"
         )
     forced = 0 if scene.speed > 0.0 else scene.time.size
-    many = _many(motion, FEW_STEPS + 2 * forced) or len(scene.ends) > 2 or room < CLOSE
+    many = _many(motion, FEW_STEPS + 2 * forced) or inside or room < CLOSE
     many = many and scene.solver == SECOND_ORDER
     if not (many or motion.method == RADAU) or rtol < 1e-12:  # no finer run could tell
         return motion
@@ -187,6 +189,11 @@ def _followed(
 def _many(motion: Motion, few: int) -> bool:
     """Whether a motion took many steps; those of springs under one stress are but switches."""
     return motion.steps > few and motion.method != AGGREGATE
+
+
+def _damped_below_a_mass(scene: Plan, rows: Array) -> bool:
+    """Whether dashpots at the base feel how fast a mass inside moves."""
+    return len(scene.ends) > 1 and bool((rows[: scene.ends[0], kernels.ETA] > 0.0).any())
 
 
 def _difference(one: Array, other: Array) -> float:

@@ -73,6 +73,9 @@ DONE, TOO_MANY_STEPS, STEP_UNDERFLOW, FLAT_UNDER_STRESS, NOT_FINITE = range(5)
 # Strains closer than this to the end of a branch are at it.
 CLOSE = 1e-13
 MOST_ORDERS = 24
+# The base stress is followed to its own size where that is at least so much of the springs'
+# stresses: what has not come through to the base yet is not worth a step.
+LEAST_BASE = 1e-6
 
 
 class Samples(NamedTuple):
@@ -91,13 +94,24 @@ class Samples(NamedTuple):
 
 
 @inlined
-def _tail(law: Array, s: Array, n: int, per_reach: float, per_load: float) -> float:
-    """Largest coefficient of order n among strains and stresses, over motion and stress so far."""
-    worst = 0.0
+def _tail(
+    law: Array, s: Array, n: int, per_reach: float, per_load: float, per_base: float
+) -> float:
+    """Largest coefficient of order n among strains, stresses and base stress, over their scales."""
+    worst = abs(s[GROUP, 0, n]) * per_base
     for i in range(law.shape[0]):
         worst = max(worst, abs(s[EPS, i, n]) * law[i, HEIGHT] * per_reach)
         worst = max(worst, abs(s[SIG, i, n]) * per_load)
     return worst
+
+
+@inner
+def is_apart(links: Links) -> bool:
+    """Whether the base stress may be much smaller than the springs' stresses, or change faster.
+
+    So it is where a mass hides the base from the blow, or a dashpot acts there.
+    """
+    return links.ends.size > 1 or links.law[0, DASHPOT] > 0.0
 
 
 @inlined
@@ -110,8 +124,12 @@ def step_length(
     span: float,
     w_scale: float,
     s_scale: float,
+    b_scale: float,
 ) -> float:
-    """Longest step within `span` whose last two terms fall below `tol` of motion and stress."""
+    """Longest step within `span` whose last two terms fall below `tol` of motion and stress.
+
+    The base stress is measured by its own size: by that of all springs if `b_scale` is infinite.
+    """
     reach, load = w_scale, max(s_scale, abs(push[0]))
     for _ in range(60):  # at rest the only scale is what the step itself reaches
         tried = span
@@ -124,11 +142,17 @@ def step_length(
                 load = max(load, abs(s[SIG, i, 1]) * span)
         per_reach = 1.0 / reach if reach > 0.0 else 0.0
         per_load = 1.0 / load if load > 0.0 else 0.0
+        base = b_scale
+        if b_scale < math.inf:
+            base = max(b_scale, abs(value_at(s[GROUP, 0], order, span)), LEAST_BASE * load)
+        per_base = 1.0 / base if base > 0.0 else 0.0
         for n in (order - 1, order):
-            tail = _tail(links.law, s, n, per_reach, per_load)
+            tail = _tail(links.law, s, n, per_reach, per_load, per_base)
             if tail * span**n > tol:
                 span = (tol / tail) ** (1.0 / n)
-        if span >= 0.5 * tried or (w_scale > 0.0 and s_scale > 0.0):
+        if span >= 0.5 * tried:
+            break
+        if w_scale > 0.0 and s_scale > 0.0 and base == b_scale:
             break
     return span
 
@@ -146,14 +170,22 @@ def first_switch(law: Array, s: Array, order: int, span: float) -> tuple[float, 
 
 @inner
 def _enough(
-    law: Array, s: Array, order: int, span: float, tol: float, w_scale: float, s_scale: float
+    law: Array,
+    s: Array,
+    order: int,
+    span: float,
+    tol: float,
+    w_scale: float,
+    s_scale: float,
+    b_scale: float,
 ) -> int:
     """Orders that are enough over a step that a switch or a sample made short."""
+    base = max(b_scale, LEAST_BASE * s_scale)
     if w_scale == 0.0 or s_scale == 0.0 or span == 0.0:
         return order
     tail, power, per_span = 0.0, span**order, 1.0 / span
     while order > 2:
-        tail += _tail(law, s, order, 1.0 / w_scale, 1.0 / s_scale) * power
+        tail += _tail(law, s, order, 1.0 / w_scale, 1.0 / s_scale, 1.0 / base) * power
         if tail > tol:
             break
         power *= per_span
@@ -559,8 +591,8 @@ def integrate(
     for p in range(size):
         late[p] = 0.0
     begin(rows, heights, start, directions, branches, law, s, d)
-    bare = is_bare(links)
-    w_scale, s_scale, pressed, knot, stalled = 0.0, 0.0, False, 0, 0
+    bare, apart = is_bare(links), is_apart(links)
+    w_scale, s_scale, b_scale, pressed, knot, stalled = 0.0, 0.0, math.inf, False, 0, 0
     switches = count - count  # a whole number, and no constant: one type to compile for
     now, done = (0.0 if struck else t[0]), 0
     if struck:
@@ -583,7 +615,9 @@ def integrate(
             return FLAT_UNDER_STRESS, now, step, switches
         if step > 0:
             s_scale = _loaded(s, s_scale)
-        span = step_length(links, s, push, order, tol, horizon - now, w_scale, s_scale)
+        if apart:
+            b_scale = max(b_scale if step > 0 else 0.0, abs(s[GROUP, 0, 0]))
+        span = step_length(links, s, push, order, tol, horizon - now, w_scale, s_scale, b_scale)
         if not math.isfinite(span) or not math.isfinite(s[GROUP, 0, order]):
             return NOT_FINITE, now, step, switches
         span, spring, side = first_switch(law, s, order, span)
@@ -600,7 +634,7 @@ def integrate(
         end = horizon if last else end
         least = order
         if spring >= 0 or leaves or last:  # it was not its own error that ended the step
-            least = _enough(law, s, order, span, 1e-3 * tol, w_scale, s_scale)
+            least = _enough(law, s, order, span, 1e-3 * tol, w_scale, s_scale, b_scale)
         more = min(least + 2, order)  # for what is, in time, a derivative of these
         if tangent:
             expand_tangents(links, s, d, more)

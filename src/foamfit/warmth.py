@@ -81,7 +81,7 @@ def _calls() -> _Calls:
             (series.expand_bare, (links, cube, one, 0)),
             (series.advance, (cube, 0, 0, 0.0)),
             (taylor.before_contact, (flat, one, 0.0)),
-            (taylor.step_length, (links, cube, one, 0, 0.0, 0.0, 0.0, 0.0)),
+            (taylor.step_length, (links, cube, one, 0, 0.0, 0.0, 0.0, 0.0, 0.0)),
             (taylor.settle, (links, cube)),
         ],
         whole=[(taylor.integrate, (*scene, flat, cube, flat))],
