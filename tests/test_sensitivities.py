@@ -19,6 +19,8 @@ PAIR = [LINEAR, SOFT]
 IMPACT = ff.Impact(7e-3, 2.0)
 PULSE = np.sin(np.pi * TIME / TIME[-1]) ** 2
 MOTION, STRESS = ff.DisplacementDrive(0.5e-3 * PULSE), ff.StressDrive(6e6 * PULSE)
+HELD = ff.LinearSpring(60e6, unilateral=True)
+PULLED = ff.DisplacementDrive(0.5e-3 * PULSE - 4e-5 * TIME / TIME[-1])
 MOVED = ff.DisplacementDrive(0.5e-3 * PULSE + 1e-5)
 
 
@@ -51,6 +53,9 @@ SCENES: dict[str, tuple[ff.Chain, Drive]] = {
     "motion of two, one damped": (chain(damped(PAIR, 0.0, 30.0)), MOTION),
     "motion of two from a strain, damped": (chain(damped(PAIR, 20.0, 30.0)), MOVED),
     "motion of two, interior mass": (chain(PAIR, [5e-5, 0.0]), MOTION),
+    "motion that opens a gap": (chain([HELD, SOFT]), PULLED),
+    "motion that opens a gap, damped": (chain(damped([HELD, SOFT], 0.0, 30.0)), PULLED),
+    "motion that opens a gap, interior mass": (chain([HELD, SOFT], [5e-5, 0.0]), PULLED),
     "stress": (chain([BISTABLE]), STRESS),
     "stress, dashpot": (chain(damped([BISTABLE], 20.0)), STRESS),
     "stress on two": (chain(PAIR), STRESS),
@@ -68,6 +73,7 @@ STIFF: dict[str, tuple[ff.Chain, Drive]] = {
     "stiff: one of three damped": (chain(damped([*PAIR, BISTABLE], 0.0, 1e-2, 0.0)), IMPACT),
     "stiff: motion of two": (chain(damped(PAIR, 1e-2, 1e-2)), MOVED),
     "stiff: motion, light mass": (chain(damped(PAIR, 50.0, 30.0), [1e-8, 0.0]), MOTION),
+    "stiff: motion that opens a gap": (chain(damped([HELD, SOFT], 0.0, 30.0), [1e-8, 0.0]), PULLED),
     "stiff: stress on two": (chain(damped(PAIR, 1e-2, 1e-2)), STRESS),
     "stiff: stress, viscous top": (chain(damped(PAIR, 0.0, 1e-1), site=300.0), STRESS),
 }

@@ -110,6 +110,25 @@ def test_what_was_compiled_of_another_source_is_no_use(
     assert [path.exists() for path in made] == [True, False]
 
 
+def test_what_is_compiled_where_it_is_needed_is_announced_once(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    class Loop:
+        __name__ = "integrate_slowly"
+        signatures: tuple[object, ...] = ()
+
+    monkeypatch.setattr(warmth, "_cache", lambda: tmp_path)
+    new, known, kept = Loop(), Loop(), Loop()
+    known.signatures = ((),)
+    for loop in (new, new, known):
+        warmth.announce(loop, "the solver of slow scenes")
+    (tmp_path / "implicit.integrate_slowly-30.py311.1.nbc").touch()
+    warmth.announce(kept, "the solver of slow scenes")
+    assert [record.getMessage() for record in caplog.records] == [
+        "foamfit: compiling the solver of slow scenes, once after installation"
+    ]
+
+
 def test_every_module_with_compiled_loops_is_known() -> None:
     package = Path(warmth.__file__).parent
     written = {

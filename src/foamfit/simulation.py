@@ -39,10 +39,10 @@ _RINGING = (
     "masses vibrate too fast to be followed, by up to {size:.1g} of the range: ask for no smaller "
     "rtol than that, give the springs heavier dashpots, or leave the masses out"
 )
-# From so many steps on, and where steps are implicit, several masses are inside, or dashpots below a
-# mass, a motion is run again to check it; so it is where a strain comes so close to the end of its
-# branch.
-FEW_STEPS, CLOSE = 1000, 1e-3
+# From so many steps on, or switches under masses, and where steps are implicit, several masses are
+# inside, or dashpots below a mass, a motion is run again to check it; so it is where a strain comes
+# so close to the end of its branch.
+FEW_STEPS, FEW_SWITCHES, CLOSE = 1000, 32, 1e-3
 LOST = 0.03  # so large a difference is not mended by still shorter steps
 
 
@@ -111,7 +111,7 @@ def _verified(
     """
     motion = scene.run(rows, heights, rtol, directions=directions)
     inside = len(scene.ends) > 2 or _damped_below_a_mass(scene, rows)
-    many = _many(motion, FEW_STEPS) or inside or motion.method == RADAU
+    many = _many(scene, motion, FEW_STEPS) or inside or motion.method == RADAU
     if scene.speed > 0.0 and not many and not _hard(scene, rows, heights):
         return motion
     motion = _resolved(scene, rows, heights, rtol, directions, motion)
@@ -129,7 +129,7 @@ def _verified(
             f"rounding alone makes errors above rtol = {rtol:g}"
         )
     forced = 0 if scene.speed > 0.0 else scene.time.size
-    many = _many(motion, FEW_STEPS + 2 * forced) or inside or room < CLOSE
+    many = _many(scene, motion, FEW_STEPS + 2 * forced) or inside or room < CLOSE
     many = many and scene.solver == SECOND_ORDER
     if not (many or motion.method == RADAU) or rtol < 1e-12:  # no finer run could tell
         return motion
@@ -186,9 +186,10 @@ def _followed(
         raise SimulationError(_RINGING.format(size=lost)) from None
 
 
-def _many(motion: Motion, few: int) -> bool:
-    """Whether a motion took many steps; those of springs under one stress are but switches."""
-    return motion.steps > few and motion.method != AGGREGATE
+def _many(scene: Plan, motion: Motion, few: int) -> bool:
+    """Whether a motion took many steps (those of springs under one stress are but switches)."""
+    shaken = len(scene.ends) > 1 and len(motion.switches) > FEW_SWITCHES
+    return (motion.steps > few or shaken) and motion.method != AGGREGATE
 
 
 def _damped_below_a_mass(scene: Plan, rows: Array) -> bool:

@@ -1,12 +1,14 @@
 """First use: what is compiled is made by two processes side by side, and kept in the cache.
 
 Compiling in one process takes twice as long. Nothing else depends on it: what is not in the cache
-is compiled where it is first needed.
+is compiled where it is first needed, and said so.
 """
 
 from __future__ import annotations
 
+import functools
 import gc
+import logging
 import os
 import signal
 import subprocess
@@ -18,6 +20,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+
+_LOG = logging.getLogger(__name__)
 
 Call = tuple[Any, tuple[Any, ...]]
 
@@ -106,8 +110,15 @@ def _cache() -> Path:
     return Path(integrate.stats.cache_path or ".")
 
 
-def compiled() -> bool:
-    """Tell whether an earlier run left the integrator, compiled of this very source, in the cache.
+@functools.cache
+def announce(function: Any, what: str) -> None:
+    """Log, once in a process, that `function` is about to be compiled, unless it has been."""
+    if not function.signatures and not compiled(function.__name__):
+        _LOG.warning("foamfit: compiling %s, once after installation", what)
+
+
+def compiled(name: str = "integrate") -> bool:
+    """Tell whether an earlier run left a loop, compiled of this very source, in the cache.
 
     What is older than any module that compiled loops are written in is removed: numba itself
     compares it with the module of the outermost loop alone.
@@ -119,7 +130,7 @@ def compiled() -> bool:
         if made.stat().st_mtime < written:
             with suppress(OSError):  # not ours to remove
                 made.unlink(missing_ok=True)
-        elif made.name.startswith("taylor.integrate-"):
+        elif f".{name}-" in made.name:
             fresh = fresh or made.suffix == ".nbc"
     return fresh
 
