@@ -76,6 +76,8 @@ MOST_ORDERS = 24
 # The base stress is followed to its own size where that is at least so much of the springs'
 # stresses: what has not come through to the base yet is not worth a step.
 LEAST_BASE = 1e-6
+# Truncation of derivatives, relative to what they were so far, over that of the motion.
+OF_TANGENTS = 1e3
 
 
 class Samples(NamedTuple):
@@ -154,6 +156,42 @@ def step_length(
             break
         if w_scale > 0.0 and s_scale > 0.0 and base == b_scale:
             break
+    return span
+
+
+@piece
+def tangent_length(
+    heights: Array, d: Tangents, order: int, tol: float, span: float, sizes: Array
+) -> float:
+    """Longest step within `span` whose last two terms fall below `tol` of the derivatives so far.
+
+    A vibration or relaxation that the motion itself does not show may be in its derivatives: steps
+    that are too long for it let these grow without bound. `sizes` (p, 2) holds the largest
+    elongation and base stress of each direction.
+    """
+    for p in range(d.drag.size):
+        if d.live[p] == 0.0:
+            continue
+        for part in range(2):
+            for _ in range(2):  # what a step that is too long reaches is too large
+                bar = tail = before = 0.0
+                for i in range(heights.size if part == 0 else 1):
+                    c = d.series[p, EPS, i] if part == 0 else d.series[p, GROUP, 0]
+                    weight, power = heights[i] if part == 0 else 1.0, 1.0
+                    for n in range(order // 2 + 1):
+                        bar = max(bar, weight * abs(c[n]) * power)
+                        power *= span
+                    before = max(before, weight * abs(c[order - 1]))
+                    tail = max(tail, weight * abs(c[order]))
+                size, longest = max(sizes[p, part], bar), span
+                bar = tol * size
+                if before * span ** (order - 1) > bar:
+                    span = (bar / before) ** (1.0 / (order - 1))
+                if tail * span**order > bar:
+                    span = (bar / tail) ** (1.0 / order)
+                if span == longest:
+                    break
+            sizes[p, part] = size
     return span
 
 
@@ -587,6 +625,7 @@ def integrate(
     branches = np.empty(count, np.int64)
     room = np.empty((6, max(order + 1, max(size, curves.shape[0]))))
     late, c, push, motion = room[0], room[3], room[4], room[5]
+    sizes = np.zeros((size, 2))
     push[0] = push[1] = 0.0
     for p in range(size):
         late[p] = 0.0
@@ -626,18 +665,21 @@ def integrate(
             pressed = pressed or s[GROUP, 0, 0] > tol * s_scale
             span, leaves = first_lift(s, order, step == 0, pressed, span)
             spring = -1 if leaves else spring
+        least = order
+        if spring >= 0 or leaves or now + span >= horizon:  # not its own error ended the step
+            least = _enough(law, s, order, span, 1e-3 * tol, w_scale, s_scale, b_scale)
+        more = min(least + 2, order)  # for what is, in time, a derivative of these
+        if tangent:
+            expand_tangents(links, s, d, more)
+            shorter = tangent_length(heights, d, more, OF_TANGENTS * tol, span, sizes)
+            if shorter < span:
+                span, spring, leaves = shorter, -1, False
         end = now + span
         stalled = stalled + 1 if span == 0.0 else 0
         if (end <= now and span > 0.0) or stalled > 4 * count + 8:
             return STEP_UNDERFLOW, now, step, switches
         last = end >= horizon and not leaves and spring < 0
         end = horizon if last else end
-        least = order
-        if spring >= 0 or leaves or last:  # it was not its own error that ended the step
-            least = _enough(law, s, order, span, 1e-3 * tol, w_scale, s_scale, b_scale)
-        more = min(least + 2, order)  # for what is, in time, a derivative of these
-        if tangent:
-            expand_tangents(links, s, d, more)
         if top == MOTION and knot > 0 and fresh:
             _mend_kink(out, s, d, knot)
         first, done = done, first_past(t, done, end, last)

@@ -65,6 +65,7 @@ def _calls() -> _Calls:
             (series.advance_tangents, (d, 0, 0, 0.0)),
             (taylor.depart, (links, cube, d, 0, 0, 0.0, 0.0, out, 0, flat)),
             (taylor.first_switch, (flat, cube, 0, 0.0)),
+            (taylor.tangent_length, (one, d, 0, 0.0, 0.0, flat)),
             (taylor.first_lift, (cube, 0, True, True, 0.0)),
         ],
         rest=[
@@ -113,7 +114,8 @@ def _cache() -> Path:
 @functools.cache
 def announce(function: Any, what: str) -> None:
     """Log, once in a process, that `function` is about to be compiled, unless it has been."""
-    if not function.signatures and not compiled(function.__name__):
+    made = getattr(function, "signatures", True)  # where numba is switched off there are none
+    if not made and not compiled(function.__name__):
         _LOG.warning("foamfit: compiling %s, once after installation", what)
 
 
