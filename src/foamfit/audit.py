@@ -251,6 +251,7 @@ def describe(measurement: Measurement, audit: EnergyAudit) -> str:
     test = measurement
     lines = [("test", test.name), ("file", str(test.path or "none"))]
     lines += [("specimen", _specimen(test)), ("striker", _striker(test))]
+    lines += _labelled("rows", test.rows.sentences())
     lines += [("samples", _sampling(test))]
     lines += _peaks(test)
     lines += _labelled("noise", noise_sentences(test))

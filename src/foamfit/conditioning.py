@@ -16,8 +16,10 @@ from foamfit.errors import InputError
 from foamfit.measurement import (
     INTEGRATED,
     Array,
+    Dropped,
     NoiseLevel,
     Outliers,
+    RowCount,
     Specimen,
     Striker,
     interior_channel,
@@ -38,7 +40,9 @@ class Record:
     deceleration in m/s² (like the stress that causes it, it is positive in compression). `interior`
     holds the displacement of masses inside in m, 1 for the one above spring 1. `excess` is what the
     file has beyond the straight line that bridges an outlier, 0 elsewhere, for each channel that
-    has outliers.
+    has outliers. `clipped` marks the samples at which the force is clipped. `numbers` holds the row
+    number in the file of each sample (None: they count from 1), and `dropped` the rows of the file
+    that were left out so far.
     """
 
     time: Array | None
@@ -48,10 +52,34 @@ class Record:
     acceleration: Array | None = None
     interior: dict[int, Array] = field(default_factory=dict)
     excess: dict[str, Array] = field(default_factory=dict)
+    clipped: NDArray[np.bool_] | None = None
+    numbers: NDArray[np.int64] | None = None
+    dropped: tuple[Dropped, ...] = ()
+
+    @property
+    def row_numbers(self) -> NDArray[np.int64]:
+        """Row number in the file of each sample, shape (n,)."""
+        return np.arange(1, len(self) + 1) if self.numbers is None else self.numbers
+
+    def without(self, gone: slice | NDArray[np.bool_], why: str) -> Record:
+        """Leave out some rows of every channel, and count them with the reason."""
+        numbers = self.row_numbers
+        lost = numbers[gone]
+        if not lost.size:
+            return self
+        kept = np.ones(len(self), dtype=bool)
+        kept[gone] = False
+        item = Dropped(lost.size, int(lost[0]), int(lost[-1]), why)
+        return replace(self, numbers=numbers, dropped=(*self.dropped, item)).rows(kept)
+
+    def between(self, first: int, end: int, before: str, after: str) -> Record:
+        """Keep the samples from `first` up to `end`; the reasons count what lies outside."""
+        return self.without(slice(end, None), after).without(slice(0, first), before)
 
     def rows(self, which: slice | NDArray[np.bool_]) -> Record:
-        """Keep some rows of every channel."""
+        """Keep some rows of every channel; rows that `without` leaves out are counted, too."""
         channels: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
+        del channels["dropped"]
         inside = {node: values[which] for node, values in channels.pop("interior").items()}
         excess = {name: values[which] for name, values in channels.pop("excess").items()}
         kept: dict[str, Any] = {k: v[which] for k, v in channels.items() if v is not None}
@@ -111,6 +139,7 @@ class Conditioned:
     outliers: dict[str, Outliers]
     noise: dict[str, NoiseLevel]
     contact: str
+    count: RowCount
 
 
 @dataclass(frozen=True)
@@ -198,7 +227,8 @@ def condition(
     notes += [
         _outlier_note(name, count, outliers.get(name), record) for name, count in spoilt.items()
     ]
-    return Conditioned(record, motion, tuple(notes), outliers, noise, start.by)
+    count = _row_count(whole, outliers, block)
+    return Conditioned(record, motion, tuple(notes), outliers, noise, start.by, count)
 
 
 def engineering(value: float, unit: str) -> str:
@@ -320,7 +350,7 @@ def cut_to_window(record: Record, window: Window) -> tuple[Record, list[str]]:
             f"{first} and {last} are needed."
         )
     note = f"[window] cut {cut} of {len(record)} samples."
-    record = record.rows(inside)
+    record = record.without(~inside, "outside [window] start and end")
     for name in ("stress", "displacement"):
         values = getattr(record, name)
         if values is not None and np.ptp(values) == 0:
@@ -375,6 +405,30 @@ def _outliers(whole: Record, record: Record, block: int) -> dict[str, Outliers]:
         at = np.flatnonzero(wrong)
         found[name] = Outliers(share > 0.5, whole.clock[at], values[at] + excess[at])
     return found
+
+
+def _row_count(whole: Record, outliers: dict[str, Outliers], block: int) -> RowCount:
+    """Count the rows of the file: `whole` holds those that are left, before it was thinned."""
+    dropped, used = list(whole.dropped), np.ones(len(whole), dtype=bool)
+
+    def drop(wrong: NDArray[np.bool_], why: str) -> None:
+        wrong = wrong & used
+        lost = whole.row_numbers[wrong]
+        used[wrong] = False
+        if lost.size:
+            dropped.append(Dropped(lost.size, int(lost[0]), int(lost[-1]), why))
+
+    for name, excess in whole.excess.items():
+        drop(excess != 0.0, f"a spike or gap of the {name}, bridged by a straight line")
+    if whole.clipped is not None:
+        left_out = np.repeat(outliers["stress"].left_out, block)[: len(whole)]
+        drop(left_out & whole.clipped, "the force is clipped")
+    for name, found in outliers.items():
+        left_out = np.repeat(found.left_out, block)[: len(whole)]
+        drop(left_out, f"in a block of {block} samples of the {name} that is not fitted")
+    count = int(used.sum())
+    total = len(whole) + sum(item.rows for item in whole.dropped)
+    return RowCount(total, count, tuple(sorted(dropped, key=lambda item: item.first)))
 
 
 def noise_of_held(record: Record) -> dict[str, NoiseLevel]:
@@ -505,7 +559,8 @@ def select_cycle(record: Record, cycle: int) -> tuple[Record, list[str]]:
         )
     if cycle > len(falls):
         notes.append("The record has no unloading, so nothing in it determines unloading.")
-    return record.rows(slice(start, end)), notes
+    record = record.between(start, end, f"before cycle {cycle}", f"after cycle {cycle}")
+    return record, notes
 
 
 def _rise(values: Array, share: float) -> int:
@@ -725,7 +780,7 @@ def cut_to_contact(record: Record, start: Start, impact: bool) -> tuple[Record, 
         time=None if record.time is None else time - zero_time,
         displacement=None if w is None else w - start.zero,
     )
-    return record.rows(slice(first, end)), notes
+    return record.between(first, end, "before contact starts", "after contact ends"), notes
 
 
 def integrate_motion(record: Record, specimen: Specimen, striker: Striker) -> tuple[Record, str]:

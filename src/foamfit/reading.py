@@ -17,15 +17,27 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from foamfit.conditioning import Record, condition
 from foamfit.errors import InputError
-from foamfit.measurement import Array, Measurement, Striker, interior_channel, interior_node
+from foamfit.measurement import (
+    Array,
+    Dropped,
+    Measurement,
+    Striker,
+    interior_channel,
+    interior_node,
+)
 from foamfit.noise import with_noise
 from foamfit.settings import Column, Settings, read_settings
 from foamfit.units import factor, is_unit
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 # Channel: its SI unit, an example of a header, and the words that name it (the first one is best).
 _CHANNELS: dict[str, tuple[str, str, tuple[str, ...]]] = {
@@ -42,6 +54,7 @@ _WORDS = {word for _, _, words in _CHANNELS.values() for word in words}
 _OTHER = {"std", "sd", "dev", "error", "err", "noise", "uncertainty", "rate", "specific", "energy"}
 _MIN_ROWS = 10
 _HEAD_ROWS = 400
+_LONGEST = 200  # characters of a column's name
 
 
 # The table: separator, headers, numbers.
@@ -65,6 +78,8 @@ class _Table:
     encoding: str
     separator: str
     decimal: str
+    header_row: int
+    header_cells: tuple[str, ...]  # as they stand in the file
     first_row: int  # rows above the numbers
     n_fields: int
     headers: tuple[_Header, ...]
@@ -73,17 +88,36 @@ class _Table:
         """Yield (row number in the file, cells) of the rows that are not blank."""
         lines = io.TextIOWrapper(io.BytesIO(self.raw), self.encoding, errors="replace", newline="")
         reader = csv.reader(lines, delimiter=self.separator)
-        for cells in reader:
-            if reader.line_num > self.first_row and any(cell.strip() for cell in cells):
-                yield reader.line_num, cells
+        try:
+            for cells in reader:
+                if reader.line_num > self.first_row and any(cell.strip() for cell in cells):
+                    yield reader.line_num, cells
+        except csv.Error as error:
+            raise InputError(f"{self.path}: row {reader.line_num + 1}: {error}.") from None
 
-    def row_number(self, index: int) -> int:
-        """Return the number in the file of the sample at `index`."""
-        return next(number for i, (number, _) in enumerate(self.rows()) if i == index)
+    def body(self) -> bytes:
+        """Return the rows below the header."""
+        return self.raw.split(b"\n", self.first_row)[-1] if self.first_row else self.raw
+
+    def row_numbers(self, count: int) -> NDArray[np.int64]:
+        """Return the row numbers in the file of its `count` samples."""
+        body = self.body().rstrip()
+        if body.count(b"\n") + 1 == count:  # without a blank line
+            return np.arange(count, dtype=np.int64) + self.first_row + 1
+        return np.fromiter((number for number, _ in self.rows()), np.int64, count)
+
+    def empty_rows(self) -> NDArray[np.int64]:
+        """Return the numbers of the rows that have separators, but nothing between them."""
+        empty = re.compile(rb'[\s"%s]+' % re.escape(self.separator).encode())
+        lines = self.body().split(b"\n")
+        found = [i for i, line in enumerate(lines) if line.strip(b"\r") and empty.fullmatch(line)]
+        return np.array(found, dtype=np.int64) + self.first_row + 1
 
 
 def _parse_header(text: str) -> _Header:
     text = text.strip()
+    if len(text) > _LONGEST:  # a title or a comment
+        return _Header(text, (), None)
     bracket = re.fullmatch(r"(.*)[(\[{]([^()\[\]{}]*)[)\]}]", text)
     bracket = bracket or re.fullmatch(r"(.+) / (\S+)", text)
     if bracket:
@@ -160,39 +194,91 @@ def _decode(path: Path, raw: bytes) -> tuple[bytes, str]:
     return raw, "utf-8"
 
 
+_NUMBER = re.compile(
+    r"[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|nan|inf(?:inity)?)", re.IGNORECASE | re.ASCII
+)
+
+
 def _number(cell: str) -> bool:
-    try:
-        float(cell.strip().replace(",", "."))
-    except ValueError:
-        return False
-    return True
+    return _NUMBER.fullmatch(cell.strip().replace(",", ".")) is not None
 
 
 def _find_table(path: Path, raw: bytes, encoding: str, names: set[str]) -> _Table:
     """Find separator, header row and decimal sign; `names` are column names given in the TOML."""
     lines = io.TextIOWrapper(io.BytesIO(raw), encoding, newline=None)
-    head = [line for line, _ in zip(lines, range(_HEAD_ROWS), strict=False)]
+    head = [line.rstrip("\r\n") for line, _ in zip(lines, range(_HEAD_ROWS), strict=False)]
     best: tuple[int, int, str, list[list[str]]] = (0, 0, ",", [])
     for separator in ("\t", ";", ","):
-        grid = list(csv.reader([line.rstrip("\r\n") for line in head], delimiter=separator))
+        grid = _cells(path, head, separator)
+        numbers = False
         for i, cells in enumerate(grid):
             # On a tie the last row wins: titles and instrument settings stand above the header.
+            # Below rows of numbers it is another header, which `_refuse_cells` will meet.
             score = _score(cells, names)
-            if score and score >= best[0]:
-                best = (score, i, separator, grid)
+            if score > best[0] or (score and score == best[0] and not numbers):
+                best, numbers = (score, i, separator, grid), False
+            numbers = numbers or _holds_numbers(cells)
     score, i, separator, grid = best
     if not score:
         example = "time (ms), stress (MPa), displacement (mm)"
         raise InputError(f"{path}: no row names the columns; the first must be like '{example}'.")
+    above = [k for k, cells in enumerate(grid[:i], 1) if _holds_numbers(cells)]
+    if len(above) >= _MIN_ROWS:
+        raise InputError(
+            f"{path}: rows {above[0]} to {above[-1]} hold numbers above the header in row {i + 1}; "
+            "a file must hold one table with one header."
+        )
+    for k, text in enumerate(grid[i], 1):
+        if len(text) > _LONGEST:
+            raise InputError(
+                f"{path}: row {i + 1}: the name of column {k} has {len(text)} characters; "
+                f"it must have {_LONGEST} at most."
+            )
     first, texts = _unit_row(grid, i)
     headers = tuple(_parse_header(text) for text in texts)
     body = [cells for cells in grid[first:] if any(c.strip() for c in cells)]
     if not body:
         raise InputError(f"{path}: has a header in row {i + 1} but no rows of numbers below it.")
-    values = (value for row in body for value in row[: len(texts)])
-    comma = any(re.fullmatch(r"\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*", v) for v in values)
-    decimal = "," if separator != "," and comma else "."
-    return _Table(path, raw, encoding, separator, decimal, first, len(texts), headers)
+    decimal = _decimal_sign(path, body, len(texts), separator)
+    named = tuple(cell.strip() for cell in grid[i])
+    return _Table(
+        path, raw, encoding, separator, decimal, i + 1, named, first, len(texts), headers
+    )  # fmt: skip
+
+
+def _cells(path: Path, lines: list[str], separator: str) -> list[list[str]]:
+    reader = csv.reader(lines, delimiter=separator)
+    try:
+        return list(reader)
+    except csv.Error:
+        raise InputError(
+            f"{path}: row {reader.line_num + 1} has a cell of more than {csv.field_size_limit()} "
+            "characters; the file must be a text table (CSV)."
+        ) from None
+
+
+def _holds_numbers(cells: list[str]) -> bool:
+    """Whether a row is one of numbers: two at least, and nothing else."""
+    full = [cell for cell in cells if cell.strip()]
+    return len(full) > 1 and all(map(_number, full))
+
+
+def _decimal_sign(path: Path, body: list[list[str]], width: int, separator: str) -> str:
+    """Comma or point; where the comma separates cells too, the numbers stand in quotation marks."""
+    values = [value.strip() for row in body for value in row[:width]]
+    commas = [v for v in values if re.fullmatch(r"[+-]?\d*(?:,\d+)+(?:[eE][+-]?\d+)?", v)]
+    if not commas:
+        return "."
+    if separator == ",":
+        thousands = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+")
+        if all(thousands.fullmatch(v) for v in commas):
+            raise InputError(
+                f"{path}: {commas[0]!r} may have a decimal comma or a separator of thousands; "
+                "write the numbers with a decimal point and without separators."
+            )
+        points = sum(1 for v in values if "." in v and _number(v))
+        return "," if len(commas) > points else "."
+    return ","
 
 
 def _score(cells: list[str], names: set[str]) -> int:
@@ -288,40 +374,66 @@ def _factor(table: _Table, channel: str, header: _Header, given: Column | None) 
     )
 
 
-def _read_numbers(table: _Table, columns: dict[str, int]) -> dict[str, Array]:
-    """Read the columns as they stand in the file; whatever is no number is refused."""
-    import pandas as pd
+def _read_numbers(
+    table: _Table, columns: dict[str, int]
+) -> tuple[dict[str, Array], NDArray[np.int64]]:
+    """Read the columns as they stand in the file; whatever is no number is refused.
 
-    # A header of our own, with one column more: that one shows if any row has too many cells.
-    header = table.separator.join(str(k) for k in range(table.n_fields + 1)).encode()
-    body = table.raw.split(b"\n", table.first_row)[-1]
-    kinds = {str(k): "float64" for k in columns.values()}
-    excess = str(table.n_fields)
+    Returns
+    -------
+    numbers : dict of str to (n,) array
+        By the keys of `columns`.
+    empty : (k,) array of int
+        Numbers of the rows that hold separators only; they are left out.
+    """
+    empty = np.zeros(0, dtype=np.int64)
     try:
-        frame = pd.read_csv(
-            io.BytesIO(header + b"\n" + body),
-            sep=table.separator,
-            decimal=table.decimal,
-            encoding=table.encoding,
-            usecols=[*kinds, excess],
-            dtype=kinds | {excess: "str"},
-            na_filter=False,
-            index_col=False,
-        )
-    except (ValueError, pd.errors.ParserError) as error:
+        frame = _frame(table, columns, table.body())
+    except ValueError as error:
         _refuse_cells(table, columns)
-        raise InputError(f"{table.path}: is no regular table ({error}).") from None
-    if frame[excess].astype(bool).any():
+        empty = table.empty_rows()
+        if not empty.size:
+            raise InputError(f"{table.path}: is no regular table ({error}).") from None
+        lines = table.body().split(b"\n")
+        for number in empty:
+            lines[number - table.first_row - 1] = b""
+        frame = _frame(table, columns, b"\n".join(lines))
+    if frame[str(table.n_fields)].astype(bool).any():
         _refuse_cells(table, columns)
     numbers = {c: frame[str(k)].to_numpy(np.float64) for c, k in columns.items()}
     if not all(np.isfinite(values).all() for values in numbers.values()):
         _refuse_cells(table, columns)
-    return numbers
+    return numbers, empty
+
+
+def _frame(table: _Table, columns: dict[str, int], body: bytes) -> pd.DataFrame:
+    """Parse rows of numbers; the columns have their places as names."""
+    import pandas as pd
+
+    # A header of our own, with one column more: that one shows if any row has too many cells.
+    header = table.separator.join(str(k) for k in range(table.n_fields + 1)).encode()
+    kinds = {str(k): "float64" for k in columns.values()}
+    excess = str(table.n_fields)
+    return pd.read_csv(  # its ParserError is a ValueError
+        io.BytesIO(header + b"\n" + body),
+        sep=table.separator,
+        decimal=table.decimal,
+        encoding=table.encoding,
+        usecols=[*kinds, excess],
+        dtype=kinds | {excess: "str"},
+        na_filter=False,
+        index_col=False,
+    )
 
 
 def _refuse_cells(table: _Table, columns: dict[str, int]) -> None:
     """Find the first bad cell, row by row, and name it."""
     for row, cells in table.rows():
+        if tuple(cell.strip() for cell in cells) == table.header_cells:
+            raise InputError(
+                f"{table.path}: row {row} repeats the header of row {table.header_row}; a file "
+                "must hold one table with one header."
+            )
         if any(cell.strip() for cell in cells[table.n_fields :]):
             raise InputError(
                 f"{table.path}: row {row} has {len(cells)} cells, but the header has "
@@ -332,13 +444,26 @@ def _refuse_cells(table: _Table, columns: dict[str, int]) -> None:
             where = f"{table.path}: row {row}, column {table.headers[k].text!r}"
             if not cell:
                 raise InputError(f"{where} is empty; every sample must have a number there.")
+            if table.decimal == "," and "." in cell and _number(cell):
+                raise InputError(
+                    f"{where} is {cell!r}, but other numbers have a decimal comma; all must have "
+                    "the same decimal sign."
+                )
             text = cell.replace(",", ".") if table.decimal == "," else cell
-            try:
-                finite = math.isfinite(float(text))
-            except ValueError:
-                raise InputError(f"{where} is {cell!r}; it must be a number.") from None
-            if not finite:
+            if not _NUMBER.fullmatch(text):
+                raise InputError(f"{where} is {_short(cell)}; it must be a number{_hint(cell)}.")
+            if not math.isfinite(float(text)):
                 raise InputError(f"{where} is {cell!r}; it must be a finite number.")
+
+
+def _short(text: str) -> str:
+    return repr(text if len(text) <= _LONGEST else text[:_LONGEST] + " …")
+
+
+def _hint(cell: str) -> str:
+    """Say how to write a number whose digits are separated in groups."""
+    plain = re.sub(r"(?<=\d)[_' ,\u2009\u202f](?=\d{3})", "", cell)
+    return f" without separators, {plain}" if plain != cell and _number(plain) else ""
 
 
 # From columns to channels.
@@ -352,18 +477,25 @@ def _record(
     factors = {
         c: _factor(table, c, table.headers[k], settings.columns.get(c)) for c, k in needed.items()
     }
-    numbers = _read_numbers(table, needed)
-    if len(next(iter(numbers.values()))) < _MIN_ROWS:
+    numbers, empty = _read_numbers(table, needed)
+    count = len(next(iter(numbers.values())))
+    if count < _MIN_ROWS:
         raise InputError(f"{table.path}: has fewer than {_MIN_ROWS} rows; a test needs more.")
     for channel, values in numbers.items():
         if np.ptp(values) == 0:
             name = table.headers[needed[channel]].text
             raise InputError(f"{table.path}: column {name!r} is constant; a {channel} must vary.")
         numbers[channel] = values * factors[channel]
-    notes = [_columns_note(table, needed, settings), *_announced(table, len(values))]
+    notes = [_columns_note(table, needed, settings), *_announced(table, count)]
+    rows, dropped = table.row_numbers(count), list[Dropped]()
+    if empty.size:
+        why = "no cell of it holds anything"
+        dropped.append(Dropped(empty.size, int(empty[0]), int(empty[-1]), why))
+    if "time" in numbers:
+        if settings.duplicates == "average":
+            numbers, rows = _averaged(numbers, rows, dropped, notes)
+        _check_time(table, numbers["time"], table.headers[needed["time"]].text, rows)
     time = numbers.pop("time", None)
-    if time is not None:
-        _check_time(table, time, table.headers[needed["time"]].text)
     specimen = settings.specimen
     stress = _one_of(numbers, "stress", "force", specimen.area, "the area", notes)
     displacement = _one_of(numbers, "displacement", "strain", 1 / specimen.height, "height", notes)
@@ -378,7 +510,8 @@ def _record(
             notes.append(
                 f"{interior_channel(node)} is the displacement of the top; it is left out."
             )
-    return Record(time, stress, displacement, velocity, acceleration, inside), tuple(notes)
+    record = Record(time, stress, displacement, velocity, acceleration, inside)
+    return replace(record, numbers=rows, dropped=tuple(dropped)), tuple(notes)
 
 
 def _needed(table: _Table, columns: dict[str, int], settings: Settings) -> dict[str, int]:
@@ -434,15 +567,39 @@ def _announced(table: _Table, n: int) -> list[str]:
     return []
 
 
-def _check_time(table: _Table, time: Array, name: str) -> None:
+def _averaged(
+    numbers: dict[str, Array], rows: NDArray[np.int64], dropped: list[Dropped], notes: list[str]
+) -> tuple[dict[str, Array], NDArray[np.int64]]:
+    """Average neighbouring rows with the same time stamp; each is counted with its reason."""
+    time = numbers["time"]
+    fresh = np.append(True, np.diff(time) != 0.0)
+    again = rows[~fresh]
+    if not again.size:
+        return numbers, rows
+    starts = np.flatnonzero(fresh)
+    counts = np.diff(np.append(starts, len(time)))
+    why = "the time stamp of the row before, averaged with it"
+    dropped.append(Dropped(again.size, int(again[0]), int(again[-1]), why))
+    notes.append(
+        f"Check: {again.size} of {len(time)} rows have the time stamp of the row before, the first "
+        f"in row {again[0]}; rows with the same stamp are averaged (or refused by [data] "
+        'duplicates = "refuse").'
+    )
+    means = {c: np.add.reduceat(values, starts) / counts for c, values in numbers.items()}
+    return means | {"time": time[starts]}, rows[starts]
+
+
+def _check_time(table: _Table, time: Array, name: str, rows: NDArray[np.int64]) -> None:
     back = np.flatnonzero(np.diff(time) <= 0)
     if back.size:
         index = int(back[0]) + 1
-        what = "repeats" if time[index] == time[index - 1] else "goes back"
-        raise InputError(
-            f"{table.path}: row {table.row_number(index)}, column {name!r}: time {what}; "
-            "it must increase from row to row."
-        )
+        where = f"{table.path}: row {rows[index]}, column {name!r}: time"
+        if time[index] == time[index - 1]:
+            raise InputError(
+                f"{where} repeats; it must increase from row to row (in a test, [data] "
+                'duplicates = "average" averages rows with the same time stamp).'
+            )
+        raise InputError(f"{where} goes back; it must increase from row to row.")
 
 
 def _one_of(
@@ -508,8 +665,9 @@ def read_history(path: Path, channel: str) -> tuple[Array, Array]:
         if name not in found:
             raise InputError(f"{path}: has no column for the {name}; it must be {wanted}.")
     columns = {name: found[name] for name in ("time", channel)}
-    numbers = _read_numbers(table, columns)
-    _check_time(table, numbers["time"], table.headers[columns["time"]].text)
+    numbers, _ = _read_numbers(table, columns)
+    rows = table.row_numbers(len(numbers["time"]))
+    _check_time(table, numbers["time"], table.headers[columns["time"]].text, rows)
     for name, k in columns.items():
         header = table.headers[k]
         in_si = Column(header.text, _CHANNELS[name][0]) if header.unit is None else None
@@ -568,5 +726,6 @@ def read_test(path: str | Path, specimen: str | Path | None = None) -> Measureme
         interior=conditioned.record.interior,
         outliers=conditioned.outliers,
         contact=conditioned.contact,
+        count=conditioned.count,
     )
     return with_noise(measurement)

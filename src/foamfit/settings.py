@@ -27,7 +27,9 @@ _SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
     "striker": {"mass": ("kg", "7 g"), "velocity": ("m/s", "1.75 m/s")},
     "noise": {"stress": ("Pa", "20 kPa"), "displacement": ("m", "2 um")},
     "window": {"start": ("s", "0.5 ms"), "end": ("s", "2 ms"), "cycle": ("", "1")},
+    "data": {"duplicates": ("", "average")},
 }
+DUPLICATES = ("average", "refuse")
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,11 @@ class Column:
 
 @dataclass(frozen=True)
 class Settings:
-    """What the TOML says, in SI."""
+    """What the TOML says, in SI.
+
+    `duplicates` says what becomes of neighbouring rows with the same time stamp: "average" makes
+    one sample of them, "refuse" ends the reading.
+    """
 
     name: str
     specimen: Specimen
@@ -50,6 +56,7 @@ class Settings:
     noise: Noise
     window: Window
     columns: dict[str, Column] = field(default_factory=dict)
+    duplicates: str = "average"
 
 
 def load_toml(path: Path, otherwise: str) -> dict[str, Any]:
@@ -106,7 +113,7 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
         Naming the file and the key that is wrong or missing.
     """
     document = load_toml(path, f"{test.name} needs a TOML with [specimen] height and diameter")
-    check_keys(f"{path}:", document, ["name", "specimen", "striker", "columns", "noise", "window"])
+    check_keys(f"{path}:", document, ["name", "columns", *_SECTIONS])
     name = document.get("name", test.stem)
     if not isinstance(name, str) or not name.strip():
         raise InputError(f"{path}: name = {name!r} is no text; give it in quotation marks.")
@@ -124,6 +131,7 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
         noise=Noise(**values["noise"]),
         window=Window(**values["window"]),
         columns=_columns(path, document.get("columns", {}), channels),
+        **values["data"],
     )
 
 
@@ -133,6 +141,10 @@ def _value(path: Path, section: str, key: str, value: Any) -> Any:
     if key == "cycle":
         if type(value) is not int or value < 1:
             raise InputError(f"{where} = {value!r} must be a whole number from 1 up.")
+        return value
+    if key == "duplicates":
+        if value not in DUPLICATES:
+            raise InputError(f"{where} = {value!r} must be one of {', '.join(DUPLICATES)}.")
         return value
     if key == "heights":
         if not isinstance(value, list) or not value:
