@@ -77,8 +77,9 @@ def test_two_tables_in_a_file_are_refused(tmp_path):
 
 def test_duplicate_time_stamps_are_averaged_and_counted(tmp_path):
     time, stress, displacement = loop()
-    stress[[31, 41, 42]] += 0.003, 0.001, 0.002
-    time[[31, 41, 42]] = time[[30, 40, 40]]
+    for values in (time, stress, displacement):
+        values[[31, 41, 42]] = values[[30, 40, 40]]
+    stress[[41, 42]] += 0.001, 0.002
     lines = table(time, stress, displacement)
     test = read_test(write(tmp_path, lines))
     count = accounted(test)
@@ -104,7 +105,8 @@ def test_rows_without_a_cell_are_counted(tmp_path):
 
 def test_row_numbers_are_lines_of_the_file(tmp_path):
     time, stress, displacement = loop()
-    time[7] = time[6]
+    for values in (time, stress, displacement):
+        values[7] = values[6]
     lines = ["A title", "", *table(time, stress, displacement)]
     lines[5:5] = ["", ""]
     (item,) = accounted(read_test(write(tmp_path, lines))).dropped
@@ -168,7 +170,8 @@ def test_every_row_that_is_not_used_has_its_reason(tmp_path, kind, toml, why):
 
 def test_the_rows_stand_in_the_terminal_and_in_the_result(tmp_path):
     time, stress, displacement = loop()
-    time[7] = time[6]
+    for values in (time, stress, displacement):
+        values[7] = values[6]
     path = write(tmp_path, table(time, stress, displacement))
     assert "101 in the file, 100 used." in CliRunner().invoke(main, ["check", str(path)]).stdout
     result = fabricated.result(measurement=read_test(path))

@@ -6,8 +6,9 @@ Each step is a function that returns a new `Record` and a sentence for each thin
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -169,6 +170,7 @@ def condition(
     *,
     striker: Striker | None = None,
     window: Window | None = None,
+    reversed_: Mapping[str, str] | None = None,
 ) -> Conditioned:
     """Turn the samples of a file into one loading and unloading.
 
@@ -182,6 +184,8 @@ def condition(
         With it and a time the record is an impact, else a slow test whose displacement is driven.
     window : Window, optional
         What the user chose to look at.
+    reversed_ : mapping, optional
+        What to say of a channel that is plainly the other way round; see `check_signs`.
 
     Returns
     -------
@@ -199,7 +203,7 @@ def condition(
     record = done(cut_to_window(record, window))
     record = bridge_outliers(record)
     spoilt = {name: int(np.count_nonzero(excess)) for name, excess in record.excess.items()}
-    check_signs(record)
+    check_signs(record, reversed_ or {})
     held = noise_of_held(record)
     record = done(fill_staircase(record))
     if impact and window.cycle != 1:
@@ -261,27 +265,34 @@ def line_at(time: Array, values: Array, at: float) -> tuple[float, float]:
     return float(level), float(slope)
 
 
-def check_signs(record: Record) -> None:
-    """Refuse a channel that is plainly the other way round: compression is positive."""
-    hint = "is negative in compression; it must be positive: give its column and scale = -1"
+def check_signs(record: Record, reversed_: Mapping[str, str]) -> None:
+    """Refuse a channel that is plainly the other way round: compression is positive.
+
+    `reversed_` holds, by channel, what is wrong and what the user can write to turn it round.
+    """
+
+    def refuse(channel: str) -> NoReturn:
+        wrong = "is negative in compression; it must be positive: give its column and scale = -1"
+        raise InputError(f"the {reversed_.get(channel, f'{channel} {wrong} in [columns]')}.")
+
     stress, peak = record.stress, int(np.argmax(record.stress))
     first = float(np.median(stress[:5]))
     if first - stress.min() > 2 * max(stress[peak] - first, 0) and abs(stress.min()) > stress[peak]:
-        raise InputError(f"the stress or force {hint} in [columns].")
+        refuse("stress")
     if record.displacement is not None:
         moved = record.displacement[peak] - record.displacement[0]
         if moved < -0.5 * np.ptp(record.displacement[: peak + 1]):
-            raise InputError(f"the displacement or strain {hint} in [columns].")
+            refuse("displacement")
     for node, values in record.interior.items():
         if values[peak] - values[0] < -0.5 * np.ptp(values[: peak + 1]):
-            raise InputError(f"{interior_channel(node)} {hint} in [columns].")
+            refuse(interior_channel(node))
     if record.displacement is not None:
         return
     if record.acceleration is not None:
         if np.dot(stress - first, record.acceleration) < 0:
-            raise InputError(f"the acceleration {hint} in [columns] (braking is positive).")
+            refuse("acceleration")
     elif record.velocity is not None and record.velocity[0] < record.velocity[-1]:
-        raise InputError(f"the velocity {hint} in [columns].")
+        refuse("velocity")
 
 
 def checks(record: Record, specimen: Specimen, striker: Striker | None, motion: str) -> list[str]:
@@ -369,7 +380,7 @@ def bridge_outliers(record: Record) -> Record:
     for name in record.measured:
         values = record.channel(name)
         assert values is not None
-        wrong = find_outliers(values)
+        wrong = find_outliers(values, record.time)
         if wrong.any():
             line = bridged(values, wrong, record.clock)
             excess = record.excess | {name: np.where(wrong, values - line, 0.0)}

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from foamfit.conditioning import Record, condition
+from foamfit.conditioning import Record, condition, engineering
 from foamfit.errors import InputError
 from foamfit.measurement import (
     Array,
@@ -49,9 +49,15 @@ _CHANNELS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "acceleration": ("m/s**2", "acceleration (m/s^2)", ("acceleration", "accel", "deceleration")),
     "velocity": ("m/s", "velocity (m/s)", ("velocity", "speed")),
 }
+# Words that name the displacement where nothing better does: a machine's travel, or a gap.
+_MOTION = ("extension", "gap", "travel", "stroke", "deflection", "crosshead", "position")
 _WORDS = {word for _, _, words in _CHANNELS.values() for word in words}
 # With one of these beside it a channel's name means something else.
 _OTHER = {"std", "sd", "dev", "error", "err", "noise", "uncertainty", "rate", "specific", "energy"}
+_WEIGHTS = {"lb": "lbf", "lbs": "lbf", "kg": "kgf", "kgs": "kgf"}
+# Units of the examples in refusals; the others are in mm.
+_UNITS = {"time": "ms", "stress": "MPa", "force": "N", "strain": "%"}
+_UNITS |= {"acceleration": "m/s^2", "velocity": "m/s"}
 _MIN_ROWS = 10
 _HEAD_ROWS = 400
 _LONGEST = 200  # characters of a column's name
@@ -121,8 +127,7 @@ def _parse_header(text: str) -> _Header:
     bracket = re.fullmatch(r"(.*)[(\[{]([^()\[\]{}]*)[)\]}]", text)
     bracket = bracket or re.fullmatch(r"(.+) / (\S+)", text)
     if bracket:
-        words = re.split(r"[\s_]+", bracket[1].strip().lower())
-        return _Header(text, tuple(words), bracket[2].strip())
+        return _Header(text, _words(bracket[1]), bracket[2].strip())
     tokens = re.split(r"[\s_]+", text)
     for i in range(1, len(tokens)):
         rest = tokens[i:]
@@ -130,18 +135,32 @@ def _parse_header(text: str) -> _Header:
             continue
         unit = "/".join(token for token in rest if token.lower() != "per")  # m_s2, N_per_kg
         if is_unit(unit, any_case=True):
-            return _Header(text, tuple(t.lower() for t in tokens[:i]), unit)
-    return _over_unit(text) or _Header(text, tuple(t.lower() for t in tokens), None)
+            return _Header(text, _words(" ".join(tokens[:i])), unit)
+    return _over_unit(text) or _Header(text, _words(text), None)
+
+
+def _words(name: str) -> tuple[str, ...]:
+    """Words of a name, in small letters: Force(Linear:Load) has three."""
+    return tuple(word for word in re.split(r"[\s_:;()]+", name.lower()) if word)
 
 
 def _over_unit(text: str) -> _Header | None:
     """Header of a quantity over its unit, Time/ms; None where these two do not belong together."""
     name, _, unit = (part.strip() for part in text.partition("/"))
-    header = _Header(text, tuple(re.split(r"[\s_]+", name.lower())), unit)
-    for channel, (si, _, _) in _CHANNELS.items():
-        if unit and _rank(header, channel) is not None and factor(unit, si) is not None:
+    header = _Header(text, _words(name), unit)
+    for channel in _CHANNELS:
+        if unit and _rank(header, channel) is not None and _in_si(channel, unit) is not None:
             return header
     return None
+
+
+def _in_si(channel: str, unit: str, times: str = "") -> float | None:
+    """SI value of one `unit` · `times` of a channel; a mass or gram can only mean a weight or g."""
+    if channel == "acceleration" and unit in {"g", "G"}:
+        unit = "standard_gravity"
+    if channel == "force":
+        unit = _WEIGHTS.get(unit.casefold(), unit)
+    return factor(unit, _kind(channel)[0], times=times)
 
 
 def _kind(channel: str) -> tuple[str, str, tuple[str, ...]]:
@@ -150,6 +169,9 @@ def _kind(channel: str) -> tuple[str, str, tuple[str, ...]]:
         return _CHANNELS[channel]
     si, _, words = _CHANNELS["displacement"]
     return si, f"{channel} (mm)", words
+
+
+_WEAK = 3
 
 
 def _rank(header: _Header, channel: str) -> int | None:
@@ -162,9 +184,11 @@ def _rank(header: _Header, channel: str) -> int | None:
     if len(rest) == 1 and rest[0] in words:
         return 0 if rest[0] == words[0] else 1
     named = [w for w in rest if w in _WORDS and len(w) > 1]
-    if len(named) != 1 or named[0] not in words or _OTHER & set(rest):
+    if _OTHER & set(rest) or not all(word in words for word in named):
         return None
-    return 2
+    if named:
+        return 2
+    return _WEAK if channel == "displacement" and set(_MOTION) & set(rest) else None
 
 
 def _channels(table: _Table, given: dict[str, Column]) -> list[str]:
@@ -313,6 +337,7 @@ def _unit_row(grid: list[list[str]], i: int) -> tuple[int, list[str]]:
 def _assign(table: _Table, given: dict[str, Column], toml: Path | None) -> dict[str, int]:
     """Which column each channel is in: as the TOML says, else as the headers do."""
     found: dict[str, int] = {}
+    strained = "strain" in given or any(_rank(h, "strain") is not None for h in table.headers)
     for channel in _channels(table, given):
         if channel in given:
             name = given[channel].column
@@ -331,12 +356,17 @@ def _assign(table: _Table, given: dict[str, Column], toml: Path | None) -> dict[
             taken = {found[c] for c in given if c in found}
             ranks = {k: r for k, r in ranks.items() if k not in taken}
         best = [k for k, r in ranks.items() if r == min(ranks.values())]
+        if len(best) > 1 and channel == "time":
+            best = _clear_time(table, best)
         if len(best) > 1:
             both = " and ".join(repr(table.headers[k].text) for k in best)
+            entry = f'{channel} = {{ column = "{table.headers[best[0]].text}" }}'
             raise InputError(
                 f"{table.path}: columns {both} could both be the {channel}; keep one"
-                + (f", or name it in [columns] of {toml.name}." if toml else ".")
+                + (f", or write {entry} in [columns] of {toml.name}." if toml else ".")
             )
+        if best and ranks[best[0]] == _WEAK and strained:
+            continue
         if best:
             found[channel] = best[0]
     # A channel that the TOML names replaces its twin that only a header names.
@@ -347,31 +377,59 @@ def _assign(table: _Table, given: dict[str, Column], toml: Path | None) -> dict[
     return found
 
 
+def _clear_time(table: _Table, columns: list[int]) -> list[int]:
+    """Of several columns that could be the time keep the one that never goes back, if it is one.
+
+    The others start anew with each cycle, or stand still.
+    """
+    numbers, _ = _read_numbers(table, {str(k): k for k in columns})
+    steps = {k: np.diff(numbers[str(k)]) for k in columns}
+    onward = [k for k, step in steps.items() if step.size and step.min() >= 0.0 < step.max()]
+    return onward if len(onward) == 1 else columns
+
+
 def _factor(table: _Table, channel: str, header: _Header, given: Column | None) -> float:
     """Return what the numbers of a column are multiplied by to be SI."""
-    si, example, _ = _kind(channel)
-    unit = given.unit if given and given.unit is not None else header.unit
-    scale, scale_unit = (given.scale, given.scale_unit) if given else (1.0, "")
+    _, example, _ = _kind(channel)
+    given = given or Column("")
+    unit = given.unit if given.unit is not None else header.unit
     where = f"{table.path}: column {header.text!r}"
     over = header.text.partition("/")[2].strip()  # Weg/mm, which only the TOML calls displacement
-    if unit is None and over and factor(over, si, times=scale_unit) is not None:
+    if unit is None and over and _in_si(channel, over, given.scale_unit) is not None:
         unit = over
-    if unit is None and not scale_unit and channel != "strain":
+    if unit is None and not given.scale_unit and channel != "strain":
+        entry = f'{channel} = {{ column = "{header.text}", unit = "{_UNITS.get(channel, "mm")}" }}'
         raise InputError(
-            f"{where} has no unit; write it in the header like '{example}' or in [columns]."
+            f"{where} has no unit; write it in the header like '{example}' or in [columns] like "
+            f"{entry}."
         )
     unit = unit or ""
-    if channel == "acceleration" and unit in {"g", "G"}:
-        unit = "standard_gravity"  # not gram
     if not is_unit(unit, any_case=True):
         raise InputError(f"{where} has an unknown unit {unit!r}; write it like '{example}'.")
-    si_per_unit = factor(unit, si, times=scale_unit)
+    if given.unit is not None:
+        _check_unit(channel, header, given.unit, where)
+    si_per_unit = _in_si(channel, unit, given.scale_unit)
     if si_per_unit is not None:
-        return scale * si_per_unit
+        return given.scale * si_per_unit * (-1.0 if given.counts_down else 1.0)
     raise InputError(
         f"{where} cannot be read as {channel}: its unit {unit!r} is of another kind; "
         f"write it like '{example}' or give a scale in [columns]."
     )
+
+
+def _check_unit(channel: str, header: _Header, given: str, where: str) -> None:
+    """Refuse a unit in [columns] that contradicts the one in the header."""
+    own = header.unit
+    if own is None or not is_unit(own, any_case=True):
+        return
+    stated, there = _in_si(channel, given), _in_si(channel, own)
+    if there is None and not header.text.endswith((")", "]", "}")):
+        return  # the last word of a name only looks like a unit
+    if stated != there or (stated is None and given.casefold() != own.casefold()):
+        raise InputError(
+            f"{where} has the unit {own!r} in its header, but [columns] {channel} says {given!r}; "
+            "leave unit out, or, if the header is wrong, correct it by scale."
+        )
 
 
 def _read_numbers(
@@ -499,8 +557,13 @@ def _record(
     specimen = settings.specimen
     stress = _one_of(numbers, "stress", "force", specimen.area, "the area", notes)
     displacement = _one_of(numbers, "displacement", "strain", 1 / specimen.height, "height", notes)
-    assert stress is not None  # _needed has seen to it
     velocity, acceleration = numbers.get("velocity"), numbers.get("acceleration")
+    if stress is None:  # _needed has seen to it that these are there
+        assert settings.striker is not None
+        assert settings.striker.mass is not None
+        assert acceleration is not None
+        stress, acceleration = acceleration * settings.striker.mass / specimen.area, None
+        notes.append("The force is the striker's mass times its acceleration.")
     inside = {node: values for c, values in numbers.items() if (node := interior_node(c))}
     for node, values in tuple(inside.items()):
         if displacement is not None and np.allclose(
@@ -518,25 +581,30 @@ def _needed(table: _Table, columns: dict[str, int], settings: Settings) -> dict[
     """Choose the channels worth reading; refuse a file that lacks one that nothing can replace."""
     has = set(columns)
     listed = ", ".join(repr(h.text) for h in table.headers if h.text)
-    if not has & {"stress", "force"}:
+    striker = settings.striker or Striker()
+    forced = bool(has & {"stress", "force"})
+    if not forced and not ({"acceleration", "time"} <= has and striker.mass):
+        more = "; with a time and the [striker] mass an acceleration will do"
         raise InputError(
             f"{table.path}: no column is a stress or a force (there are {listed}); name one like "
-            "'stress (MPa)' or in [columns]."
+            f'\'stress (MPa)\', or write force = {{ column = "…", unit = "N" }} in [columns]{more}.'
         )
     if has & {"displacement", "strain"}:
-        return {c: k for c, k in columns.items() if c not in {"velocity", "acceleration"}}
-    for channel in has & {"velocity", "acceleration"} - set(settings.columns):
+        spare = {"velocity", "acceleration"} if forced else {"velocity"}
+        return {c: k for c, k in columns.items() if c not in spare}
+    helping = {"velocity", "acceleration"} if forced else {"velocity"}
+    for channel in has & helping - set(settings.columns):
         try:  # these only help, so one whose unit does not say what it is can be left
             _factor(table, channel, table.headers[columns[channel]], None)
         except InputError:
             has.remove(channel)
-    striker = settings.striker or Striker()
     sources = "velocity" in has or (striker.velocity and (striker.mass or "acceleration" in has))
     if "time" not in has or not sources:
+        timed = "" if "time" in has else 'time = { column = "…", unit = "s" } there, and '
         raise InputError(
             f"{table.path}: no column is a displacement or a strain (there are {listed}); name one "
-            "like 'displacement (mm)' or in [columns], or give a time column and the [striker] "
-            "mass and velocity to integrate the motion."
+            'like \'displacement (mm)\', or write displacement = { column = "…", unit = "mm" } in '
+            f"[columns], or give {timed}the [striker] mass and velocity to integrate the motion."
         )
     return {c: k for c, k in columns.items() if c in has}
 
@@ -548,12 +616,43 @@ def _columns_note(table: _Table, needed: dict[str, int], settings: Settings) -> 
         unit = f" in {given.unit}" if given.unit else ""
         by = f"{given.scale:.6g} {given.scale_unit}".strip()
         scale = f" times {by}" if by != "1" else ""
+        scale += ", counting down" if given.counts_down else ""
+        own = given.unit or table.headers[k].unit or ""
+        if channel == "force" and own.casefold() in _WEIGHTS:
+            scale += f" ({_WEIGHTS[own.casefold()]}: the weight of that mass)"
         parts.append(f"{channel} from {table.headers[k].text!r}{unit}{scale}")
     read = ", ".join(parts)
     rest = [
         repr(h.text) for k, h in enumerate(table.headers) if h.text and k not in needed.values()
     ]
     return f"Read {read}" + (f"; not used: {', '.join(rest)}." if rest else ".")
+
+
+def _reversed(table: _Table, columns: dict[str, int], settings: Settings) -> dict[str, str]:
+    """Say for each channel of a record what would turn it round; see `check_signs`."""
+    found = {}
+    for channel, k in columns.items():
+        given, text = settings.columns.get(channel) or Column(""), table.headers[k].text
+        if given.counts_down:
+            told = "leave counts_down = true out"
+        elif given.scale < 0.0:
+            told = f"leave the minus sign of scale = {given.scale:g} out"
+        else:
+            by = f"{-given.scale:g} {given.scale_unit}".strip()
+            by = f'"{by}"' if given.scale_unit else by
+            told = f'write {channel} = {{ column = "{text}", scale = {by} }}'
+            if channel.startswith("displacement"):
+                down = f'write {channel} = {{ column = "{text}", counts_down = true }}'
+                told = f"{down} (of a gap or a position; else scale = {by})"
+        wrong = f"{channel} is negative in compression; it must be positive"
+        if channel.startswith("displacement"):
+            wrong = f"{channel} is negative or gets smaller in compression; it must get larger"
+        found[channel] = f"{wrong}: {told} in [columns]"
+    twins = {"stress": ("force", "acceleration"), "displacement": ("strain",)}
+    for channel, others in twins.items():
+        source = next((c for c in (channel, *others) if c in found), None)
+        found |= {channel: found[source]} if source else {}
+    return found
 
 
 def _announced(table: _Table, n: int) -> list[str]:
@@ -675,6 +774,18 @@ def read_history(path: Path, channel: str) -> tuple[Array, Array]:
     return numbers["time"], numbers[channel]
 
 
+def _check_noise(toml: Path, settings: Settings, record: Record) -> None:
+    """Refuse a stated noise that is larger than all that was measured."""
+    for channel, unit in (("stress", "Pa"), ("displacement", "m")):
+        values, sigma = record.channel(channel), getattr(settings.noise, channel)
+        if values is not None and sigma is not None and sigma > np.ptp(values):
+            raise InputError(
+                f"{toml}: [noise] {channel} = {engineering(sigma, unit)} is "
+                f"{100.0 * sigma / np.ptp(values):.3g} % of the range of the measured {channel}, "
+                f"{engineering(float(np.ptp(values)), unit)}; give one standard deviation."
+            )
+
+
 def read_test(path: str | Path, specimen: str | Path | None = None) -> Measurement:
     """Read a test file and its TOML, check both and condition the data.
 
@@ -707,10 +818,15 @@ def read_test(path: str | Path, specimen: str | Path | None = None) -> Measureme
     record, notes = _record(table, columns, settings)
     try:
         conditioned = condition(
-            record, settings.specimen, striker=settings.striker, window=settings.window
+            record,
+            settings.specimen,
+            striker=settings.striker,
+            window=settings.window,
+            reversed_=_reversed(table, columns, settings),
         )
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+    _check_noise(toml, settings, conditioned.record)
     measurement = Measurement(
         name=settings.name,
         path=path,

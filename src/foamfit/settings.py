@@ -34,12 +34,17 @@ DUPLICATES = ("average", "refuse")
 
 @dataclass(frozen=True)
 class Column:
-    """What [columns] says of one channel: its column, and the unit and scale of its numbers."""
+    """What [columns] says of one channel: its column, and the unit and scale of its numbers.
+
+    `counts_down` says that the column is a gap or a position that gets smaller in compression; the
+    displacement is what it has lost since contact.
+    """
 
     column: str
     unit: str | None = None
     scale: float = 1.0
     scale_unit: str = ""
+    counts_down: bool = False
 
 
 @dataclass(frozen=True)
@@ -186,11 +191,16 @@ def _columns(path: Path, table: Any, channels: Iterable[str]) -> dict[str, Colum
         where = f"{path}: [columns] {channel}"
         if not isinstance(spec, dict) or not isinstance(spec.get("column"), str):
             raise InputError(f'{where} must be like {{ column = "Load", unit = "V" }}.')
-        check_keys(where, spec, ["column", "unit", "scale"])
+        motion = channel == "displacement" or interior_node(channel) is not None
+        check_keys(where, spec, ["column", "unit", "scale", *(["counts_down"] if motion else [])])
+        down = spec.get("counts_down", False)
+        if not isinstance(down, bool):
+            raise InputError(f"{where}: counts_down = {down!r} must be true or false.")
         unit = spec.get("unit")
         if unit is not None and (not isinstance(unit, str) or not is_unit(unit)):
             raise InputError(f'{where}: unit = {unit!r} is unknown; give it like unit = "mm".')
-        columns[channel] = Column(spec["column"], unit, *_scale(where, spec.get("scale", 1)))
+        scale = _scale(where, spec.get("scale", 1))
+        columns[channel] = Column(spec["column"], unit, *scale, down)
     return columns
 
 
