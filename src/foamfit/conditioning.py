@@ -30,7 +30,13 @@ from foamfit.measurement import (
 _MIN_ROWS = 10
 _MIN_REST = 20
 _MAX_ROWS = 1500
+# A force may be clipped where so many samples are equal at its top; a parabola falls by so many
+# steps of its digits within half that length on either side.
+_FLAT, _PARABOLA = 5, 3
 _BLOCKS = 1000
+# Shares of the largest displacement: what a reversal goes back at least, what is left of it at
+# rest, what counts as unloading, and a cycle that is named for being small.
+_TURN, _REST, _UNLOADED, _SMALLER = 0.05, 0.35, 0.1, 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,6 +208,7 @@ def condition(
     impact = striker is not None and record.time is not None
     record = done(cut_to_window(record, window))
     record = bridge_outliers(record)
+    record = done(mark_clipped(record))
     spoilt = {name: int(np.count_nonzero(excess)) for name, excess in record.excess.items()}
     check_signs(record, reversed_ or {})
     held = noise_of_held(record)
@@ -220,8 +227,14 @@ def condition(
     record = done(cut_to_contact(record, start, impact))
     motion = "measured"
     if record.displacement is None:
+        if record.clipped is not None and record.acceleration is None and record.velocity is None:
+            raise InputError(
+                "the force is clipped, so the motion cannot be integrated from it; give a "
+                "displacement, an acceleration or a velocity."
+            )
         record, motion = integrate_motion(record, specimen, striker or Striker())
         notes.append(f"The file has no displacement: the motion is {motion}.")
+    notes += inner_reversals(record)
     notes += checks(record, specimen, striker if impact else None, motion)
     whole, record = record, done(thin(record))
     block = -(-len(whole) // len(record))
@@ -373,6 +386,40 @@ def cut_to_window(record: Record, window: Window) -> tuple[Record, list[str]]:
     return record, [note]
 
 
+def mark_clipped(record: Record) -> tuple[Record, list[str]]:
+    """Find the samples at which the force is clipped: a flat top at one value, with steep flanks.
+
+    A rounded top shows equal samples, too, where its values are rounded: it is about a parabola,
+    which falls by some three more steps of the digits within half the length of the flat on either
+    side. A clipped force falls by more.
+    """
+    stress = record.stress
+    top = float(stress.max())
+    at_top = stress >= top - 1e-9 * float(np.ptp(stress))
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], at_top.astype(np.int8), [0]])))
+    starts, ends = edges[::2], edges[1::2]
+    longest = int(np.argmax(ends - starts))
+    first, end = int(starts[longest]), int(ends[longest])
+    fresh = np.append(0, np.flatnonzero(np.diff(stress) != 0.0) + 1)
+    held = float(np.median(np.diff(np.append(fresh, len(stress)))))
+    if end - first < max(_FLAT, 3 * held):
+        return record, []
+    reach = -(-(end - first) // 2)
+    around = stress[max(first - reach, 0)], stress[min(end - 1 + reach, len(stress) - 1)]
+    levels = np.diff(np.unique(stress))
+    step = float(levels[levels > 1e-9 * np.ptp(stress)].min())
+    if top - max(around) < 4 * _PARABOLA * step:
+        return record, []
+    count, told = int(at_top.sum()), engineering(top, "Pa")
+    lines = record.row_numbers[at_top]
+    note = (
+        f"Check: the force is clipped: {count} samples have one and the same value at its top, a "
+        f"stress of {told} (rows {lines[0]} to {lines[-1]}); they are not fitted, the true peak is "
+        "not known, and energy and impulse come out too small."
+    )
+    return replace(record, clipped=at_top), [note]
+
+
 def bridge_outliers(record: Record) -> Record:
     """Put a straight line in the place of spikes and short gaps; `excess` keeps what was there."""
     from foamfit.noise import bridged, find_outliers
@@ -392,7 +439,7 @@ def _outlier_note(name: str, count: int, found: Outliers | None, record: Record)
     """Name a channel's outliers: how many, and where those of the part that is used are."""
     some = f"{count} samples" if count > 1 else "1 sample"
     note = f"Check: {some} of the {name} stood out as spikes or gaps and"
-    if found is None:
+    if found is None or not found.at.size:
         return f"{note} were bridged, none of them in the part that is used."
     unit = {"stress": "Pa", "velocity": "m/s", "acceleration": "m/s²"}.get(name, "m")
     told = []
@@ -408,13 +455,20 @@ def _outlier_note(name: str, count: int, found: Outliers | None, record: Record)
 def _outliers(whole: Record, record: Record, block: int) -> dict[str, Outliers]:
     """Outliers of a record that was thinned: a block of them is left out, one in a block is not."""
     found = {}
+    edges = np.arange(0, len(whole), block)
     for name, excess in whole.excess.items():
         values, wrong = whole.channel(name), excess != 0.0
         if values is None or not wrong.any():
             continue
-        share = np.add.reduceat(wrong.astype(float), np.arange(0, len(whole), block)) / block
+        share = np.add.reduceat(wrong.astype(float), edges) / block
         at = np.flatnonzero(wrong)
         found[name] = Outliers(share > 0.5, whole.clock[at], values[at] + excess[at])
+    if whole.clipped is not None and whole.clipped.any():
+        left_out = np.add.reduceat(whole.clipped.astype(float), edges) > 0.0
+        none = np.zeros(0)
+        spikes = found.get("stress") or Outliers(np.zeros(left_out.size, dtype=bool), none, none)
+        top = float(whole.stress[whole.clipped].max())
+        found["stress"] = replace(spikes, left_out=spikes.left_out | left_out, clipped_at=top)
     return found
 
 
@@ -538,40 +592,119 @@ def _filled(clock: Array, values: Array, name: str, notes: list[str]) -> Array |
 
 
 def select_cycle(record: Record, cycle: int) -> tuple[Record, list[str]]:
-    """Keep one loading and unloading of a slow test, cycle 1 being the first in the file."""
+    """Keep one loading and unloading of a slow test, cycle 1 being the first in the file.
+
+    A cycle ends where the motion has gone back most of the way of the smaller of the peaks on
+    either side, so that cycles of growing amplitude count from the first; a reversal that goes
+    back less is part of its cycle.
+    """
     displacement = record.displacement
     if displacement is None:
         return record, []  # refused or integrated later
-    level = (displacement - displacement.min()) / np.ptp(displacement)
-    marks = np.where(level > 0.65, 1, np.where(level < 0.35, -1, 0))
-    at = np.flatnonzero(marks)
-    up, turn = marks[at] == 1, np.diff(marks[at])
-    rises = [*at[:1][up[:1]], *at[1:][turn > 0]]
-    falls = list(at[1:][turn < 0])
-    if rises and falls and falls[0] < rises[0]:
-        falls = falls[1:]
-    n = len(rises)
+    turns = find_turns(displacement)
+    peaks, rests = _cycles(record, turns)
+    n = len(peaks)
     if cycle > n:
         raise InputError(f"[window] cycle = {cycle}, but the file has {n}; give one from 1 to {n}.")
     # A cycle runs from the last rest before its rise to its first return to rest after its fall.
-    start, end = 0, len(record)
-    if cycle > 1:
-        between = displacement[falls[cycle - 2] : rises[cycle - 1]]
-        start = rises[cycle - 1] - 1 - int(np.argmin(between[::-1]))
-    if cycle <= len(falls):
-        after = displacement[falls[cycle - 1] : rises[cycle] if cycle < n else len(record)]
-        rest = after.min() + 0.005 * np.ptp(displacement)
-        end = falls[cycle - 1] + int(np.argmax(after <= rest)) + 1
+    size = float(np.ptp(displacement))
+    start = 0 if cycle == 1 else rests[cycle - 2]
+    top = peaks[cycle - 1]
+    after = displacement[top : peaks[cycle] if cycle < n else len(record)]
+    unloaded = float(after[0] - after.min())
+    end = len(record)
+    if unloaded > _UNLOADED * size:
+        end = top + int(np.argmax(after <= after.min() + 0.005 * size)) + 1
     notes = []
     if n > 1 or end - start < len(record):
         notes.append(
             f"Cycle {cycle} of {n} is used: {end - start} of {len(record)} samples, "
             f"{start} before it and {len(record) - end} after it are cut."
         )
-    if cycle > len(falls):
+    largest = int(np.argmax(displacement[peaks]))
+    share = (displacement[top] - displacement.min()) / size
+    if share < _SMALLER:
+        notes.append(
+            f"Check: cycle {cycle} reaches {share:.0%} of the largest displacement; "
+            f"cycle {largest + 1} of {n} reaches all of it ([window] cycle = {largest + 1})."
+        )
+    if unloaded <= _UNLOADED * size:
         notes.append("The record has no unloading, so nothing in it determines unloading.")
     record = record.between(start, end, f"before cycle {cycle}", f"after cycle {cycle}")
     return record, notes
+
+
+def find_turns(values: Array) -> NDArray[np.int64]:
+    """Samples at which a motion turns round: peaks and valleys by turns, the first a peak.
+
+    Only what goes back by more than a twentieth of the range, and by more than the noise, turns.
+    """
+    back = max(_TURN * float(np.ptp(values)), 8.0 * noise_level(values))
+    # The extremes of short blocks are all that counts.
+    block = max(1, len(values) // 20_000)
+    at = np.arange(len(values))
+    if block > 1:
+        parts = values[: len(values) // block * block].reshape(-1, block)
+        first = np.arange(len(parts)) * block
+        ends = np.arange(parts.size, len(values))
+        at = np.unique(
+            np.concatenate([first + parts.argmin(axis=1), first + parts.argmax(axis=1), ends])
+        )
+    turns: list[int] = []
+    up, best = True, int(at[0])
+    for i, value in zip(at.tolist(), values[at].tolist(), strict=True):
+        ahead = value - values[best] if up else values[best] - value
+        if ahead > 0.0:
+            best = i
+        elif ahead < -back:
+            turns.append(best)
+            up, best = not up, i
+    if up or not turns:  # the record ends on its way up
+        turns.append(best)
+    return np.array(turns, dtype=np.int64)
+
+
+def _cycles(record: Record, turns: NDArray[np.int64]) -> tuple[list[int], list[int]]:
+    """Peaks of the cycles of a slow test, and the last sample of the rest between two of them."""
+    displacement, stress = record.displacement, record.stress
+    assert displacement is not None
+    low = float(displacement.min())
+    free = float(np.median(stress[displacement <= low + 0.02 * np.ptp(displacement)]))
+    least = free + 0.01 * (float(stress.max()) - free)
+    peaks, rests = [int(turns[0])], list[int]()
+    for valley, peak in zip(turns[1::2], turns[2::2], strict=False):
+        smaller = min(displacement[peaks[-1]], displacement[peak]) - low
+        if stress[peaks[-1]] < least:  # a movement without a force, as an approach, is no cycle
+            peaks[-1] = int(peak)
+        elif displacement[valley] - low < _REST * smaller:
+            between = displacement[peaks[-1] : peak + 1]
+            rests.append(int(peak) - int(np.argmin(between[::-1])))
+            peaks.append(int(peak))
+        elif displacement[peak] > displacement[peaks[-1]]:
+            peaks[-1] = int(peak)
+    return peaks, rests
+
+
+def inner_reversals(record: Record) -> list[str]:
+    """Say where a record of one loading and unloading turns round below its peak."""
+    displacement = record.displacement
+    assert displacement is not None
+    turns = find_turns(displacement)
+    peak = int(np.argmax(displacement[turns]))
+    size = float(np.ptp(displacement))
+    # Before the peak each valley after a peak is a reversal, after it each peak after a valley.
+    backs = [
+        abs(float(displacement[turns[i]] - displacement[turns[i + 1]]))
+        for i in [*range(0, peak, 2), *range(peak + 1, len(turns) - 1, 2)]
+    ]
+    if not backs:
+        return []
+    times = "once" if len(backs) == 1 else f"{len(backs)} times"
+    return [
+        f"Check: the record reverses {times} below its peak, by up to {max(backs) / size:.0%} of "
+        "it; the law has no inner loops: partial unloading runs back along the branch it came "
+        "along, so a loop there stays in the residuals."
+    ]
 
 
 def _rise(values: Array, share: float) -> int:

@@ -99,7 +99,7 @@ class _Table:
                 if reader.line_num > self.first_row and any(cell.strip() for cell in cells):
                     yield reader.line_num, cells
         except csv.Error as error:
-            raise InputError(f"{self.path}: row {reader.line_num + 1}: {error}.") from None
+            raise InputError(f"{self.path}: row {reader.line_num}: {error}.") from None
 
     def body(self) -> bytes:
         """Return the rows below the header."""
@@ -276,7 +276,7 @@ def _cells(path: Path, lines: list[str], separator: str) -> list[list[str]]:
         return list(reader)
     except csv.Error:
         raise InputError(
-            f"{path}: row {reader.line_num + 1} has a cell of more than {csv.field_size_limit()} "
+            f"{path}: row {reader.line_num} has a cell of more than {csv.field_size_limit()} "
             "characters; the file must be a text table (CSV)."
         ) from None
 

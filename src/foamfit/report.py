@@ -11,6 +11,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 from foamfit.conditioning import engineering
+from foamfit.errors import printable
 from foamfit.measurement import interior_channel
 from foamfit.plots import (
     DPI,
@@ -194,7 +195,7 @@ def summary_text(result: FitResult) -> str:
         lines += _wrap("note: ", note)
     for warning in result.warnings:
         lines += _wrap("warning: ", warning)
-    return "\n".join(lines)
+    return printable("\n".join(lines))
 
 
 def _data_lines(measurement: Measurement) -> list[str]:

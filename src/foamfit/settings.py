@@ -1,9 +1,16 @@
-"""The TOML beside a test: specimen, striker, columns, noise and window, checked and in SI."""
+"""The TOML beside a test: specimen, striker, columns, noise, window and data, checked and in SI.
+
+[columns] names the column of a channel where its header does not: ``column``, ``unit``, ``scale``
+(a number, or a quantity such as "4444.4 N/V"; negative turns a sign round) and, for displacements,
+``counts_down = true`` (a gap or a position that gets smaller in compression). [data] ``duplicates``
+is "average" (neighbouring rows with one time stamp make one sample) or "refuse".
+"""
 
 from __future__ import annotations
 
 import difflib
 import math
+import re
 import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -11,10 +18,14 @@ from pathlib import Path
 from typing import Any
 
 from foamfit.conditioning import Window
-from foamfit.errors import InputError
+from foamfit.errors import InputError, printable
 from foamfit.measurement import Noise, Specimen, Striker, interior_node
 from foamfit.units import is_unit, parse_quantity, split_quantity
 
+_LARGEST = 1_000_000  # characters of a TOML
+_LONGEST = 200  # characters of a name
+# Many keys that are joined by dots.
+_DOTTED = re.compile(r"""(?<![\w"'-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){32}""")
 # Section, key: SI unit and an example.
 _SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
     "specimen": {
@@ -80,7 +91,19 @@ def load_toml(path: Path, otherwise: str) -> dict[str, Any]:
         If there is none or it is no TOML.
     """
     try:
-        return tomllib.loads(path.read_bytes().decode("utf-8-sig"))
+        with path.open("rb") as file:
+            raw = file.read(_LARGEST + 1)
+        if len(raw) > _LARGEST:
+            size = path.stat().st_size
+            raise InputError(f"{path}: has {size} characters; a TOML must have {_LARGEST} at most.")
+        text = raw.decode("utf-8-sig")
+        if _DOTTED.search(text):  # tomllib takes a time that grows with the square of their number
+            raise RecursionError
+        return tomllib.loads(text)
+    except RecursionError:
+        raise InputError(
+            f"{path}: is nested too deeply; a TOML of foamfit has few levels."
+        ) from None
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; {otherwise}.") from None
     except OSError as error:
@@ -96,7 +119,8 @@ def check_keys(where: str, given: Iterable[str], valid: Iterable[str]) -> None:
     valid = list(valid)
     for key in given:
         if key not in valid:
-            near = difflib.get_close_matches(key, valid, n=2, cutoff=0.4) or valid
+            near = difflib.get_close_matches(key[:_LONGEST], valid, n=2, cutoff=0.4) or valid
+            key = key if len(key) <= _LONGEST else f"{key[:_LONGEST]} …"
             raise InputError(f"{where} has no key {key!r}; meant may be {', '.join(near)}.")
 
 
@@ -122,6 +146,15 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
     name = document.get("name", test.stem)
     if not isinstance(name, str) or not name.strip():
         raise InputError(f"{path}: name = {name!r} is no text; give it in quotation marks.")
+    if len(name) > _LONGEST:
+        raise InputError(
+            f"{path}: name has {len(name)} characters; it must have {_LONGEST} at most."
+        )
+    control = next((c for c in name if not c.isprintable()), None)
+    if control is not None and "name" in document:
+        raise InputError(
+            f"{path}: name has a control character, U+{ord(control):04X}; write it in plain text."
+        )
     values: dict[str, dict[str, Any]] = {}
     for section, keys in _SECTIONS.items():
         table = document.get(section, {})
@@ -130,7 +163,7 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
         check_keys(f"{path}: [{section}]", table, keys)
         values[section] = {k: _value(path, section, k, v) for k, v in table.items()}
     return Settings(
-        name=name,
+        name=printable(name),
         specimen=_specimen(path, values["specimen"]),
         striker=Striker(**values["striker"]) if values["striker"] else None,
         noise=Noise(**values["noise"]),
