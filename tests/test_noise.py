@@ -162,6 +162,59 @@ def test_clean_records_have_next_to_no_outliers():
     assert flagged / samples < 1e-3
 
 
+def uneven(rng: np.random.Generator, n: int, kind: str) -> np.ndarray:
+    """A clock whose steps differ, from 0 to 1."""
+    if kind == "random":
+        step = rng.uniform(0.1, 1.0, n)
+    else:  # of a machine that records every 10 ms, or sooner where it turns
+        step = np.where(rng.random(n) < 0.1, 3.0, 10.0)
+    clock = np.cumsum(step)
+    return (clock - clock[0]) / (clock[-1] - clock[0])
+
+
+@pytest.mark.parametrize("kind", ["random", "machine"])
+def test_uneven_times_make_no_outliers(kind):
+    rng = np.random.default_rng(6)
+    flagged = by_number = samples = 0
+    for channel in CHANNELS:
+        fine = signal(channel, 6000)
+        for n in (150, 300, 600, 1500):
+            clock = uneven(rng, n, kind)
+            values = np.interp(clock, np.linspace(0.0, 1.0, fine.size), fine)
+            assert not find_outliers(values, clock).any()
+            for level in (0.0005, 0.003, 0.01, 0.03):
+                noisy = values + level * slow_noise(rng, n, 0.5)
+                flagged += int(find_outliers(noisy, clock).sum())
+                by_number += int(find_outliers(noisy).sum())
+                samples += n
+    assert flagged / samples < 2e-4
+    assert by_number > 3 * flagged  # the test can fail
+
+
+@pytest.mark.parametrize(("size", "least"), [(10.0, 0.9), (20.0, 0.98)])
+def test_spikes_at_uneven_times_are_found(size, least):
+    rng = np.random.default_rng(7)
+    found = []
+    for _ in range(100):
+        n = int(rng.choice([300, 600]))
+        clock = uneven(rng, n, "machine")
+        values = np.interp(clock, np.linspace(0.0, 1.0, 6000), signal(rng.choice(CHANNELS), 6000))
+        values += 0.01 * rng.standard_normal(n)
+        at = int(rng.integers(8, n - 8))
+        values[at] += size * 0.01 * rng.choice([-1, 1])
+        found.append(find_outliers(values, clock)[at])
+    assert np.mean(found) >= least
+
+
+@needs_data
+def test_a_machine_that_records_unevenly_has_no_outliers():
+    path = DATA / "lattice-cycles" / "tpu87-20_raw.csv"
+    table = np.loadtxt(path, delimiter=",", skiprows=1, usecols=(0, 7, 8, 9), encoding="utf-8-sig")
+    clock, *channels = table[:1000].T
+    assert sum(int(find_outliers(values).sum()) for values in channels) > 20
+    assert not any(find_outliers(values, clock).any() for values in channels)
+
+
 @pytest.mark.parametrize(("size", "least"), [(5.0, 0.4), (7.0, 0.85), (10.0, 0.97), (20.0, 0.99)])
 def test_spikes_are_found(size, least):
     rng = np.random.default_rng(7)

@@ -318,13 +318,16 @@ def test_refuses_a_motion_that_nothing_gives(tmp_path):
         ("7,inf,1", ["row 9", "'stress (MPa)'", "finite"]),
         ("7,1,1,1", ["row 9", "4 cells", "3"]),
         ("5,1,1", ["row 9", "'time (ms)'", "goes back"]),
-        ("6,1,1", ["row 9", "'time (ms)'", "repeats"]),
+        ("6,1,1", ["row 9", "'time (ms)'", "repeats", 'duplicates = "average"']),
+        ("7,1_000,1", ["row 9", "'1_000'", "without separators, 1000"]),
+        ("7,12 345.5,1", ["row 9", "without separators, 12345.5"]),
     ],
 )
 def test_refuses_rows_by_their_number(tmp_path, row, words):
     rows = numbers()
     rows[7] = row
-    refused(write(tmp_path, rows=rows), "test.csv", *words)
+    toml = SPECIMEN + '[data]\nduplicates = "refuse"\n'
+    refused(write(tmp_path, rows=rows, toml=toml), "test.csv", *words)
 
 
 def test_row_numbers_count_titles_and_blank_lines(tmp_path):

@@ -18,7 +18,7 @@ from foamfit.result import check_target, load_result
 FILES = {"fit.json", "parameters.csv", "curves.csv", "report.html", "fit.png", "fit.pdf"}
 KEYS = {
     "schema", "foamfit", "test", "data_sha256", "model", "drive", "seed", "status", "warnings",
-    "notes", "checklist",
+    "notes", "checklist", "data",
     "parameters", "derived", "visited", "misfit", "weights", "statistics", "energy", "runtime_s",
     "stopped", "loss", "noise", "outliers",
 }  # fmt: skip

@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from foamfit.conditioning import engineering, line_at, noise_level
+from foamfit.errors import printable
 from foamfit.measurement import INTEGRATED, Array, Measurement, Striker, interior_channel
 
 
@@ -251,11 +252,12 @@ def describe(measurement: Measurement, audit: EnergyAudit) -> str:
     test = measurement
     lines = [("test", test.name), ("file", str(test.path or "none"))]
     lines += [("specimen", _specimen(test)), ("striker", _striker(test))]
+    lines += _labelled("rows", test.rows.sentences())
     lines += [("samples", _sampling(test))]
     lines += _peaks(test)
     lines += _labelled("noise", noise_sentences(test))
     lines += _labelled("done", test.notes) + _labelled("energy", audit.sentences())
-    return "\n".join(f"{label:<10}{_wrap(text)}" for label, text in lines)
+    return printable("\n".join(f"{label:<10}{_wrap(text)}" for label, text in lines))
 
 
 def noise_sentences(measurement: Measurement) -> list[str]:

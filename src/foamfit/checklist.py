@@ -351,6 +351,10 @@ def _clocks(e: Evidence) -> Check:
     if objective.time_shift:
         late = engineering(e.estimates["time_shift"].value, "s").replace("-", "−")
         return Check("clocks", question, True, f"Their shift is fitted: {late}.")
+    force = e.problem.measurement.outliers.get("stress")
+    if force is not None and force.clipped_at is not None:
+        told = "The force is clipped, which looks like a shift of its peak."
+        return Check("clocks", question, None, told)
     try:
         check_time_shift(e.problem.measurement, objective.drive)
     except InputError:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from foamfit.errors import InputError, SimulationError
+from foamfit.errors import InputError, SimulationError, printable
 
 if TYPE_CHECKING:
     import lmfit
@@ -65,7 +65,7 @@ def _spare_the_collector() -> None:
 
 def _refuse(message: str) -> NoReturn:
     """Print one line on stderr and leave."""
-    click.echo(f"foamfit: {' '.join(message.split())}", err=True)
+    click.echo(printable(f"foamfit: {' '.join(message.split())}"), err=True)
     sys.exit(WRONG)
 
 
@@ -110,7 +110,7 @@ _SPECIMEN = click.option(
     "--specimen",
     metavar="FILE.toml",
     type=click.Path(path_type=Path),
-    help="Specimen, striker, columns, noise. Default: TEST.toml beside the CSV.",
+    help="Specimen, striker, columns, noise, window, data. Default: TEST.toml beside the CSV.",
 )
 
 
@@ -366,7 +366,7 @@ def fit(
         from foamfit.report import summary_text
 
         click.echo(summary_text(result))
-        click.echo(f"\nwritten to {folder}: open {folder / 'report.html'}")
+        click.echo(printable(f"\nwritten to {folder}: open {folder / 'report.html'}"))
     if result.status == "failed":
         click.echo(f"foamfit: no acceptable fit was found; see {folder}", err=True)
         return NOT_ACCEPTABLE

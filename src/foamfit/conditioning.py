@@ -6,8 +6,9 @@ Each step is a function that returns a new `Record` and a sentence for each thin
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +17,10 @@ from foamfit.errors import InputError
 from foamfit.measurement import (
     INTEGRATED,
     Array,
+    Dropped,
     NoiseLevel,
     Outliers,
+    RowCount,
     Specimen,
     Striker,
     interior_channel,
@@ -27,7 +30,13 @@ from foamfit.measurement import (
 _MIN_ROWS = 10
 _MIN_REST = 20
 _MAX_ROWS = 1500
+# A force may be clipped where so many samples are equal at its top; a parabola falls by so many
+# steps of its digits within half that length on either side.
+_FLAT, _PARABOLA = 5, 3
 _BLOCKS = 1000
+# Shares of the largest displacement: what a reversal goes back at least, what is left of it at
+# rest, what counts as unloading, and a cycle that is named for being small.
+_TURN, _REST, _UNLOADED, _SMALLER = 0.05, 0.35, 0.1, 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +47,9 @@ class Record:
     deceleration in m/s² (like the stress that causes it, it is positive in compression). `interior`
     holds the displacement of masses inside in m, 1 for the one above spring 1. `excess` is what the
     file has beyond the straight line that bridges an outlier, 0 elsewhere, for each channel that
-    has outliers.
+    has outliers. `clipped` marks the samples at which the force is clipped. `numbers` holds the row
+    number in the file of each sample (None: they count from 1), and `dropped` the rows of the file
+    that were left out so far.
     """
 
     time: Array | None
@@ -48,10 +59,34 @@ class Record:
     acceleration: Array | None = None
     interior: dict[int, Array] = field(default_factory=dict)
     excess: dict[str, Array] = field(default_factory=dict)
+    clipped: NDArray[np.bool_] | None = None
+    numbers: NDArray[np.int64] | None = None
+    dropped: tuple[Dropped, ...] = ()
+
+    @property
+    def row_numbers(self) -> NDArray[np.int64]:
+        """Row number in the file of each sample, shape (n,)."""
+        return np.arange(1, len(self) + 1) if self.numbers is None else self.numbers
+
+    def without(self, gone: slice | NDArray[np.bool_], why: str) -> Record:
+        """Leave out some rows of every channel, and count them with the reason."""
+        numbers = self.row_numbers
+        lost = numbers[gone]
+        if not lost.size:
+            return self
+        kept = np.ones(len(self), dtype=bool)
+        kept[gone] = False
+        item = Dropped(lost.size, int(lost[0]), int(lost[-1]), why)
+        return replace(self, numbers=numbers, dropped=(*self.dropped, item)).rows(kept)
+
+    def between(self, first: int, end: int, before: str, after: str) -> Record:
+        """Keep the samples from `first` up to `end`; the reasons count what lies outside."""
+        return self.without(slice(end, None), after).without(slice(0, first), before)
 
     def rows(self, which: slice | NDArray[np.bool_]) -> Record:
-        """Keep some rows of every channel."""
+        """Keep some rows of every channel; rows that `without` leaves out are counted, too."""
         channels: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
+        del channels["dropped"]
         inside = {node: values[which] for node, values in channels.pop("interior").items()}
         excess = {name: values[which] for name, values in channels.pop("excess").items()}
         kept: dict[str, Any] = {k: v[which] for k, v in channels.items() if v is not None}
@@ -111,6 +146,7 @@ class Conditioned:
     outliers: dict[str, Outliers]
     noise: dict[str, NoiseLevel]
     contact: str
+    count: RowCount
 
 
 @dataclass(frozen=True)
@@ -140,6 +176,7 @@ def condition(
     *,
     striker: Striker | None = None,
     window: Window | None = None,
+    reversed_: Mapping[str, str] | None = None,
 ) -> Conditioned:
     """Turn the samples of a file into one loading and unloading.
 
@@ -153,6 +190,8 @@ def condition(
         With it and a time the record is an impact, else a slow test whose displacement is driven.
     window : Window, optional
         What the user chose to look at.
+    reversed_ : mapping, optional
+        What to say of a channel that is plainly the other way round; see `check_signs`.
 
     Returns
     -------
@@ -169,8 +208,9 @@ def condition(
     impact = striker is not None and record.time is not None
     record = done(cut_to_window(record, window))
     record = bridge_outliers(record)
+    record = done(mark_clipped(record))
     spoilt = {name: int(np.count_nonzero(excess)) for name, excess in record.excess.items()}
-    check_signs(record)
+    check_signs(record, reversed_ or {})
     held = noise_of_held(record)
     record = done(fill_staircase(record))
     if impact and window.cycle != 1:
@@ -187,8 +227,14 @@ def condition(
     record = done(cut_to_contact(record, start, impact))
     motion = "measured"
     if record.displacement is None:
+        if record.clipped is not None and record.acceleration is None and record.velocity is None:
+            raise InputError(
+                "the force is clipped, so the motion cannot be integrated from it; give a "
+                "displacement, an acceleration or a velocity."
+            )
         record, motion = integrate_motion(record, specimen, striker or Striker())
         notes.append(f"The file has no displacement: the motion is {motion}.")
+    notes += inner_reversals(record)
     notes += checks(record, specimen, striker if impact else None, motion)
     whole, record = record, done(thin(record))
     block = -(-len(whole) // len(record))
@@ -198,7 +244,8 @@ def condition(
     notes += [
         _outlier_note(name, count, outliers.get(name), record) for name, count in spoilt.items()
     ]
-    return Conditioned(record, motion, tuple(notes), outliers, noise, start.by)
+    count = _row_count(whole, outliers, block)
+    return Conditioned(record, motion, tuple(notes), outliers, noise, start.by, count)
 
 
 def engineering(value: float, unit: str) -> str:
@@ -231,27 +278,34 @@ def line_at(time: Array, values: Array, at: float) -> tuple[float, float]:
     return float(level), float(slope)
 
 
-def check_signs(record: Record) -> None:
-    """Refuse a channel that is plainly the other way round: compression is positive."""
-    hint = "is negative in compression; it must be positive: give its column and scale = -1"
+def check_signs(record: Record, reversed_: Mapping[str, str]) -> None:
+    """Refuse a channel that is plainly the other way round: compression is positive.
+
+    `reversed_` holds, by channel, what is wrong and what the user can write to turn it round.
+    """
+
+    def refuse(channel: str) -> NoReturn:
+        wrong = "is negative in compression; it must be positive: give its column and scale = -1"
+        raise InputError(f"the {reversed_.get(channel, f'{channel} {wrong} in [columns]')}.")
+
     stress, peak = record.stress, int(np.argmax(record.stress))
     first = float(np.median(stress[:5]))
     if first - stress.min() > 2 * max(stress[peak] - first, 0) and abs(stress.min()) > stress[peak]:
-        raise InputError(f"the stress or force {hint} in [columns].")
+        refuse("stress")
     if record.displacement is not None:
         moved = record.displacement[peak] - record.displacement[0]
         if moved < -0.5 * np.ptp(record.displacement[: peak + 1]):
-            raise InputError(f"the displacement or strain {hint} in [columns].")
+            refuse("displacement")
     for node, values in record.interior.items():
         if values[peak] - values[0] < -0.5 * np.ptp(values[: peak + 1]):
-            raise InputError(f"{interior_channel(node)} {hint} in [columns].")
+            refuse(interior_channel(node))
     if record.displacement is not None:
         return
     if record.acceleration is not None:
         if np.dot(stress - first, record.acceleration) < 0:
-            raise InputError(f"the acceleration {hint} in [columns] (braking is positive).")
+            refuse("acceleration")
     elif record.velocity is not None and record.velocity[0] < record.velocity[-1]:
-        raise InputError(f"the velocity {hint} in [columns].")
+        refuse("velocity")
 
 
 def checks(record: Record, specimen: Specimen, striker: Striker | None, motion: str) -> list[str]:
@@ -320,7 +374,7 @@ def cut_to_window(record: Record, window: Window) -> tuple[Record, list[str]]:
             f"{first} and {last} are needed."
         )
     note = f"[window] cut {cut} of {len(record)} samples."
-    record = record.rows(inside)
+    record = record.without(~inside, "outside [window] start and end")
     for name in ("stress", "displacement"):
         values = getattr(record, name)
         if values is not None and np.ptp(values) == 0:
@@ -332,6 +386,40 @@ def cut_to_window(record: Record, window: Window) -> tuple[Record, list[str]]:
     return record, [note]
 
 
+def mark_clipped(record: Record) -> tuple[Record, list[str]]:
+    """Find the samples at which the force is clipped: a flat top at one value, with steep flanks.
+
+    A rounded top shows equal samples, too, where its values are rounded: it is about a parabola,
+    which falls by some three more steps of the digits within half the length of the flat on either
+    side. A clipped force falls by more.
+    """
+    stress = record.stress
+    top = float(stress.max())
+    at_top = stress >= top - 1e-9 * float(np.ptp(stress))
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], at_top.astype(np.int8), [0]])))
+    starts, ends = edges[::2], edges[1::2]
+    longest = int(np.argmax(ends - starts))
+    first, end = int(starts[longest]), int(ends[longest])
+    fresh = np.append(0, np.flatnonzero(np.diff(stress) != 0.0) + 1)
+    held = float(np.median(np.diff(np.append(fresh, len(stress)))))
+    if end - first < max(_FLAT, 3 * held):
+        return record, []
+    reach = -(-(end - first) // 2)
+    around = stress[max(first - reach, 0)], stress[min(end - 1 + reach, len(stress) - 1)]
+    levels = np.diff(np.unique(stress))
+    step = float(levels[levels > 1e-9 * np.ptp(stress)].min())
+    if top - max(around) < 4 * _PARABOLA * step:
+        return record, []
+    count, told = int(at_top.sum()), engineering(top, "Pa")
+    lines = record.row_numbers[at_top]
+    note = (
+        f"Check: the force is clipped: {count} samples have one and the same value at its top, a "
+        f"stress of {told} (rows {lines[0]} to {lines[-1]}); they are not fitted, the true peak is "
+        "not known, and energy and impulse come out too small."
+    )
+    return replace(record, clipped=at_top), [note]
+
+
 def bridge_outliers(record: Record) -> Record:
     """Put a straight line in the place of spikes and short gaps; `excess` keeps what was there."""
     from foamfit.noise import bridged, find_outliers
@@ -339,7 +427,7 @@ def bridge_outliers(record: Record) -> Record:
     for name in record.measured:
         values = record.channel(name)
         assert values is not None
-        wrong = find_outliers(values)
+        wrong = find_outliers(values, record.time)
         if wrong.any():
             line = bridged(values, wrong, record.clock)
             excess = record.excess | {name: np.where(wrong, values - line, 0.0)}
@@ -351,7 +439,7 @@ def _outlier_note(name: str, count: int, found: Outliers | None, record: Record)
     """Name a channel's outliers: how many, and where those of the part that is used are."""
     some = f"{count} samples" if count > 1 else "1 sample"
     note = f"Check: {some} of the {name} stood out as spikes or gaps and"
-    if found is None:
+    if found is None or not found.at.size:
         return f"{note} were bridged, none of them in the part that is used."
     unit = {"stress": "Pa", "velocity": "m/s", "acceleration": "m/s²"}.get(name, "m")
     told = []
@@ -367,14 +455,45 @@ def _outlier_note(name: str, count: int, found: Outliers | None, record: Record)
 def _outliers(whole: Record, record: Record, block: int) -> dict[str, Outliers]:
     """Outliers of a record that was thinned: a block of them is left out, one in a block is not."""
     found = {}
+    edges = np.arange(0, len(whole), block)
     for name, excess in whole.excess.items():
         values, wrong = whole.channel(name), excess != 0.0
         if values is None or not wrong.any():
             continue
-        share = np.add.reduceat(wrong.astype(float), np.arange(0, len(whole), block)) / block
+        share = np.add.reduceat(wrong.astype(float), edges) / block
         at = np.flatnonzero(wrong)
         found[name] = Outliers(share > 0.5, whole.clock[at], values[at] + excess[at])
+    if whole.clipped is not None and whole.clipped.any():
+        left_out = np.add.reduceat(whole.clipped.astype(float), edges) > 0.0
+        none = np.zeros(0)
+        spikes = found.get("stress") or Outliers(np.zeros(left_out.size, dtype=bool), none, none)
+        top = float(whole.stress[whole.clipped].max())
+        found["stress"] = replace(spikes, left_out=spikes.left_out | left_out, clipped_at=top)
     return found
+
+
+def _row_count(whole: Record, outliers: dict[str, Outliers], block: int) -> RowCount:
+    """Count the rows of the file: `whole` holds those that are left, before it was thinned."""
+    dropped, used = list(whole.dropped), np.ones(len(whole), dtype=bool)
+
+    def drop(wrong: NDArray[np.bool_], why: str) -> None:
+        wrong = wrong & used
+        lost = whole.row_numbers[wrong]
+        used[wrong] = False
+        if lost.size:
+            dropped.append(Dropped(lost.size, int(lost[0]), int(lost[-1]), why))
+
+    for name, excess in whole.excess.items():
+        drop(excess != 0.0, f"a spike or gap of the {name}, bridged by a straight line")
+    if whole.clipped is not None:
+        left_out = np.repeat(outliers["stress"].left_out, block)[: len(whole)]
+        drop(left_out & whole.clipped, "the force is clipped")
+    for name, found in outliers.items():
+        left_out = np.repeat(found.left_out, block)[: len(whole)]
+        drop(left_out, f"in a block of {block} samples of the {name} that is not fitted")
+    count = int(used.sum())
+    total = len(whole) + sum(item.rows for item in whole.dropped)
+    return RowCount(total, count, tuple(sorted(dropped, key=lambda item: item.first)))
 
 
 def noise_of_held(record: Record) -> dict[str, NoiseLevel]:
@@ -473,39 +592,119 @@ def _filled(clock: Array, values: Array, name: str, notes: list[str]) -> Array |
 
 
 def select_cycle(record: Record, cycle: int) -> tuple[Record, list[str]]:
-    """Keep one loading and unloading of a slow test, cycle 1 being the first in the file."""
+    """Keep one loading and unloading of a slow test, cycle 1 being the first in the file.
+
+    A cycle ends where the motion has gone back most of the way of the smaller of the peaks on
+    either side, so that cycles of growing amplitude count from the first; a reversal that goes
+    back less is part of its cycle.
+    """
     displacement = record.displacement
     if displacement is None:
         return record, []  # refused or integrated later
-    level = (displacement - displacement.min()) / np.ptp(displacement)
-    marks = np.where(level > 0.65, 1, np.where(level < 0.35, -1, 0))
-    at = np.flatnonzero(marks)
-    up, turn = marks[at] == 1, np.diff(marks[at])
-    rises = [*at[:1][up[:1]], *at[1:][turn > 0]]
-    falls = list(at[1:][turn < 0])
-    if rises and falls and falls[0] < rises[0]:
-        falls = falls[1:]
-    n = len(rises)
+    turns = find_turns(displacement)
+    peaks, rests = _cycles(record, turns)
+    n = len(peaks)
     if cycle > n:
         raise InputError(f"[window] cycle = {cycle}, but the file has {n}; give one from 1 to {n}.")
     # A cycle runs from the last rest before its rise to its first return to rest after its fall.
-    start, end = 0, len(record)
-    if cycle > 1:
-        between = displacement[falls[cycle - 2] : rises[cycle - 1]]
-        start = rises[cycle - 1] - 1 - int(np.argmin(between[::-1]))
-    if cycle <= len(falls):
-        after = displacement[falls[cycle - 1] : rises[cycle] if cycle < n else len(record)]
-        rest = after.min() + 0.005 * np.ptp(displacement)
-        end = falls[cycle - 1] + int(np.argmax(after <= rest)) + 1
+    size = float(np.ptp(displacement))
+    start = 0 if cycle == 1 else rests[cycle - 2]
+    top = peaks[cycle - 1]
+    after = displacement[top : peaks[cycle] if cycle < n else len(record)]
+    unloaded = float(after[0] - after.min())
+    end = len(record)
+    if unloaded > _UNLOADED * size:
+        end = top + int(np.argmax(after <= after.min() + 0.005 * size)) + 1
     notes = []
     if n > 1 or end - start < len(record):
         notes.append(
             f"Cycle {cycle} of {n} is used: {end - start} of {len(record)} samples, "
             f"{start} before it and {len(record) - end} after it are cut."
         )
-    if cycle > len(falls):
+    largest = int(np.argmax(displacement[peaks]))
+    share = (displacement[top] - displacement.min()) / size
+    if share < _SMALLER:
+        notes.append(
+            f"Check: cycle {cycle} reaches {share:.0%} of the largest displacement; "
+            f"cycle {largest + 1} of {n} reaches all of it ([window] cycle = {largest + 1})."
+        )
+    if unloaded <= _UNLOADED * size:
         notes.append("The record has no unloading, so nothing in it determines unloading.")
-    return record.rows(slice(start, end)), notes
+    record = record.between(start, end, f"before cycle {cycle}", f"after cycle {cycle}")
+    return record, notes
+
+
+def find_turns(values: Array) -> NDArray[np.int64]:
+    """Samples at which a motion turns round: peaks and valleys by turns, the first a peak.
+
+    Only what goes back by more than a twentieth of the range, and by more than the noise, turns.
+    """
+    back = max(_TURN * float(np.ptp(values)), 8.0 * noise_level(values))
+    # The extremes of short blocks are all that counts.
+    block = max(1, len(values) // 20_000)
+    at = np.arange(len(values))
+    if block > 1:
+        parts = values[: len(values) // block * block].reshape(-1, block)
+        first = np.arange(len(parts)) * block
+        ends = np.arange(parts.size, len(values))
+        at = np.unique(
+            np.concatenate([first + parts.argmin(axis=1), first + parts.argmax(axis=1), ends])
+        )
+    turns: list[int] = []
+    up, best = True, int(at[0])
+    for i, value in zip(at.tolist(), values[at].tolist(), strict=True):
+        ahead = value - values[best] if up else values[best] - value
+        if ahead > 0.0:
+            best = i
+        elif ahead < -back:
+            turns.append(best)
+            up, best = not up, i
+    if up or not turns:  # the record ends on its way up
+        turns.append(best)
+    return np.array(turns, dtype=np.int64)
+
+
+def _cycles(record: Record, turns: NDArray[np.int64]) -> tuple[list[int], list[int]]:
+    """Peaks of the cycles of a slow test, and the last sample of the rest between two of them."""
+    displacement, stress = record.displacement, record.stress
+    assert displacement is not None
+    low = float(displacement.min())
+    free = float(np.median(stress[displacement <= low + 0.02 * np.ptp(displacement)]))
+    least = free + 0.01 * (float(stress.max()) - free)
+    peaks, rests = [int(turns[0])], list[int]()
+    for valley, peak in zip(turns[1::2], turns[2::2], strict=False):
+        smaller = min(displacement[peaks[-1]], displacement[peak]) - low
+        if stress[peaks[-1]] < least:  # a movement without a force, as an approach, is no cycle
+            peaks[-1] = int(peak)
+        elif displacement[valley] - low < _REST * smaller:
+            between = displacement[peaks[-1] : peak + 1]
+            rests.append(int(peak) - int(np.argmin(between[::-1])))
+            peaks.append(int(peak))
+        elif displacement[peak] > displacement[peaks[-1]]:
+            peaks[-1] = int(peak)
+    return peaks, rests
+
+
+def inner_reversals(record: Record) -> list[str]:
+    """Say where a record of one loading and unloading turns round below its peak."""
+    displacement = record.displacement
+    assert displacement is not None
+    turns = find_turns(displacement)
+    peak = int(np.argmax(displacement[turns]))
+    size = float(np.ptp(displacement))
+    # Before the peak each valley after a peak is a reversal, after it each peak after a valley.
+    backs = [
+        abs(float(displacement[turns[i]] - displacement[turns[i + 1]]))
+        for i in [*range(0, peak, 2), *range(peak + 1, len(turns) - 1, 2)]
+    ]
+    if not backs:
+        return []
+    times = "once" if len(backs) == 1 else f"{len(backs)} times"
+    return [
+        f"Check: the record reverses {times} below its peak, by up to {max(backs) / size:.0%} of "
+        "it; the law has no inner loops: partial unloading runs back along the branch it came "
+        "along, so a loop there stays in the residuals."
+    ]
 
 
 def _rise(values: Array, share: float) -> int:
@@ -725,7 +924,7 @@ def cut_to_contact(record: Record, start: Start, impact: bool) -> tuple[Record, 
         time=None if record.time is None else time - zero_time,
         displacement=None if w is None else w - start.zero,
     )
-    return record.rows(slice(first, end)), notes
+    return record.between(first, end, "before contact starts", "after contact ends"), notes
 
 
 def integrate_motion(record: Record, specimen: Specimen, striker: Striker) -> tuple[Record, str]:

@@ -7,3 +7,8 @@ class InputError(ValueError):
 
 class SimulationError(RuntimeError):
     """A simulation cannot go on; the message says why. A simulation never returns NaN instead."""
+
+
+def printable(text: str) -> str:
+    """Return a text without control characters, for a terminal; names and paths may hold some."""
+    return "".join(c if c.isprintable() or c == "\n" else "\N{REPLACEMENT CHARACTER}" for c in text)

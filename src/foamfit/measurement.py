@@ -105,21 +105,71 @@ class Noise:
 
 @dataclass(frozen=True, eq=False)
 class Outliers:
-    """Samples of a channel that are plainly wrong: spikes and short gaps.
+    """Samples of a channel that are not fitted: spikes, short gaps, and a clipped top.
 
     Attributes
     ----------
     left_out : (n,) array of bool
-        Samples of the test that are not fitted; the channel holds a straight line there.
+        Samples of the test that are not fitted; at spikes and gaps the channel holds a straight
+        line.
     at : (k,) array
-        Where the file has them: time in s, or the sample where the test has no time.
+        Where the file has spikes and gaps: time in s, or the sample where the test has no time.
     values : (k,) array
         What the file has there, Pa or m.
+    clipped_at : float or None
+        The value at which the sensor or its amplifier clips the channel, Pa; None if it does not.
     """
 
     left_out: NDArray[np.bool_]
     at: Array
     values: Array
+    clipped_at: float | None = None
+
+
+@dataclass(frozen=True)
+class Dropped:
+    """Rows of a file that are not used, for one reason.
+
+    Attributes
+    ----------
+    rows : int
+        How many.
+    first, last : int
+        Row numbers of the first and the last of them: lines of the file as an editor counts them,
+        from 1 and with the header. Rows that are used may lie between.
+    why : str
+        The reason, to follow "not used: ".
+    """
+
+    rows: int
+    first: int
+    last: int
+    why: str
+
+    def __str__(self) -> str:
+        """Return for example "rows 2 to 200 (199): before contact starts"."""
+        if self.rows == 1:
+            return f"row {self.first}: {self.why}"
+        part = "" if self.rows == self.last - self.first + 1 else "of "
+        return f"{part}rows {self.first} to {self.last} ({self.rows}): {self.why}"
+
+
+@dataclass(frozen=True)
+class RowCount:
+    """How many rows of numbers a file has, how many of them are used, and why not the others.
+
+    `rows` is `used` plus the rows of all `dropped`. A row is used if each channel that was read
+    from it is fitted or integrated as it stands, or is averaged with its neighbours.
+    """
+
+    rows: int
+    used: int
+    dropped: tuple[Dropped, ...] = ()
+
+    def sentences(self) -> list[str]:
+        """Say how many rows there are, and name those that are not used."""
+        told = f"{self.rows} in the file, {self.used} used"
+        return [f"{told}.", *(f"Not used: {item}." for item in self.dropped)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,6 +205,8 @@ class Measurement:
     contact : str
         What set time zero: "stress" (then the displacement is zero there too), "motion", or "file"
         for the file's own.
+    count : RowCount or None
+        The rows of the file; None if the test was not read from one.
     """
 
     name: str
@@ -171,6 +223,15 @@ class Measurement:
     interior: dict[int, Array] = field(default_factory=dict)
     outliers: dict[str, Outliers] = field(default_factory=dict)
     contact: str = "file"
+    count: RowCount | None = None
+
+    @property
+    def rows(self) -> RowCount:
+        """Rows of the file, used and not used; without a file all samples are used."""
+        if self.count is not None:
+            return self.count
+        n = max((values.size for values in self.channels().values()), default=0)
+        return RowCount(n, n)
 
     def channels(self) -> dict[str, Array]:
         """Stress, displacement and displacements of masses inside, as far as they are there."""

@@ -6,7 +6,7 @@ spring and no ringing is taken for noise where it is sampled well enough to be s
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -32,7 +32,12 @@ _OFF, _ALONE = 4.0, 2.5
 # A gap is entered and left by a jump so many times the median one of the samples nearby.
 _JUMP, _NEARBY, _MAX_RUN = 10.0, 31, 5
 # Weights of three samples in the line's next one, and where they are: left and right of the fifth.
+_WIDTH, _HALF = 9, 4  # samples of a cubic, and on either side of its middle
 _ONWARD, _SIDES = np.array([-2.0, 1.0, 4.0]) / 3.0, ([1, 2, 3], [7, 6, 5])
+# Samples count as even if their steps differ by this share at most; a pause is so many times the
+# usual step; a middle sample is judged if its neighbours hold so much of the cubic.
+_EVEN, _PAUSE, _OPEN = 0.02, 6.0, 0.1
+_CHUNK = 50_000
 _LEAST = 5e-3  # of the range: what is less far off is let be
 _MOST = 0.02  # of the samples: if more stand out, they are no exceptions
 
@@ -147,7 +152,7 @@ def with_noise(measurement: Measurement) -> Measurement:
 # ---------------------------------------------------------------------------------- the outliers
 
 
-def find_outliers(values: Array) -> NDArray[np.bool_]:
+def find_outliers(values: Array, clock: Array | None = None) -> NDArray[np.bool_]:
     """Isolated samples that no smooth signal with this noise can hold: spikes and gaps.
 
     First the jumps into and out of gaps of up to five samples are looked for (dropped to zero,
@@ -159,8 +164,11 @@ def find_outliers(values: Array) -> NDArray[np.bool_]:
     Parameters
     ----------
     values : (n,) array
-        Evenly sampled. In one that is held for some samples at a time only gaps are looked for:
-        the steps have no even spacing.
+        The channel. In one that is held for some samples at a time only gaps are looked for: the
+        steps have no even spacing.
+    clock : (n,) array, optional
+        Time of each sample, increasing; without it they are evenly spaced. Cubics and lines go by
+        the true spacing, and nothing is judged across a pause in the record.
 
     Returns
     -------
@@ -171,16 +179,30 @@ def find_outliers(values: Array) -> NDArray[np.bool_]:
     if n < 30:
         return np.zeros(n, dtype=bool)
     least = _LEAST * float(np.ptp(np.quantile(values, (0.005, 0.995))))
-    wrong = _gaps(values)
+    clock = None if clock is None or _is_even(clock, values, least) else clock
+    times = None if clock is None else _Times.of(clock)
+    wrong = _gaps(values, clock)
     for _ in range(4):  # what a big spike hides
-        smooth = bridged(values, wrong)
+        smooth = bridged(values, wrong, clock)
         if is_staircase(smooth):
             break
-        found = _spikes(smooth, least) & ~wrong
+        found = _spikes(smooth, least, times) & ~wrong
         if not found.any():
             break
         wrong |= found
     return wrong if wrong.sum() <= max(_MOST * n, 2) else np.zeros(n, dtype=bool)
+
+
+def _is_even(clock: Array, values: Array, least: float) -> bool:
+    """Whether the steps of a clock are the same, or as near as makes no difference to the values.
+
+    Time stamps are rounded; what the signal does in the time that a step is off is far less than
+    what counts as an outlier then.
+    """
+    step = np.diff(clock)
+    usual = float(np.median(step))
+    off = float(np.abs(step - usual).max()) / usual
+    return off <= _EVEN or off * float(np.quantile(np.abs(np.diff(values)), 0.99)) < 0.1 * least
 
 
 def is_staircase(values: Array) -> bool:
@@ -195,13 +217,19 @@ def bridged(values: Array, wrong: NDArray[np.bool_], clock: Array | None = None)
     return np.where(wrong, np.interp(at, at[~wrong], values[~wrong]), values)
 
 
-def _gaps(values: Array) -> NDArray[np.bool_]:
-    """Short runs into which the signal jumps and out of which it jumps back."""
+def _gaps(values: Array, clock: Array | None = None) -> NDArray[np.bool_]:
+    """Short runs into which the signal jumps and out of which it jumps back.
+
+    In a step of the clock that is longer than usual the signal itself may go farther.
+    """
     from scipy.ndimage import median_filter
 
     out = np.zeros(values.size, dtype=bool)
     jump = np.diff(values)
     usual = np.abs(jump)
+    if clock is not None:
+        step = np.diff(clock)
+        usual = usual / np.maximum(step / median_filter(step, _NEARBY), 1.0)
     floor = float(np.median(usual[usual > 0.0])) if usual.any() else 0.0
     high = np.flatnonzero(usual > _JUMP * np.maximum(median_filter(usual, _NEARBY), floor))
     for start, end in ((i, j) for i in high for j in high[(high > i) & (high <= i + _MAX_RUN)]):
@@ -212,28 +240,100 @@ def _gaps(values: Array) -> NDArray[np.bool_]:
     return out
 
 
-def _spikes(values: Array, least: float) -> NDArray[np.bool_]:
+def _spikes(values: Array, least: float, times: _Times | None = None) -> NDArray[np.bool_]:
     """Samples that the cubic through their eight neighbours does not expect."""
     out = np.zeros(values.size, dtype=bool)
-    width, half = 9, 4
-    if values.size < 3 * width:
-        return out
-    cubic = np.vander(np.arange(-half, half + 1) / half, 4)
-    project = np.eye(width) - cubic @ np.linalg.pinv(cubic)  # what a cubic leaves
-    open_ = float(project[half, half])
-    residual = np.convolve(values, project[half], "valid")
-    windows = np.lib.stride_tricks.sliding_window_view(values, width)
+    windows = np.lib.stride_tricks.sliding_window_view(values, _WIDTH)
+    if times is None:
+        cubic = np.vander(np.arange(-_HALF, _HALF + 1) / _HALF, 4)
+        project = np.eye(_WIDTH) - cubic @ np.linalg.pinv(cubic)  # what a cubic leaves
+        open_ = np.full(len(windows), project[_HALF, _HALF])
+        residual = np.convolve(values, project[_HALF], "valid")
+    else:
+        open_, residual = times.open_, times.residual(values)
     off = np.abs(residual) / open_
-    usual = np.sqrt(_robust_variance(residual)) / open_
+    usual = np.sqrt(_robust_variance(residual / np.sqrt(open_)) / open_)
     far = np.flatnonzero(off > np.maximum(_OFF * usual, least))
-    rest = np.sum((windows[far] @ project) ** 2, axis=1) - residual[far] ** 2 / open_
-    alone = np.sqrt(np.maximum(rest, 0.0) / (width - 5) / open_)
+    if times is None:
+        left = windows[far] @ project
+        onward = [np.broadcast_to(_ONWARD, (far.size, 3))] * 2
+    else:
+        clock = np.lib.stride_tricks.sliding_window_view(times.clock, _WIDTH)[far]
+        basis = _cubics(clock.T)
+        shares = np.einsum("ksw,ws->kw", basis, windows[far])
+        left = windows[far] - np.einsum("kw,ksw->ws", shares, basis)
+        onward = [_line_to_middle(clock, at) for at in _SIDES]
+    rest = np.sum(left**2, axis=1) - residual[far] ** 2 / open_[far]
+    alone = np.sqrt(np.maximum(rest, 0.0) / (_WIDTH - 5) / open_[far])
     # Beside a spike the cubic is off too: only the farthest of five is one.
     nearby = np.lib.stride_tricks.sliding_window_view(np.pad(off, 2), 5).max(axis=1)
     # The tip of a kink is where the line from one of its sides leads.
-    sides = np.array([windows[far, half] - windows[far][:, at] @ _ONWARD for at in _SIDES])
-    beside = np.min(sides * np.sign(residual[far]), axis=0)
-    out[far + half] = (
+    leads = [
+        np.sum(windows[far][:, at] * weights, axis=1)
+        for at, weights in zip(_SIDES, onward, strict=True)
+    ]
+    beside = np.min((windows[far, _HALF] - np.array(leads)) * np.sign(residual[far]), axis=0)
+    out[far + _HALF] = (
         (off[far] > _ALONE * alone) & (off[far] >= nearby[far]) & (beside > 0.5 * off[far])
     )
     return out
+
+
+@dataclass(frozen=True, eq=False)
+class _Times:
+    """Cubics over nine samples at uneven times, for every sample with four on either side.
+
+    `weights` (samples of a window, windows) are those of "sample minus cubic"; the share `open_` of
+    a sample in it is its own weight. They are zero and one where nothing is judged: across a pause,
+    and where the middle sample alone holds the cubic.
+    """
+
+    clock: Array
+    weights: Array
+    open_: Array
+
+    @classmethod
+    def of(cls, clock: Array) -> _Times:
+        """Prepare a clock; in parts, for all cubics at once would take much memory."""
+        n = clock.size - _WIDTH + 1
+        weights = np.empty((_WIDTH, n))
+        windows = np.lib.stride_tricks.sliding_window_view(clock, _WIDTH)
+        for first in range(0, n, _CHUNK):
+            basis = _cubics(windows[first : first + _CHUNK].T)
+            weights[:, first : first + _CHUNK] = -np.einsum("kw,ksw->sw", basis[:, _HALF], basis)
+        weights[_HALF] += 1.0
+        step = np.diff(clock)
+        steps = np.lib.stride_tricks.sliding_window_view(step, _WIDTH - 1)
+        pause = steps.max(axis=1) > _PAUSE * float(np.median(step))
+        unjudged = pause | (weights[_HALF] < _OPEN)
+        weights[:, unjudged] = 0.0
+        return cls(clock, weights, np.where(unjudged, 1.0, weights[_HALF]))
+
+    def residual(self, values: Array) -> Array:
+        """What the cubics leave of the middle samples."""
+        n = self.open_.size
+        left = np.zeros(n)
+        for i, weights in enumerate(self.weights):
+            left += weights * values[i : i + n]
+        return left
+
+
+def _cubics(times: Array) -> Array:
+    """Orthonormal cubics over times (samples, windows), shape (4, samples, windows)."""
+    x = times - times[_HALF]
+    x = x / np.abs(x).max(axis=0)
+    basis = np.empty((4, *x.shape))
+    for k in range(4):
+        new = x**k
+        for lower in basis[:k]:
+            new = new - np.einsum("sw,sw->w", new, lower) * lower
+        basis[k] = new / np.sqrt(np.einsum("sw,sw->w", new, new))
+    return basis
+
+
+def _line_to_middle(times: Array, at: list[int]) -> Array:
+    """Weights of three samples of each window in the value of their line in its middle."""
+    x = times[:, at] - times[:, [_HALF]]
+    centre = x.mean(axis=1, keepdims=True)
+    x = x - centre
+    return np.asarray(1.0 / 3.0 - centre * x / np.sum(x**2, axis=1, keepdims=True))

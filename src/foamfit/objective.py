@@ -97,6 +97,12 @@ def check_drive(measurement: Measurement, drive: str) -> None:
         missing.append("a displacement or strain column")
     if missing:
         raise InputError(f"{measurement.name}: the {drive} drive needs {' and '.join(missing)}")
+    force = measurement.outliers.get("stress")
+    if drive == "stress" and force is not None and force.clipped_at is not None:
+        raise InputError(
+            f"{measurement.name}: the force is clipped, so it cannot drive the specimen; choose "
+            "the displacement or the impact drive"
+        )
 
 
 def interior_curves(measurement: Measurement, springs: int) -> dict[str, int]:

@@ -11,6 +11,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 from foamfit.conditioning import engineering
+from foamfit.errors import printable
 from foamfit.measurement import interior_channel
 from foamfit.plots import (
     DPI,
@@ -24,6 +25,7 @@ from foamfit.plots import (
 
 if TYPE_CHECKING:
     from foamfit.ladder import Ladder
+    from foamfit.measurement import Measurement
     from foamfit.result import FitResult, ParameterEstimate
 
 CURVES = {
@@ -188,12 +190,22 @@ def summary_text(result: FitResult) -> str:
     lines += _wrap("", "fixed: " + ", ".join(fixed)) if fixed else []
     lines += _reasons(rows)
     lines += list(_checks(result))
-    lines += [""] if result.warnings or result.notes else []
+    lines += ["", *_data_lines(m)]
     for note in result.notes:
         lines += _wrap("note: ", note)
     for warning in result.warnings:
         lines += _wrap("warning: ", warning)
-    return "\n".join(lines)
+    return printable("\n".join(lines))
+
+
+def _data_lines(measurement: Measurement) -> list[str]:
+    """Say how many rows of the file are used, why not the others, and what was noticed of them."""
+    lines = []
+    for sentence in measurement.rows.sentences():
+        lines += _wrap("rows: ", sentence)
+    for note in measurement.notes:
+        lines += _wrap("data: ", note) if note.startswith("Check:") else []
+    return lines
 
 
 def _reasons(rows: list[Readable]) -> list[str]:

@@ -157,6 +157,7 @@ class FitResult:
                 "foamfit": version("foamfit"),
                 "test": self.measurement.name,
                 "data_sha256": self.measurement.data_sha256,
+                "data": asdict(self.measurement.rows) | {"notes": self.measurement.notes},
                 "model": self.model,
                 "drive": self.drive,
                 "seed": self.seed,
@@ -178,7 +179,11 @@ class FitResult:
                 "statistics": self.statistics,
                 "noise": self.noise,
                 "outliers": {
-                    channel: {"at": found.at, "values": found.values}
+                    channel: {
+                        "at": found.at,
+                        "values": found.values,
+                        "clipped_at": found.clipped_at,
+                    }
                     for channel, found in self.measurement.outliers.items()
                 },
                 "energy": self.energy,

@@ -1,9 +1,16 @@
-"""The TOML beside a test: specimen, striker, columns, noise and window, checked and in SI."""
+"""The TOML beside a test: specimen, striker, columns, noise, window and data, checked and in SI.
+
+[columns] names the column of a channel where its header does not: ``column``, ``unit``, ``scale``
+(a number, or a quantity such as "4444.4 N/V"; negative turns a sign round) and, for displacements,
+``counts_down = true`` (a gap or a position that gets smaller in compression). [data] ``duplicates``
+is "average" (neighbouring rows with one time stamp make one sample) or "refuse".
+"""
 
 from __future__ import annotations
 
 import difflib
 import math
+import re
 import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -11,10 +18,14 @@ from pathlib import Path
 from typing import Any
 
 from foamfit.conditioning import Window
-from foamfit.errors import InputError
+from foamfit.errors import InputError, printable
 from foamfit.measurement import Noise, Specimen, Striker, interior_node
 from foamfit.units import is_unit, parse_quantity, split_quantity
 
+_LARGEST = 1_000_000  # characters of a TOML
+_LONGEST = 200  # characters of a name
+# Many keys that are joined by dots.
+_DOTTED = re.compile(r"""(?<![\w"'-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){32}""")
 # Section, key: SI unit and an example.
 _SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
     "specimen": {
@@ -27,22 +38,33 @@ _SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
     "striker": {"mass": ("kg", "7 g"), "velocity": ("m/s", "1.75 m/s")},
     "noise": {"stress": ("Pa", "20 kPa"), "displacement": ("m", "2 um")},
     "window": {"start": ("s", "0.5 ms"), "end": ("s", "2 ms"), "cycle": ("", "1")},
+    "data": {"duplicates": ("", "average")},
 }
+DUPLICATES = ("average", "refuse")
 
 
 @dataclass(frozen=True)
 class Column:
-    """What [columns] says of one channel: its column, and the unit and scale of its numbers."""
+    """What [columns] says of one channel: its column, and the unit and scale of its numbers.
+
+    `counts_down` says that the column is a gap or a position that gets smaller in compression; the
+    displacement is what it has lost since contact.
+    """
 
     column: str
     unit: str | None = None
     scale: float = 1.0
     scale_unit: str = ""
+    counts_down: bool = False
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What the TOML says, in SI."""
+    """What the TOML says, in SI.
+
+    `duplicates` says what becomes of neighbouring rows with the same time stamp: "average" makes
+    one sample of them, "refuse" ends the reading.
+    """
 
     name: str
     specimen: Specimen
@@ -50,6 +72,7 @@ class Settings:
     noise: Noise
     window: Window
     columns: dict[str, Column] = field(default_factory=dict)
+    duplicates: str = "average"
 
 
 def load_toml(path: Path, otherwise: str) -> dict[str, Any]:
@@ -68,7 +91,19 @@ def load_toml(path: Path, otherwise: str) -> dict[str, Any]:
         If there is none or it is no TOML.
     """
     try:
-        return tomllib.loads(path.read_bytes().decode("utf-8-sig"))
+        with path.open("rb") as file:
+            raw = file.read(_LARGEST + 1)
+        if len(raw) > _LARGEST:
+            size = path.stat().st_size
+            raise InputError(f"{path}: has {size} characters; a TOML must have {_LARGEST} at most.")
+        text = raw.decode("utf-8-sig")
+        if _DOTTED.search(text):  # tomllib takes a time that grows with the square of their number
+            raise RecursionError
+        return tomllib.loads(text)
+    except RecursionError:
+        raise InputError(
+            f"{path}: is nested too deeply; a TOML of foamfit has few levels."
+        ) from None
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; {otherwise}.") from None
     except OSError as error:
@@ -84,7 +119,8 @@ def check_keys(where: str, given: Iterable[str], valid: Iterable[str]) -> None:
     valid = list(valid)
     for key in given:
         if key not in valid:
-            near = difflib.get_close_matches(key, valid, n=2, cutoff=0.4) or valid
+            near = difflib.get_close_matches(key[:_LONGEST], valid, n=2, cutoff=0.4) or valid
+            key = key if len(key) <= _LONGEST else f"{key[:_LONGEST]} …"
             raise InputError(f"{where} has no key {key!r}; meant may be {', '.join(near)}.")
 
 
@@ -106,10 +142,19 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
         Naming the file and the key that is wrong or missing.
     """
     document = load_toml(path, f"{test.name} needs a TOML with [specimen] height and diameter")
-    check_keys(f"{path}:", document, ["name", "specimen", "striker", "columns", "noise", "window"])
+    check_keys(f"{path}:", document, ["name", "columns", *_SECTIONS])
     name = document.get("name", test.stem)
     if not isinstance(name, str) or not name.strip():
         raise InputError(f"{path}: name = {name!r} is no text; give it in quotation marks.")
+    if len(name) > _LONGEST:
+        raise InputError(
+            f"{path}: name has {len(name)} characters; it must have {_LONGEST} at most."
+        )
+    control = next((c for c in name if not c.isprintable()), None)
+    if control is not None and "name" in document:
+        raise InputError(
+            f"{path}: name has a control character, U+{ord(control):04X}; write it in plain text."
+        )
     values: dict[str, dict[str, Any]] = {}
     for section, keys in _SECTIONS.items():
         table = document.get(section, {})
@@ -118,12 +163,13 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
         check_keys(f"{path}: [{section}]", table, keys)
         values[section] = {k: _value(path, section, k, v) for k, v in table.items()}
     return Settings(
-        name=name,
+        name=printable(name),
         specimen=_specimen(path, values["specimen"]),
         striker=Striker(**values["striker"]) if values["striker"] else None,
         noise=Noise(**values["noise"]),
         window=Window(**values["window"]),
         columns=_columns(path, document.get("columns", {}), channels),
+        **values["data"],
     )
 
 
@@ -133,6 +179,10 @@ def _value(path: Path, section: str, key: str, value: Any) -> Any:
     if key == "cycle":
         if type(value) is not int or value < 1:
             raise InputError(f"{where} = {value!r} must be a whole number from 1 up.")
+        return value
+    if key == "duplicates":
+        if value not in DUPLICATES:
+            raise InputError(f"{where} = {value!r} must be one of {', '.join(DUPLICATES)}.")
         return value
     if key == "heights":
         if not isinstance(value, list) or not value:
@@ -174,11 +224,16 @@ def _columns(path: Path, table: Any, channels: Iterable[str]) -> dict[str, Colum
         where = f"{path}: [columns] {channel}"
         if not isinstance(spec, dict) or not isinstance(spec.get("column"), str):
             raise InputError(f'{where} must be like {{ column = "Load", unit = "V" }}.')
-        check_keys(where, spec, ["column", "unit", "scale"])
+        motion = channel == "displacement" or interior_node(channel) is not None
+        check_keys(where, spec, ["column", "unit", "scale", *(["counts_down"] if motion else [])])
+        down = spec.get("counts_down", False)
+        if not isinstance(down, bool):
+            raise InputError(f"{where}: counts_down = {down!r} must be true or false.")
         unit = spec.get("unit")
         if unit is not None and (not isinstance(unit, str) or not is_unit(unit)):
             raise InputError(f'{where}: unit = {unit!r} is unknown; give it like unit = "mm".')
-        columns[channel] = Column(spec["column"], unit, *_scale(where, spec.get("scale", 1)))
+        scale = _scale(where, spec.get("scale", 1))
+        columns[channel] = Column(spec["column"], unit, *scale, down)
     return columns
 
 

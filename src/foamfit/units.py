@@ -108,6 +108,11 @@ def parse_quantity(value: object, si: str, where: str, example: str) -> float:
     if parts is None:
         raise InputError(f'{where} = {value!r} is no quantity; give it like "{example}".')
     number, unit = parts
+    if re.match(r"[_',]\d", unit):
+        raise InputError(
+            f'{where} = "{value}" must be written with a decimal point and without separators, '
+            f'like "{example}".'
+        )
     one = _unit(unit)
     if one is None:
         raise InputError(f'{where} = "{value}" has an unknown unit; give it like "{example}".')

@@ -140,7 +140,8 @@ def _noise_notes(objective: Objective) -> list[str]:
     else:
         told.append("Residuals count in units of the noise: at its floor the reduced χ² is 1.")
     for channel, outliers in measurement.outliers.items():
-        told.append(f"{outliers.at.size} outliers of the {channel} are not fitted.")
+        if outliers.at.size:
+            told.append(f"{outliers.at.size} outliers of the {channel} are not fitted.")
     if objective.time_shift and objective.drive != "impact":
         told.append(
             "time_shift: a foam whose stress relaxes leads its strain, and looks just as if the "

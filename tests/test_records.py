@@ -1,0 +1,508 @@
+"""What a record can be, and what becomes of each row of it."""
+
+import itertools
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import fabricated
+import foamfit as ff
+from conftest import synthetic_impact
+from foamfit.audit import audit, describe
+from foamfit.cli import main
+from foamfit.errors import InputError
+from foamfit.measurement import Outliers
+from foamfit.objective import check_drive
+from foamfit.reading import read_test
+from foamfit.report import render_report, summary_text
+
+SPECIMEN = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\n'
+STRIKER = '[striker]\nmass = "1 kg"\nvelocity = "1 m/s"\n'
+HEADER = "time (ms),stress (MPa),displacement (mm)"
+
+
+def write(folder, lines, toml=SPECIMEN):
+    path = folder / "test.csv"
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    path.with_suffix(".toml").write_text(toml, encoding="utf-8")
+    return path
+
+
+def table(*columns, header=HEADER):
+    rows = zip(*columns, strict=True)
+    return [header, *(",".join(f"{value:.9g}" for value in row) for row in rows)]
+
+
+def loop(n=101, top=4.0):
+    """Time (ms), stress (MPa) and displacement (mm) of one loading and unloading."""
+    shape = np.sin(np.linspace(0.0, np.pi, n))
+    return np.arange(float(n)), 0.5 * top * shape, top * shape
+
+
+def refused(path, *words):
+    with pytest.raises(InputError) as caught:
+        read_test(path)
+    message = str(caught.value)
+    assert "\n" not in message
+    for word in words:
+        assert word in message
+
+
+def accounted(test):
+    """Every row of the file is used or counted with its reason."""
+    count = test.rows
+    assert count.rows == count.used + sum(item.rows for item in count.dropped)
+    for item in count.dropped:
+        assert item.rows <= item.last - item.first + 1
+        assert item.why
+    return count
+
+
+# ---------------------------------------------------------------------------------- every row
+
+
+def test_all_rows_are_used_where_nothing_is_wrong(tmp_path):
+    count = accounted(read_test(write(tmp_path, table(*loop()))))
+    assert (count.rows, count.used, count.dropped) == (101, 101, ())
+
+
+@pytest.mark.parametrize("at", [60, 800])  # within the lines that are searched for a header or not
+def test_a_repeated_header_is_refused_with_both_rows(tmp_path, at):
+    lines = table(*loop(1284))
+    lines.insert(at, HEADER.replace(",", ", "))
+    refused(write(tmp_path, lines), f"row {at + 1} repeats the header of row 1")
+
+
+def test_two_tables_in_a_file_are_refused(tmp_path):
+    lines = [*table(*loop()[:2], header="time (ms),stress (MPa)"), *table(*loop())]
+    refused(write(tmp_path, lines), "rows 2 to 102 hold numbers above the header in row 103")
+
+
+def test_duplicate_time_stamps_are_averaged_and_counted(tmp_path):
+    clock, stress, displacement = loop()
+    for values in (clock, stress, displacement):
+        values[[31, 41, 42]] = values[[30, 40, 40]]
+    stress[[41, 42]] += 0.001, 0.002
+    lines = table(clock, stress, displacement)
+    test = read_test(write(tmp_path, lines))
+    count = accounted(test)
+    assert (count.rows, count.used) == (101, 98)
+    (item,) = count.dropped
+    assert (item.rows, item.first, item.last) == (3, 33, 44)
+    assert "time stamp of the row before" in item.why
+    assert test.time.size == 98
+    assert test.stress[40 - 1] == pytest.approx(1e6 * stress[40:43].mean())
+    refused(
+        write(tmp_path, lines, SPECIMEN + '[data]\nduplicates = "refuse"\n'), "row 33", "repeats"
+    )
+    refused(write(tmp_path, lines, SPECIMEN + "[data]\nduplicates = 3\n"), "average, refuse")
+
+
+def test_rows_without_a_cell_are_counted(tmp_path):
+    lines = [*table(*loop()), ",,", " , , "]
+    lines.insert(50, ",,")
+    count = accounted(read_test(write(tmp_path, lines)))
+    assert (count.rows, count.used) == (104, 101)
+    assert (count.dropped[0].first, count.dropped[0].last) == (51, 105)
+
+
+def test_row_numbers_are_lines_of_the_file(tmp_path):
+    clock, stress, displacement = loop()
+    for values in (clock, stress, displacement):
+        values[7] = values[6]
+    lines = ["A title", "", *table(clock, stress, displacement)]
+    lines[5:5] = ["", ""]
+    (item,) = accounted(read_test(write(tmp_path, lines))).dropped
+    assert lines[item.first - 1].startswith("6,")
+    assert lines[item.first - 2].startswith("6,")
+
+
+def triangles(tops, n=80, low=0.02):
+    """Displacement (mm) of triangles to the given tops, with a rest at both ends."""
+    corners = [0.0, *(level for top in tops for level in (top, low * max(tops)))]
+    parts = [np.linspace(a, b, n, endpoint=False) for a, b in itertools.pairwise(corners)]
+    return np.concatenate([*parts, [corners[-1]]])
+
+
+def record(kind):
+    """Time (ms), stress (MPa) and displacement (mm) of a record with something to leave out."""
+    rng = np.random.default_rng(0)
+    clock, stress, displacement = loop(601)
+    if kind in ("impact", "window"):
+        stress = np.concatenate([np.zeros(200), stress, np.zeros(300)])
+        displacement = np.concatenate([np.zeros(200), displacement, np.zeros(300)])
+        stress += 0.002 * rng.standard_normal(stress.size)
+    elif kind == "cycles":
+        displacement = triangles([4.0, 4.0, 4.0])
+        stress = 0.5 * displacement
+    elif kind == "spikes":
+        stress += 0.002 * rng.standard_normal(stress.size)
+        stress[[150, 400]] += 1.0
+        displacement[400] = 0.0
+    elif kind == "many":
+        clock, stress, displacement = loop(20_000)
+        stress[5000:5400] += 0.0
+        stress[7000] = 9.0
+    clock = np.arange(float(stress.size))
+    return table(clock, stress, displacement)
+
+
+@pytest.mark.parametrize(
+    ("kind", "toml", "why"),
+    [
+        ("impact", STRIKER, {"before contact starts", "after contact ends"}),
+        ("window", '[window]\nend = "0.9 s"\n', {"outside [window] start and end"}),
+        ("cycles", "[window]\ncycle = 2\n", {"before cycle 2", "after cycle 2"}),
+        ("spikes", "", {"a spike or gap of the stress, bridged by a straight line"}),
+        ("many", "", {"a spike or gap of the stress, bridged by a straight line"}),
+    ],
+)
+def test_every_row_that_is_not_used_has_its_reason(tmp_path, kind, toml, why):
+    lines = record(kind)
+    test = read_test(write(tmp_path, lines, SPECIMEN + toml))
+    count = accounted(test)
+    assert count.rows == len(lines) - 1
+    assert why <= {item.why for item in count.dropped}
+    if kind != "many":  # these are averaged in blocks
+        left_out = np.any([found.left_out for found in test.outliers.values()], axis=0)
+        assert count.used == test.stress.size - np.count_nonzero(left_out)
+    told = describe(test, audit(test))
+    assert f"{count.rows} in the file, {count.used} used" in told
+    assert all(f"Not used: {str(item)[:20]}" in told for item in count.dropped)
+
+
+def test_the_rows_stand_in_the_terminal_and_in_the_result(tmp_path):
+    clock, stress, displacement = loop()
+    for values in (clock, stress, displacement):
+        values[7] = values[6]
+    path = write(tmp_path, table(clock, stress, displacement))
+    assert "101 in the file, 100 used." in CliRunner().invoke(main, ["check", str(path)]).stdout
+    result = fabricated.result(measurement=read_test(path))
+    told = summary_text(result)
+    assert "rows: 101 in the file, 100 used." in told
+    assert "rows: Not used: row 9: the time stamp of the row before" in told
+    assert "data: Check: 1 of 101 rows" in told
+    data = result.to_json_dict()["data"]
+    assert (data["rows"], data["used"]) == (101, 100)
+    (item,) = data["dropped"]
+    assert item == {"rows": 1, "first": 9, "last": 9, "why": item["why"]}
+    assert "101 in the file" in render_report(result, fit_png=b"\x89PNG" + bytes(20))
+
+
+def test_a_test_that_is_not_read_from_a_file_uses_all_samples():
+    data = fabricated.result().to_json_dict()["data"]
+    assert (data["rows"], data["used"], data["dropped"]) == (601, 601, [])
+
+
+# ------------------------------------------------------------------------ what a record can be
+
+
+def cycles(path):
+    return next((note for note in path.notes if note.startswith("Cycle")), "")
+
+
+@pytest.mark.parametrize(
+    ("tops", "cycle", "count"),
+    [([0.8, 1.6, 2.4, 4.0], 1, 4), ([0.8, 1.6, 2.4, 4.0], 4, 4), ([4.0, 0.8, 4.0], 2, 3)],
+)
+def test_cycles_of_any_amplitude_are_counted(tmp_path, tops, cycle, count):
+    displacement = triangles(tops)
+    lines = table(np.arange(float(displacement.size)), displacement**1.5 / 4, displacement)
+    test = read_test(write(tmp_path, lines, SPECIMEN + f"[window]\ncycle = {cycle}\n"))
+    accounted(test)
+    assert f"Cycle {cycle} of {count} is used" in cycles(test)
+    assert test.displacement.max() == pytest.approx(1e-3 * tops[cycle - 1], rel=0.03)
+    small = [note for note in test.notes if "of the largest displacement" in note]
+    assert len(small) == (tops[cycle - 1] < 4.0)
+    assert all("[window] cycle = " in note for note in small)
+    assert not any("reverses" in note for note in test.notes)
+
+
+@pytest.mark.parametrize(
+    ("corners", "reversals", "count"),
+    [
+        ([0, 2.0, 1.2, 4.0, 0], 1, 1),  # unloaded in part on the way up
+        ([0, 4.0, 2.0, 3.0, 0], 1, 1),  # and loaded again on the way down
+        ([0, 2.0, 1.0, 3.0, 2.0, 4.0, 2.0, 3.0, 0], 3, 1),
+        ([0, 4.0, 0.1, 3.0, 2.0, 4.0, 0], 0, 2),  # in the cycle that is not used
+    ],
+)
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_a_record_that_reverses_below_its_peak_is_told(tmp_path, corners, reversals, count, noise):
+    parts = [np.linspace(a, b, 80, endpoint=False) for a, b in itertools.pairwise(corners)]
+    displacement = np.concatenate([*parts, [corners[-1]]])
+    displacement += noise * np.random.default_rng(0).standard_normal(displacement.size)
+    lines = table(np.arange(float(displacement.size)), 0.5 * displacement, displacement)
+    test = read_test(write(tmp_path, lines))
+    accounted(test)
+    assert (f"of {count} is used" in cycles(test)) == (count > 1)
+    told = [note for note in test.notes if "reverses" in note]
+    assert len(told) == (reversals > 0)
+    if told:
+        assert ("once" if reversals == 1 else f"{reversals} times") in told[0]
+        assert "no inner loops" in told[0]
+        assert "no inner loops" in " ".join(
+            summary_text(fabricated.result(measurement=test)).split()
+        )
+
+
+def test_a_movement_without_a_force_is_no_cycle(tmp_path):
+    displacement = triangles([1.0, 3.0, 3.0])
+    stress = 0.5 * displacement
+    stress[: displacement.size // 3] = 0.0
+    lines = table(np.arange(float(displacement.size)), stress, displacement)
+    assert "Cycle 1 of 2" in cycles(read_test(write(tmp_path, lines)))
+
+
+def clipped_impact(share, n=600, noise=0.0, digits=9):
+    """Half-sine impact of 1 kg at 1 m/s, the force clipped at a share of its peak."""
+    clock = np.linspace(0.0, 10.0, n)
+    stress = 3.0 * np.sin(np.pi * clock / 10.0)
+    stress += noise * np.random.default_rng(0).standard_normal(n)
+    displacement = 3.2 * np.sin(np.pi * clock / 10.0)
+    stress = np.round(np.minimum(stress, 3.0 * share), digits)
+    return table(clock, stress, displacement)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+@pytest.mark.parametrize("n", [600, 6000])
+def test_a_clipped_force_is_named_and_not_fitted(tmp_path, n, noise):
+    lines = clipped_impact(0.8, n, noise)
+    test = read_test(write(tmp_path, lines, SPECIMEN + STRIKER))
+    (note,) = [note for note in test.notes if "clipped" in note]
+    top = sum(line.split(",")[1] == "2.4" for line in lines)
+    assert f"{top} samples" in note
+    assert "2.4 MPa" in note
+    found = test.outliers["stress"]
+    assert found.clipped_at == pytest.approx(2.4e6, rel=1e-3)
+    assert found.at.size == 0
+    count = accounted(test)
+    (item,) = [item for item in count.dropped if "clipped" in item.why]
+    assert item.rows == top
+    assert test.stress[~found.left_out].max() < 2.4e6 * (1 + 1e-9)
+    with pytest.raises(InputError, match="clipped, so it cannot drive"):
+        check_drive(test, "stress")
+
+
+@pytest.mark.parametrize("digits", [1, 2, 3, 9])
+def test_a_rounded_top_is_not_clipped(tmp_path, digits):
+    test = read_test(write(tmp_path, clipped_impact(1.1, digits=digits), SPECIMEN + STRIKER))
+    assert not any("clipped" in note for note in test.notes)
+
+
+def test_a_motion_is_not_integrated_from_a_clipped_force(tmp_path):
+    lines = [line.rsplit(",", 1)[0] for line in clipped_impact(0.8)]
+    path = write(tmp_path, lines, SPECIMEN + STRIKER)
+    refused(path, "the force is clipped, so the motion cannot be integrated from it")
+
+
+def test_a_clipped_force_is_no_shift_of_the_clocks():
+    _, test = synthetic_impact()
+    top = 0.5 * test.stress.max()
+    at_top = test.stress > top
+    none = np.zeros(0)
+    found = Outliers(at_top, none, none, clipped_at=top)
+    stress = np.minimum(test.stress, top)
+    clipped = replace(test, stress=stress, outliers={"stress": found})
+    results = [ff.fit(each, starts=4) for each in (clipped, replace(clipped, outliers={}))]
+    told = [[w for w in result.warnings if "--time-shift" in w] for result in results]
+    assert told[0] == []
+    assert told[1]  # what a clipped force looks like
+    (check,) = [c for c in results[0].checklist if c.key == "clocks"]
+    assert check.answer is None
+    assert "clipped" in check.sentence
+
+
+# ------------------------------------------------------------------------- names and units
+
+
+COLUMNS = SPECIMEN + "[columns]\n"
+
+
+@pytest.mark.parametrize("name", ["Gap (mm)", "Position (mm)", "gap_mm", "Gap/mm"])
+def test_a_gap_counts_down_by_one_setting(tmp_path, name):
+    clock, stress, displacement = loop()
+    lines = table(clock, stress, 10.0 - displacement, header=f"time (ms),stress (MPa),{name}")
+    entry = f'displacement = {{ column = "{name}", counts_down = true }}'
+    refused(write(tmp_path, lines), entry)
+    test = read_test(write(tmp_path, lines, COLUMNS + entry + "\n"))
+    np.testing.assert_allclose(test.displacement, 1e-3 * displacement, atol=1e-6)
+    assert "counting down" in test.notes[0]
+    lines = table(clock, stress, displacement, header=f"time (ms),stress (MPa),{name}")
+    refused(write(tmp_path, lines, COLUMNS + entry + "\n"), "leave counts_down = true out")
+
+
+def test_counts_down_is_for_motions(tmp_path):
+    lines = table(*loop())
+    toml = COLUMNS + 'stress = { column = "stress (MPa)", counts_down = true }\n'
+    refused(write(tmp_path, lines, toml), "no key 'counts_down'")
+    toml = COLUMNS + 'displacement = { column = "displacement (mm)", counts_down = 1 }\n'
+    refused(write(tmp_path, lines, toml), "counts_down = 1 must be true or false")
+
+
+@pytest.mark.parametrize("name", ["Extension (mm)", "Compressive extension [mm]", "Travel_mm"])
+def test_a_displacement_has_other_names(tmp_path, name):
+    lines = table(*loop(), header=f"time (ms),stress (MPa),{name}")
+    assert read_test(write(tmp_path, lines)).displacement.max() == pytest.approx(4e-3)
+    better = table(
+        *loop(), loop()[2] / 2, header=f"time (ms),stress (MPa),{name},displacement (mm)"
+    )
+    assert read_test(write(tmp_path, better)).displacement.max() == pytest.approx(2e-3)
+    strained = table(*loop(), loop()[2] * 5, header=f"time (ms),stress (MPa),{name},strain (%)")
+    assert read_test(write(tmp_path, strained)).displacement.max() == pytest.approx(2e-3)
+
+
+def test_of_two_times_the_one_that_goes_on_is_read(tmp_path):
+    clock, stress, displacement = loop()
+    header = "total time (ms),cycle time (ms),stress (MPa),displacement (mm)"
+    lines = table(clock, clock % 50, stress, displacement, header=header)
+    test = read_test(write(tmp_path, lines))
+    assert test.time[-1] == pytest.approx(0.1)
+    assert "time from 'total time (ms)'" in test.notes[0]
+    lines = table(clock, 2 * clock, stress, displacement, header=header)
+    entry = 'time = { column = "total time (ms)" }'
+    refused(write(tmp_path, lines), entry)
+    assert read_test(write(tmp_path, lines, COLUMNS + entry)).time[-1] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ("header", "newton"),
+    [
+        ("Time/ms,Force/lb,displacement (mm)", 4.4482216),
+        ("t / ms,Load (lbs),displacement (mm)", 4.4482216),
+        ("Time [msec],Load [lbf],displacement (mm)", 4.4482216),
+        ("time (ms),Force (kg),displacement (mm)", 9.80665),
+        ("time_ms,Force(Linear:Load) (kN),displacement (mm)", 1000.0),
+    ],
+)
+def test_force_and_time_have_other_units(tmp_path, header, newton):
+    clock, stress, displacement = loop()
+    lines = table(clock, 200 * stress / newton, displacement, header=header)
+    test = read_test(write(tmp_path, lines))
+    assert test.time[-1] == pytest.approx(0.1)
+    assert test.stress.max() == pytest.approx(200 * stress.max() / 1e-4, rel=1e-6)
+
+
+def test_decimal_commas_in_quotation_marks(tmp_path):
+    header, *rows = table(*loop())
+    quoted = [",".join(f'"{cell.replace(".", ",")}"' for cell in row.split(",")) for row in rows]
+    test = read_test(write(tmp_path, [header, *quoted]))
+    np.testing.assert_allclose(test.displacement, 1e-3 * loop()[2], atol=1e-9)
+    rows = [f'{i},"1,{i:03d}",{i / 100}' for i in range(100)]
+    refused(write(tmp_path, [header, *rows]), "'1,000' may have a decimal comma or a separator")
+    quoted[40] = quoted[40].replace(",", ".").replace('"."', '","')
+    refused(write(tmp_path, [header, *quoted]), "row 42", "the same decimal sign")
+
+
+@pytest.mark.parametrize("columns", [2, 3])
+def test_the_force_is_mass_times_acceleration_where_it_is_missing(tmp_path, columns):
+    clock, stress, displacement = loop()
+    lines = table(clock, stress * 1e2, displacement, header="time (ms),accel (m/s^2),disp (mm)")
+    lines = [",".join(line.split(",")[:columns]) for line in lines]
+    striker = '[striker]\nmass = "2 kg"\nvelocity = "6.5 m/s"\n'
+    toml = SPECIMEN.replace("10 mm", "1 m") + striker
+    test = read_test(write(tmp_path, lines, toml))
+    assert test.stress.max() == pytest.approx(2.0 * 1e2 * stress.max() / 1e-4)
+    assert any("striker's mass times its acceleration" in note for note in test.notes)
+    assert test.motion == ("measured" if columns == 3 else "integrated from force")
+    refused(write(tmp_path, lines), "no column is a stress or a force", "[striker] mass")
+    turned = [lines[0], *(f"{t:g},{-a:g},{d:g}" for t, a, d in zip(*loop(), strict=True))]
+    turned = [",".join(line.split(",")[:columns]) for line in turned]
+    entry = 'acceleration = { column = "accel (m/s^2)", scale = -1 }'
+    refused(write(tmp_path, turned, toml), "acceleration is negative in compression", entry)
+
+
+# ------------------------------------------------------------------------------ one sentence
+
+
+@pytest.mark.parametrize(
+    ("toml", "words"),
+    [
+        (
+            '[columns]\nstress = { column = "stress (MPa)", scale = -1 }\n',
+            ["stress is negative", "leave the minus sign of scale = -1 out"],
+        ),
+        (
+            '[columns]\nstress = { column = "stress (MPa)", unit = "kPa" }\n',
+            ["has the unit 'MPa' in its header", "says 'kPa'"],
+        ),
+        (
+            '[columns]\nstress = { column = "stress (MPa)", unit = "V", scale = "2 MPa/V" }\n',
+            ["has the unit 'MPa' in its header", "says 'V'"],
+        ),
+        ('[noise]\nstress = "400 MPa"\n', ["[noise] stress = 400 MPa is 2e+04 %", "2 MPa"]),
+        ('[noise]\ndisplacement = "1 m"\n', ["[noise] displacement = 1 m is 2.5e+04 %"]),
+    ],
+)
+def test_what_contradicts_the_file_is_refused(tmp_path, toml, words):
+    refused(write(tmp_path, table(*loop()), SPECIMEN + toml), *words)
+
+
+def test_the_unit_of_the_header_may_be_said_again(tmp_path):
+    toml = '[columns]\nstress = { column = "stress (MPa)", unit = "N/mm^2" }\n'
+    test = read_test(write(tmp_path, table(*loop()), SPECIMEN + toml))
+    assert test.stress.max() == pytest.approx(2e6)
+
+
+@pytest.mark.parametrize(
+    ("toml", "words"),
+    [
+        ("a = " + 5000 * "[" + 5000 * "]", ["nested too deeply"]),
+        ("a = " + 5000 * "{ a = " + "1" + 5000 * "}", ["nested too deeply"]),
+        (".".join(["a"] * 50_000) + " = 1", ["nested too deeply"]),
+        (".".join(['"a"'] * 50_000) + " = 1", ["nested too deeply"]),
+        ("[" + ".".join(["a"] * 50_000) + "]", ["nested too deeply"]),
+        ('name = "' + 10_000_000 * "a" + '"', ["has 10", "characters"]),
+        (10_000_000 * "a" + " = 1", ["has 10", "characters"]),
+        ('name = "' + 500_000 * "a" + '"\n' + SPECIMEN, ["name has 500000 characters"]),
+        (500_000 * "a" + " = 1\n" + SPECIMEN, ["no key"]),
+        ('name = "a\\u001b[31mb"\n' + SPECIMEN, ["name", "U+001B"]),
+        ('[specimen]\nheight = "1_000 mm"\narea = "1 mm^2"\n', ["height", "without separators"]),
+        ('[specimen]\nheight = "1,19 mm"\narea = "1 mm^2"\n', ["height", "decimal point"]),
+    ],
+)
+def test_a_toml_that_no_one_would_write_is_refused_quickly(tmp_path, toml, words):
+    path = write(tmp_path, table(*loop()), toml)
+    begin = time.perf_counter()
+    with pytest.raises(InputError) as caught:
+        read_test(path)
+    assert time.perf_counter() - begin < 2.0
+    message = str(caught.value)
+    assert len(message) < 600
+    assert all(word in message for word in words)
+
+
+@pytest.mark.parametrize(
+    "name", [10_000_000 * "a", 1_000_000 * "a ", 1_000_000 * "(", 100_000 * "a ", 100_000 * "(a"]
+)
+def test_a_column_name_of_megabytes_is_refused_quickly(tmp_path, name):
+    header, *rows = table(*loop(), loop()[0])
+    path = write(tmp_path, [f"{header},{name}", *rows])
+    begin = time.perf_counter()
+    with pytest.raises(InputError) as caught:
+        read_test(path)
+    assert time.perf_counter() - begin < 2.0
+    assert len(str(caught.value)) < 600
+    assert "row 1" in str(caught.value)
+
+
+def test_no_control_character_reaches_the_terminal(tmp_path):
+    escape = "\x1b[31m"
+    header, *rows = table(*loop(), loop()[0])
+    path = tmp_path / f"a{escape}b.csv"
+    path.write_text("\n".join([f"{header},{escape}comment", *rows]))
+    call = ["check", str(path), "--specimen", str(tmp_path / f"t{escape}.toml")]
+    out = CliRunner().invoke(main, call)
+    assert out.exit_code == 1
+    assert "no such file" in out.stderr
+    (tmp_path / f"t{escape}.toml").write_text(SPECIMEN)
+    told = CliRunner().invoke(main, call)
+    assert told.exit_code == 0
+    test = read_test(path, tmp_path / f"t{escape}.toml")
+    summary = summary_text(fabricated.result(measurement=test))
+    for text in (out.stderr, told.stdout, summary):
+        assert "\x1b" not in text
+        assert "[31m" in text
