@@ -2,7 +2,10 @@
 
 
 class InputError(ValueError):
-    """A file, key, column or option is wrong; the message names it and says what would be right."""
+    """A file, key, column, option or argument is wrong; the message says what would be right.
+
+    Any other ValueError, as numpy's LinAlgError is one, is a defect of foamfit.
+    """
 
 
 class SimulationError(RuntimeError):

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import gc
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -136,6 +135,7 @@ def side_by_side() -> Iterator[Callable[[], None]]:
         [sys.executable, "-m", "foamfit.warmth"],
         stdout=subprocess.PIPE,
         env=os.environ | {"PYTHONPATH": path},
+        process_group=0,  # Ctrl-C is for the process that starts this one
     ) as other:
 
         def finish() -> None:
@@ -147,13 +147,13 @@ def side_by_side() -> Iterator[Callable[[], None]]:
 
         try:
             yield finish
+            other.wait()
         except BaseException:
             other.terminate()
             raise
 
 
 def _other() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that started this one
     calls = _calls()
     _compile(calls.pieces)
     print("pieces", flush=True)
