@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import re
 import signal
@@ -16,7 +17,7 @@ from click.testing import CliRunner
 
 import fabricated
 import foamfit.plots
-import foamfit.report
+import foamfit.result
 from conftest import EXPERIMENTS
 from foamfit import files
 from foamfit.cli import main
@@ -32,11 +33,15 @@ posix = pytest.mark.skipif(os.name != "posix", reason="signals and permissions o
 
 @pytest.fixture(autouse=True)
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty working directory, and results without the time that figures take."""
-    for module in (foamfit.plots, foamfit.report):
-        monkeypatch.setattr(module, "image", lambda *_: b"\x89PNG" + bytes(20))
+    """An empty working directory, and results of one file that need no time."""
+    monkeypatch.setattr(foamfit.result, "_write", write_json)
+    monkeypatch.setattr(foamfit.plots, "image", lambda *_: b"\x89PNG" + bytes(20))
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+def write_json(result: FitResult, folder: Path) -> None:
+    (folder / "fit.json").write_text(json.dumps(result.to_json_dict()))
 
 
 def names(folder: Path) -> list[str]:
@@ -98,11 +103,11 @@ def test_what_is_put_into_the_folder_while_it_is_written_stays(
 ) -> None:
     folder = fabricated.result(seed=1).save("r")
 
-    def late(*_: object, **__: object) -> str:
+    def late(result: FitResult, folder: Path) -> None:
+        write_json(result, folder)
         (here / "r" / "notes.txt").write_text("x")
-        return "page"
 
-    monkeypatch.setattr(foamfit.report, "render_report", late)
+    monkeypatch.setattr(foamfit.result, "_write", late)
     with pytest.raises(InputError, match=r"notes\.txt"):
         fabricated.result(seed=2).save("r")
     assert load_result(folder)["seed"] == 1
@@ -260,7 +265,7 @@ def test_an_older_result_that_a_killed_process_put_aside_comes_back(
     def fail(*_: object, **__: object) -> None:
         raise RuntimeError
 
-    monkeypatch.setattr(foamfit.report, "render_report", fail)
+    monkeypatch.setattr(foamfit.result, "_write", fail)
     with pytest.raises(RuntimeError):
         fabricated.result(seed=2).save("r")
     assert load_result("r")["seed"] == 1

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from foamfit.errors import InputError
 from foamfit.files import write_file
+from foamfit.terminal import printable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -703,7 +704,7 @@ def _switch_samples(result: FitResult, loop: _Line) -> list[int]:
 
 
 def _head(figure: Figure, result: FitResult) -> None:
-    name = " ".join(result.measurement.name.split())
+    name = printable(" ".join(result.measurement.name.split()))
     name = name if len(name) <= 60 else name[:59] + "…"
     title = f"{name} · {result.model} · {result.drive} drive"
     word = origin_word(result)

@@ -18,8 +18,9 @@ from typing import TextIO
 from foamfit.errors import InputError
 
 # Control characters but tab and new line, and what turns the direction of writing round: in a name
-# they would move the cursor, colour the terminal or hide what stands there.
-_CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
+# they would move the cursor, colour the terminal or hide what stands there. And what Python makes
+# of file names that are no Unicode.
+_CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 # What stands for a character that an encoding does not have; Greek letters are named.
 _INSTEAD = {
     "−": "-", "–": "-", "±": "+/-", "·": "*", "…": "...", "→": "->", "√": "sqrt", "µ": "u",
