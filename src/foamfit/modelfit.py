@@ -20,7 +20,15 @@ from foamfit.measurement import Measurement
 from foamfit.model import Model, split_name
 from foamfit.problem import Problem, make_problem
 from foamfit.result import FitResult
-from foamfit.search import SearchRecord, SearchStoppedError, Tracker, salvage, search
+from foamfit.search import (
+    STOPPING,
+    SearchRecord,
+    SearchStoppedError,
+    Tracker,
+    salvage,
+    search,
+    what_stopped,
+)
 from foamfit.verdict import conclude
 from foamfit.vicinity import Vicinity
 
@@ -206,10 +214,9 @@ def _search(
         record = replace(record, costs=tuple(costs))
         progress(0.95, "refinement")
         _refine(problem, tracker)
-    except (SearchStoppedError, KeyboardInterrupt) as error:
+    except STOPPING as error:
         salvage(tracker, problem.space(), np.random.default_rng(record.seed))
-        late = isinstance(error, SearchStoppedError)
-        return replace(record, stopped="the time limit" if late else "Ctrl-C")
+        return replace(record, stopped=what_stopped(error))
     progress(1.0, "done")
     return record
 
