@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import io
 import json
 import os
@@ -9,6 +10,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +26,7 @@ from foamfit import identification, terminal
 from foamfit.cli import main
 from foamfit.errors import InputError
 from foamfit.result import FitResult
-from foamfit.terminal import printable, without_ctrl_c
+from foamfit.terminal import ending_cleanly, printable, without_ctrl_c
 
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
 ODD = "foam \x1b[31mred\x1b[0m\x07\x9b2J\u202eback χ"
@@ -210,6 +212,21 @@ def test_what_springs_and_chains_refuse_is_an_input_error() -> None:
     ):
         with pytest.raises(InputError):
             refuse()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_in_code_that_cannot_raise_is_not_lost(number: signal.Signals) -> None:
+    """As in the callbacks by which numba loads what it has compiled."""
+    callback = ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(number))
+    hook = sys.unraisablehook
+
+    def run_on() -> None:
+        callback()
+        time.sleep(5.0)
+
+    with pytest.raises((KeyboardInterrupt, terminal.TerminatedError)), ending_cleanly():
+        run_on()
+    assert sys.unraisablehook is hook
 
 
 def test_ctrl_c_waits_only_while_the_result_is_written() -> None:

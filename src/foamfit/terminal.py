@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from io import TextIOWrapper
 from types import FrameType
-from typing import TextIO
+from typing import Any, TextIO
 
 from foamfit.errors import InputError
 
@@ -121,18 +121,39 @@ def _handles_signals() -> bool:
 
 @contextmanager
 def ending_cleanly() -> Iterator[None]:
-    """Make SIGTERM and SIGHUP an exception, so that nothing half done stays behind."""
-    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    """Make SIGTERM and SIGHUP an exception, so that nothing half done stays behind.
+
+    Neither these nor Ctrl-C are lost in code that cannot raise, as the callbacks by which numba
+    loads what it compiled.
+    """
     if not _handles_signals():
-        numbers = []
+        yield
+        return
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
     taken = [number for number in numbers if signal.getsignal(number) is signal.SIG_DFL]
     for number in taken:
         signal.signal(number, _terminate)
+    told, sys.unraisablehook = sys.unraisablehook, _raise_again
     try:
         yield
     finally:
+        sys.unraisablehook = told
         for number in taken:
             signal.signal(number, signal.SIG_DFL)
+
+
+def _raise_again(lost: Any) -> None:
+    """Send a signal once more whose exception was ignored: a hook of `sys`."""
+    if isinstance(lost.exc_value, TerminatedError):
+        number = lost.exc_value.number
+    elif isinstance(lost.exc_value, KeyboardInterrupt):
+        number = signal.SIGINT
+    else:
+        sys.__unraisablehook__(lost)
+        return
+    again = threading.Timer(0.02, signal.raise_signal, (number,))
+    again.daemon = True
+    again.start()
 
 
 @contextmanager
