@@ -418,6 +418,11 @@ def test_refuses_calls_of_fit(here: Path, args: list[str], words: tuple[str, ...
         (["--verbose"], ("--verbose", "foamfit --help")),
         (["check", "none.csv"], ("none.csv", "no such file")),
         (["check", "."], ("directory",)),
+        (["check", RECONSTRUCTION, "--model", "rubber"], ("model 'rubber'",)),
+        (
+            ["check", RECONSTRUCTION, "--model", "bistable", "--published", "none"],
+            ("no published set 'none'",),
+        ),
         (["simulate", "none.toml"], ("none.toml", "no such file")),
         (["compare", "none"], ("none is not a result folder",)),
     ],

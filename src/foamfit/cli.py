@@ -187,18 +187,20 @@ def check(
         figure_format(plot)
     if published_set is not None and params is not None:
         raise InputError("--published and --params exclude each other; give one of them")
-    planned = model is not None and test.suffix.lower() == ".toml"
-    if not planned:
+    description = ""
+    if model is None or test.suffix.lower() != ".toml":
         measurement = read_test(test, specimen)
-        say(describe(measurement, audit(measurement)))
+        description = describe(measurement, audit(measurement)) + "\n"
     if model is None:
+        say(description, newline=False)
         return
     from foamfit.planning import describe_plan, plan_test
 
     with _compiling(quiet=False) as compile_rest:
         compile_rest()
     plan = plan_test(test, specimen, model, drive, published_set=published_set, result=params)
-    say("" if planned else "\n", newline=False)
+    if description:
+        say(description)
     say(describe_plan(plan))
     if plot is not None:
         from foamfit.insight_plots import plot_plan

@@ -560,19 +560,24 @@ def mcmc(vicinity: Vicinity, steps: int, seed: int, tracker: Tracker | None = No
     sampler = emcee.EnsembleSampler(count, k, log_probability)
     # Not through emcee's wrapper, which prints a traceback of whatever ends the chain.
     sampler.log_prob_fn = log_probability
-    sampler.random_state = np.random.RandomState(seed).get_state()
-    done, stopped = 0, None
+    bits = np.random.MT19937(np.random.SeedSequence([seed, 3]))  # of a seed of any size
+    sampler.random_state = np.random.RandomState(bits).get_state()
+    steps_done: list[Array] = []  # emcee would make room for all of them at once
+    stopped = None
     try:
         begin = _begin(vicinity, refit, log_probability, count, np.random.default_rng([seed, 2]))
         if begin is None:
             stopped = "the best point, next to which nothing can be simulated"
         else:
-            for _ in sampler.sample(begin, iterations=steps, skip_initial_state_check=True):
-                done += 1
+            for state in sampler.sample(
+                begin, iterations=steps, skip_initial_state_check=True, store=False
+            ):
+                steps_done.append(state.coords.copy())
     except STOPPING as error:
         stopped = what_stopped(error)
+    done = len(steps_done)
     burn_in = done // 5
-    chain = sampler.get_chain()[burn_in:done] if done else np.empty((0, count, k))
+    chain = np.array(steps_done[burn_in:]).reshape(-1, count, k)
     with np.errstate(invalid="ignore", divide="ignore"):  # of a walker that never moved
         times = emcee.autocorr.integrated_time(chain, tol=0, quiet=True) if done > 10 else [np.inf]
     slowest = float(np.max(np.nan_to_num(times, nan=np.inf)))
