@@ -167,7 +167,7 @@ def test_an_older_result_is_replaced_and_quiet_is_quiet(
     here: Path, fitted: tuple[Path, Result]
 ) -> None:
     shutil.copytree(next(fitted[0].rglob("fit.json")).parent, "old")
-    (here / "old" / "stale").write_text("x")
+    (here / "old" / "profiles.csv").write_text("x")
     args = ("--drive", "displacement", "--fix", "s1_k0=5.5e6", "--vary", "s1_eta", "--starts", 3)
     result = accepted("fit", RECONSTRUCTION, "--out", "old", "--quiet", *args)
     assert result.stdout == ""
@@ -418,6 +418,11 @@ def test_refuses_calls_of_fit(here: Path, args: list[str], words: tuple[str, ...
         (["--verbose"], ("--verbose", "foamfit --help")),
         (["check", "none.csv"], ("none.csv", "no such file")),
         (["check", "."], ("directory",)),
+        (["check", RECONSTRUCTION, "--model", "rubber"], ("model 'rubber'",)),
+        (
+            ["check", RECONSTRUCTION, "--model", "bistable", "--published", "none"],
+            ("no published set 'none'",),
+        ),
         (["simulate", "none.toml"], ("none.toml", "no such file")),
         (["compare", "none"], ("none is not a result folder",)),
     ],
@@ -478,7 +483,8 @@ def test_refuses_scenes(here: Path, text: str, words: tuple[str, ...]) -> None:
         (["--plot", "no/x.png"], ("no/x.png", "no folder no")),
         (["--out", "no/x.csv"], ("no/x.csv", "no folder no")),
         (["--out", "."], ("is a folder",)),
-        (["--rtol", "0"], ("rtol = 0", "between")),
+        (["--rtol", "0"], ("--rtol 0", "between")),
+        (["--rtol", "nan"], ("--rtol nan", "between")),
     ],
 )
 def test_refuses_calls_of_simulate(here: Path, args: list[str], words: tuple[str, ...]) -> None:
@@ -521,7 +527,7 @@ def test_a_defect_is_one_line_too(here: Path, monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr("foamfit.reading.read_test", broken)
     result = run("check", "x.csv")
-    assert (result.exit_code, result.stdout) == (1, "")
+    assert (result.exit_code, result.stdout) == (70, "")
     assert re.fullmatch(r"foamfit: [^\n]*KeyError[^\n]+\n", result.stderr)
     monkeypatch.setenv("FOAMFIT_TRACEBACK", "1")
     assert isinstance(run("check", "x.csv").exception, KeyError)

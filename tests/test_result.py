@@ -146,7 +146,7 @@ def test_a_curve_that_is_not_there_has_no_column(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("no_figures")
 def test_an_older_result_is_replaced_whole(tmp_path: Path) -> None:
     folder = fabricated.result().save(tmp_path / "r")
-    (folder / "of an older version.txt").write_text("x")
+    (folder / "profiles.csv").write_text("of a fit that had profiles")
     fabricated.result(seed=8).save(folder)
     assert {path.name for path in folder.iterdir()} == FILES
     assert load_result(folder)["seed"] == 8

@@ -11,7 +11,6 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from foamfit.conditioning import engineering, line_at, noise_level
-from foamfit.errors import printable
 from foamfit.measurement import INTEGRATED, Array, Measurement, Striker, interior_channel
 
 
@@ -257,7 +256,7 @@ def describe(measurement: Measurement, audit: EnergyAudit) -> str:
     lines += _peaks(test)
     lines += _labelled("noise", noise_sentences(test))
     lines += _labelled("done", test.notes) + _labelled("energy", audit.sentences())
-    return printable("\n".join(f"{label:<10}{_wrap(text)}" for label, text in lines))
+    return "\n".join(f"{label:<10}{_wrap(text)}" for label, text in lines)
 
 
 def noise_sentences(measurement: Measurement) -> list[str]:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foamfit.errors import InputError
 from foamfit.spring import BistableSpring, LinearSpring, Spring, as_number, as_samples
 
 Array = NDArray[np.float64]
@@ -20,7 +21,7 @@ def _finite(value: object, name: str, least: float, strict: bool) -> float:
     number = as_number(value, name)
     if not math.isfinite(number) or number < least or (strict and number == least):
         wanted = f"greater than {least:g}" if strict else f"at least {least:g}"
-        raise ValueError(f"{name} = {number:g} is not admissible: it must be finite and {wanted}")
+        raise InputError(f"{name} = {number:g} is not admissible: it must be finite and {wanted}")
     return number
 
 
@@ -31,7 +32,7 @@ def _listed(values: Any, name: str, wanted: str) -> tuple[Any, ...]:
             return tuple(values)
     except TypeError:
         pass
-    raise ValueError(
+    raise InputError(
         f"{name} = {values!r} is not admissible: it must be a sequence of {wanted}, base first"
     )
 
@@ -92,10 +93,10 @@ class Chain:
         springs = _listed(springs, "springs", "BistableSpring or LinearSpring")
         n = len(springs)
         if n == 0:
-            raise ValueError("springs is empty: a chain needs at least one spring")
+            raise InputError("springs is empty: a chain needs at least one spring")
         for i, spring in enumerate(springs, start=1):
             if not isinstance(spring, BistableSpring | LinearSpring):
-                raise ValueError(
+                raise InputError(
                     f"springs: spring {i} is a {type(spring).__name__}; "
                     "it must be a BistableSpring or a LinearSpring"
                 )
@@ -103,7 +104,7 @@ class Chain:
         masses = _listed([0.0] * n if masses is None else masses, "masses", "numbers")
         for name, values in (("heights", heights), ("masses", masses)):
             if len(values) != n:
-                raise ValueError(
+                raise InputError(
                     f"{name} has {len(values)} values for {n} springs: give one per spring"
                 )
         put = object.__setattr__
@@ -134,10 +135,10 @@ class Chain:
 def _samples(values: ArrayLike, name: str) -> Array:
     samples = as_samples(values, name)
     if samples.ndim != 1 or samples.size == 0:
-        raise ValueError(f"{name} must be a one-dimensional array with at least one sample")
+        raise InputError(f"{name} must be a one-dimensional array with at least one sample")
     if not np.all(np.isfinite(samples)):
         at = int(np.argmin(np.isfinite(samples)))
-        raise ValueError(f"{name} must be finite; sample {at} is {samples[at]}")
+        raise InputError(f"{name} must be finite; sample {at} is {samples[at]}")
     samples.setflags(write=False)
     return samples
 
@@ -189,9 +190,9 @@ def check_scene(chain: object, drive: object) -> None:
         Naming which.
     """
     if not isinstance(chain, Chain):
-        raise ValueError(f"chain is a {type(chain).__name__}; it must be a Chain")
+        raise InputError(f"chain is a {type(chain).__name__}; it must be a Chain")
     if not isinstance(drive, Drive):
-        raise ValueError(
+        raise InputError(
             f"drive is a {type(drive).__name__}; it must be an Impact, a StressDrive or a "
             "DisplacementDrive"
         )

@@ -17,7 +17,7 @@ from foamfit.errors import InputError
 from foamfit.measurement import INTEGRATED
 from foamfit.model import split_name
 from foamfit.objective import check_time_shift
-from foamfit.uncertainty import WEAK
+from foamfit.uncertainty import AT_LIMIT, WEAK
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -306,7 +306,7 @@ def _bounds(e: Evidence) -> Check:
     sizes = e.problem.sizes(tuple(varied), e.values)
     stuck, natural = [], []
     for name, size in zip(varied, sizes, strict=True):
-        value, edge = e.estimates[name].value, 1e-6 * size
+        value, edge = e.estimates[name].value, AT_LIMIT * size
         for bound in (params[name].min, params[name].max):
             if abs(value - bound) > edge or e.estimates[name].stderr is None:
                 continue

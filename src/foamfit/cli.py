@@ -18,37 +18,48 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from foamfit.errors import InputError, SimulationError, printable
+from foamfit.errors import InputError, SimulationError
+from foamfit.files import check_file
+from foamfit.terminal import TerminatedError, ending_cleanly, say, show_all, without_ctrl_c
 
 if TYPE_CHECKING:
     import lmfit
 
-WRONG, NOT_ACCEPTABLE = 1, 2
+    from foamfit.result import FitResult
+
+# Exit codes: the input or the call is wrong; no acceptable fit; a defect (EX_SOFTWARE of
+# sysexits.h). The number of a signal that ended the command is added to the last.
+WRONG, NOT_ACCEPTABLE, DEFECT, SIGNALLED = 1, 2, 70, 128
 
 
 class _Group(click.Group):
-    """A command group whose every refusal is one sentence and exit code 1."""
+    """A command group whose every refusal is one sentence with its exit code."""
 
     def main(self, *args: Any, **kwargs: Any) -> Any:
         kwargs["standalone_mode"] = False
         _spare_the_collector()
+        show_all()
         try:
-            code = super().main(*args, **kwargs)
-            sys.stdout.flush()
+            with ending_cleanly():
+                code = super().main(*args, **kwargs)
+                say("", newline=False)  # what click has printed
         except click.ClickException as error:
-            _refuse(_one_sentence(error))
-        except (InputError, SimulationError, ValueError) as error:
-            _refuse(str(error))
+            _leave(WRONG, _one_sentence(error))
+        except (InputError, SimulationError) as error:
+            _leave(WRONG, str(error))
         except (click.Abort, KeyboardInterrupt):
-            _refuse("interrupted before anything was found")
-        except BrokenPipeError:  # whoever read the output has enough, as `head`
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            sys.exit(WRONG)
+            _leave(SIGNALLED + signal.SIGINT, "interrupted by Ctrl-C")
+        except TerminatedError as error:
+            _leave(SIGNALLED + error.number, f"ended by {signal.Signals(error.number).name}")
         except Exception as error:
             if os.environ.get("FOAMFIT_TRACEBACK"):
                 raise
             told = f"{type(error).__name__}: {error}"
-            _refuse(f"this is a defect of foamfit ({told}); FOAMFIT_TRACEBACK=1 shows where it is")
+            _leave(
+                DEFECT,
+                f"this is a defect of foamfit, please report it ({told}); FOAMFIT_TRACEBACK=1 "
+                "shows where it is",
+            )
         sys.exit(code if isinstance(code, int) else 0)
 
 
@@ -63,10 +74,10 @@ def _spare_the_collector() -> None:
     atexit.register(gc.freeze)
 
 
-def _refuse(message: str) -> NoReturn:
+def _leave(code: int, message: str) -> NoReturn:
     """Print one line on stderr and leave."""
-    click.echo(printable(f"foamfit: {' '.join(message.split())}"), err=True)
-    sys.exit(WRONG)
+    say(f"foamfit: {' '.join(message.split())}", err=True)
+    sys.exit(code)
 
 
 def _one_sentence(error: click.ClickException) -> str:
@@ -102,7 +113,7 @@ def main(context: click.Context) -> None:
     The model is that of Thevamaran, Fraternali & Daraio (2014), J. Appl. Mech. 81, 121006.
     """
     if context.invoked_subcommand is None:
-        click.echo(context.get_help())
+        say(context.get_help())
 
 
 _TEST = click.argument("test", metavar="TEST.csv", type=click.Path(path_type=Path))
@@ -172,28 +183,30 @@ def check(
     if plot is not None:
         from foamfit.plots import figure_format
 
-        _check_file(plot)
+        check_file(plot)
         figure_format(plot)
     if published_set is not None and params is not None:
         raise InputError("--published and --params exclude each other; give one of them")
-    planned = model is not None and test.suffix.lower() == ".toml"
-    if not planned:
+    description = ""
+    if model is None or test.suffix.lower() != ".toml":
         measurement = read_test(test, specimen)
-        click.echo(describe(measurement, audit(measurement)))
+        description = describe(measurement, audit(measurement)) + "\n"
     if model is None:
+        say(description, newline=False)
         return
     from foamfit.planning import describe_plan, plan_test
 
     with _compiling(quiet=False) as compile_rest:
         compile_rest()
     plan = plan_test(test, specimen, model, drive, published_set=published_set, result=params)
-    click.echo("" if planned else "\n", nl=False)
-    click.echo(describe_plan(plan))
+    if description:
+        say(description)
+    say(describe_plan(plan))
     if plot is not None:
         from foamfit.insight_plots import plot_plan
 
         plot_plan(plan, plot)
-        click.echo(f"\ndrawn in {plot}")
+        say(f"\ndrawn in {plot}")
 
 
 def _fixes(
@@ -308,7 +321,8 @@ def fit(
     """Identify the parameters of TEST.csv and write a result folder.
 
     Exit code 0: a fit was made; 1: the input or the call is wrong; 2: no acceptable fit was found
-    (what was found is written).
+    (what was found is written); 70: a defect of foamfit; 130 and 143: ended by Ctrl-C before
+    anything was found, and by SIGTERM.
 
     \b
     Examples:
@@ -354,23 +368,33 @@ def fit(
                 intervals=intervals,
                 draws=draws,
                 progress=progress,
-                tell=None if quiet else lambda told: click.echo(f"foamfit: {told}", err=True),
+                tell=None if quiet else lambda told: say(f"foamfit: {told}", err=True),
             )
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # now Ctrl-C could only lose the result
-        result.save(folder)
+        try:
+            with without_ctrl_c():
+                result.save(folder)
+        except InputError:  # the numbers are not lost with the folder
+            _tell_result(result, None, as_json, quiet)
+            raise
+    _tell_result(result, folder, as_json, quiet)
+    if result.status == "failed":
+        say(f"foamfit: no acceptable fit was found; see {folder}", err=True)
+        return NOT_ACCEPTABLE
+    return 0
+
+
+def _tell_result(result: FitResult, folder: Path | None, as_json: bool, quiet: bool) -> None:
+    """Print a result, and the folder that it was written to."""
     if as_json:
         import json
 
-        click.echo(json.dumps(result.to_json_dict(), ensure_ascii=False, allow_nan=False))
+        say(json.dumps(result.to_json_dict(), allow_nan=False))
     elif not quiet:
         from foamfit.report import summary_text
 
-        click.echo(summary_text(result))
-        click.echo(printable(f"\nwritten to {folder}: open {folder / 'report.html'}"))
-    if result.status == "failed":
-        click.echo(f"foamfit: no acceptable fit was found; see {folder}", err=True)
-        return NOT_ACCEPTABLE
-    return 0
+        say(summary_text(result))
+        if folder is not None:
+            say(f"\nwritten to {folder}: open {folder / 'report.html'}")
 
 
 def _result_folder(out: Path | None, test: Path, specimen: Path | None, model: str) -> Path:
@@ -413,7 +437,7 @@ def _compiling(quiet: bool) -> Iterator[Callable[[], None]]:
         yield lambda: None
         return
     if not quiet:
-        click.echo("foamfit: compiling the solver, once after installation", err=True)
+        say("foamfit: compiling the solver, once after installation", err=True)
     with warmth.side_by_side() as finish:
         yield finish
 
@@ -471,6 +495,8 @@ def simulate(scene: Path, out: Path | None, plot: Path | None, rtol: float) -> N
     from foamfit.scene import files_of_scene, read_scene, write_response
     from foamfit.simulation import simulate as run
 
+    if not 1e-14 <= rtol <= 0.1:
+        raise InputError(f"--rtol {rtol:g} is not admissible; it must be between 1e-14 and 0.1")
     target = Path(scene.with_suffix(".csv").name) if out is None else out
     _check_files((target, plot), files_of_scene(scene))
     if plot is not None:
@@ -482,33 +508,23 @@ def simulate(scene: Path, out: Path | None, plot: Path | None, rtol: float) -> N
         compile_rest()
     response = run(chain, drive, time, rtol)
     write_response(response, target)
-    click.echo(f"{response.solver}, {response.time.size} samples, written to {target}")
+    say(f"{response.solver}, {response.time.size} samples, written to {target}")
     if plot is not None:
         from foamfit.plots import plot_response
 
         plot_response(response, plot)
-        click.echo(f"drawn in {plot}")
+        say(f"drawn in {plot}")
 
 
 def _check_files(outputs: tuple[Path | None, ...], inputs: Iterable[Path]) -> None:
     """Refuse files that could not be written, or that are read too, before anything is computed."""
     given = [path for path in outputs if path is not None]
     for path in given:
-        _check_file(path)
+        check_file(path)
         if path.resolve() in [source.resolve() for source in inputs]:
             raise InputError(f"{path} is read by this command and would be lost; name another file")
     if len({path.resolve() for path in given}) < len(given):
         raise InputError(f"{given[0]} cannot be two things; name two files")
-
-
-def _check_file(path: Path) -> None:
-    """Refuse a file that could not be written."""
-    if path.is_dir():
-        raise InputError(f"{path} is a folder; name a file")
-    if not path.parent.is_dir():
-        raise InputError(f"{path} cannot be written: there is no folder {path.parent}")
-    if not os.access(path.parent, os.W_OK) or (path.exists() and not os.access(path, os.W_OK)):
-        raise InputError(f"{path} cannot be written: permission denied")
 
 
 @main.command()
@@ -541,13 +557,13 @@ def compare(
     if plot is not None:
         figure_format(plot)
     comparison = side_by_side(results, name)
-    click.echo(comparison_text(comparison))
+    say(comparison_text(comparison))
     if plot is not None:
         plot_comparison(comparison, plot)
-        click.echo(f"\ndrawn in {plot}")
+        say(f"\ndrawn in {plot}")
     if table is not None:
         write_csv(comparison, table)
-        click.echo(f"\nwritten to {table}")
+        say(f"\nwritten to {table}")
 
 
 @main.command()
@@ -555,4 +571,4 @@ def published() -> None:
     """Print the published parameter sets and their derived points."""
     from foamfit.literature import table
 
-    click.echo(table())
+    say(table())

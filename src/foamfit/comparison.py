@@ -8,6 +8,7 @@ nothing, there is a sentence instead of a percentage.
 from __future__ import annotations
 
 import csv
+import io
 import math
 import re
 import textwrap
@@ -18,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from foamfit.errors import InputError
+from foamfit.files import write_file
 from foamfit.literature import MM, MPA, PublishedSet
 from foamfit.literature import published as published_sets
 from foamfit.model import Model
@@ -639,16 +641,14 @@ def write_csv(comparison: Comparison, path: str | Path) -> None:
         "test", "model", "drive", "reference", "spring", "parameter", "unit", "value", "stderr",
         "state", "reference_value", "reference_stderr", "percent", "standard_errors", "remark",
     )  # fmt: skip
-    try:
-        with Path(path).open("w", encoding="utf-8", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(head)
-            for s in comparison.sections:
-                for row in s.rows:
-                    writer.writerow((
-                        s.test, s.model, s.drive, s.reference, row.spring or "", row.name,
-                        row.unit, row.value, row.stderr, row.state, row.reference,
-                        row.reference_stderr, row.percent, row.standard_errors, row.remark,
-                    ))  # fmt: skip
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror or error}") from None
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(head)
+    for s in comparison.sections:
+        for row in s.rows:
+            writer.writerow((
+                s.test, s.model, s.drive, s.reference, row.spring or "", row.name,
+                row.unit, row.value, row.stderr, row.state, row.reference,
+                row.reference_stderr, row.percent, row.standard_errors, row.remark,
+            ))  # fmt: skip
+    write_file(path, text.getvalue().encode(errors="replace"))

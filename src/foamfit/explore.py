@@ -77,7 +77,7 @@ def turn(strain: Array, measured: Array, values: Mapping[str, float]) -> Turned:
     try:
         spring = BistableSpring(**values)
         stress = spring.stress(strain)
-    except (ValueError, SimulationError) as error:
+    except (InputError, SimulationError) as error:
         return Turned(spring, None, None, str(error))
     misfit = math.sqrt(float(np.mean((stress - measured) ** 2))) / float(np.ptp(measured))
     return Turned(spring, stress, misfit)

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.errors import InputError
-from foamfit.search import SearchStoppedError, Tracker
+from foamfit.search import STOPPING, Tracker, what_stopped
 from foamfit.uncertainty import NoiseProcess
 from foamfit.vicinity import Place, Refit, Vicinity, m_estimate
 
@@ -41,6 +41,10 @@ BENT = 0.15
 METHODS = ("auto", "local", "profile", "bootstrap", "mcmc")
 # Refits of an average profile, for the announcement; draws that percentiles need.
 REFITS, ENOUGH_DRAWS = 9, 40
+# Farthest that a walker of a Markov chain begins from the best point along a direction that the
+# test does not fix, in natural sizes; and how often its way there is halved where nothing can be
+# simulated.
+FARTHEST, HALVINGS = 0.1, 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +67,8 @@ class Profile:
         Outermost crossings of the cut; a limit of the parameter where there is none.
     open_low, open_high : bool
         Whether the cost does not reach the cut on that side.
-    complete : bool
-        Whether it was followed to its end on both sides.
+    stopped : str or None
+        What ended it before its end on both sides: "the time limit", "Ctrl-C".
     """
 
     name: str
@@ -75,7 +79,12 @@ class Profile:
     ci95: tuple[float, float]
     open_low: bool
     open_high: bool
-    complete: bool = True
+    stopped: str | None = None
+
+    @property
+    def complete(self) -> bool:
+        """Whether it was followed to its end on both sides."""
+        return self.stopped is None
 
 
 def profile(
@@ -262,7 +271,8 @@ class _Walk:
     def __init__(self, vicinity: Vicinity, name: str, tracker: Tracker) -> None:
         refit = Refit(vicinity, tracker)
         self.low, self.high = (_Side(vicinity, name, refit, sign) for sign in (-1.0, 1.0))
-        self.complete, self._turned = True, False
+        self.stopped: str | None = None
+        self._turned = False
 
     def follow(self, valleys: Sequence[Array]) -> None:
         """Follow both sides, or go on beyond further valleys; incomplete if that was ended."""
@@ -270,8 +280,8 @@ class _Walk:
             self.low.follow(valleys)
             self._turned = True
             self.high.follow(valleys)
-        except (SearchStoppedError, KeyboardInterrupt):
-            self.complete = False
+        except STOPPING as error:
+            self.stopped = what_stopped(error)
 
     @property
     def better(self) -> Array | None:
@@ -293,7 +303,7 @@ class _Walk:
             ci95=(low.bound, high.bound if self._turned else high.value(high.places[0])),
             open_low=low.is_open,
             open_high=high.is_open or not self._turned,
-            complete=self.complete,
+            stopped=self.stopped,
         )
 
 
@@ -383,7 +393,23 @@ class Blocks:
         return np.asarray(self.residual[drawn.ravel()[:n]])
 
 
-def bootstrap(vicinity: Vicinity, draws: int, seed: int, tracker: Tracker | None = None) -> Array:
+@dataclass(frozen=True, eq=False)
+class Refits:
+    """Parameters refitted to resampled data.
+
+    Attributes
+    ----------
+    values : (m, k) array
+        One refit per row, SI.
+    stopped : str or None
+        What ended them before they were as many as asked for: "the time limit", "Ctrl-C".
+    """
+
+    values: Array
+    stopped: str | None = None
+
+
+def bootstrap(vicinity: Vicinity, draws: int, seed: int, tracker: Tracker | None = None) -> Refits:
     """Refits to data remade from the fitted curves and blocks of the residuals.
 
     Each refit descends from the best point; other valleys of the cost are not searched.
@@ -401,8 +427,8 @@ def bootstrap(vicinity: Vicinity, draws: int, seed: int, tracker: Tracker | None
 
     Returns
     -------
-    (m, k) array
-        Refitted parameters, SI; m < draws if the deadline or Ctrl-C ended it.
+    Refits
+        Fewer than asked for if the deadline or Ctrl-C ended them.
     """
     objective = vicinity.problem.objective
     tracker = Tracker(objective) if tracker is None else tracker
@@ -416,14 +442,15 @@ def bootstrap(vicinity: Vicinity, draws: int, seed: int, tracker: Tracker | None
         for (part, like), process in zip(pairs, vicinity.spread.noise, strict=True)
     ]
     out: list[Array] = []
+    stopped = None
     try:
         for _ in range(draws):
             noise = np.concatenate([block.draw(rng) for block in blocks])
             refit = Refit(vicinity, tracker, vicinity.residual - noise)
             out.append(refit.run(refit.start(), free).point[refit.places])
-    except (SearchStoppedError, KeyboardInterrupt):
-        pass
-    return np.array(out).reshape(-1, len(vicinity.names))
+    except STOPPING as error:
+        stopped = what_stopped(error)
+    return Refits(np.array(out).reshape(-1, len(vicinity.names)), stopped)
 
 
 # ---------------------------------------------------------------- Markov chain
@@ -443,6 +470,8 @@ class Chain:
         Number of walkers.
     autocorrelation : float
         Integrated autocorrelation time of the slowest parameter, steps.
+    stopped : str or None
+        What ended it before its steps were done.
     """
 
     samples: Array
@@ -450,6 +479,7 @@ class Chain:
     burn_in: int
     walkers: int
     autocorrelation: float
+    stopped: str | None = None
 
     @property
     def converged(self) -> bool:
@@ -464,6 +494,7 @@ class Chain:
             f"Markov chain of {self.walkers} walkers and {self.steps} steps, the first "
             f"{self.burn_in} left out: {length / self.autocorrelation:.0f} autocorrelation times "
             f"of the slowest parameter, which is {word}."
+            + (f" It was stopped by {self.stopped}." if self.stopped else "")
         )
 
 
@@ -484,7 +515,8 @@ def mcmc(vicinity: Vicinity, steps: int, seed: int, tracker: Tracker | None = No
     """Sample the posterior by emcee's affine-invariant ensemble (Foreman-Mackey et al. 2013).
 
     Flat priors within the limits; the likelihood counts n/τ samples of each curve: its sum of
-    squares over the variance of its noise is divided by τ.
+    squares over the variance of its noise is divided by τ. What the test does not determine is
+    sampled too and runs over its limits, so that the others are those whatever its value is.
 
     Parameters
     ----------
@@ -524,29 +556,61 @@ def mcmc(vicinity: Vicinity, steps: int, seed: int, tracker: Tracker | None = No
         residual = refit.residual(refit.complete(point)) if inside else None
         return -0.5 * float(weights @ residual**2) if residual is not None else -np.inf
 
-    rng = np.random.default_rng([seed, 2])
     count, k = walkers(vicinity), len(vicinity.names)
-    scale = vicinity.spread.matrix / np.outer(vicinity.sizes, vicinity.sizes)
-    at = start.point[refit.places]
-    begin: list[Array] = []
-    while len(begin) < count:
-        drawn = rng.multivariate_normal(at / vicinity.sizes, 0.25 * scale)
-        drawn = np.clip(drawn, refit.low / vicinity.sizes, refit.high / vicinity.sizes)
-        if np.isfinite(log_probability(drawn)):
-            begin.append(drawn)
     sampler = emcee.EnsembleSampler(count, k, log_probability)
-    sampler.random_state = np.random.RandomState(seed).get_state()
-    done = 0
+    # Not through emcee's wrapper, which prints a traceback of whatever ends the chain.
+    sampler.log_prob_fn = log_probability
+    bits = np.random.MT19937(np.random.SeedSequence([seed, 3]))  # of a seed of any size
+    sampler.random_state = np.random.RandomState(bits).get_state()
+    steps_done: list[Array] = []  # emcee would make room for all of them at once
+    stopped = None
     try:
-        for _ in sampler.sample(np.array(begin), iterations=steps, skip_initial_state_check=True):
-            done += 1
-    except (SearchStoppedError, KeyboardInterrupt):
-        pass
+        begin = _begin(vicinity, refit, log_probability, count, np.random.default_rng([seed, 2]))
+        if begin is None:
+            stopped = "the best point, next to which nothing can be simulated"
+        else:
+            for state in sampler.sample(
+                begin, iterations=steps, skip_initial_state_check=True, store=False
+            ):
+                steps_done.append(state.coords.copy())
+    except STOPPING as error:
+        stopped = what_stopped(error)
+    done = len(steps_done)
     burn_in = done // 5
-    chain = sampler.get_chain()[burn_in:done] if done else np.empty((0, count, k))
-    times = emcee.autocorr.integrated_time(chain, tol=0, quiet=True) if done > 10 else [np.inf]
+    chain = np.array(steps_done[burn_in:]).reshape(-1, count, k)
+    with np.errstate(invalid="ignore", divide="ignore"):  # of a walker that never moved
+        times = emcee.autocorr.integrated_time(chain, tol=0, quiet=True) if done > 10 else [np.inf]
     slowest = float(np.max(np.nan_to_num(times, nan=np.inf)))
-    return Chain(chain.reshape(-1, k) * vicinity.sizes, done, burn_in, count, slowest)
+    return Chain(chain.reshape(-1, k) * vicinity.sizes, done, burn_in, count, slowest, stopped)
+
+
+def _begin(
+    vicinity: Vicinity,
+    refit: Refit,
+    log_probability: Callable[[Array], float],
+    count: int,
+    rng: np.random.Generator,
+) -> Array | None:
+    """Points about the best one at which walkers begin, scaled, (count, k); None if there are none.
+
+    Half a standard error away along what the test fixes, no more than `FARTHEST` along the rest.
+    """
+    noise = max(process.variance * process.tau for process in vicinity.spread.noise)
+    _, singular, axes = np.linalg.svd(vicinity.jacobian * vicinity.sizes, full_matrices=False)
+    reach = 0.5 * math.sqrt(noise) / np.maximum(singular, 1e-300)
+    low, high = refit.low / vicinity.sizes, refit.high / vicinity.sizes
+    best = refit.start().point[refit.places] / vicinity.sizes
+    begin = []
+    for _ in range(count):
+        away = (np.minimum(reach, FARTHEST) * rng.standard_normal(reach.size)) @ axes
+        for halving in range(HALVINGS):
+            drawn = np.clip(best + 0.5**halving * away, low, high)
+            if np.isfinite(log_probability(drawn)):
+                begin.append(drawn)
+                break
+        else:
+            return None
+    return np.array(begin)
 
 
 # ---------------------------------------------------------------- the intervals of a fit
@@ -645,13 +709,19 @@ def assess(
         Told what it will cost before it is paid.
     """
     tracker = Tracker(vicinity.problem.objective, deadline, best_cost=vicinity.cost)
-    if choice.method == "local":
+    known = [name for name in vicinity.names if vicinity.knows(name)]
+    if choice.method == "local" or (choice.method == "auto" and not known):
         return Intervals()
+    if not known:
+        what = {"mcmc": "a Markov chain", "bootstrap": "a bootstrap"}.get(choice.method, "profiles")
+        none = (
+            f"The test determines no parameter, so {what} would make no interval and was not run."
+        )
+        return Intervals(warnings=(none,))
     if choice.method == "bootstrap":
         return _by_bootstrap(vicinity, choice, tracker, tell)
     if choice.method == "mcmc":
         return _by_mcmc(vicinity, choice, tracker, tell)
-    known = [name for name in vicinity.names if vicinity.knows(name)]
     if choice.method == "profile":
         tell(_cost_told(vicinity, "profile likelihood", REFITS * len(known)))
         return _by_profiles(vicinity, known, valleys, tracker, math.inf)
@@ -706,23 +776,23 @@ def _by_profiles(
         walk = walks.setdefault(name, _Walk(vicinity, name, tracker))
         walk.follow(met if begun else [*valleys, *met])
         better = walk.better
-        if better is not None or not walk.complete:
+        if better is not None or walk.stopped:
             break
     profiles = [walk.profile for walk in walks.values()]
     whole = {p.name: p for p in profiles if p.complete}
     left = tuple(name for name in wanted if name not in whole)
-    notes: tuple[str, ...] = ()
-    if len(whole) < len(profiles):
-        notes = (
-            f"The profiles were stopped: {len(whole)} of {len(wanted)} were done, and "
-            f"the intervals of {', '.join(left)} are local.",
-        )
+    warnings = tuple(
+        f"The profiles were stopped by {p.stopped}: {len(whole)} of {len(wanted)} were done, and "
+        f"the intervals of {', '.join(left)} are local."
+        for p in profiles
+        if p.stopped
+    )
     return Intervals(
         ends={name: p.ci95 for name, p in whole.items()},
         methods=dict.fromkeys(whole, "profile likelihood"),
         profiles=tuple(profiles),
         doubtful=left,
-        notes=notes,
+        warnings=warnings,
         better=better,
     )
 
@@ -753,12 +823,14 @@ def _by_bootstrap(
     sizes = vicinity.problem.objective.sizes
     lengths = [block_length(p, n) for p, n in zip(vicinity.spread.noise, sizes, strict=True)]
     note = (
-        f"Block bootstrap: {len(drawn)} of {choice.draws} refits, blocks of "
+        f"Block bootstrap: {len(drawn.values)} of {choice.draws} refits, blocks of "
         f"{' and '.join(map(str, lengths))} samples."
     )
-    if len(drawn) < ENOUGH_DRAWS:
+    if drawn.stopped:
+        note += f" It was stopped by {drawn.stopped}."
+    if len(drawn.values) < ENOUGH_DRAWS:
         return Intervals(warnings=(note + " These are too few, so the intervals are local.",))
-    return _percentiles(vicinity, drawn, "block bootstrap", note)
+    return _percentiles(vicinity, drawn.values, "block bootstrap", note, drawn.stopped is None)
 
 
 def _by_mcmc(
@@ -768,21 +840,32 @@ def _by_mcmc(
     seconds = count * _seconds(vicinity)[0]
     tell(f"Markov chain: {count} simulations, about {seconds:.2g} s")
     chain = mcmc(vicinity, choice.draws, choice.seed, tracker)
+    note = chain.sentence()
     if len(chain.samples) < ENOUGH_DRAWS:
-        return Intervals(warnings=(chain.sentence() + " The intervals are local.",))
-    found = _percentiles(vicinity, chain.samples, "MCMC", chain.sentence())
-    return found if chain.converged else replace(found, notes=(), warnings=found.notes)
+        return Intervals(warnings=(note + " The intervals are local.",))
+    lost = [name for name in vicinity.names if not vicinity.knows(name)]
+    if lost:
+        note += (
+            f" The test does not determine {', '.join(lost)}: the chain samples them with a flat "
+            "prior within their limits, and they have no interval."
+        )
+    fine = chain.converged and chain.stopped is None
+    return _percentiles(vicinity, chain.samples, "MCMC", note, fine)
 
 
-def _percentiles(vicinity: Vicinity, drawn: Array, method: str, note: str) -> Intervals:
-    """Intervals between the 2.5th and the 97.5th percentile of what was drawn."""
+def _percentiles(vicinity: Vicinity, drawn: Array, method: str, note: str, fine: bool) -> Intervals:
+    """Intervals between the 2.5th and the 97.5th percentile of what was drawn.
+
+    What is said of them is a warning if they are not what was asked for.
+    """
     low, high = np.percentile(drawn, [2.5, 97.5], axis=0)
     ends = {
         name: (float(low[i]), float(high[i]))
         for i, name in enumerate(vicinity.names)
         if vicinity.knows(name)
     }
-    return Intervals(ends=ends, methods=dict.fromkeys(ends, method), notes=(note,))
+    notes, warnings = ((note,), ()) if fine else ((), (note,))
+    return Intervals(ends, dict.fromkeys(ends, method), notes=notes, warnings=warnings)
 
 
 def _seconds(vicinity: Vicinity) -> tuple[float, float]:

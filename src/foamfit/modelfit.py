@@ -20,7 +20,16 @@ from foamfit.measurement import Measurement
 from foamfit.model import Model, split_name
 from foamfit.problem import Problem, make_problem
 from foamfit.result import FitResult
-from foamfit.search import SearchRecord, SearchStoppedError, Tracker, salvage, search
+from foamfit.search import (
+    STOPPING,
+    SearchRecord,
+    SearchStoppedError,
+    Tracker,
+    salvage,
+    search,
+    what_stopped,
+)
+from foamfit.uncertainty import AT_LIMIT
 from foamfit.verdict import conclude
 from foamfit.vicinity import Vicinity
 
@@ -151,7 +160,7 @@ def judge(found: Found, choice: Choice, tell: Tell) -> FitResult:
 
 def _finish(found: Found, record: SearchRecord, intervals: Intervals) -> FitResult:
     """Order the springs, write the point into the parameters, and conclude."""
-    values = _ordered(found.problem, found.values)
+    values = _on_limits(found.problem, _ordered(found.problem, found.values))
     found.problem.put(values)
     return conclude(found.problem, values, record, intervals)
 
@@ -206,10 +215,9 @@ def _search(
         record = replace(record, costs=tuple(costs))
         progress(0.95, "refinement")
         _refine(problem, tracker)
-    except (SearchStoppedError, KeyboardInterrupt) as error:
+    except STOPPING as error:
         salvage(tracker, problem.space(), np.random.default_rng(record.seed))
-        late = isinstance(error, SearchStoppedError)
-        return replace(record, stopped="the time limit" if late else "Ctrl-C")
+        return replace(record, stopped=what_stopped(error))
     progress(1.0, "done")
     return record
 
@@ -257,6 +265,28 @@ def _move_inside(params: lmfit.Parameters, names: tuple[str, ...]) -> None:
             parameter.value = min(
                 max(parameter.value, parameter.min + margin), parameter.max - margin
             )
+
+
+def _on_limits(problem: Problem, values: Array) -> Array:
+    """Put parameters that are within rounding of a limit on it, if that costs nothing.
+
+    The refinement stays off the limits by a hair (`_move_inside`).
+    """
+    names = problem.free()
+    places = [problem.index[name] for name in names]
+    near = AT_LIMIT * problem.sizes(names, values)
+    moved = values = values + 0.0  # no -0
+    for limits in (problem.space().low, problem.space().high):
+        close = np.abs(values[places] - limits[places]) <= near
+        moved = moved.copy()
+        moved[places] = np.where(close, limits[places], moved[places])
+    moved = problem.space().complete(moved)
+    if np.array_equal(moved, values):
+        return values
+    failures = problem.objective.failures
+    before, after = (float(r @ r) for r in map(problem.objective.residual, (values, moved)))
+    fine = problem.objective.failures == failures and after <= before + 1e-6 * (1.0 + before)
+    return moved if fine else values
 
 
 def _moved(model: Model, values: Array, sources: Mapping[int, int]) -> Array:

@@ -17,6 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.errors import InputError
+from foamfit.files import write_file
+from foamfit.terminal import printable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -122,9 +124,7 @@ def plot_fit(result: FitResult, path: str | Path | None = None) -> Figure:
             if panel.key == "stress_strain":
                 _name_branches(ax, panel, result)
         _head(figure, result)
-    if path is not None:
-        _save(figure, Path(path))
-    return figure
+    return save(figure, path)
 
 
 def plot_residuals(result: FitResult, path: str | Path | None = None) -> Figure:
@@ -160,9 +160,7 @@ def plot_residuals(result: FitResult, path: str | Path | None = None) -> Figure:
             column[-1].set_xlabel(f"time ({unit})" if unit else "sample")
         if not strips:
             _say_nothing_there(column[0])
-    if path is not None:
-        _save(figure, Path(path))
-    return figure
+    return save(figure, path)
 
 
 def plot_profiles(result: FitResult, path: str | Path | None = None) -> Figure:
@@ -197,9 +195,7 @@ def plot_profiles(result: FitResult, path: str | Path | None = None) -> Figure:
                 ax.set_ylabel("rise of χ²")
         else:
             _say_nothing_there(axes[0])
-    if path is not None:
-        _save(figure, Path(path))
-    return figure
+    return save(figure, path)
 
 
 def _draw_profile(ax: Axes, profile: Profile, estimate: ParameterEstimate) -> None:
@@ -275,9 +271,7 @@ def plot_response(response: Response, path: str | Path | None = None) -> Figure:
             )  # fmt: skip
         if len(nodes) > 1:
             axes[1].legend(loc="best", handlelength=1.4)
-    if path is not None:
-        _save(figure, Path(path))
-    return figure
+    return save(figure, path)
 
 
 def plot_comparison(comparison: Comparison, path: str | Path | None = None) -> Figure:
@@ -320,9 +314,7 @@ def plot_comparison(comparison: Comparison, path: str | Path | None = None) -> F
                 if i == len(rows) - 1 or len(rows[i + 1]) <= j:
                     ax.set_xlabel("deviation (standard errors)")
         _name_results(figure, list(groups.values()))
-    if path is not None:
-        _save(figure, Path(path))
-    return figure
+    return save(figure, path)
 
 
 @contextmanager
@@ -712,7 +704,7 @@ def _switch_samples(result: FitResult, loop: _Line) -> list[int]:
 
 
 def _head(figure: Figure, result: FitResult) -> None:
-    name = " ".join(result.measurement.name.split())
+    name = printable(" ".join(result.measurement.name.split()))
     name = name if len(name) <= 60 else name[:59] + "…"
     title = f"{name} · {result.model} · {result.drive} drive"
     word = origin_word(result)
@@ -764,13 +756,5 @@ def figure_format(path: str | Path) -> Literal["png", "pdf", "svg"]:
 def save(figure: Figure, path: str | Path | None) -> Figure:
     """Save a figure, if there is a path, in the format of its suffix; returns the figure."""
     if path is not None:
-        _save(figure, Path(path))
+        write_file(path, image(figure, figure_format(path)))
     return figure
-
-
-def _save(figure: Figure, path: Path) -> None:
-    content = image(figure, figure_format(path))
-    try:
-        path.write_bytes(content)
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror or error}") from None

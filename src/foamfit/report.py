@@ -11,7 +11,6 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 from foamfit.conditioning import engineering
-from foamfit.errors import printable
 from foamfit.measurement import interior_channel
 from foamfit.plots import (
     DPI,
@@ -195,7 +194,7 @@ def summary_text(result: FitResult) -> str:
         lines += _wrap("note: ", note)
     for warning in result.warnings:
         lines += _wrap("warning: ", warning)
-    return printable("\n".join(lines))
+    return "\n".join(lines)
 
 
 def _data_lines(measurement: Measurement) -> list[str]:

@@ -6,19 +6,17 @@ import csv
 import json
 import math
 import os
-import shutil
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from uuid import uuid4
 
 import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.errors import InputError
+from foamfit.files import reason, replacing
 from foamfit.measurement import interior_channel
 
 if TYPE_CHECKING:
@@ -33,6 +31,13 @@ if TYPE_CHECKING:
     from foamfit.spring import BistableSpring
 
 SCHEMA = 1
+# All that `FitResult.save` may write.
+RESULT_FILES = frozenset(
+    {
+        "fit.json", "parameters.csv", "curves.csv", "profiles.csv", "ladder.csv", "fit.png",
+        "fit.pdf", "report.html",
+    }
+)  # fmt: skip
 DERIVED_POINTS = ("sigma_a", "sigma_c", "eps_star", "eps_hat_a", "eps_hat_c")
 
 Array = NDArray[np.float64]
@@ -199,7 +204,8 @@ class FitResult:
         Parameters
         ----------
         folder : str or Path
-            Where to; made with its parents. What stood there must be empty or a result folder.
+            Where to; made with its parents. What stood there must be empty or a result folder that
+            holds nothing else.
 
         Returns
         -------
@@ -216,11 +222,12 @@ class FitResult:
         folder = Path(folder)
         check_target(folder)
         try:
-            with _replacing(folder.resolve()) as fresh:
+            with replacing(folder.resolve()) as fresh:
                 _write(self, fresh)
+                check_target(folder)  # what has been put there in the meantime stays
         except OSError as error:
             raise InputError(
-                f"the result cannot be written to {folder}: {error.strerror or error}"
+                f"the result cannot be written to {folder}: {reason(error)}; choose another folder"
             ) from error
         return folder
 
@@ -229,15 +236,18 @@ def check_target(folder: str | Path) -> None:
     """Raise InputError unless `folder` is free, empty or an older result that may be replaced."""
     folder = Path(folder)
     try:
-        if folder.is_dir():
-            if any(folder.iterdir()) and not (folder / "fit.json").is_file():
-                raise InputError(
-                    f"{folder} is not empty and holds no foamfit result (no fit.json), so it is "
-                    "not replaced; choose a new or an empty folder"
-                )
-        elif folder.exists():
+        place = folder.resolve()
+        here = Path.cwd()
+        if place.exists() and any(place.samefile(at) for at in (here, *here.parents)):
+            raise InputError(
+                f"{folder} is the current directory or holds it, and a result folder is replaced "
+                "as a whole; choose a folder of its own"
+            )
+        if place.is_dir():
+            _check_replaceable(folder, place)
+        elif os.path.lexists(place):
             raise InputError(f"{folder} is a file; choose a new or an empty folder")
-        there = next(path for path in folder.absolute().parents if path.exists())
+        there = next(path for path in place.parents if path.exists())
         if not there.is_dir():
             raise InputError(
                 f"{folder} cannot be written: {there} is a file; choose another folder"
@@ -246,8 +256,44 @@ def check_target(folder: str | Path) -> None:
             raise InputError(
                 f"{folder} cannot be written: Permission denied in {there}; choose another folder"
             )
-    except OSError as error:
-        raise InputError(f"{folder} cannot be read: {error.strerror or error}") from error
+    except (OSError, RuntimeError) as error:  # also a link to itself
+        raise InputError(
+            f"{folder} cannot be written: {reason(error)}; choose another folder"
+        ) from error
+
+
+def _check_replaceable(folder: Path, place: Path) -> None:
+    """Refuse a folder that is there, at `place`, and must not or cannot be replaced."""
+    if place.is_mount():
+        raise InputError(f"{folder} is a mount point and cannot be replaced; name a folder in it")
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise InputError(f"{folder} cannot be written: Permission denied; choose another folder")
+    there = sorted(place.iterdir())
+    if there and not _is_of_fit(place / "fit.json"):
+        raise InputError(
+            f"{folder} is not empty and holds no foamfit result (no fit.json of foamfit), so it is "
+            "not replaced; choose a new or an empty folder"
+        )
+    for path in there:
+        if not is_written(path):
+            raise InputError(
+                f"{folder} holds {path.name}, which foamfit did not write, so it is not replaced; "
+                "move that or choose another folder"
+            )
+
+
+def is_written(path: Path) -> bool:
+    """Whether something in a result folder is what a fit writes there."""
+    return path.name in RESULT_FILES and path.is_file() and not path.is_symlink()
+
+
+def _is_of_fit(path: Path) -> bool:
+    """Whether a fit.json is that of a fit, of this version or another one."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):  # neither UTF-8 nor JSON
+        return False
+    return isinstance(content, dict) and {"schema", "foamfit"} <= content.keys()
 
 
 def load_result(folder: str | Path) -> dict[str, Any]:
@@ -294,7 +340,8 @@ def _write(result: FitResult, folder: Path) -> None:
     from foamfit.report import render_report
 
     text = json.dumps(result.to_json_dict(), indent=2, ensure_ascii=False, allow_nan=False)
-    (folder / "fit.json").write_text(text + "\n", encoding="utf-8")
+    # A name that is no UTF-8 keeps its bytes as an escape of JSON.
+    (folder / "fit.json").write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
     _write_table(folder / "parameters.csv", _parameter_rows(result.parameters))
     _write_table(folder / "curves.csv", _curve_rows(result.curves, result.measurement.outliers))
     if result.intervals is not None and result.intervals.profiles:
@@ -306,7 +353,8 @@ def _write(result: FitResult, folder: Path) -> None:
         png, pdf = image(figure, "png"), image(figure, "pdf")
     (folder / "fit.png").write_bytes(png)
     (folder / "fit.pdf").write_bytes(pdf)
-    (folder / "report.html").write_text(render_report(result, fit_png=png), encoding="utf-8")
+    page = render_report(result, fit_png=png)
+    (folder / "report.html").write_text(page, encoding="utf-8", errors="replace")
 
 
 def _write_table(path: Path, rows: Iterable[Iterable[object]]) -> None:
@@ -362,29 +410,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
-
-
-@contextmanager
-def _replacing(folder: Path) -> Iterator[Path]:
-    """Give an empty sibling of `folder` to write into, and put it in its place if all went well."""
-    made = [parent for parent in folder.parents if not parent.exists()]
-    mark = uuid4().hex[:12]
-    fresh = folder.with_name(f".{folder.name}.{mark}.new")
-    old = folder.with_name(f".{folder.name}.{mark}.old")
-    try:
-        fresh.mkdir(parents=True)
-        yield fresh
-        if folder.exists():
-            folder.rename(old)
-        fresh.rename(folder)
-    except BaseException:  # KeyboardInterrupt too must leave everything as it was
-        if old.exists() and not folder.exists():
-            old.rename(folder)
-        shutil.rmtree(fresh, ignore_errors=True)
-        for parent in made:
-            with suppress(OSError):
-                parent.rmdir()
-        raise
-    finally:
-        if folder.exists():  # never the last copy
-            shutil.rmtree(old, ignore_errors=True)

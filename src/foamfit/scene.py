@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 from pathlib import Path
 from typing import Any
-from uuid import uuid4
 
 import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.errors import InputError
+from foamfit.files import write_file
 from foamfit.literature import published
 from foamfit.model import KINDS
 from foamfit.reading import read_history
@@ -115,7 +116,7 @@ def _chain(where: str, table: dict[str, Any]) -> Chain:
     site = _number(where, table, "site_damping") if "site_damping" in table else 0.0
     try:
         return Chain(springs, heights, area, masses, site_damping=site)
-    except ValueError as error:
+    except InputError as error:
         raise InputError(f"{where} {error}.") from None
 
 
@@ -131,7 +132,7 @@ def _spring(where: str, given: dict[str, Any]) -> Spring:
         if kind == "bistable":
             return BistableSpring(**values)
         return LinearSpring(**values, unilateral=kind == "unilateral")
-    except ValueError as error:
+    except InputError as error:
         raise InputError(f"{where} {error}.") from None
 
 
@@ -143,11 +144,10 @@ def _drive(path: Path, document: dict[str, Any]) -> tuple[Drive, Array]:
         check_keys(where, table, ["kind", "mass", "velocity"])
         mass, velocity = (_number(where, table, key) for key in ("mass", "velocity"))
         try:
-            return Impact(mass, velocity), _samples(path, document)
-        except InputError:
-            raise
-        except ValueError as error:
+            drive = Impact(mass, velocity)
+        except InputError as error:
             raise InputError(f"{where} {error}.") from None
+        return drive, _samples(path, document)
     if kind not in ("stress", "displacement"):
         raise InputError(f"{where} kind = {kind!r}; it must be impact, stress or displacement.")
     check_keys(where, table, ["kind", "file"])
@@ -185,13 +185,8 @@ def write_response(response: Response, path: Path) -> None:
     nodes = range(1, len(response.displacement) + 1)
     header = ["time (s)", "base stress (Pa)", "strain", *(f"displacement_{i} (m)" for i in nodes)]
     columns = [response.time, response.base_stress, response.strain, *response.displacement]
-    fresh = path.with_name(f".{path.name}.{uuid4().hex[:12]}.new")
-    try:
-        with fresh.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(header)
-            writer.writerows(zip(*(column.tolist() for column in columns), strict=True))
-        fresh.replace(path)
-    except OSError as error:
-        fresh.unlink(missing_ok=True)
-        raise InputError(f"{path} cannot be written: {error.strerror or error}.") from None
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(zip(*(column.tolist() for column in columns), strict=True))
+    write_file(path, text.getvalue().encode())

@@ -35,6 +35,15 @@ class SearchStoppedError(Exception):
     """The time is up; the best point so far is the answer."""
 
 
+# What ends a search, refits or a chain before they are done: what was found is kept.
+STOPPING = (SearchStoppedError, KeyboardInterrupt)
+
+
+def what_stopped(error: BaseException) -> str:
+    """Say what has raised one of `STOPPING`."""
+    return "the time limit" if isinstance(error, SearchStoppedError) else "Ctrl-C"
+
+
 @dataclass(frozen=True)
 class SearchRecord:
     """How a search went.

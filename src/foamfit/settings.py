@@ -18,8 +18,9 @@ from pathlib import Path
 from typing import Any
 
 from foamfit.conditioning import Window
-from foamfit.errors import InputError, printable
+from foamfit.errors import InputError
 from foamfit.measurement import Noise, Specimen, Striker, interior_node
+from foamfit.terminal import printable
 from foamfit.units import is_unit, parse_quantity, split_quantity
 
 _LARGEST = 1_000_000  # characters of a TOML

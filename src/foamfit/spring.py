@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from foamfit.errors import SimulationError
+from foamfit.errors import InputError, SimulationError
 from foamfit.law import BISTABLE, LINEAR, UNILATERAL, derived_points
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ LINEAR_NAMES = ("k0", "eta")
 
 def _require(holds: bool, name: str, value: float, wanted: str) -> None:
     if not holds:
-        raise ValueError(f"{name} = {value:g} is not admissible: it must be {wanted}")
+        raise InputError(f"{name} = {value:g} is not admissible: it must be {wanted}")
 
 
 def as_number(value: object, name: str) -> float:
@@ -41,7 +41,7 @@ def as_number(value: object, name: str) -> float:
             return float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError):
         pass
-    raise ValueError(f"{name} = {value!r} is not admissible: it must be a number")
+    raise InputError(f"{name} = {value!r} is not admissible: it must be a number")
 
 
 def as_samples(values: ArrayLike, name: str) -> Array:
@@ -57,15 +57,15 @@ def as_samples(values: ArrayLike, name: str) -> Array:
             return np.array(values, dtype=np.float64, order="C")
     except (TypeError, ValueError):  # rows of several lengths
         pass
-    raise ValueError(f"{name} must be an array of numbers")
+    raise InputError(f"{name} must be an array of numbers")
 
 
 def _as_history(values: ArrayLike, name: str) -> Array:
     history = np.ascontiguousarray(as_samples(values, name))
     if history.ndim > 1:
-        raise ValueError(f"{name} must be one history (one dimension), not {history.ndim}")
+        raise InputError(f"{name} must be one history (one dimension), not {history.ndim}")
     if not np.all(np.isfinite(history)):
-        raise ValueError(f"{name} must be finite; sample {_first(~np.isfinite(history))} is not")
+        raise InputError(f"{name} must be finite; sample {_first(~np.isfinite(history))} is not")
     return np.atleast_1d(history)
 
 

@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 # Half widths of the 95 % interval, over the natural size of a parameter, past which it is weak,
 # and past which the test says nothing about it.
 WEAK, NOTHING = 0.5, 3.0
+# A parameter this close to a limit, over its natural size, lies at it.
+AT_LIMIT = 1e-6
 # Two directions closer than this cannot be told apart.
 SINGULAR = 1e-12
 # Of the autoregressive noise: most orders, largest reflection coefficient, rounds of correction.
@@ -348,7 +350,7 @@ def state(value: float, half: float, size: float, low: float, high: float) -> tu
     """
     if not math.isfinite(half):
         return "not determined", "the data fix only a combination of it with other parameters"
-    edge = 1e-6 * size
+    edge = AT_LIMIT * size
     if half > NOTHING * size:
         return "not determined", f"its 95 % interval is {_wide(half / size)} its natural size"
     if value - low <= edge or high - value <= edge:

@@ -275,8 +275,12 @@ def _varied(
     stderr = float(spread.stderr[column])
     half = uncertainty.half_width(stderr, float(spread.freedom[column]))
     local = (value - half, value + half)
-    ends = intervals.ends.get(name, local)
-    ratio = 0.5 * (ends[1] - ends[0]) / half if half > 0.0 else math.nan
+    ends = _holding(value, intervals.ends.get(name, local))
+    made, by_local = (
+        min(pair[1], high) - max(pair[0], low)  # within the limits, which cut both
+        for pair in (ends, local)
+    )
+    ratio = made / by_local if by_local > 0.0 else math.nan
     # refits that stall in a long valley make a profile narrow: the wider interval is the honest one
     stalled = ratio < 1.0 / ASTRAY and intervals.methods.get(name) == "profile likelihood"
     ends = local if stalled else ends
@@ -296,6 +300,14 @@ def _varied(
         stderr *= ratio
         why += "; its standard error is that of the interval, as the local one does not hold"
     return ParameterEstimate(value, stderr, ci95, unit_of(name), True, verdict, why, method)
+
+
+def _holding(value: float, ends: tuple[float, float]) -> tuple[float, float]:
+    """Ends of an interval in their order, moved out where they do not hold the value.
+
+    Percentiles of refits, or of a chain, may all lie to one side of the best point.
+    """
+    return min(*ends, value), max(*ends, value)
 
 
 def state_of(
@@ -332,7 +344,8 @@ def state_of(
     if short in MAY_VANISH and ends[0] <= 0.0 <= ends[1] and not at_bound:
         reach = engineering(ends[0] if short == "dsigma" else ends[1], unit_of(name))
         reach = reach.replace("Pa s", "Pa·s").replace("-", "−")
-        return "weak", f"it is not told from zero: its 95 % interval goes from 0 to {reach}"
+        where = "lies at its limit 0" if value == 0.0 else "is not told from zero"
+        return "weak", f"it {where}: its 95 % interval goes from 0 to {reach}"
     if verdict == "determined":
         return verdict, why
     past = [ends[0] <= limits[0], ends[1] >= limits[1]]

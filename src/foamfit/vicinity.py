@@ -174,7 +174,8 @@ class Refit:
             for own in (name.removesuffix("dsigma") for name in best.names if "_dsigma" in name)
         ]
         # Of the cost: less than this is no gain.
-        self.enough = 1e-3 * float(np.nanmin(best.quantiles**2 * best.spread.inflation))
+        cuts = best.quantiles**2 * best.spread.inflation  # NaN where the test says nothing
+        self.enough = 1e-3 * float(min(cuts[np.isfinite(cuts)], default=1.0))
 
     def start(self) -> Place:
         """The best point itself."""

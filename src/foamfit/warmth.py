@@ -10,7 +10,6 @@ import functools
 import gc
 import logging
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -149,6 +148,7 @@ def side_by_side() -> Iterator[Callable[[], None]]:
         [sys.executable, "-m", "foamfit.warmth"],
         stdout=subprocess.PIPE,
         env=os.environ | {"PYTHONPATH": path},
+        process_group=0,  # Ctrl-C is for the process that starts this one
     ) as other:
 
         def finish() -> None:
@@ -160,13 +160,13 @@ def side_by_side() -> Iterator[Callable[[], None]]:
 
         try:
             yield finish
+            other.wait()
         except BaseException:
             other.terminate()
             raise
 
 
 def _other() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that started this one
     calls = _calls()
     _compile(calls.pieces)
     print("pieces", flush=True)

@@ -1,0 +1,164 @@
+"""What is written: a whole file or a whole folder, or nothing.
+
+Each is made beside its place under a name that tells which process makes it, and is put in its
+place at the end. What a process that was killed has left behind is removed by the next one that
+writes to the same place.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import re
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from uuid import uuid4
+
+from foamfit.errors import InputError
+
+# Of this process; another one may have its number later, or in another container.
+_TOKEN = uuid4().hex[:8]
+# Where it cannot be told whether a process lives, what is older than this, s, has been left behind:
+# to write a folder takes seconds.
+_ABANDONED = 86400.0
+
+
+def check_file(path: Path) -> None:
+    """Raise InputError if a file could not be written."""
+    try:
+        if path.is_dir():
+            raise InputError(f"{path} is a folder; name a file")
+        if not path.parent.is_dir():
+            raise InputError(f"{path} cannot be written: there is no folder {path.parent}")
+        special = path.exists() and not path.is_file()
+        if not special and not os.access(path.resolve().parent, os.W_OK | os.X_OK):
+            raise InputError(f"{path} cannot be written: permission denied")
+        if path.exists() and not os.access(path, os.W_OK):
+            raise InputError(f"{path} cannot be written: permission denied")
+    except (OSError, RuntimeError) as error:  # a name that is too long, a link to itself
+        raise InputError(f"{path} cannot be written: {reason(error)}") from None
+
+
+def write_file(path: str | Path, content: bytes) -> None:
+    """Write a whole file; what stood there stays if that fails.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written.
+    """
+    path = Path(path)
+    try:
+        if path.exists() and not path.is_file():  # a device or a pipe, which stays what it is
+            path.write_bytes(content)
+            return
+        target = path.resolve()  # a link stays a link
+        _sweep(target)
+        fresh = _beside(target, "new")
+        try:
+            fresh.write_bytes(content)
+            if target.exists():
+                shutil.copymode(target, fresh)
+            fresh.replace(target)
+        except BaseException:  # KeyboardInterrupt too must leave everything as it was
+            fresh.unlink(missing_ok=True)
+            raise
+    except (OSError, RuntimeError) as error:
+        raise InputError(f"{path} cannot be written: {reason(error)}") from None
+
+
+@contextmanager
+def replacing(folder: Path) -> Iterator[Path]:
+    """Give an empty sibling of `folder` to write into, and put it in its place if all went well.
+
+    Parameters
+    ----------
+    folder : Path
+        Resolved: no link, no "..".
+    """
+    made = [parent for parent in folder.parents if not parent.exists()]
+    fresh, old = _beside(folder, "new"), _beside(folder, "old")
+    try:
+        _sweep(folder)
+        fresh.mkdir(parents=True)
+        yield fresh
+        if folder.exists():
+            folder.rename(old)
+        fresh.rename(folder)
+    except BaseException:  # KeyboardInterrupt too must leave everything as it was
+        if old.exists() and not folder.exists():
+            old.rename(folder)
+        shutil.rmtree(fresh, ignore_errors=True)
+        for parent in made:
+            with suppress(OSError):
+                parent.rmdir()
+        raise
+    finally:
+        if folder.exists():  # never the last copy
+            shutil.rmtree(old, ignore_errors=True)
+
+
+def reason(error: BaseException) -> str:
+    """Why a file could not be read or written, in the system's words."""
+    return getattr(error, "strerror", None) or str(error)
+
+
+def _beside(path: Path, ending: str) -> Path:
+    """Name of what this process makes beside a path."""
+    owner = f"{_host()}.{os.getpid()}.{_TOKEN}{uuid4().hex[:8]}"
+    return path.with_name(f".{_short(path.name)}.{owner}.{ending}")
+
+
+def _short(name: str) -> str:
+    """Name that leaves room for an ending; its own if that is short enough."""
+    raw = os.fsencode(name)
+    return name if len(raw) <= 100 else f"{name[:20]}~{hashlib.sha256(raw).hexdigest()[:12]}"
+
+
+def _host() -> str:
+    return re.sub(r"[^\w-]", "-", platform.node())[:40] or "host"
+
+
+def _sweep(path: Path) -> None:
+    """Remove what processes that are gone have left beside a path.
+
+    An older result that one of them had put aside goes back if nothing is in its place.
+    """
+    if not path.parent.is_dir():
+        return
+    mark = re.compile(
+        rf"\.{re.escape(_short(path.name))}\.{re.escape(_host())}\."
+        r"(?P<process>\d+)\.(?P<token>[0-9a-f]{8})[0-9a-f]{8}\.(?P<ending>new|old)"
+    )
+    for left in list(path.parent.iterdir()):
+        found = mark.fullmatch(left.name)
+        if found is None or _lives(int(found["process"]), found["token"], left):
+            continue
+        with suppress(OSError):
+            if found["ending"] == "old" and not path.exists():
+                left.rename(path)
+            elif left.is_dir():
+                shutil.rmtree(left)
+            else:
+                left.unlink()
+
+
+def _lives(process: int, token: str, left: Path) -> bool:
+    """Whether the process of this machine that has made something may still be at it."""
+    if process == os.getpid():
+        return token == _TOKEN
+    if os.name != "posix":  # no harmless signal asks whether a process lives
+        with suppress(OSError):
+            return time.time() - left.stat().st_mtime < _ABANDONED
+        return True
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:  # another user's
+        pass
+    return True

@@ -1,0 +1,343 @@
+"""What is written is whole, replaces nothing of others, and leaves nothing behind."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+import fabricated
+import foamfit.plots
+import foamfit.result
+from conftest import EXPERIMENTS
+from foamfit import files
+from foamfit.cli import main
+from foamfit.comparison import compare, write_csv
+from foamfit.errors import InputError
+from foamfit.files import check_file, replacing, write_file
+from foamfit.plots import plot_fit
+from foamfit.result import FitResult, check_target, load_result
+
+RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
+posix = pytest.mark.skipif(os.name != "posix", reason="signals and permissions of POSIX")
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty working directory, and results of one file that need no time."""
+    monkeypatch.setattr(foamfit.result, "_write", write_json)
+    monkeypatch.setattr(foamfit.plots, "image", lambda *_: b"\x89PNG" + bytes(20))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def write_json(result: FitResult, folder: Path) -> None:
+    (folder / "fit.json").write_text(json.dumps(result.to_json_dict()))
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def gone() -> int:
+    """The number of a process that has ended."""
+    with subprocess.Popen([sys.executable, "-c", ""]) as process:
+        pass
+    return process.pid
+
+
+def left_behind(path: Path, ending: str, process: int) -> Path:
+    """What a process with this number has left beside a path."""
+    ours = files._beside(path, ending).name
+    token = "0" * 8
+    named = ours.replace(f".{os.getpid()}.{files._TOKEN}", f".{process}.{token}")
+    assert named != ours
+    return path.with_name(named)
+
+
+# ---------------------------------------------------------------- whose folder it is
+
+
+def test_a_result_with_a_file_of_others_is_refused_and_kept(here: Path) -> None:
+    folder = fabricated.result(seed=1).save("r")
+    (here / "r" / "notes.txt").write_text("a month of work")
+    with pytest.raises(InputError, match=r"r holds notes\.txt, which foamfit did not write"):
+        fabricated.result(seed=2).save("r")
+    assert load_result(folder)["seed"] == 1
+    assert (here / "r" / "notes.txt").read_text() == "a month of work"
+    assert names(here) == ["r"]
+
+
+def test_a_folder_or_a_link_in_a_result_is_not_what_a_fit_writes(here: Path) -> None:
+    for made in (Path.mkdir, lambda path: path.symlink_to(here)):
+        fabricated.result().save("r")
+        (here / "r" / "ladder.csv").unlink(missing_ok=True)
+        made(here / "r" / "ladder.csv")
+        with pytest.raises(InputError, match=r"holds ladder\.csv"):
+            check_target("r")
+        if (here / "r" / "ladder.csv").is_symlink():
+            (here / "r" / "ladder.csv").unlink()
+        else:
+            (here / "r" / "ladder.csv").rmdir()
+
+
+@pytest.mark.parametrize("text", ["{}", "[]", "no json", '{"schema": "of another program"}'])
+def test_a_fit_json_of_another_program_makes_no_result(here: Path, text: str) -> None:
+    (here / "r").mkdir()
+    (here / "r" / "fit.json").write_text(text)
+    with pytest.raises(InputError, match="no foamfit result"):
+        check_target("r")
+
+
+def test_what_is_put_into_the_folder_while_it_is_written_stays(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = fabricated.result(seed=1).save("r")
+
+    def late(result: FitResult, folder: Path) -> None:
+        write_json(result, folder)
+        (here / "r" / "notes.txt").write_text("x")
+
+    monkeypatch.setattr(foamfit.result, "_write", late)
+    with pytest.raises(InputError, match=r"notes\.txt"):
+        fabricated.result(seed=2).save("r")
+    assert load_result(folder)["seed"] == 1
+    assert names(here) == ["r"]
+
+
+@pytest.mark.parametrize("out", [".", "..", "{here}", "link", "sub/.."])
+def test_the_current_directory_is_refused_empty_or_not(here: Path, out: str) -> None:
+    (here / "cwd" / "sub").mkdir(parents=True)
+    os.chdir(here / "cwd")
+    (here / "cwd" / "link").symlink_to(here / "cwd")
+    for empty in (False, True):
+        if empty:
+            (here / "cwd" / "link").unlink()
+            (here / "cwd" / "sub").rmdir()
+            out = "." if out in ("link", "sub/..") else out
+        path = out.format(here=here / "cwd")
+        result = CliRunner().invoke(main, ["fit", str(RECONSTRUCTION), "--out", path])
+        assert (result.exit_code, result.stdout) == (1, "")
+        assert "current directory" in result.stderr
+        assert result.stderr.count("\n") == 1
+        assert Path.cwd() == here / "cwd"
+
+
+def test_a_link_to_a_result_stays_a_link(here: Path) -> None:
+    fabricated.result(seed=1).save("r")
+    (here / "link").symlink_to("r")
+    fabricated.result(seed=2).save("link")
+    assert (here / "link").is_symlink()
+    assert load_result("r")["seed"] == 2
+    (here / "to nothing").symlink_to("new")
+    fabricated.result().save("to nothing")
+    assert load_result("new")["schema"] == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("loop", "link|levels"), ("x" * 300, "too long"), ("file", "is a file"), ("file/r", "a file")],
+)
+def test_what_cannot_be_a_folder_is_said_before_the_fit(here: Path, name: str, words: str) -> None:
+    (here / "loop").symlink_to("loop")
+    (here / "file").write_text("x")
+    with pytest.raises(InputError, match=f"(?i){words}"):
+        check_target(name)
+
+
+def test_a_mount_point_is_refused(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (here / "mounted").mkdir()
+    monkeypatch.setattr(Path, "is_mount", lambda path: path.name == "mounted")
+    with pytest.raises(InputError, match="mounted is a mount point"):
+        check_target("mounted")
+
+
+def test_a_long_name_leaves_room_for_what_is_beside_it(here: Path) -> None:
+    assert load_result(fabricated.result().save("é" * 127))["schema"] == 1
+    write_file("y" * 255, b"x")
+    assert len(names(here)) == 2
+
+
+# ---------------------------------------------------------------- nothing half written
+
+
+@pytest.mark.parametrize("failure", [OSError(errno.ENOSPC, "No space left on device")])
+def test_a_full_disk_leaves_the_older_file(
+    here: Path, monkeypatch: pytest.MonkeyPatch, failure: OSError
+) -> None:
+    fabricated.result().save("r")
+    comparison = compare(["r"], "foam-1/model-1")
+    write = Path.write_bytes
+
+    def full(path: Path, content: bytes) -> int:
+        write(path, content[: len(content) // 2])
+        raise failure
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    for path, make in (
+        (here / "a.csv", lambda path: write_csv(comparison, path)),
+        (here / "a.png", lambda path: plot_fit(fabricated.result(), path)),
+    ):
+        path.write_text("older")
+        with pytest.raises(InputError, match="No space left on device"):
+            make(path)
+        assert path.read_text() == "older"
+    assert names(here) == ["a.csv", "a.png", "r"]
+
+
+def test_a_full_disk_loses_no_numbers(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The folder cannot be written: the numbers are printed all the same, the exit code is true."""
+
+    def full(*_: object) -> None:
+        raise InputError("the result cannot be written to r: No space left on device")
+
+    monkeypatch.setattr(FitResult, "save", full)
+    call = ["fit", str(RECONSTRUCTION), "--starts", "1", "--max-time", "0.1", "--out", "r"]
+    result = CliRunner().invoke(main, call)
+    assert result.exit_code == 1
+    assert "s1_k0" in result.stdout
+    assert "written to" not in result.stdout
+    assert result.stderr == "foamfit: the result cannot be written to r: No space left on device\n"
+
+
+def test_a_file_keeps_its_link_its_mode_and_a_device_what_it_is(here: Path) -> None:
+    target = here / "deep" / "a.csv"
+    target.parent.mkdir()
+    target.write_text("older")
+    target.chmod(0o640)
+    (here / "link.csv").symlink_to(target)
+    write_file("link.csv", b"newer")
+    assert (here / "link.csv").is_symlink()
+    assert target.read_bytes() == b"newer"
+    assert target.stat().st_mode & 0o777 == 0o640
+    if os.name == "posix":
+        os.mkfifo("pipe")
+        with subprocess.Popen(["cat", "pipe"], stdout=subprocess.PIPE) as reader:
+            check_file(Path("pipe"))
+            write_file("pipe", b"through")
+            assert reader.communicate()[0] == b"through"
+        assert Path("pipe").is_fifo()
+
+
+# ---------------------------------------------------------------- remnants
+
+
+@posix
+def test_what_a_killed_process_left_is_swept_and_nothing_else(here: Path) -> None:
+    target = here / "r"
+    dead = left_behind(target, "new", gone())
+    others = [
+        left_behind(target, "new", os.getppid()),  # it lives
+        left_behind(here / "another", "new", gone()),
+        here / ".r.notes.new",
+        here / ".r.abcdef123456.new",
+        here / dead.name.replace(files._host(), "another-machine"),
+    ]
+    for folder in (dead, *others):
+        folder.mkdir()
+        (folder / "fit.json").write_text("{")
+    recycled = left_behind(target, "new", os.getpid())  # of an earlier process of the same number
+    recycled.mkdir()
+    fabricated.result().save("r")
+    assert names(here) == sorted([*(path.name for path in others), "r"])
+    write_file(dead.with_name("a.csv"), b"")
+    left_behind(here / "a.csv", "new", gone()).write_text("half")
+    write_file(here / "a.csv", b"x")
+    assert len([name for name in names(here) if "a.csv" in name]) == 1
+
+
+@posix
+def test_an_older_result_that_a_killed_process_put_aside_comes_back(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fabricated.result(seed=1).save("r")
+    (here / "r").rename(left_behind(here / "r", "old", gone()))
+
+    def fail(*_: object, **__: object) -> None:
+        raise RuntimeError
+
+    monkeypatch.setattr(foamfit.result, "_write", fail)
+    with pytest.raises(RuntimeError):
+        fabricated.result(seed=2).save("r")
+    assert load_result("r")["seed"] == 1
+    assert names(here) == ["r"]
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from foamfit.cli import main
+from foamfit.files import replacing
+import click
+
+@main.command()
+def write():
+    with replacing(Path("r").resolve()) as fresh:
+        (fresh / "fit.json").write_text("half")
+        print("half", flush=True)
+        signal.pause()
+
+main(["write"])
+"""
+
+
+@posix
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL, signal.SIGINT])
+def test_a_signal_while_writing(here: Path, number: signal.Signals) -> None:
+    """SIGTERM and Ctrl-C clean up and say so in a sentence; after SIGKILL the next one does."""
+    with subprocess.Popen(
+        [sys.executable, "-c", KILLED], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "half\n"
+        assert [name for name in names(here) if name.startswith(".r.")]
+        process.send_signal(number)
+        told = process.communicate()[1].strip()
+    if number == signal.SIGKILL:
+        assert [name for name in names(here) if name.startswith(".r.")]
+        with replacing(here / "r"):
+            pass
+        assert names(here) == ["r"]
+    else:
+        assert process.returncode == 128 + number
+        assert re.fullmatch(r"foamfit: (ended by SIGTERM|interrupted by Ctrl-C)", told)
+        assert names(here) == []
+
+
+@posix
+def test_the_process_that_compiles_is_ended_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is in a group of its own, where Ctrl-C does not reach it, and is stopped by what ends us.
+
+    Also while its end is waited for.
+    """
+    from foamfit import warmth
+
+    begun: list[subprocess.Popen[bytes]] = []
+    real = subprocess.Popen
+
+    def other(command: list[str], **options: object) -> subprocess.Popen[bytes]:
+        process = real(["sleep", "60"], **options)  # type: ignore[call-overload]
+        begun.append(process)
+        assert os.getpgid(process.pid) == process.pid != os.getpgid(0)
+        return process
+
+    monkeypatch.setattr(subprocess, "Popen", other)
+    before = signal.signal(signal.SIGALRM, signal.default_int_handler)
+    signal.setitimer(signal.ITIMER_REAL, 0.1)
+    began = time.monotonic()
+    try:
+        with pytest.raises(KeyboardInterrupt), warmth.side_by_side():
+            pass
+    finally:
+        signal.signal(signal.SIGALRM, before)
+    assert begun[0].wait() == -signal.SIGTERM
+    assert time.monotonic() - began < 10

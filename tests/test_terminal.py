@@ -1,0 +1,246 @@
+"""What reaches the terminal: every encoding, no control characters, true exit codes."""
+
+from __future__ import annotations
+
+import ctypes
+import io
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+import fabricated
+import foamfit.plots
+import foamfit.report
+import foamfit.result
+from conftest import EXPERIMENTS
+from foamfit import identification, terminal
+from foamfit.cli import main
+from foamfit.errors import InputError
+from foamfit.result import FitResult
+from foamfit.terminal import ending_cleanly, printable, without_ctrl_c
+
+RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
+ODD = "foam \x1b[31mred\x1b[0m\x07\x9b2J\u202eback χ"
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty working directory, and figures that need no time."""
+    monkeypatch.chdir(tmp_path)
+    for module in (foamfit.plots, foamfit.report):
+        monkeypatch.setattr(module, "image", lambda *_: b"\x89PNG" + bytes(20))
+    return tmp_path
+
+
+def run(*args: object, encoding: str = "utf-8") -> Result:
+    return CliRunner(charset=encoding).invoke(main, [str(arg) for arg in args])
+
+
+def write_json(result: FitResult, folder: Path) -> None:
+    (folder / "fit.json").write_text(json.dumps(result.to_json_dict()))
+
+
+def quick(monkeypatch: pytest.MonkeyPatch, *, light: bool = True, **changed: object) -> None:
+    """Let the fit be there at once, and its folder hold its fit.json alone."""
+    made = fabricated.result(**changed)
+    monkeypatch.setattr(identification, "fit", lambda *_, **__: made)
+    if light:
+        monkeypatch.setattr(foamfit.result, "_write", write_json)
+
+
+# ---------------------------------------------------------------- encodings
+
+
+@pytest.mark.parametrize("encoding", ["cp1252", "ascii"])
+def test_every_command_prints_in_every_encoding(
+    here: Path, monkeypatch: pytest.MonkeyPatch, encoding: str
+) -> None:
+    notes = ("The reduced χ² is 1, σ_a ± −3.",)
+    quick(monkeypatch, status="ok", notes=notes)
+    told = run("fit", RECONSTRUCTION, "--json", "--out", "r", encoding=encoding)
+    assert (told.exit_code, told.stderr) == (0, "")
+    assert told.stdout_bytes.isascii()
+    assert json.loads(told.stdout_bytes)["notes"] == list(notes)
+    for args in (
+        ["check", RECONSTRUCTION],
+        ["published"],
+        ["compare", "r", "--published", "foam-1/model-1"],
+        ["fit", RECONSTRUCTION, "--out", "r"],
+        ["fit", "--help"],
+    ):
+        told = run(*args, encoding=encoding)
+        assert (told.exit_code, told.stderr) == (0, ""), args
+        assert told.stdout_bytes.decode(encoding)
+    quick(monkeypatch, status="failed")
+    assert run("fit", RECONSTRUCTION, "--json", "--out", "r", encoding=encoding).exit_code == 2
+    refused = run("check", "χ.csv", encoding=encoding)
+    assert refused.exit_code == 1
+    assert "chi.csv" in refused.stderr
+
+
+def test_what_an_encoding_has_not_is_named(here: Path) -> None:
+    stream = io.TextIOWrapper(io.BytesIO(), encoding="ascii", errors="foamfit.instead")
+    stream.write("σ_a = −3 ± 1 μm, Σχ², ε̂_c → 漢")
+    stream.flush()
+    assert stream.buffer.getvalue() == b"sigma_a = -3 +/- 1 mum, Sigmachi^2, epsilon_c -> ?"
+
+
+def test_the_process_itself_in_cp1252() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "foamfit", "published"],
+        env=os.environ | {"PYTHONIOENCODING": "cp1252"},
+        capture_output=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert "sigma_a" in done.stdout.decode("cp1252")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_an_output_that_is_full_is_one_sentence() -> None:
+    command = f"{sys.executable} -m foamfit published > /dev/full"
+    done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert re.fullmatch(
+        r"foamfit: standard output cannot be written: No space [^\n]+\n", done.stderr
+    )
+
+
+def test_a_reader_that_has_enough_changes_no_exit_code() -> None:
+    command = f'({sys.executable} -m foamfit published; echo "code $?" >&2) | true'
+    done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False)
+    assert done.stderr == "code 0\n"
+
+
+# ---------------------------------------------------------------- control characters
+
+
+def test_no_control_character_of_a_name_reaches_the_terminal(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measurement = fabricated.result().measurement
+    named = type(measurement)(**{**vars(measurement), "name": ODD})
+    quick(monkeypatch, status="failed", measurement=named)
+    toml = RECONSTRUCTION.with_suffix(".toml").read_text()
+    escaped = json.dumps(ODD)
+    renamed = [line for line in toml.splitlines() if not line.startswith("name = ")]
+    (here / "odd.toml").write_text("\n".join([f"name = {escaped}", *renamed]))
+    (here / "bad.toml").write_text(f"{escaped} = 1\n" + toml)
+    for args in (
+        ["fit", RECONSTRUCTION, "--out", "out\x1b[5m"],
+        ["fit", RECONSTRUCTION, "--out", "r", "--json"],
+        ["compare", "r", "--published", "foam-1/model-1"],
+        ["check", RECONSTRUCTION, "--specimen", "odd.toml"],
+        ["check", RECONSTRUCTION, "--specimen", "bad.toml"],
+        ["check", "none\x1b[31m.csv"],
+        ["fit", "--bogus\x1b[31m"],
+        ["fit", RECONSTRUCTION, "--fix", "\x1b[31m"],
+    ):
+        told = run(*args)
+        said = told.stdout + told.stderr
+        assert said.strip(), args
+        assert not re.search("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202e]", said), args
+        assert re.search(r"\\(x|u00)1b|U\+001B", said), args
+    assert printable("a\tb\nc\x1b") == "a\tb\nc\\x1b"
+
+
+def test_a_name_that_is_no_unicode_is_written_and_printed(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a file name of another encoding is read by Python."""
+    name = os.fsdecode(b"foam \xe9")
+    measurement = fabricated.result().measurement
+    named = type(measurement)(**{**vars(measurement), "name": name})
+    quick(monkeypatch, light=False, measurement=named)
+    told = run("fit", RECONSTRUCTION, "--out", "r")
+    assert (told.exit_code, told.stderr) == (0, "")
+    assert json.loads((here / "r" / "fit.json").read_text(encoding="utf-8"))["test"] == name
+    told = run("compare", "r", "--published", "foam-1/model-1", "--csv", "table.csv")
+    assert told.exit_code == 0
+
+
+# ---------------------------------------------------------------- whose fault it is
+
+
+def broken(error: BaseException):
+    def fail(*_: object, **__: object) -> None:
+        raise error
+
+    return fail
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "words"),
+    [
+        (InputError("x is wrong"), 1, "x is wrong"),
+        (np.linalg.LinAlgError("SVD did not converge"), 70, "a defect of foamfit"),
+        (ValueError("operands could not be broadcast"), 70, "a defect of foamfit"),
+        (KeyboardInterrupt(), 130, "interrupted by Ctrl-C"),
+        (terminal.TerminatedError(signal.SIGTERM), 143, "ended by SIGTERM"),
+    ],
+)
+def test_only_input_errors_are_the_users(
+    here: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException, code: int, words: str
+) -> None:
+    monkeypatch.setattr(identification, "fit", broken(error))
+    told = run("fit", RECONSTRUCTION, "--out", "r")
+    assert (told.exit_code, told.stdout) == (code, "")
+    assert re.fullmatch(rf"\n?foamfit: [^\n]*{words}[^\n]*\n", told.stderr)
+    assert not (here / "r").exists()
+
+
+def test_what_springs_and_chains_refuse_is_an_input_error() -> None:
+    import foamfit as ff
+
+    for refuse in (
+        lambda: ff.LinearSpring(-1.0),
+        lambda: ff.LinearSpring("stiff"),
+        lambda: ff.Chain([], [1.0], 1.0),
+        lambda: ff.Chain(3, [1.0], 1.0),
+        lambda: ff.Impact(0.0, 1.0),
+        lambda: ff.StressDrive([[1.0]]),
+        lambda: ff.published["foam-1/model-1"].bistable.stress([np.nan]),
+    ):
+        with pytest.raises(InputError):
+            refuse()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_in_code_that_cannot_raise_is_not_lost(number: signal.Signals) -> None:
+    """As in the callbacks by which numba loads what it has compiled."""
+    callback = ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(number))
+    hook = sys.unraisablehook
+
+    def run_on() -> None:
+        callback()
+        time.sleep(5.0)
+
+    with pytest.raises((KeyboardInterrupt, terminal.TerminatedError)), ending_cleanly():
+        run_on()
+    assert sys.unraisablehook is hook
+
+
+def test_ctrl_c_waits_only_while_the_result_is_written() -> None:
+    before = signal.getsignal(signal.SIGINT)
+    with without_ctrl_c():
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_command_leaves_the_signals_as_they_were(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.getsignal(number) for number in numbers]
+    quick(monkeypatch)
+    assert run("fit", RECONSTRUCTION, "--out", "r", "--quiet").exit_code == 0
+    assert [signal.getsignal(number) for number in numbers] == before
