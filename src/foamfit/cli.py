@@ -431,8 +431,12 @@ def _intervals(profile: bool, bootstrap: int | None, mcmc: int | None) -> tuple[
 @contextmanager
 def _compiling(quiet: bool) -> Iterator[Callable[[], None]]:
     """Compile at first use, beside the body; it calls what is given before it simulates."""
+    import logging
+
     from foamfit import warmth
 
+    if quiet:  # what is compiled later is announced by the log
+        logging.getLogger("foamfit").setLevel(logging.ERROR)
     if warmth.compiled():
         yield lambda: None
         return
@@ -465,7 +469,13 @@ def _progress(quiet: bool) -> Iterator[Callable[[float, str], None]]:
 @click.argument("scene", metavar="SCENE.toml", type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(path_type=Path), help="CSV. Default: SCENE.csv here.")
 @click.option("--plot", type=click.Path(path_type=Path), help="Also draw a PNG, PDF or SVG.")
-@click.option("--rtol", default=1e-6, show_default=True, help="Wanted error over the range.")
+@click.option(
+    "--rtol",
+    type=click.FloatRange(1e-14, 0.1),
+    default=1e-6,
+    show_default=True,
+    help="Wanted error over the range.",
+)
 def simulate(scene: Path, out: Path | None, plot: Path | None, rtol: float) -> None:
     """Run any chain under any drive forward and write its response as CSV.
 
@@ -495,8 +505,6 @@ def simulate(scene: Path, out: Path | None, plot: Path | None, rtol: float) -> N
     from foamfit.scene import files_of_scene, read_scene, write_response
     from foamfit.simulation import simulate as run
 
-    if not 1e-14 <= rtol <= 0.1:
-        raise InputError(f"--rtol {rtol:g} is not admissible; it must be between 1e-14 and 0.1")
     target = Path(scene.with_suffix(".csv").name) if out is None else out
     _check_files((target, plot), files_of_scene(scene))
     if plot is not None:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from foamfit import aggregate, implicit, kernels, ringing, series, taylor, warmth
 from foamfit.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
-from foamfit.errors import SimulationError
+from foamfit.errors import InputError, SimulationError
 from foamfit.law import BISTABLE
 from foamfit.series import equilibrium_tangents
 from foamfit.spring import as_samples
@@ -342,12 +342,12 @@ def _switches(time: Array, strain: Array, branches: NDArray[np.int64]) -> Array:
 def _time(t: ArrayLike) -> Array:
     time = as_samples(t, "t")  # a copy of one compiled type: writable
     if time.ndim != 1 or time.size == 0:
-        raise ValueError("t must be a one-dimensional array with at least one sample")
+        raise InputError("t must be a one-dimensional array with at least one sample")
     at = kernels.fault(time)
     if at >= 0 and not math.isfinite(time[at]):
-        raise ValueError(f"t must be finite; sample {at} is not")
+        raise InputError(f"t must be finite; sample {at} is not")
     if at >= 0:
-        raise ValueError(f"t must increase; sample {at} is not later than the one before it")
+        raise InputError(f"t must increase; sample {at} is not later than the one before it")
     return time
 
 
@@ -390,7 +390,7 @@ def plan(
         name = "stress" if isinstance(drive, StressDrive) else "displacement"
         values = np.array(drive.stress if isinstance(drive, StressDrive) else drive.displacement)
         if values.size != time.size:
-            raise ValueError(
+            raise InputError(
                 f"{name} has {values.size} samples and t has {time.size}: give one value per sample"
             )
         if isinstance(drive, DisplacementDrive):

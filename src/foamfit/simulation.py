@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from foamfit import kernels, series
 from foamfit.chain import Chain, Drive, check_scene
-from foamfit.errors import SimulationError
+from foamfit.errors import InputError, SimulationError
 from foamfit.law import BISTABLE
 from foamfit.motion import (
     AGGREGATE,
@@ -273,7 +273,7 @@ def _direction(chain: Chain, name: str) -> tuple[int, int]:
             return spring, series.OWN_HEIGHT
         if short in own:
             return spring, BISTABLE_NAMES.index(short)
-    raise ValueError(
+    raise InputError(
         f"sensitivities: '{name}' is not a parameter of this chain; give names like s1_k0, "
         "s2_height or site_eta"
     )
@@ -334,7 +334,7 @@ def simulate(
     """
     check_scene(chain, drive)
     if not 1e-14 <= as_number(rtol, "rtol") <= 1e-1:
-        raise ValueError(f"rtol = {rtol:g} is not admissible: it must be between 1e-14 and 0.1")
+        raise InputError(f"rtol = {rtol:g} is not admissible: it must be between 1e-14 and 0.1")
     directions = NO_DIRECTIONS
     if sensitivities:
         wanted = [_direction(chain, name) for name in sensitivities]
