@@ -3,8 +3,8 @@
 Five families, drawn at random from a seed (every scene is synthetic):
 
 - study: the ranges of scenes.py, another seed;
-- base: impacts on a chain whose base spring has a dashpot, with a mass above it; windows from 1e-7 s
-  on, shorter than the contact or longer;
+- base: impacts on a chain whose base spring has a dashpot, with a mass above it; windows from 1e-7
+  s on, shorter than the contact or longer;
 - gap: unilateral springs that open, with derivatives by parameters;
 - turns: displacement and stress histories that turn round at random places;
 - long: chains of 3 to 10 springs with masses inside and few or no dashpots.

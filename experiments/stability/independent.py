@@ -284,7 +284,6 @@ def _follow(
     Returns how it ended, the steps, the switches, the end of contact (NaN if none), the least
     minimum of the base stress before it over its maximum, and the time reached.
     """
-    ra, rb, rc, re3, re5 = tableau
     count, groups = springs.shape[0], ends.size
     moving = groups if top == MASS else groups - 1
     size = moving + count
@@ -313,12 +312,19 @@ def _follow(
             branch[i] = after
     knot, steps, switches, peak, largest = 0, 0, 0, 0.0, 0.0
     pressed, least, last_base, falling = False, math.inf, 0.0, False
-    h, before = 0.0, 0.0
+    h = 0.0
     late = 0.0  # what the clock has lost to rounding
     value = rate = 0.0
-    fresh = True
+    fresh, since = True, now
     while True:
+        # samples that are due, by the rate of the drive that led to them
+        due = done < times.size and times[done] <= now
+        if due and not fresh:
+            value += rate * (now - since)
+            due = _rates(y, k[0], stress, branch, springs, ends, mass, drag, top, value, rate)
+            done = _record(y, moving, springs, times, now, done, stress[0], nodes, base, due)
         # what the drive does from here on
+        since = now
         if not struck:
             while knot + 2 < times.size and now >= times[knot + 1]:
                 knot += 1
@@ -348,13 +354,7 @@ def _follow(
             if steps > most:
                 return TOO_LONG, steps, switches, math.nan, least, now
             continue
-        while done < times.size and times[done] <= now:
-            place = 0.0
-            for i in range(count):
-                place += springs[i, H] * y[moving + i]
-                nodes[i, done] = place
-            base[done] = stress[0]
-            done += 1
+        done = _record(y, moving, springs, times, now, done, stress[0], nodes, base, fine)
         if done == times.size:
             return DONE, steps, switches, math.nan, least, now
         if not fine:
@@ -506,6 +506,30 @@ def _follow(
             if lifts and stress1[0] <= 1e-15 * peak:
                 _fly(y, moving, groups, springs, times, done, now, nodes, base)
                 return DONE, steps, switches, now, least, now
+
+
+@njit(cache=True, error_model="numpy")
+def _record(
+    y: Array,
+    moving: int,
+    springs: Array,
+    times: Array,
+    now: float,
+    done: int,
+    pressure: float,
+    nodes: Array,
+    base: Array,
+    fine: bool,
+) -> int:
+    """Write the samples that are due; returns how many are done."""
+    while fine and done < times.size and times[done] <= now:
+        place = 0.0
+        for i in range(springs.shape[0]):
+            place += springs[i, H] * y[moving + i]
+            nodes[i, done] = place
+        base[done] = pressure
+        done += 1
+    return done
 
 
 @njit(cache=True, error_model="numpy")
