@@ -85,12 +85,13 @@ def bistable(rng: Generator, k0: float, eta: float = 0.0) -> Spec:
 def foam(rng: Generator, k0: float, eta: float = 0.0) -> Spec:
     """Draw a bistable spring near one of the published ones, of another first slope."""
     names = list(ff.published)
-    spring = asdict(ff.published[names[int(rng.integers(len(names)))]].bistable)
-    scale = {"eps_a": 1.0, "eps_c": 1.0}
+    item = ff.published[names[int(rng.integers(len(names)))]].bistable
     near = {
-        key: value * scale.get(key, k0 / spring["k0"]) * rng.uniform(0.93, 1.07)
-        for key, value in spring.items()
+        key: value * rng.uniform(0.93, 1.07) * (1.0 if key.startswith("eps") else k0 / item.k0)
+        for key, value in asdict(item).items()
     }
+    sigma_a = near["k0"] * near["eps_a"] / (1.0 - near["eps_a"])
+    near["dsigma"] = item.dsigma / item.sigma_a * sigma_a * rng.uniform(0.93, 1.07)
     return near | {"eta": eta}
 
 
@@ -329,37 +330,39 @@ def moved(spec: Spec, name: str, factor: float) -> tuple[Spec, float]:
     return other, value
 
 
-def slopes_of(spec: Spec, name: str, most: int) -> tuple[Array, Array, NDArray[np.bool_]] | None:
-    """Derivatives of displacement and base stress by differences of the judge's own runs.
+STEPS = (1e-4, 1e-5)  # of the differences, relative to the parameter
+LEAST_SLOPE = 1e-3  # range of a derivative that counts, over the range of the curve per parameter
 
-    Also the samples that count: not those between two ends of contact, or where the differences of
-    two lengths do not agree. None where the judge has nothing to say.
+
+def slopes_of(spec: Spec, name: str, most: int) -> tuple[Array, Array, NDArray[np.bool_]] | None:
+    """Derivatives of base stress and displacements by differences of the judge's own runs.
+
+    (curves, n_t), with the range over which each counts, and the samples that count: not those
+    between two ends of contact, or where the differences of two lengths do not agree. None where
+    the judge has nothing to say.
     """
     found, ends = [], []
-    for step in (1e-5, 1e-6):
+    span = np.zeros(0)
+    for step in STEPS:
         sides = []
         for sign in (1.0, -1.0):
             other, value = moved(spec, name, 1.0 + sign * step)
             truth = follow(*scene_from(other), LOOSE, most)
             if truth.why:
                 return None
-            sides.append(truth)
+            sides.append(np.vstack((truth.base_stress, truth.displacement)))
             ends.append(math.nan if truth.contact_end is None else truth.contact_end)
-        width = 2.0 * step * value
-        found.append(
-            (
-                (sides[0].displacement - sides[1].displacement) / width,
-                (sides[0].base_stress - sides[1].base_stress) / width,
-            )
-        )
+        found.append((sides[0] - sides[1]) / (2.0 * step * value))
+        reach = np.abs(sides[0]).max(axis=1) * LEAST_SLOPE / value
+        span = np.maximum(np.abs(found[-1]).max(axis=1), reach)
+        span[1:] = span[1:].max()  # displacements count together
     grid = scene_from(spec)[2]
     counts = np.ones(grid.size, bool)
     if not np.isnan(ends).all():
         counts = (grid < np.nanmin(ends)) | (grid > np.nanmax(ends))
-    for coarse, fine in zip(*found, strict=True):
-        span = float(np.abs(fine).max()) or 1.0
-        counts &= np.atleast_2d(np.abs(coarse - fine) <= 0.1 * SLOPE_BAR * span).all(axis=0)
-    return found[1][0], found[1][1], counts
+    span = np.where(span > 0.0, span, 1.0)
+    counts &= (np.abs(found[0] - found[1]) <= 0.1 * SLOPE_BAR * span[:, None]).all(axis=0)
+    return found[1], span, counts
 
 
 def slope_bar(rtol: float) -> float:
@@ -379,12 +382,11 @@ def slope_error(spec: Spec, scene: Scene, rtol: float, most: int, known: dict[st
             known[name] = slopes_of(spec, name, most)
         if known[name] is None or known[name][2].sum() < 0.5 * scene[2].size:
             continue
-        w, s, counts = known[name]
+        want, span, counts = known[name]
         got = answer.sensitivities[name]
-        for mine, his in ((got.displacement, w), (got.base_stress[None, :], s[None, :])):
-            miss = float(np.abs(mine - his)[:, counts].max())
-            span = max(float(np.ptp(np.append(his, 0.0))), float(np.abs(his).max()))
-            worst = np.nanmax([worst, miss / span if span > 0.0 else (math.inf if miss else 0.0)])
+        mine = np.vstack((got.base_stress, got.displacement))
+        miss = np.abs(mine - want)[:, counts].max(axis=1) / span
+        worst = np.nanmax([worst, miss.max() if np.isfinite(miss).all() else math.inf])
     return float(worst)
 
 
