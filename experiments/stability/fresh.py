@@ -53,7 +53,7 @@ Spec = dict[str, Any]
 
 SEED = 2027
 RTOLS = (1e-4, 1e-6, 1e-8)
-MOST = {"study": 4_000_000, "base": 30_000_000, "gap": 4_000_000, "turns": 4_000_000,
+MOST = {"study": 4_000_000, "base": 10_000_000, "gap": 4_000_000, "turns": 4_000_000,
         "long": 8_000_000}  # fmt: skip
 BAD, POOR = 3.0, 1.0  # error over rtol
 SLOPE_BAR = 1e-3  # error of a derivative over its range, at an rtol of up to 1e-5
