@@ -414,14 +414,17 @@ def lines_of(task: tuple[str, int, tuple[float, ...]]) -> list[dict[str, Any]]:
     truth = judge(*scene, most)
     took = time.perf_counter() - began
     known: dict[str, Any] = {}
-    return [
+    lines = [
         {
             "scene": f"{family}:{number}", "family": family, "rtol": rtol,
             **judged(spec, scene, truth, rtol, most, known), "judge_seconds": round(took, 3),
-            "parameters": json.dumps(spec),
         }
         for rtol in rtols
     ]  # fmt: skip
+    for line in lines:  # those of the others follow from the name and the seed
+        told = line["outcome"] != "answer" or line["error"] > POOR
+        line["parameters"] = json.dumps(spec) if told else ""
+    return lines
 
 
 def judged(
