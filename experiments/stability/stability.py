@@ -286,7 +286,8 @@ def fresh_table(lines: pd.DataFrame) -> str:
         body.append(
             f"| {family} | {row.rtol:g} | {row.scenes} | {row.judged} | {row.answers} | "
             f"{refused} | {row['over 1 rtol']} | {row['over 3 rtol']} | "
-            f"{_number(row.largest, '.2g')} | {row.derivatives} | {row['wrong derivatives']} | {row['longest s']:.2g} |"
+            f"{_number(row.largest, '.2g')} | {row.derivatives} | {row['wrong derivatives']} | "
+            f"{row['longest s']:.2g} |"
         )
     return "\n".join([head, *body])
 
