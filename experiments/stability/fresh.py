@@ -259,7 +259,7 @@ def long(rng: Generator, number: int) -> Spec:
         linear(rng, k0) if rng.random() < 0.2 else draw(rng, k0 * log(rng, 0.7, 1.5))
         for _ in range(count)
     ]
-    heavy = log(rng, 1e-7, 1e-3)
+    heavy = log(rng, 1e-9, 1e-3)
     masses = [heavy * log(rng, 0.5, 2.0) for _ in range(count - 1)] + [0.0]
     spec = chain_of(rng, springs, log(rng, 5e-4, 1e-2), masses)
     kind = number % 4
@@ -268,7 +268,7 @@ def long(rng: Generator, number: int) -> Spec:
         whole = bounce(spec, spec["impact"][0])
         spec["stop"] = whole * log(rng, 0.2, 1.5)
     else:
-        whole = bounce(spec, heavy * count) * log(rng, 2.0, 50.0)
+        whole = bounce(spec, heavy * count) * log(rng, 2.0, 1000.0)
         spec["stop"] = whole
         way = path(rng, 0.7 * sum(spec["heights"]), int(rng.integers(1, 5)))
         if kind == 2:
@@ -280,7 +280,7 @@ def long(rng: Generator, number: int) -> Spec:
     few = rng.random()
     for i, spring in enumerate(springs):
         if few < 0.25 or (few < 0.5 and i == int(few * 1000) % count):
-            spring["eta"] = spring["k0"] * whole * log(rng, 1e-4, 1e-2)
+            spring["eta"] = spring["k0"] * whole * log(rng, 1e-6, 1e-2)
     return spec | {"samples": 151}
 
 
