@@ -168,7 +168,7 @@ def test_impacts_of_the_reference(springs: tuple, masses: tuple | None, site: fl
     ],
 )
 def test_displacements_of_the_reference(springs: tuple, masses: tuple | None, site: float) -> None:
-    time = np.sort(np.append(np.linspace(0.0, 4e-3, 30), 1.234e-3))
+    time = np.sort(np.append(np.linspace(0.0, 4e-3, 12), 1.234e-3))
     motion = np.interp(time, [0.0, 1.2e-3, 2e-3, 2.9e-3, 4e-3], [0.0, 1e-3, 4e-4, 1.3e-3, 0.0])
     made = chain(*springs, masses=masses, site=site)
     want = reference.reference_displacement(made, motion, time)
@@ -186,10 +186,10 @@ def test_displacements_of_the_reference(springs: tuple, masses: tuple | None, si
 
 
 @pytest.mark.parametrize(
-    ("masses", "site"), [((0.0, 5e-5), 0.0), (None, 2e3), (None, 0.0), ((1e-5, 0.0), 5e2)]
+    ("masses", "site"), [((0.0, 5e-5), 0.0), (None, 2e3), (None, 0.0), ((1e-3, 0.0), 5e2)]
 )
 def test_stresses_of_the_reference(masses: tuple | None, site: float) -> None:
-    time = np.linspace(0.0, 4e-3, 30)
+    time = np.linspace(0.0, 4e-3, 12)
     load = np.interp(time, [0.0, 1.2e-3, 2e-3, 2.9e-3, 4e-3], [0.0, 12e6, 2e6, 20e6, 1e5])
     made = chain(Linear(250e6, 3e3), SPRING, masses=masses, site=site)
     want, got = reference.reference_stress(made, load, time), follow(made, Stress(load), time)
