@@ -1,10 +1,14 @@
 """What the solver does with stiff and extreme scenes: a study of more than two thousand of them.
 
 Each scene must end with an answer inside its tolerance or with a `SimulationError` that says why.
-The judges are in judges.py, the scenes in scenes.py; every scene is synthetic. One command writes
-scenes.csv (a line per scene), table.csv, stability.png and README.md beside itself:
+The judges are in judges.py and independent.py, the scenes in scenes.py; every scene is synthetic.
+One command runs fresh scenes (fresh.py), and one the study, which writes scenes.csv (a line per
+scene), table.csv, stability.png and README.md beside itself; the last only writes these again from
+scenes.csv and fresh.csv:
 
+    python experiments/stability/fresh.py
     python experiments/stability/stability.py
+    python experiments/stability/stability.py --page
 """
 
 from __future__ import annotations
@@ -29,6 +33,8 @@ from matplotlib.figure import Figure
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
 
+import fresh  # noqa: E402
+from independent import judge, over_range  # noqa: E402
 from judges import balance_of, explicit_fits, refined, ripple_of  # noqa: E402
 from scenes import SWEEPS, Point, designed, scene_of, swept  # noqa: E402
 
@@ -38,6 +44,7 @@ from foamfit.motion import MOST_WORK  # noqa: E402
 RTOL, DESIGNED, SEED = 1e-6, 1550, 4
 ENERGY_BAR = 10.0 * RTOL  # the energy is made of both displacement and stress, over a whole history
 LONGEST = 300  # s; a scene that takes longer ends the study
+BRUTE = 3_000_000  # steps times springs up to which brute force judges
 CHEAP = 50_000  # steps times springs up to which the other method is tried too
 REASONS = {
     "step underflow": "shrank to nothing",  # first: its message speaks of flat branches too
@@ -55,7 +62,7 @@ def judged(point: Point) -> dict[str, Any]:
     found: dict[str, Any] = {
         "outcome": "refused", "reason": "", "method": "", "steps": 0, "seconds": 0.0,
         "refinement": math.nan, "other method": math.nan, "energy": math.nan,
-        "impulse": math.nan, "ripple": math.nan, "error": math.nan,
+        "impulse": math.nan, "ripple": math.nan, "independent": math.nan, "error": math.nan,
     }  # fmt: skip
     scene = scene_of(point)
     began = time.perf_counter()
@@ -86,7 +93,13 @@ def judged(point: Point) -> dict[str, Any]:
         found |= {"energy": balance.energy, "impulse": balance.impulse}
     ripple = ripple_of(scene, answer, RTOL)
     found["ripple"] = math.nan if ripple is None else ripple
-    errors = [found["refinement"], found["other method"]]
+    truth = judge(*scene, BRUTE)
+    if not truth.why and truth.unsure <= 0.1 * RTOL:
+        found["independent"] = max(
+            over_range(answer.displacement, truth.displacement),
+            over_range(answer.base_stress, truth.base_stress),
+        )
+    errors = [found["refinement"], found["other method"], found["independent"]]
     found["error"] = np.nanmax([math.inf if e is None else e for e in errors])
     bad = [
         name
@@ -96,6 +109,7 @@ def judged(point: Point) -> dict[str, Any]:
             ("energy", ENERGY_BAR),
             ("impulse", ENERGY_BAR),
             ("ripple", RTOL),
+            ("independent", RTOL),
         )
         if found[name] is None or found[name] > bar
     ]
@@ -189,6 +203,8 @@ def table(lines: pd.DataFrame) -> pd.DataFrame:
                     "median error": answers.error.median(),
                     "largest error": answers.error.max(),
                     "largest energy residual": answers.energy.max(),
+                    "judged by brute force": int(answers.independent.notna().sum()),
+                    "largest by brute force": answers.independent.max(),
                     "closed form": int(methods.get("closed form", 0)),
                     "Taylor": int(methods.get("Taylor series", 0)),
                     "Radau": int(methods.get("Radau IIA", 0)),
@@ -255,12 +271,34 @@ def _number(value: float, form: str = ".0e") -> str:
     return "–" if not math.isfinite(value) else "0" if value == 0.0 else format(value, form)
 
 
-def page(lines: pd.DataFrame, rows: pd.DataFrame) -> str:
+def fresh_table(lines: pd.DataFrame) -> str:
+    """Count the fresh scenes per family and rtol, as a table of the page."""
+    head = "| family | rtol | scenes | judged | answers | refused | over 1 rtol | over 3 rtol | "
+    head += (
+        "largest error / rtol | derivatives judged | wrong | longest s |\n" + "| --- " * 12 + "|"
+    )
+    body = []
+    last = ""
+    for _, row in fresh.summary(lines).iterrows():
+        family = row.family if row.family != last else ""
+        last = row.family
+        refused = f"{row.refused} ({row.reasons})" if row.refused else "0"
+        body.append(
+            f"| {family} | {row.rtol:g} | {row.scenes} | {row.judged} | {row.answers} | "
+            f"{refused} | {row['over 1 rtol']} | {row['over 3 rtol']} | "
+            f"{_number(row.largest, '.2g')} | {row.derivatives} | {row['wrong derivatives']} | "
+            f"{row['longest s']:.2g} |"
+        )
+    return "\n".join([head, *body])
+
+
+def page(lines: pd.DataFrame, rows: pd.DataFrame, drawn: pd.DataFrame) -> str:
     """Write the README of the study."""
     answers = lines[lines.outcome == "answer"]
     text = (HERE / "page.template.md").read_text(encoding="utf-8")
     head = "| axis | range | scenes | answers | refused | failures | median error | largest error "
-    head += "| closed form / Taylor / Radau | median s | longest s |\n" + "| --- " * 11 + "|"
+    head += "| by brute force: judged / largest | closed form / Taylor / Radau | median s "
+    head += "| longest s |\n" + "| --- " * 12 + "|"
     body = []
     last = ""
     for _, row in rows.iterrows():
@@ -270,6 +308,7 @@ def page(lines: pd.DataFrame, rows: pd.DataFrame) -> str:
         body.append(
             f"| {axis} | {row['range']} | {row.scenes} | {row.answers} | {refused} | "
             f"{row.failures} | {_number(row['median error'])} | {_number(row['largest error'])} | "
+            f"{row['judged by brute force']} / {_number(row['largest by brute force'])} | "
             f"{row['closed form']} / {row.Taylor} / {row.Radau} | "
             f"{_number(row['median s'], '.2g')} | {_number(row['longest s'], '.2g')} |"
         )
@@ -283,6 +322,12 @@ def page(lines: pd.DataFrame, rows: pd.DataFrame) -> str:
         ripples=int(answers.ripple.notna().sum()),
         largest_ripple=_number(answers.ripple.max()),
         other=int(answers["other method"].notna().sum()),
+        independent=int(answers.independent.notna().sum()),
+        largest_independent=_number(answers.independent.max()),
+        fresh=fresh_table(drawn),
+        fresh_scenes=f"{drawn.scene.nunique():,}",
+        fresh_judged=f"{drawn[drawn.judge == 'judged'].scene.nunique():,}",
+        fresh_seed=fresh.SEED,
         design=int((lines.axis == "design").sum()),
         largest=_number(answers.error.max()),
         longest=format(lines.seconds.max(), ".0f"),
@@ -300,16 +345,23 @@ def page(lines: pd.DataFrame, rows: pd.DataFrame) -> str:
 def main() -> None:
     """Run the study and write its files."""
     warnings.simplefilter("ignore")
-    lines = study()
+    if not (HERE / "fresh.csv").exists():
+        sys.exit("fresh.csv is missing: make it first with python experiments/stability/fresh.py")
+    drawn = pd.read_csv(HERE / "fresh.csv")
+    again = "--page" in sys.argv[1:]
+    lines = pd.read_csv(HERE / "scenes.csv", keep_default_na=True) if again else study()
+    lines["reason"] = lines.reason.fillna("")
     rows = table(lines)
-    floats = {"seconds": 4, "error": 12}
-    lines.round(floats).to_csv(HERE / "scenes.csv", index=False, float_format="%.6g")
+    if not again:
+        floats = {"seconds": 4, "error": 12}
+        lines.round(floats).to_csv(HERE / "scenes.csv", index=False, float_format="%.6g")
     rows.to_csv(HERE / "table.csv", index=False, float_format="%.4g")
     heat_map(rows).savefig(HERE / "stability.png", dpi=150)
-    (HERE / "README.md").write_text(page(lines, rows), encoding="utf-8")
+    (HERE / "README.md").write_text(page(lines, rows, drawn), encoding="utf-8")
     print(rows.iloc[0].to_string())
-    if (lines.outcome == "failure").any():
-        sys.exit("some scenes ended with a wrong answer: see scenes.csv")
+    print(fresh.summary(drawn).to_string(index=False))
+    if (lines.outcome == "failure").any() or (drawn.outcome == "failure").any():
+        sys.exit("some scenes ended with a wrong answer: see scenes.csv and fresh.csv")
 
 
 if __name__ == "__main__":

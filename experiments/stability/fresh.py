@@ -1,0 +1,581 @@
+"""Fresh scenes, each answered by the solver and by a judge that shares nothing with it.
+
+Five families, drawn at random from a seed (every scene is synthetic):
+
+- study: the ranges of scenes.py, another seed;
+- base: impacts on a chain whose base spring has a dashpot, with a mass above it; windows from 1e-7
+  s on, shorter than the contact or longer;
+- gap: unilateral springs that open, with derivatives by parameters;
+- turns: displacement and stress histories that turn round at random places;
+- long: chains of 3 to 10 springs with masses inside and few or no dashpots.
+
+One command runs them and writes a line per scene and rtol; another shows one scene:
+
+    python experiments/stability/fresh.py --scenes 400 --out fresh.csv
+    python experiments/stability/fresh.py --scene base:17 --rtol 1e-6
+    python experiments/stability/fresh.py --again fresh.csv --out again.csv
+
+`--again` takes only the scenes of a file that were wrong. Another checkout's solver is judged with
+PYTHONPATH=that/checkout/src.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE))
+
+from independent import LOOSE, Truth, follow, judge, over_range  # noqa: E402
+from scenes import Point, designed, scene_of  # noqa: E402
+
+import foamfit as ff  # noqa: E402
+
+Array = NDArray[np.float64]
+Scene = tuple[ff.Chain, ff.Impact | ff.StressDrive | ff.DisplacementDrive, Array]
+Spec = dict[str, Any]
+
+SEED = 2027
+RTOLS = (1e-4, 1e-6, 1e-8)
+MOST = {"study": 4_000_000, "base": 10_000_000, "gap": 4_000_000, "turns": 4_000_000,
+        "long": 20_000_000}  # fmt: skip
+BAD, POOR = 3.0, 1.0  # error over rtol
+SLOPE_BAR = 1e-3  # error of a derivative over its range, at an rtol of up to 1e-5
+
+
+# ------------------------------------------------------------------------------------- the scenes
+
+
+def log(rng: Generator, low: float, high: float) -> float:
+    return float(low * (high / low) ** rng.random())
+
+
+def bistable(rng: Generator, k0: float, eta: float = 0.0) -> Spec:
+    """Draw a bistable spring of a first slope."""
+    eps_a = log(rng, 0.02, 0.5)
+    sigma_a = k0 * eps_a / (1.0 - eps_a)
+    return {
+        "k0": k0,
+        "kc": k0 * log(rng, 2.0, 100.0),
+        "dsigma": -sigma_a * rng.uniform(0.0, 0.95),
+        "eps_a": eps_a,
+        "eps_c": eps_a + (0.9 - eps_a) * rng.uniform(0.1, 0.9),
+        "kh_plus": k0 * log(rng, 0.1, 30.0),
+        "kh_minus": k0 * log(rng, 0.05, 5.0),
+        "eta": eta,
+    }
+
+
+def foam(rng: Generator, k0: float, eta: float = 0.0) -> Spec:
+    """Draw a bistable spring near one of the published ones, of another first slope."""
+    names = list(ff.published)
+    item = ff.published[names[int(rng.integers(len(names)))]].bistable
+    near = {
+        key: value * rng.uniform(0.93, 1.07) * (1.0 if key.startswith("eps") else k0 / item.k0)
+        for key, value in asdict(item).items()
+    }
+    sigma_a = near["k0"] * near["eps_a"] / (1.0 - near["eps_a"])
+    near["dsigma"] = item.dsigma / item.sigma_a * sigma_a * rng.uniform(0.93, 1.07)
+    return near | {"eta": eta}
+
+
+def linear(rng: Generator, k0: float, eta: float = 0.0, unilateral: bool | None = None) -> Spec:
+    """Draw a linear spring in series with bistable ones of a first slope."""
+    one_sided = bool(rng.random() < 0.5) if unilateral is None else unilateral
+    return {"k0": k0 * log(rng, 1.0, 50.0), "eta": eta, "unilateral": one_sided}
+
+
+def chain_of(
+    rng: Generator, springs: list[Spec], height: float, masses: list[float], site: float = 0.0
+) -> Spec:
+    """Write a chain with heights that differ."""
+    share = rng.uniform(0.5, 1.5, len(springs))
+    return {
+        "springs": springs,
+        "heights": list(height * share / share.sum()),
+        "area": log(rng, 5e-6, 5e-5),
+        "masses": masses,
+        "site": site,
+    }
+
+
+def bounce(spec: Spec, mass: float) -> float:
+    """Half a period of a mass on a chain at rest, roughly."""
+    soft = sum(h / s["k0"] for s, h in zip(spec["springs"], spec["heights"], strict=True))
+    return math.pi * math.sqrt(mass * soft / spec["area"])
+
+
+def struck(rng: Generator, spec: Spec, low: float, high: float) -> None:
+    """Add a striker that brings so much of what the chain takes on its first branches."""
+    mass = log(rng, 1e-3, 2e-2)
+    k0 = min(s["k0"] for s in spec["springs"])
+    energy = 0.05 * k0 * log(rng, low, high) * spec["area"] * sum(spec["heights"])
+    spec["impact"] = [mass, math.sqrt(2.0 * energy / mass)]
+
+
+def study(number: int) -> Spec:
+    return {"point": asdict(_designed()[number])}
+
+
+@cache
+def _designed() -> list[Point]:
+    # what brute force can follow: not the longest chains and histories
+    return [
+        replace(p, springs=min(p.springs, 12), samples=min(p.samples, 2001))
+        for p in designed(1000, SEED)
+    ]
+
+
+def base(rng: Generator, number: int) -> Spec:
+    """Half of them the published foam-2, half any spring; the base spring has a dashpot."""
+    if number % 2 == 0:
+        item = ff.published["foam-2"]
+        springs = [asdict(s) for s in item.chain.springs]
+        springs[0]["eta"] = log(rng, 3e2, 1e6)
+        spec: Spec = {
+            "springs": springs,
+            "heights": list(item.chain.heights),
+            "area": item.chain.area,
+            "masses": [log(rng, 1e-6, 2e-3), 0.0],
+            "site": item.chain.site_damping if rng.random() < 0.3 else 0.0,
+            "impact": [item.striker_mass, 4.44],
+        }
+        return spec | {"stop": log(rng, 1e-5, 1.5e-3), "samples": 301}
+    k0 = log(rng, 1e5, 3e7)
+    count = 2 if rng.random() < 0.7 else 3
+    springs = [bistable(rng, k0 * log(rng, 0.5, 2.0)) for _ in range(count)]
+    if rng.random() < 0.7:
+        springs[0] = linear(rng, k0)
+    masses = [log(rng, 1e-7, 5e-3) for _ in range(count - 1)] + [0.0]
+    if count == 3 and rng.random() < 0.3:
+        masses[int(rng.integers(2))] = 0.0
+    spec = chain_of(rng, springs, log(rng, 2e-4, 5e-3), masses)
+    if rng.random() < 0.2:
+        spec["site"] = log(rng, 1.0, 1e5)
+    spec["impact"] = [log(rng, 1e-3, 2e-2), log(rng, 0.1, 30.0)]
+    whole = bounce(spec, spec["impact"][0])
+    for i in range(count):  # damping that may stop what is above within the contact, or hardly acts
+        if i == 0 or rng.random() < 0.3:
+            springs[i]["eta"] = springs[i]["k0"] * whole * log(rng, 1e-4, 1e3)
+    return spec | {"stop": log(rng, min(1e-7, 0.1 * whole), 2.0 * whole), "samples": 201}
+
+
+def path(rng: Generator, top: float, turns: int) -> tuple[list[float], list[float]]:
+    """Turn round at random levels and times, from rest."""
+    levels = [0.0]
+    for turn in range(turns):
+        up = turn % 2 == 0
+        last = levels[-1]
+        levels.append(rng.uniform(last, top) if up else rng.uniform(-0.02 * top, last))
+    return list(np.cumsum(rng.uniform(0.2, 1.0, turns + 1))), levels
+
+
+def gap(rng: Generator, number: int) -> Spec:
+    """A unilateral spring at the base, inside or on top, pulled or thrown open."""
+    k0 = log(rng, 5e5, 3e7)
+    count = int(rng.integers(2, 4))
+    springs = [bistable(rng, k0) for _ in range(count)]
+    at = int(rng.integers(count))
+    springs[at] = linear(rng, k0, unilateral=True)
+    inertia = rng.random() < 0.5 or number % 3 == 0
+    masses = [log(rng, 1e-6, 5e-3) if inertia else 0.0 for _ in range(count - 1)] + [0.0]
+    spec = chain_of(rng, springs, log(rng, 3e-4, 3e-3), masses)
+    names = []
+    for i, spring in enumerate(springs, start=1):
+        own = ["k0", "height"] if "unilateral" in spring else ["k0", "kc", "eps_a", "kh_plus"]
+        names.append(f"s{i}_{rng.choice(own)}")
+    spec["sensitivities"] = names
+    if number % 3 == 0:
+        struck(rng, spec, 0.05, 3.0)
+        whole = bounce(spec, spec["impact"][0])
+        spec["stop"] = whole * log(rng, 0.3, 2.0)
+    else:
+        whole = bounce(spec, max(1e-4, *masses)) * log(rng, 3.0, 100.0)
+        at_times, levels = path(rng, 0.75 * sum(spec["heights"]), int(rng.integers(2, 5)))
+        levels.append(-0.01 * sum(spec["heights"]) * rng.random())  # pulled open at the end
+        at_times.append(at_times[-1] + rng.uniform(0.2, 1.0))
+        spec["displacement"] = [at_times, levels]
+        spec["stop"] = whole
+    if rng.random() < 0.4:
+        for spring in springs:
+            spring["eta"] = spring["k0"] * whole * log(rng, 1e-4, 1e-1)
+    return spec | {"samples": 151}
+
+
+def turns(rng: Generator, number: int) -> Spec:
+    """Histories of displacement and of stress that turn round anywhere."""
+    k0 = log(rng, 3e5, 3e7)
+    count = int(rng.integers(1, 4))
+    springs = [
+        linear(rng, k0) if rng.random() < 0.25 and count > 1 else bistable(rng, k0)
+        for _ in range(count)
+    ]
+    inertia, damped = rng.random() < 0.5, rng.random() < 0.6
+    masses = [log(rng, 1e-7, 1e-2) if inertia else 0.0 for _ in range(count)]
+    stressed = number % 2 == 1
+    if not stressed or rng.random() < 0.5:
+        masses[-1] = 0.0
+    spec = chain_of(rng, springs, log(rng, 2e-4, 5e-3), masses)
+    stop = log(rng, 1e-5, 1e-1)
+    if inertia:
+        stop = bounce(spec, max(masses) + 1e-9) * log(rng, 1.0, 100.0)
+    if damped:
+        for spring in springs:
+            if rng.random() < 0.7:
+                spring["eta"] = spring["k0"] * stop * log(rng, 1e-4, 10.0)
+    if rng.random() < 0.3:
+        spec["site"] = k0 * stop * log(rng, 1e-4, 1.0)
+    number_of_turns = int(rng.integers(1, 9))
+    if stressed:
+        spec["stress"] = list(path(rng, k0 * log(rng, 0.1, 3.0), number_of_turns))
+        spec["stress"][1] = [max(level, 0.0) for level in spec["stress"][1]]
+    else:
+        spec["displacement"] = list(path(rng, 0.8 * sum(spec["heights"]), number_of_turns))
+    return spec | {"stop": stop, "samples": int(rng.choice([21, 101, 501]))}
+
+
+def long(rng: Generator, number: int) -> Spec:
+    """Three to ten springs with a mass above each, light or heavy; most without a dashpot."""
+    k0 = log(rng, 5e5, 3e7)
+    count = int(rng.integers(3, 11))
+    draw = foam if rng.random() < 0.5 else bistable
+    springs = [
+        linear(rng, k0) if rng.random() < 0.2 else draw(rng, k0 * log(rng, 0.7, 1.5))
+        for _ in range(count)
+    ]
+    spec = chain_of(rng, springs, log(rng, 5e-4, 1e-2), [0.0] * count)
+    kind = number % 4
+    if kind < 2:
+        struck(rng, spec, 0.1, 6.0)
+        whole = bounce(spec, spec["impact"][0])
+        spec["stop"] = whole * log(rng, 0.2, 1.5)
+    else:
+        whole = spec["stop"] = log(rng, 1e-4, 1e-1)
+        way = path(rng, 0.7 * sum(spec["heights"]), int(rng.integers(1, 5)))
+        if kind == 2:
+            spec["displacement"] = list(way)
+        else:
+            spec["stress"] = [way[0], [k0 * log(rng, 0.1, 1.0) * max(x, 0.0)
+                                       / (0.7 * sum(spec["heights"])) for x in way[1]]]  # fmt: skip
+    # masses that vibrate through so many radians meanwhile
+    radians = log(rng, 30.0, 3e5)
+    stiff = 4.0 * k0 * spec["area"] * count / sum(spec["heights"])
+    heavy = min(stiff * (spec["stop"] / radians) ** 2, 3e-3)
+    masses = [heavy * log(rng, 0.5, 2.0) for _ in range(count)]
+    spec["masses"] = masses if kind == 3 else [*masses[:-1], 0.0]
+    few = rng.random()
+    for i, spring in enumerate(springs):
+        if few < 0.25 or (few < 0.5 and i == int(few * 1000) % count):
+            spring["eta"] = spring["k0"] * whole * log(rng, 1e-6, 1e-2)
+    return spec | {"samples": 151}
+
+
+DRAWN: dict[str, Callable[[Generator, int], Spec]] = {
+    "base": base, "gap": gap, "turns": turns, "long": long,
+}  # fmt: skip
+FAMILIES = ("study", *DRAWN)
+
+
+def spec_of(family: str, number: int) -> Spec:
+    """Draw what a scene is made of."""
+    if family == "study":
+        return study(number)
+    rng = np.random.default_rng([SEED, FAMILIES.index(family), number])
+    return DRAWN[family](rng, number)
+
+
+def scene_from(spec: Spec) -> Scene:
+    """Make chain, drive and samples."""
+    if "point" in spec:
+        return scene_of(Point(**spec["point"]))
+    springs = [
+        ff.BistableSpring(**s) if "kc" in s else ff.LinearSpring(**s) for s in spec["springs"]
+    ]
+    chain = ff.Chain(springs, spec["heights"], spec["area"], spec["masses"], spec["site"])
+    grid = np.linspace(0.0, spec["stop"], spec["samples"])
+    if "impact" in spec:
+        return chain, ff.Impact(*spec["impact"]), grid
+    drive = "stress" if "stress" in spec else "displacement"
+    at, levels = np.array(spec[drive][0]), np.array(spec[drive][1])
+    values = np.interp(grid, spec["stop"] * (at - at[0]) / (at[-1] - at[0]), levels)
+    return chain, (ff.StressDrive if drive == "stress" else ff.DisplacementDrive)(values), grid
+
+
+# ------------------------------------------------------------------------------- the derivatives
+
+
+def moved(spec: Spec, name: str, factor: float) -> tuple[Spec, float]:
+    """Multiply a parameter; returns the scene and the parameter as it was."""
+    other: Spec = json.loads(json.dumps(spec))
+    prefix, _, short = name.partition("_")
+    i = int(prefix[1:]) - 1
+    place = other["heights"] if short == "height" else other["springs"][i]
+    key: Any = i if short == "height" else short
+    value = float(place[key])
+    place[key] = value * factor
+    return other, value
+
+
+STEPS = (1e-4, 1e-5)  # of the differences, relative to the parameter
+LEAST_SLOPE = 1e-3  # range of a derivative that counts, over the range of the curve per parameter
+
+
+def slopes_of(spec: Spec, name: str, most: int) -> tuple[Array, Array, NDArray[np.bool_]] | None:
+    """Derivatives of base stress and displacements by differences of the judge's own runs.
+
+    (curves, n_t), with the range over which each counts, and the samples that count: not those
+    between two ends of contact, or where the differences of two lengths do not agree. None where
+    the judge has nothing to say.
+    """
+    found, ends = [], []
+    span = np.zeros(0)
+    for step in STEPS:
+        sides = []
+        for sign in (1.0, -1.0):
+            other, value = moved(spec, name, 1.0 + sign * step)
+            truth = follow(*scene_from(other), LOOSE, most)
+            if truth.why:
+                return None
+            sides.append(np.vstack((truth.base_stress, truth.displacement)))
+            ends.append(math.nan if truth.contact_end is None else truth.contact_end)
+        found.append((sides[0] - sides[1]) / (2.0 * step * value))
+        reach = np.abs(sides[0]).max(axis=1) * LEAST_SLOPE / value
+        span = np.maximum(np.abs(found[-1]).max(axis=1), reach)
+        span[1:] = span[1:].max()  # displacements count together
+    grid = scene_from(spec)[2]
+    counts = np.ones(grid.size, bool)
+    if not np.isnan(ends).all():
+        counts = (grid < np.nanmin(ends)) | (grid > np.nanmax(ends))
+    span = np.where(span > 0.0, span, 1.0)
+    counts &= (np.abs(found[0] - found[1]) <= 0.1 * SLOPE_BAR * span[:, None]).all(axis=0)
+    return found[1], span, counts
+
+
+def slope_bar(rtol: float) -> float:
+    """Error of a derivative, over its range, from which on it is wrong."""
+    return max(SLOPE_BAR, 100.0 * rtol)
+
+
+def slope_error(spec: Spec, scene: Scene, rtol: float, most: int, known: dict[str, Any]) -> float:
+    """Largest error of the solver's derivatives over the range of each; NaN if not judged."""
+    names = spec.get("sensitivities", [])
+    if not names:
+        return math.nan
+    answer = ff.simulate(*scene, rtol=rtol, sensitivities=names)
+    worst = math.nan
+    for name in names:
+        if name not in known:
+            known[name] = slopes_of(spec, name, most)
+        if known[name] is None or known[name][2].sum() < 0.5 * scene[2].size:
+            continue
+        want, span, counts = known[name]
+        got = answer.sensitivities[name]
+        mine = np.vstack((got.base_stress, got.displacement))
+        miss = np.abs(mine - want)[:, counts].max(axis=1) / span
+        worst = np.nanmax([worst, miss.max() if np.isfinite(miss).all() else math.inf])
+    return float(worst)
+
+
+# ----------------------------------------------------------------------------------- the judgement
+
+
+REASONS = {
+    "step underflow": "shrank to nothing",
+    "ringing": "masses vibrate too fast",
+    "errors grow": "let the least error grow",
+    "end of a branch": "of the end of its branch",
+    "not finite": "no longer finite",
+    "flat branch under stress": "flat branch",
+    "bound on steps": "the bound of",
+}
+
+
+def lines_of(
+    task: tuple[str, int, tuple[float, ...]], most: int | None = None
+) -> list[dict[str, Any]]:
+    """Answer and judge a scene at each rtol; `most` bounds the judge's steps times springs."""
+    family, number, rtols = task
+    spec, most = spec_of(family, number), most or MOST[family]
+    scene = scene_from(spec)
+    began = time.perf_counter()
+    truth = judge(*scene, most)
+    took = time.perf_counter() - began
+    known: dict[str, Any] = {}
+    lines = [
+        {
+            "scene": f"{family}:{number}", "family": family, "rtol": rtol,
+            **judged(spec, scene, truth, rtol, most, known), "judge_seconds": round(took, 3),
+        }
+        for rtol in rtols
+    ]  # fmt: skip
+    for line in lines:  # those of the others follow from the name and the seed
+        told = line["outcome"] != "answer" or line["error"] > POOR
+        line["parameters"] = json.dumps(spec) if told else ""
+    return lines
+
+
+def judged(
+    spec: Spec, scene: Scene, truth: Truth, rtol: float, most: int, known: dict[str, Any]
+) -> dict[str, Any]:
+    """Hold the solver's answer to one scene against the truth: errors over rtol."""
+    sure = not truth.why and truth.unsure <= 0.1 * rtol
+    found: dict[str, Any] = {
+        "judge": truth.why or ("judged" if sure else "chaotic"), "unsure": truth.unsure,
+        "dip": truth.dip, "judge_steps": truth.steps, "switches": truth.switches,
+        "true_end": truth.contact_end, "outcome": "answer", "reason": "", "method": "",
+        "displacement": math.nan, "base_stress": math.nan, "error": math.nan, "end": math.nan,
+        "slope": math.nan, "seconds": math.nan, "steps": 0,
+    }  # fmt: skip
+    began = time.perf_counter()
+    try:
+        answer = ff.simulate(*scene, rtol=rtol)
+    except ff.SimulationError as refusal:
+        found["seconds"] = time.perf_counter() - began
+        found["reason"] = next((k for k, part in REASONS.items() if part in str(refusal)), "other")
+        found["outcome"] = "refused"
+        return found
+    found["seconds"] = time.perf_counter() - began
+    found |= {"method": answer.method, "steps": answer.steps}
+    if not sure:
+        return found
+    found["displacement"] = over_range(answer.displacement, truth.displacement) / rtol
+    found["base_stress"] = over_range(answer.base_stress, truth.base_stress) / rtol
+    found["error"] = max(found["displacement"], found["base_stress"])
+    ends = (answer.contact_end, truth.contact_end)
+    if None in ends:
+        found["end"] = 0.0 if ends[0] is ends[1] else math.inf
+    else:
+        found["end"] = abs(ends[0] / ends[1] - 1.0)  # type: ignore[operator]
+    try:
+        found["slope"] = slope_error(spec, scene, rtol, most, known)
+    except ff.SimulationError:
+        found["slope"] = math.nan
+    if found["error"] > BAD or not math.isfinite(found["error"]):
+        found["outcome"] = "failure"
+    elif found["slope"] > slope_bar(rtol):
+        found["outcome"] = "wrong derivative"
+    return found
+
+
+def summary(lines: pd.DataFrame) -> pd.DataFrame:
+    """Count per family and rtol."""
+    rows = []
+    for (family, rtol), group in lines.groupby(["family", "rtol"], sort=False):
+        known = group[group.judge == "judged"]
+        steady = group[group.judge.isin(["judged", "chaotic"])]
+        refused = known[known.outcome == "refused"]
+        rows.append(
+            {
+                "family": family, "rtol": rtol, "scenes": len(group), "judged": len(known),
+                "chaotic": len(steady) - len(known), "beyond the judge": len(group) - len(steady),
+                "answers": int((known.outcome != "refused").sum()),
+                "refused": len(refused),
+                "reasons": ", ".join(f"{k} {n}" for k, n in refused.reason.value_counts().items()),
+                "over 1 rtol": int((known.error > POOR).sum()),
+                "over 3 rtol": int((known.error > BAD).sum()),
+                "largest": known.error.max(),
+                "derivatives": int(known.slope.notna().sum()),
+                "wrong derivatives": int((known.slope > slope_bar(rtol)).sum()),
+                "longest s": group.seconds.max(),
+            }
+        )  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def wrong(lines: pd.DataFrame) -> pd.DataFrame:
+    """Lines of the scenes that the solver gets wrong."""
+    return lines[(lines.error > POOR) | (lines.slope > np.maximum(SLOPE_BAR, 100.0 * lines.rtol))]
+
+
+def run(
+    tasks: list[tuple[str, int, tuple[float, ...]]], processes: int
+) -> Iterator[list[dict[str, Any]]]:
+    """Judge scenes, in as many processes."""
+    if processes == 1:
+        yield from map(lines_of, tasks)
+        return
+    with ProcessPoolExecutor(processes) as pool:
+        yield from pool.map(lines_of, tasks, chunksize=4)
+
+
+def show(name: str, rtol: float) -> None:
+    """Print solver and judge side by side for one scene."""
+    family, _, number = name.partition(":")
+    spec = spec_of(family, int(number))
+    scene = scene_from(spec)
+    print(json.dumps(spec, indent=1))
+    truth = judge(*scene, MOST[family])
+    found = judged(spec, scene, truth, rtol, MOST[family], {})
+    for key, value in found.items():
+        print(f"{key:>14}  {value}")
+    if truth.why or found["outcome"] == "refused":
+        return
+    answer = ff.simulate(*scene, rtol=rtol)
+    print(f"\ncontact ends at {answer.contact_end} s; judge: {truth.contact_end} s")
+    print(f"{'t (s)':>12} {'base (Pa)':>16} {'judge':>16} {'top (m)':>16} {'judge':>16}")
+    off = np.abs(answer.base_stress - truth.base_stress)
+    shown = np.unique(np.append(np.linspace(0, off.size - 1, 12).astype(int), off.argmax()))
+    for j in shown:
+        mark = " < largest error" if j == off.argmax() else ""
+        print(
+            f"{scene[2][j]:12.5g} {answer.base_stress[j]:16.9g} {truth.base_stress[j]:16.9g} "
+            f"{answer.displacement[-1, j]:16.9g} {truth.displacement[-1, j]:16.9g}{mark}"
+        )
+
+
+def main() -> None:
+    """Run the command line."""
+    warnings.simplefilter("ignore")
+    ask = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    ask.add_argument("--scenes", type=int, default=400, help="per family")
+    ask.add_argument("--first", type=int, default=0, help="number of the first scene")
+    ask.add_argument("--family", action="append", choices=FAMILIES)
+    ask.add_argument("--rtol", type=float, action="append")
+    ask.add_argument("--out", type=Path, default=HERE / "fresh.csv")
+    ask.add_argument("--processes", type=int, default=2, choices=(1, 2))
+    ask.add_argument("--scene", help="show one, as family:number")
+    ask.add_argument("--again", type=Path, help="take the wrong scenes of this file")
+    given = ask.parse_args()
+    rtols = tuple(given.rtol or RTOLS)
+    if given.scene:
+        show(given.scene, rtols[0] if given.rtol else 1e-6)
+        return
+    if given.again:
+        names = dict.fromkeys(wrong(pd.read_csv(given.again)).scene)
+        split = [name.split(":") for name in names]
+        tasks = [(family, int(number), rtols) for family, number in split]
+    else:
+        numbers = range(given.first, given.first + given.scenes)
+        tasks = [(f, n, rtols) for f in given.family or FAMILIES for n in numbers]
+    lines: list[dict[str, Any]] = []
+    for found in run(tasks, given.processes):
+        lines += found
+        if len(lines) % (50 * len(rtols)) == 0:
+            print(f"{len(lines) // len(rtols)} of {len(tasks)}", file=sys.stderr, flush=True)
+            pd.DataFrame(lines).to_csv(given.out, index=False, float_format="%.6g")
+    table = pd.DataFrame(lines)
+    table.to_csv(given.out, index=False, float_format="%.6g")
+    with pd.option_context("display.width", 250, "display.max_columns", 30):
+        print(summary(table).to_string(index=False))
+        columns = ["scene", "rtol", "error", "slope", "end", "method", "steps", "dip", "switches"]
+        print(wrong(table)[columns].to_string(index=False))
+
+
+if __name__ == "__main__":
+    main()
