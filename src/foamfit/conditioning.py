@@ -26,10 +26,10 @@ from foamfit.measurement import (
 
 _MIN_ROWS = 10
 _MIN_REST = 20
-# A rest has as many independent samples, and a signal rises on it by less than this share of the
-# slope that follows: the branches of a foam differ less in stiffness (6 times at most in the
-# published sets), so that a soft start is no rest.
-_LEAST_REST, _STILL = 5, 0.1
+# A rest has as many independent samples, and the slope of a signal on it is less than this share of
+# the slope that follows: the branches of a foam on loading differ less in stiffness (6 times in the
+# published sets), so that a soft start is no rest. A striker in contact is not speeded up.
+_LEAST_REST, _STILL, _STILL_STRIKER = 5, 0.15, 0.5
 # Standard errors that decide whether a signal rises or rests, and whether its zero lies elsewhere.
 _ERRORS, _ELSEWHERE = 3.0, 5.0
 _MAX_ROWS = 1500
@@ -542,7 +542,9 @@ def _rise(values: Array, share: float) -> int:
     return int(np.argmax(run)) if run.any() else int(np.argmax(above))
 
 
-def leave_rest(time: Array, values: Array, noise: NoiseLevel) -> float | None:
+def leave_rest(
+    time: Array, values: Array, noise: NoiseLevel, still: float = _STILL
+) -> float | None:
     """Time at which a signal leaves its rest, or None if none is shown before it rises.
 
     Where a rise seems to start, the samples before it must be at rest (`rest_over_rise`). If they
@@ -553,7 +555,7 @@ def leave_rest(time: Array, values: Array, noise: NoiseLevel) -> float | None:
         at = _kink(time[:end], values[:end])
         if at is None:
             return None
-        if rest_over_rise(time[:end], values[:end], at, noise)[1] < _STILL:
+        if rest_over_rise(time[:end], values[:end], at, noise)[1] < still:
             return at
         before = int(np.searchsorted(time, at))
         if not _MIN_ROWS <= before < end:
@@ -735,7 +737,8 @@ def find_start(
         if abs(at) < 0.05 * (time[crossing] - time[crossing - 1]):
             at = 0.0  # the file's own time zero
         return Start(at, 0.0, False, "where the displacement passes zero")
-    by_motion = leave_rest(time[: top + 1], w[: top + 1], noise)
+    still = _STILL_STRIKER if impact else _STILL
+    by_motion = leave_rest(time[: top + 1], w[: top + 1], noise, still)
     approach = w[onset] - first.value if by_stress is not None else 0.0
     # A striker's motion starts at contact, if tracked so; a machine's may start above the specimen.
     small = approach < (0.3 if impact else 0.1) * travel
@@ -744,6 +747,11 @@ def find_start(
         told = rest.told(noise, "median of") + " at rest before contact"
         return Start(by_motion, rest.value, True, "where the displacement leaves its rest", told)
     elsewhere = away and abs(first.value) > 0.02 * travel
+    if impact and elsewhere and by_stress is None:
+        # No zero of the file speaks for its first sample: the likelier start is taken.
+        by_stress = leave_rest(time, stress, levels["stress"], _STILL_STRIKER)
+        onset = 0 if by_stress is None else int(np.searchsorted(time, by_stress))
+        approach = w[onset] - first.value
     if by_stress is not None and approach > (0.02 if elsewhere else 0.1) * travel:
         reach = max(5, min(onset, (top - onset) // 24))
         near = slice(max(0, onset - reach), onset + reach)
@@ -752,7 +760,7 @@ def find_start(
         return Start(by_stress, zero.value, True, "where the stress leaves its rest", told)
     velocity = striker.velocity if impact and striker is not None else None
     gone = (velocity or 0.0) * time[0]
-    if gone > 0 and 0.7 * gone < first.value + 3 * first.error and first.value < 1.05 * gone:
+    if surely.sureness > _ERRORS and 0.7 < first.value / max(gone, 1e-300) < 1.1:
         return Start(None, 0.0, False, "before the first sample", clock=True)
     under_load = stress[:3].mean() > 0.05 * stress.max() and 0 < first.value < travel
     if not elsewhere or under_load:
@@ -848,7 +856,7 @@ def remove_offset(
     told = f"{n} samples at rest with a standard deviation of {engineering(scatter, 'Pa')}"
     size = f"The stress before contact, {engineering(offset.value, 'Pa')}"
     if abs(offset.value) < 2 * offset.error:
-        return record, [f"{size}, is zero within its error ({told}); no offset is taken off."]
+        return record, [f"{size}, is zero within its error ({told}) and is kept."]
     ratio = f", {abs(offset.value) / scatter:.2g} times that" if scatter > 0 else ""
     note = f"{size}, is taken off as the sensor's offset ({told}{ratio})."
     a = record.acceleration
