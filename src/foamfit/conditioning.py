@@ -543,38 +543,49 @@ def _rise(values: Array, share: float) -> int:
 
 
 def leave_rest(
-    time: Array, values: Array, noise: NoiseLevel, still: float = _STILL
+    time: Array, values: Array, noise: NoiseLevel, still: float = _STILL, drift: float = np.inf
 ) -> float | None:
     """Time at which a signal leaves its rest, or None if none is shown before it rises.
 
-    Where a rise seems to start, the samples before it must be at rest (`rest_over_rise`). If they
-    are not, the kink was one in a rise, and the part before it is looked at in the same way.
+    Where a rise seems to start, the samples before it must be at rest: their slope is less than a
+    share `still` of the slope that follows, and they do not surely rise by more than `drift`. If
+    they do, the kink was one in a rise, and the part before it is looked at in the same way.
     """
     end = len(time)
     while True:
         at = _kink(time[:end], values[:end])
         if at is None:
             return None
-        if rest_over_rise(time[:end], values[:end], at, noise)[1] < still:
+        before = _slopes(time[:end], values[:end], at, noise)
+        if before.upper < still and before.drift <= drift:
             return at
-        before = int(np.searchsorted(time, at))
-        if not _MIN_ROWS <= before < end:
+        rows = int(np.searchsorted(time, at))
+        if not _MIN_ROWS <= rows < end:
             return None
-        end = before
+        end = rows
 
 
-def rest_over_rise(time: Array, values: Array, at: float, noise: NoiseLevel) -> tuple[float, float]:
-    """Slope of a signal before a time over the mean slope after it: lower and upper bound.
+@dataclass(frozen=True)
+class _Slopes:
+    """Slope of a signal before a time over its mean slope after it, up to 15 % of the peak.
 
-    The slope after it is that up to 15 % of the peak. The bounds are three standard errors away and
-    infinite where the samples before, or the rise after, are too few or too noisy to tell. The
-    upper one is of the slope's size: a signal that falls does not rest either.
+    The bounds are three standard errors away, and infinite where the samples before, or the rise
+    after, are too few or too noisy to tell. `upper` is that of the slope's size: a signal that
+    falls does not rest either. `drift` is how much the signal changes at least before that time.
     """
+
+    lower: float = -np.inf
+    upper: float = np.inf
+    drift: float = 0.0
+
+
+def _slopes(time: Array, values: Array, at: float, noise: NoiseLevel) -> _Slopes:
+    """Compare the slopes of a signal before and after a time."""
     n = int(np.searchsorted(time, at))
     high = _rise(values, 0.15)
     high = high if time[high] > at else int(np.argmax(values))
     if n < max(_LEAST_REST * noise.time, 3) or time[high] <= at:
-        return -np.inf, np.inf
+        return _Slopes()
     t, rest = time[:n] - time[:n].mean(), values[:n]
     slope = float(t @ rest) / float(t @ t)
     scatter = float(np.sqrt(np.sum((rest - rest.mean() - slope * t) ** 2) / (n - 2)))
@@ -584,10 +595,11 @@ def rest_over_rise(time: Array, values: Array, at: float, noise: NoiseLevel) -> 
     top = values[high : high + 3]
     doubt = _ERRORS * noise.sigma * np.sqrt(1.0 / len(top) + noise.time / n)
     rise, lasts = float(top.mean() - rest.mean()), float(time[high] - at)
+    drift = max(0.0, abs(slope) - error) * float(np.ptp(t))
     if rise <= doubt:
-        return -np.inf, np.inf
-    lower = (slope - error) * lasts / rise
-    return lower, (abs(slope) + error) * lasts / (rise - doubt)
+        return _Slopes(drift=drift)
+    upper = (abs(slope) + error) * lasts / (rise - doubt)
+    return _Slopes((slope - error) * lasts / rise, upper, drift)
 
 
 def _kink(time: Array, values: Array) -> float | None:
@@ -707,15 +719,14 @@ def find_start(
     that of a striker on its way. Where no rest is shown, contact starts at the first sample.
     """
     time, w, stress = record.clock, record.displacement, record.stress
-    by_stress = leave_rest(time, stress, levels["stress"])
-    if w is None and by_stress is None:
-        return Start(None, 0.0, False, "at the first sample")
+    drift = 0.01 * float(stress.max())
     if w is None:
+        by_stress = leave_rest(time, stress, levels["stress"], drift=drift)
+        if by_stress is None:
+            return Start(None, 0.0, False, "at the first sample")
         return Start(by_stress, 0.0, True, "where the stress leaves its rest")
     noise = levels["displacement"]
-    onset = 0 if by_stress is None else int(np.searchsorted(time, by_stress))
     top = int(np.argmax(w))
-    travel = float(w[top] - w[onset])
     early = slice(0, min(max(_LEAST_REST, top // 12), top + 1))
     first = _Level(float(w[0]), np.inf, 1)  # one sample shows no zero
     if top >= _LEAST_REST:
@@ -726,6 +737,15 @@ def find_start(
         balance = _level_by_balance(time[part], w[part], stress[part])
         surely = min(first, balance, key=lambda level: level.sureness)
     away = surely.sureness > _ELSEWHERE
+    elsewhere = away and abs(first.value) > 0.02 * (w[top] - first.value)
+    # Where the motion of a striker starts at its zero, no stress that rises is taken for a rest.
+    drift = np.inf if elsewhere else 0.0 if impact else drift
+    by_stress = leave_rest(time, stress, levels["stress"], drift=drift)
+    if impact and elsewhere and by_stress is None:
+        # No zero of the file speaks for its first sample: the likelier start is taken.
+        by_stress = leave_rest(time, stress, levels["stress"], _STILL_STRIKER)
+    onset = 0 if by_stress is None else int(np.searchsorted(time, by_stress))
+    travel = float(w[top] - w[onset])
     crossing, near = _passage(time, w, top, noise)
     below = crossing > 1 and away and surely.value < -1e-4 * travel
     unloaded = stress[near].mean() < 0.2 * stress.max()
@@ -746,12 +766,6 @@ def find_start(
         rest = _resting_level(w[time < by_motion], noise)
         told = rest.told(noise, "median of") + " at rest before contact"
         return Start(by_motion, rest.value, True, "where the displacement leaves its rest", told)
-    elsewhere = away and abs(first.value) > 0.02 * travel
-    if impact and elsewhere and by_stress is None:
-        # No zero of the file speaks for its first sample: the likelier start is taken.
-        by_stress = leave_rest(time, stress, levels["stress"], _STILL_STRIKER)
-        onset = 0 if by_stress is None else int(np.searchsorted(time, by_stress))
-        approach = w[onset] - first.value
     if by_stress is not None and approach > (0.02 if elsewhere else 0.1) * travel:
         reach = max(5, min(onset, (top - onset) // 24))
         near = slice(max(0, onset - reach), onset + reach)
@@ -771,7 +785,7 @@ def find_start(
 
 def _loaded(record: Record, at: float, levels: dict[str, NoiseLevel]) -> bool:
     """Whether the stress has plainly risen before a time."""
-    return rest_over_rise(record.clock, record.stress, at, levels["stress"])[0] > _STILL
+    return _slopes(record.clock, record.stress, at, levels["stress"]).lower > _STILL
 
 
 def _passage(time: Array, w: Array, top: int, noise: NoiseLevel) -> tuple[int, slice]:
@@ -898,7 +912,7 @@ def contact_end(stress: Array, noise: NoiseLevel) -> tuple[int, bool]:
         end += int(quiet[0])
         ahead = end + max(1, (end - top) // 5)
         again = np.flatnonzero(mean[end:ahead] > 0.05 * peak)
-        tail = stress[end : end + max(width, (end - top) // 4)]
+        tail = stress[end : end + max(4 * width, (end - top) // 4)]
         if again.size:
             end += max(1, int(again[-1]))
         elif len(tail) > width and tail.mean() > zero(len(tail)):
