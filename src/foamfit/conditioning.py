@@ -553,7 +553,7 @@ def leave_rest(
     """
     end = len(time)
     while True:
-        at = _kink(time[:end], values[:end])
+        at = _kink(time[:end], values[:end], noise)
         if at is None:
             return None
         before = _slopes(time[:end], values[:end], at, noise)
@@ -602,7 +602,7 @@ def _slopes(time: Array, values: Array, at: float, noise: NoiseLevel) -> _Slopes
     return _Slopes((slope - error) * lasts / rise, upper, drift)
 
 
-def _kink(time: Array, values: Array) -> float | None:
+def _kink(time: Array, values: Array, noise: NoiseLevel) -> float | None:
     """Time at which a signal seems to start to rise, None if it may do so from its first sample.
 
     A rest followed by a straight or else a quadratic rise is fitted by least squares to the samples
@@ -617,11 +617,15 @@ def _kink(time: Array, values: Array) -> float | None:
     starts = np.linspace(t[0], t[-2], 400)
     straight, curved = _rise_misfit(t, y, starts, 1), _rise_misfit(t, y, starts, 2)
     # The curve must fit clearly better: where noise hides the shape, the line is the safer guess.
-    misfit = curved if curved.min() < straight.min() * (1 - 9 / len(t)) else straight
+    variance = min(noise.sigma**2, min(straight.min(), curved.min()) / len(t))
+    slow = 9 * noise.time * variance  # three standard errors of noise with its correlation
+    less = max(9 / len(t) * straight.min(), slow)
+    misfit = curved if curved.min() < straight.min() - less else straight
     best = int(np.argmin(misfit))
     if first == 0:
-        # Would a rise from the very first sample do nearly as well (three standard errors)?
-        if misfit[0] <= misfit[best] * (1 + 9 / len(t)) + 1e-9 * np.var(y):
+        # Would a rise from the very first sample do nearly as well?
+        more = max(9 / len(t) * misfit[best], slow)
+        if misfit[0] <= misfit[best] + more + 1e-9 * np.var(y):
             return None
         # A curved start looks like a rest, but rises.
         rest = t < starts[best]
