@@ -864,23 +864,22 @@ def remove_offset(
     if n < _MIN_REST:
         return record, []
     rest, noise = record.stress[before], levels["stress"]
-    offset = _resting_level(rest, noise)
+    offset, scatter = float(np.median(rest)), float(rest.std())
     rise = line_at(np.arange(n, dtype=np.float64), rest, 0.0)[1] * n
     doubt = 4 * noise_level(rest) * np.sqrt(12 * noise.time / n)
     if abs(rise) > max(0.01 * record.stress.max(), doubt):
         told = f"by {engineering(rise, 'Pa')} in the {n} samples before contact"
         return record, [f"The stress drifts {told}, so no offset is taken off."]
-    scatter = float(rest.std())
-    told = f"{n} samples at rest with a standard deviation of {engineering(scatter, 'Pa')}"
-    size = f"The stress before contact, {engineering(offset.value, 'Pa')}"
-    if abs(offset.value) < 2 * offset.error:
-        return record, [f"{size}, is zero within its error ({told}) and is kept."]
-    ratio = f", {abs(offset.value) / scatter:.2g} times that" if scatter > 0 else ""
-    note = f"{size}, is taken off as the sensor's offset ({told}{ratio})."
+    ratio = f", {abs(offset) / scatter:.2g} times that" if scatter > 0 else ""
+    note = (
+        f"The stress before contact, {engineering(offset, 'Pa')}, is taken off as the sensor's "
+        f"offset ({n} samples at rest with a standard deviation of {engineering(scatter, 'Pa')}"
+        f"{ratio})."
+    )
     a = record.acceleration
     record = replace(
         record,
-        stress=record.stress - offset.value,
+        stress=record.stress - offset,
         acceleration=None if a is None else a - np.median(a[before]),
     )
     return record, [note]
