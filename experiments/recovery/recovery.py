@@ -257,13 +257,15 @@ def picture(table: pd.DataFrame, path: Path, tests: int) -> None:
     figure = Figure(figsize=(7.2, 4.8), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(2, 2, sharex="col", sharey="row")
-    figure.suptitle(f"{tests} synthetic impacts per class, 1 % noise, full search", fontsize=10)
+    figure.suptitle(
+        f"{tests} synthetic impacts per class, 1 % noise, read from CSV and TOML", fontsize=10
+    )
     names = (*PARAMETERS, "all")
     for column, (noise, title) in enumerate(
         (("white", "white noise"), ("correlated", f"correlated noise, τ = {TAU:g} samples"))
     ):
         above, below = axes[0, column], axes[1, column]
-        above.axhspan(92, 98, color="0.92", linewidth=0)
+        above.axhspan(93, 97, color="0.92", linewidth=0)
         above.axhline(95, color="0.6", linewidth=0.8)
         above.set_title(title, fontsize=9)
         for shift, (samples, colour) in zip((-0.22, 0.0, 0.22), COLOURS.items(), strict=True):
@@ -279,12 +281,12 @@ def picture(table: pd.DataFrame, path: Path, tests: int) -> None:
             above.plot(
                 x, 100.0 * own["coverage, linear"], "x", color=colour, markersize=3.5,
                 markeredgewidth=0.7, alpha=0.8,
-                label="linear problem, same noise" if (column, samples) == (0, 5000) else None,
             )  # fmt: skip
             below.plot(x[:-1], 100.0 * own["half width over truth, median"][:-1], "o",
                        color=colour, markersize=3)  # fmt: skip
         below.set_yscale("log")
         below.set_xticks(range(len(names)), [SYMBOLS[name] for name in names])
+    axes[0, 0].plot([], [], "x", color="0.4", markersize=3.5, label="linear problem, same noise")
     axes[0, 0].set_ylabel("truth inside the 95 % interval (%)", fontsize=8)
     axes[1, 0].set_ylabel("median half width (% of truth)", fontsize=8)
     for panel in axes.flat:

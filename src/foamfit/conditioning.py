@@ -731,15 +731,8 @@ def find_start(
         return Start(by_stress, 0.0, True, "where the stress leaves its rest")
     noise = levels["displacement"]
     top = int(np.argmax(w))
-    early = slice(0, min(max(_LEAST_REST, top // 12), top + 1))
-    first = _Level(float(w[0]), np.inf, 1)  # one sample shows no zero
-    if top >= _LEAST_REST:
-        first = _level_on_line(time[early], w[early], time[0], noise)
-    surely = first
-    if impact and top >= _LEAST_REST:
-        part = slice(0, 2 * top)
-        balance = _level_by_balance(time[part], w[part], stress[part])
-        surely = min(first, balance, key=lambda level: level.sureness)
+    first, balance = _first_levels(time, w, stress, top, noise)
+    surely = min(first, balance, key=lambda level: level.sureness) if impact else first
     away = surely.sureness > _ELSEWHERE
     elsewhere = away and abs(first.value) > 0.02 * (w[top] - first.value)
     # Where the motion of a striker starts at its zero, no stress that rises is taken for a rest.
@@ -755,11 +748,7 @@ def find_start(
     unloaded = stress[near].mean() < 0.2 * stress.max()
     unloaded &= not _loaded(record, time[crossing], levels)
     if below and unloaded and (by_stress is None or abs(w[onset]) < 0.3 * w[top]):
-        level, speed = line_at(time[near], w[near], time[crossing])
-        at = time[crossing] - level / speed if speed > 0 else time[crossing]
-        at = float(np.clip(at, time[near][0], time[near][-1]))
-        if abs(at) < 0.05 * (time[crossing] - time[crossing - 1]):
-            at = 0.0  # the file's own time zero
+        at = _time_of_passage(time, w, crossing, near)
         return Start(at, 0.0, False, "where the displacement passes zero")
     still = _STILL_STRIKER if impact else _STILL
     by_motion = leave_rest(time[: top + 1], w[: top + 1], noise, still)
@@ -785,6 +774,28 @@ def find_start(
         return Start(None, 0.0, False, "at the first sample")
     told = first.told(noise, "line through") + " from the first on; the file's zero lies elsewhere"
     return Start(None, first.value, False, "at the first sample", told)
+
+
+def _first_levels(
+    time: Array, w: Array, stress: Array, top: int, noise: NoiseLevel
+) -> list[_Level]:
+    """Level of a motion at its first sample: by a line, and by the balance of a striker."""
+    if top < _LEAST_REST:
+        return [_Level(float(w[0]), np.inf, 1)] * 2  # so few samples show no zero
+    early, loading = slice(0, max(_LEAST_REST, top // 12)), slice(0, 2 * top)
+    return [
+        _level_on_line(time[early], w[early], time[0], noise),
+        _level_by_balance(time[loading], w[loading], stress[loading]),
+    ]
+
+
+def _time_of_passage(time: Array, w: Array, crossing: int, near: slice) -> float:
+    """Time at which a motion passes zero, by the line through the samples around."""
+    level, speed = line_at(time[near], w[near], time[crossing])
+    at = time[crossing] - level / speed if speed > 0 else time[crossing]
+    at = float(np.clip(at, time[near][0], time[near][-1]))
+    own = abs(at) < 0.05 * (time[crossing] - time[crossing - 1])
+    return 0.0 if own else at  # the file's own time zero
 
 
 def _loaded(record: Record, at: float, levels: dict[str, NoiseLevel]) -> bool:
