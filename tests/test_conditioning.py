@@ -1,11 +1,16 @@
 """Each step from samples to one loading and unloading, on pulses whose truth is known."""
 
 import contextlib
+import re
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
+from conftest import EXPERIMENTS
+from foamfit import read_test
 from foamfit.conditioning import (
     Record,
     Window,
@@ -109,7 +114,128 @@ def test_a_drifting_sensor_is_left_alone_and_noted():
     assert conditioned.record.stress.max() == pytest.approx(PEAK, rel=1e-3)
 
 
+# Records of the study of recovery: random springs, 1 % noise, contact at the first sample. Where
+# branch a is soft its stress is lost in the noise. Class (noise and samples), seeds.
+SOFT = [
+    (0, (17, 19, 74, 102, 125, 176)),
+    (1, (22, 25, 32)),
+    (2, (6, 12)),
+    (3, (23, 64, 156, 189)),
+    (5, (91, 122, 129)),
+]
+
+
+@pytest.mark.parametrize(("group", "seeds"), SOFT)
+def test_nothing_is_cut_or_taken_off_where_contact_is_the_first_sample(tmp_path, group, seeds):
+    sys.path.insert(0, str(EXPERIMENTS / "recovery"))
+    import recovery
+
+    group = recovery.CLASSES[group]
+    for seed in seeds:
+        _, truth = recovery.random_case(group.rng(seed), group.samples, group.draw)
+        test = read_test(recovery.written(truth, tmp_path))
+        assert recovery.cut_before(test) == 0
+        assert not any("taken off" in note for note in test.notes)
+        width = 1 if len(test.time) > 0.4 * group.samples else round(group.samples / 1000)
+        if width == 1:
+            kept = slice(len(test.time))
+            np.testing.assert_allclose(test.time, truth.time[kept], atol=1e-15)
+            np.testing.assert_allclose(test.displacement, truth.displacement[kept], atol=1e-15)
+        without = replace(Record(truth.time, truth.stress, truth.displacement), displacement=None)
+        done = condition(without, truth.specimen, striker=truth.striker)
+        assert done.contact == "file"  # by the stress alone
+
+
+@pytest.mark.parametrize("off", [-6.0, 6.0])
+def test_one_sample_is_no_rest(off):
+    """The first displacement alone is off, or the first few: no zero is read off them."""
+    for wrong in (1, 3):
+        record = impact(300, noise=0.01)
+        w = record.displacement.copy()
+        w[:wrong] += off * 4e-6
+        done = run(replace(record, displacement=w))
+        assert done.contact == "file"
+        assert not any("taken off" in note for note in done.notes)
+        np.testing.assert_array_equal(done.record.displacement, w[: len(done.record)])
+
+
+def test_what_is_taken_off_stands_with_its_size_against_the_noise():
+    record = impact(before=0.4, after=0.3, noise=0.01, offset=0.03, w="at rest before contact")
+    random = np.random.default_rng(3)
+    offset, sigma = 5e-4, 4e-6
+    w = np.where(record.time < 0, sigma * random.normal(size=len(record)), record.displacement)
+    done = run(replace(record, displacement=w + offset))
+    assert done.contact == "motion"
+    words = r"The displacement there, (\S+) µm, is taken off \((\d+) noise standard deviations; "
+    told = re.search(words + r"median of (\d+) samples at rest before contact\)", str(done.notes))
+    assert float(told[1]) == pytest.approx(500, abs=1)
+    assert float(told[2]) == pytest.approx(offset / sigma, rel=0.15)
+    assert int(told[3]) == pytest.approx(240, abs=3)
+    told = re.search(
+        r"The stress before contact, (\S+) (\S)Pa, is taken off as the sensor's offset \((\d+) "
+        r"samples at rest with a standard deviation of .*?, (\S+) times that\)",
+        str(done.notes),
+    )
+    assert float(told[4]) == pytest.approx(3, rel=0.2)
+    assert int(told[3]) == pytest.approx(238, abs=3)
+
+
+@pytest.mark.parametrize(("before", "seed"), [(0.1, 1), (0.1, 9), (0.2, 6), (0.2, 7)])
+def test_a_rest_is_found_in_slow_noise(before, seed):
+    record = impact(1000, before=before, after=0.1)
+    random = np.random.default_rng(seed)
+    noise = lfilter([0.6], [1.0, -0.8], random.normal(size=(2, len(record))))  # unit variance
+    w = np.where(record.time < 0, 0.0, record.displacement) + 4e-6 * noise[0]
+    done = run(replace(record, displacement=w, stress=record.stress + 0.01 * PEAK * noise[1]))
+    assert done.contact == "motion"
+    cut = int(re.search(r"(\d+) samples before", str(done.notes))[1])
+    assert cut == pytest.approx(1000 * before, abs=12)
+
+
+def test_a_file_that_misses_the_first_samples_keeps_its_time_zero():
+    """By time and velocity the striker has gone as far as the first displacement says."""
+    record = impact(noise=0.003).rows(slice(30, None))
+    done = run(record)
+    np.testing.assert_array_equal(done.record.time, record.time[: len(done.record)])
+    np.testing.assert_array_equal(done.record.displacement, record.displacement[: len(done.record)])
+    assert any("Contact starts before the first sample, 0 s in the file" in n for n in done.notes)
+
+
+def test_a_slow_test_from_another_zero_without_a_rest_says_what_is_taken_off():
+    strain = 0.4 * (1 - np.abs(np.linspace(-1, 1, 400)))
+    random = np.random.default_rng(0)
+    w = strain * SPECIMEN.height + 1e-6 * random.normal(size=400)
+    stress = 1e6 * strain + 2e3 * random.normal(size=400)
+    own = condition(Record(np.arange(400.0), stress, w), SPECIMEN)
+    np.testing.assert_array_equal(own.record.displacement, w[: len(own.record)])
+    other = condition(Record(np.arange(400.0), stress, w - 8e-3), SPECIMEN)
+    np.testing.assert_allclose(other.record.displacement, own.record.displacement, atol=1.5e-6)
+    told = [note for note in other.notes if "The displacement there, -8 mm, is taken off" in note]
+    assert len(told) == 1
+    assert "noise standard deviations; line through 16 samples" in told[0]
+
+
 # Where contact ends.
+
+
+def test_a_low_stress_before_and_after_a_sharp_peak_is_contact():
+    """Branches a and e may bear a few noise levels for most of contact."""
+    n = 1000
+    s = np.linspace(0, 1.25, n)
+    stress = np.where(s < 0.5, np.exp(-(((s - 0.5) / 0.08) ** 2)), 0.0)
+    stress = np.maximum(stress, np.where(s < 0.5, 0.08 * s, 0.0))
+    stress = np.where(
+        (s >= 0.5) & (s < 1), np.maximum(0.06 * (1 - s), 1 - (s - 0.5) / 0.02), stress
+    )
+    w = 4e-4 * np.sin(np.pi * np.minimum(s, 1))
+    random = np.random.default_rng(0)
+    for _ in range(5):
+        noisy = PEAK * (stress + 0.01 * random.normal(size=n))
+        done = run(Record(s * DURATION, noisy, w + 4e-6 * random.normal(size=n)))
+        assert done.contact == "file"
+        assert done.record.time[0] == 0.0
+        assert done.record.time[-1] > 0.8 * DURATION
+        assert done.record.time[-1] < 1.1 * DURATION
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])

@@ -29,6 +29,12 @@ from foamfit.measurement import (
 
 _MIN_ROWS = 10
 _MIN_REST = 20
+# A rest has as many independent samples, and the slope of a signal on it is less than this share of
+# the slope that follows: the branches of a foam on loading differ less in stiffness (6 times in the
+# published sets), so that a soft start is no rest. A striker in contact is not speeded up.
+_LEAST_REST, _STILL, _STILL_STRIKER = 5, 0.15, 0.5
+# Standard errors that decide whether a signal rises or rests, and whether its zero lies elsewhere.
+_ERRORS, _ELSEWHERE = 3.0, 5.0
 _MAX_ROWS = 1500
 # A force may be clipped where so many samples are equal at its top; a parabola falls by so many
 # steps of its digits within half that length on either side.
@@ -153,14 +159,18 @@ class Conditioned:
 class Start:
     """Where contact starts: on the file's clock (None: at its first sample), and at which height.
 
-    `zero` is the displacement there, and `free` says that nothing pressed on the specimen before,
-    so that the samples before it show the offset of the sensor.
+    `zero` is the displacement there, and `zero_from` says what shows it. `free` says that nothing
+    pressed on the specimen before, so that the samples before it show the offset of the sensor.
+    `clock` says that the first sample lies so far behind the file's time zero as the striker has
+    gone by then: contact starts at that zero.
     """
 
     time: float | None
     zero: float
     free: bool
     how: str
+    zero_from: str = ""
+    clock: bool = False
 
     @property
     def by(self) -> str:
@@ -216,15 +226,16 @@ def condition(
     if impact and window.cycle != 1:
         raise InputError("[window] cycle is for slow tests; for an impact give start and end.")
     first = record if impact else select_cycle(record, 1)[0]
-    start = find_start(first, impact)
+    levels = noise_levels(first, held)
+    start = find_start(first, impact, levels, striker)
     resting = first if impact or start.free else None
-    record = done(zero_interior(record, first, start))
-    record = done(remove_offset(record, start, impact))
+    record = done(zero_interior(record, first, start, levels))
+    record = done(remove_offset(record, start, impact, levels))
     if not impact:
         record = done(select_cycle(record, window.cycle))
     if window.cycle > 1:  # a later cycle keeps the zero of the first, when the foam was fresh
-        start = Start(None, start.zero, False, f"with cycle {window.cycle}")
-    record = done(cut_to_contact(record, start, impact))
+        start = Start(None, start.zero, False, f"with cycle {window.cycle}", start.zero_from)
+    record = done(cut_to_contact(record, start, impact, levels))
     motion = "measured"
     if record.displacement is None:
         if record.clipped is not None and record.acceleration is None and record.velocity is None:
@@ -513,6 +524,20 @@ def noise_of_held(record: Record) -> dict[str, NoiseLevel]:
     return levels
 
 
+def noise_levels(record: Record, held: dict[str, NoiseLevel]) -> dict[str, NoiseLevel]:
+    """Noise of the channels that decide on contact, from all samples; `held` is known already."""
+    from foamfit.noise import residual_noise
+
+    levels = dict(held)
+    for name in ("stress", "displacement", *map(interior_channel, record.interior)):
+        values = record.channel(name)
+        if name not in levels and values is not None:
+            sigma, phi = residual_noise(values)
+            how = f"estimated from what local cubics leave of {len(values)} samples"
+            levels[name] = NoiseLevel(sigma, False, how, (1.0 + phi) / (1.0 - phi))
+    return levels
+
+
 def noise_at_rest(first: Record, start: Start, record: Record, block: int) -> dict[str, NoiseLevel]:
     """Estimate the noise of each channel from the samples before contact, about their line.
 
@@ -716,8 +741,68 @@ def _rise(values: Array, share: float) -> int:
     return int(np.argmax(run)) if run.any() else int(np.argmax(above))
 
 
-def leave_rest(time: Array, values: Array) -> float | None:
-    """Time at which a signal leaves its rest, or None if it has none before it rises.
+def leave_rest(
+    time: Array, values: Array, noise: NoiseLevel, still: float = _STILL, drift: float = np.inf
+) -> float | None:
+    """Time at which a signal leaves its rest, or None if none is shown before it rises.
+
+    Where a rise seems to start, the samples before it must be at rest: their slope is less than a
+    share `still` of the slope that follows, and they do not surely rise by more than `drift`. If
+    they do, the kink was one in a rise, and the part before it is looked at in the same way.
+    """
+    end = len(time)
+    while True:
+        at = _kink(time[:end], values[:end], noise)
+        if at is None:
+            return None
+        before = _slopes(time[:end], values[:end], at, noise)
+        if before.upper < still and before.drift <= drift:
+            return at
+        rows = int(np.searchsorted(time, at))
+        if not _MIN_ROWS <= rows < end:
+            return None
+        end = rows
+
+
+@dataclass(frozen=True)
+class _Slopes:
+    """Slope of a signal before a time over its mean slope after it, up to 15 % of the peak.
+
+    The bounds are three standard errors away, and infinite where the samples before, or the rise
+    after, are too few or too noisy to tell. `upper` is that of the slope's size: a signal that
+    falls does not rest either. `drift` is how much the signal changes at least before that time.
+    """
+
+    lower: float = -np.inf
+    upper: float = np.inf
+    drift: float = 0.0
+
+
+def _slopes(time: Array, values: Array, at: float, noise: NoiseLevel) -> _Slopes:
+    """Compare the slopes of a signal before and after a time."""
+    n = int(np.searchsorted(time, at))
+    high = _rise(values, 0.15)
+    high = high if time[high] > at else int(np.argmax(values))
+    if n < max(_LEAST_REST * noise.time, 3) or time[high] <= at:
+        return _Slopes()
+    t, rest = time[:n] - time[:n].mean(), values[:n]
+    slope = float(t @ rest) / float(t @ t)
+    scatter = float(np.sqrt(np.sum((rest - rest.mean() - slope * t) ** 2) / (n - 2)))
+    if n < _MIN_REST * noise.time:  # too few to show their own noise
+        scatter = max(scatter, noise.sigma)
+    error = _ERRORS * scatter * np.sqrt(noise.time / float(t @ t))
+    top = values[high : high + 3]
+    doubt = _ERRORS * noise.sigma * np.sqrt(1.0 / len(top) + noise.time / n)
+    rise, lasts = float(top.mean() - rest.mean()), float(time[high] - at)
+    drift = max(0.0, abs(slope) - error) * float(np.ptp(t))
+    if rise <= doubt:
+        return _Slopes(drift=drift)
+    upper = (abs(slope) + error) * lasts / (rise - doubt)
+    return _Slopes((slope - error) * lasts / rise, upper, drift)
+
+
+def _kink(time: Array, values: Array, noise: NoiseLevel) -> float | None:
+    """Time at which a signal seems to start to rise, None if it may do so from its first sample.
 
     A rest followed by a straight or else a quadratic rise is fitted by least squares to the samples
     up to 15 % of the peak, so that the time is finer than the sampling.
@@ -731,11 +816,15 @@ def leave_rest(time: Array, values: Array) -> float | None:
     starts = np.linspace(t[0], t[-2], 400)
     straight, curved = _rise_misfit(t, y, starts, 1), _rise_misfit(t, y, starts, 2)
     # The curve must fit clearly better: where noise hides the shape, the line is the safer guess.
-    misfit = curved if curved.min() < straight.min() * (1 - 9 / len(t)) else straight
+    variance = min(noise.sigma**2, min(straight.min(), curved.min()) / len(t))
+    slow = 9 * noise.time * variance  # three standard errors of noise with its correlation
+    less = max(9 / len(t) * straight.min(), slow)
+    misfit = curved if curved.min() < straight.min() - less else straight
     best = int(np.argmin(misfit))
     if first == 0:
-        # Would a rise from the very first sample do nearly as well (three standard errors)?
-        if misfit[0] <= misfit[best] * (1 + 9 / len(t)) + 1e-9 * np.var(y):
+        # Would a rise from the very first sample do nearly as well?
+        more = max(9 / len(t) * misfit[best], slow)
+        if misfit[0] <= misfit[best] + more + 1e-9 * np.var(y):
             return None
         # A curved start looks like a rest, but rises.
         rest = t < starts[best]
@@ -758,48 +847,162 @@ def _rise_misfit(t: Array, y: Array, starts: Array, power: int) -> Array:
     return misfit
 
 
-def find_start(record: Record, impact: bool) -> Start:
-    """Find where contact starts: by the zero of the displacement, by its rest, or by the stress."""
-    time, w = record.clock, record.displacement
-    by_stress = leave_rest(time, record.stress)
-    onset = 0 if by_stress is None else int(np.searchsorted(time, by_stress))
-    # So few samples before the onset do not overrule a file that starts at its time zero.
-    few = time[0] == 0 and onset < _MIN_ROWS
-    if w is None and (by_stress is None or few):
-        return Start(None, 0.0, False, "at the first sample")
+@dataclass(frozen=True)
+class _Level:
+    """Where a signal is at one time: by how many samples, and how sure that is."""
+
+    value: float
+    error: float
+    samples: int
+
+    def told(self, noise: NoiseLevel, shape: str) -> str:
+        """Say its size against the noise, and what it was read off."""
+        size = abs(self.value) / noise.sigma if noise.sigma > 0 else np.inf
+        ratio = f"{size:.{0 if size >= 10 else 1}f} noise standard deviations; "
+        return f"{ratio if np.isfinite(size) else ''}{shape} {self.samples} samples"
+
+    @property
+    def sureness(self) -> float:
+        """Size over standard error."""
+        if self.error > 0:
+            return abs(self.value) / self.error
+        return np.inf if self.value else 0.0
+
+
+def _resting_level(values: Array, noise: NoiseLevel) -> _Level:
+    """Level of a signal at rest: the median of its samples, whose error is 1.25 of the mean's."""
+    n = len(values)
+    error = 1.25 * float(np.std(values)) * np.sqrt(min(noise.time, n) / n)
+    return _Level(float(np.median(values)), error, n)
+
+
+def _level_on_line(time: Array, values: Array, at: float, noise: NoiseLevel) -> _Level:
+    """Level of a signal at a time, by the straight line through samples around or after it."""
+    n, t = len(time), time - time.mean()
+    away = float((at - time.mean()) ** 2 / (t @ t))
+    level, slope = line_at(time, values, at)
+    left = values - level - slope * (time - at)  # noise, or what is no straight line
+    scatter = max(noise.sigma, float(np.sqrt(left @ left / (n - 2))))
+    error = scatter * np.sqrt(noise.time * (1.0 / n + away))
+    return _Level(level, float(error), n)
+
+
+def _level_by_balance(time: Array, w: Array, stress: Array) -> _Level:
+    """Level of the motion at the first sample, by the striker's balance of motion.
+
+    w = w0 + v t - c ∬σ with free w0, v and c is fitted by least squares. What it leaves is the
+    noise, as slow as it may be, or what contradicts it, so that the error holds either.
+    """
+    t = time - time[0]
+    dt = np.diff(t, prepend=0.0)
+    slowed = np.cumsum(dt * (stress - 0.5 * np.diff(stress, prepend=stress[0])))
+    braked = np.cumsum(dt * (slowed - 0.5 * np.diff(slowed, prepend=0.0)))
+    columns = np.column_stack([np.ones(t.size), t, braked])
+    columns /= np.sqrt((columns**2).sum(axis=0))
+    inverse = np.linalg.pinv(columns)
+    level = inverse @ w
+    left = w - columns @ level
+    square = float(left @ left)
+    phi = float(np.clip(left[1:] @ left[:-1] / square, 0.0, 0.99)) if square > 0 else 0.0
+    variance = square / max(t.size - 3, 1) * (1.0 + phi) / (1.0 - phi)
+    error = np.sqrt(variance * float(inverse[0] @ inverse[0]))
+    return _Level(float(level[0]) * columns[0, 0], float(error) * columns[0, 0], t.size)
+
+
+def find_start(
+    record: Record,
+    impact: bool,
+    levels: dict[str, NoiseLevel],
+    striker: Striker | None = None,
+) -> Start:
+    """Find where contact starts, which motion and stress decide together.
+
+    A motion that passes its own zero, or leaves a rest, starts contact there, unless the stress has
+    risen before; a stress that leaves a rest starts it where the motion has gone on meanwhile, as
+    that of a striker on its way. Where no rest is shown, contact starts at the first sample.
+    """
+    time, w, stress = record.clock, record.displacement, record.stress
+    drift = 0.01 * float(stress.max())
     if w is None:
+        by_stress = leave_rest(time, stress, levels["stress"], drift=drift)
+        if by_stress is None:
+            return Start(None, 0.0, False, "at the first sample")
         return Start(by_stress, 0.0, True, "where the stress leaves its rest")
+    noise = levels["displacement"]
     top = int(np.argmax(w))
+    first, balance = _first_levels(time, w, stress, top, noise)
+    surely = min(first, balance, key=lambda level: level.sureness) if impact else first
+    away = surely.sureness > _ELSEWHERE
+    elsewhere = away and abs(first.value) > 0.02 * (w[top] - first.value)
+    # Where the motion of a striker starts at its zero, no stress that rises is taken for a rest.
+    drift = np.inf if elsewhere else 0.0 if impact else drift
+    by_stress = leave_rest(time, stress, levels["stress"], drift=drift)
+    if impact and elsewhere and by_stress is None:
+        # No zero of the file speaks for its first sample: the likelier start is taken.
+        by_stress = leave_rest(time, stress, levels["stress"], _STILL_STRIKER)
+    onset = 0 if by_stress is None else int(np.searchsorted(time, by_stress))
     travel = float(w[top] - w[onset])
-    crossing, near = _passage(time, w, top)
-    below = crossing > 1 and w[0] < -max(4 * noise_level(w), 1e-4 * travel)
-    unloaded = record.stress[near].mean() < 0.2 * record.stress.max()
+    crossing, near = _passage(time, w, top, noise)
+    below = crossing > 1 and away and surely.value < -1e-4 * travel
+    unloaded = stress[near].mean() < 0.2 * stress.max()
+    unloaded &= not _loaded(record, time[crossing], levels)
     if below and unloaded and (by_stress is None or abs(w[onset]) < 0.3 * w[top]):
-        level, speed = line_at(time[near], w[near], time[crossing])
-        at = time[crossing] - level / speed if speed > 0 else time[crossing]
-        at = float(np.clip(at, time[near][0], time[near][-1]))
-        if abs(at) < 0.05 * (time[crossing] - time[crossing - 1]):
-            at = 0.0  # the file's own time zero
+        at = _time_of_passage(time, w, crossing, near)
         return Start(at, 0.0, False, "where the displacement passes zero")
-    by_motion = leave_rest(time[: top + 1], w[: top + 1]) if by_stress is not None else None
-    approach = w[onset] - w[0]
+    still = _STILL_STRIKER if impact else _STILL
+    by_motion = leave_rest(time[: top + 1], w[: top + 1], noise, still)
+    approach = w[onset] - first.value if by_stress is not None else 0.0
     # A striker's motion starts at contact, if tracked so; a machine's may start above the specimen.
-    if by_motion is not None and approach < (0.3 if impact else 0.1) * travel:
-        rest = w[time < by_motion]
-        zero = float(np.median(rest))
-        if len(rest) < _MIN_ROWS and abs(zero) < 0.02 * travel:
-            zero = 0.0  # too short a rest to doubt the file's own zero
-        return Start(by_motion, zero, True, "where the displacement leaves its rest")
-    if by_stress is not None and approach > 0.1 * travel and not few:
-        near = slice(max(0, onset - 5), onset + 5)
-        zero = line_at(time[near], w[near], by_stress)[0]
-        return Start(by_stress, zero, True, "where the stress leaves its rest")
-    early = slice(0, min(5, top + 1))
-    zero = line_at(time[early], w[early], time[0])[0] if top > 1 else float(w[0])
-    return Start(None, zero if abs(w[0]) > 0.02 * travel else 0.0, False, "at the first sample")
+    small = approach < (0.3 if impact else 0.1) * travel
+    if by_motion is not None and small and not _loaded(record, by_motion, levels):
+        rest = _resting_level(w[time < by_motion], noise)
+        told = rest.told(noise, "median of") + " at rest before contact"
+        return Start(by_motion, rest.value, True, "where the displacement leaves its rest", told)
+    if by_stress is not None and approach > (0.02 if elsewhere else 0.1) * travel:
+        reach = max(5, min(onset, (top - onset) // 24))
+        near = slice(max(0, onset - reach), onset + reach)
+        zero = _level_on_line(time[near], w[near], by_stress, noise)
+        told = zero.told(noise, "line through") + " around it, the stress being at rest before"
+        return Start(by_stress, zero.value, True, "where the stress leaves its rest", told)
+    velocity = striker.velocity if impact and striker is not None else None
+    gone = (velocity or 0.0) * time[0]
+    if surely.sureness > _ERRORS and 0.7 < first.value / max(gone, 1e-300) < 1.1:
+        return Start(None, 0.0, False, "before the first sample", clock=True)
+    under_load = stress[:3].mean() > 0.05 * stress.max() and 0 < first.value < travel
+    if not elsewhere or under_load:
+        return Start(None, 0.0, False, "at the first sample")
+    told = first.told(noise, "line through") + " from the first on; the file's zero lies elsewhere"
+    return Start(None, first.value, False, "at the first sample", told)
 
 
-def _passage(time: Array, w: Array, top: int) -> tuple[int, slice]:
+def _first_levels(
+    time: Array, w: Array, stress: Array, top: int, noise: NoiseLevel
+) -> list[_Level]:
+    """Level of a motion at its first sample: by a line, and by the balance of a striker."""
+    if top < _LEAST_REST:
+        return [_Level(float(w[0]), np.inf, 1)] * 2  # so few samples show no zero
+    early, loading = slice(0, max(_LEAST_REST, top // 12)), slice(0, 2 * top)
+    return [
+        _level_on_line(time[early], w[early], time[0], noise),
+        _level_by_balance(time[loading], w[loading], stress[loading]),
+    ]
+
+
+def _time_of_passage(time: Array, w: Array, crossing: int, near: slice) -> float:
+    """Time at which a motion passes zero, by the line through the samples around."""
+    level, speed = line_at(time[near], w[near], time[crossing])
+    at = time[crossing] - level / speed if speed > 0 else time[crossing]
+    at = float(np.clip(at, time[near][0], time[near][-1]))
+    own = abs(at) < 0.05 * (time[crossing] - time[crossing - 1])
+    return 0.0 if own else at  # the file's own time zero
+
+
+def _loaded(record: Record, at: float, levels: dict[str, NoiseLevel]) -> bool:
+    """Whether the stress has plainly risen before a time."""
+    return _slopes(record.clock, record.stress, at, levels["stress"]).lower > _STILL
+
+
+def _passage(time: Array, w: Array, top: int, noise: NoiseLevel) -> tuple[int, slice]:
     """Sample at which a motion passes zero on its way up, and the samples around it.
 
     A mean over a fiftieth of the rise keeps noise from passing first. The samples around are as
@@ -810,7 +1013,7 @@ def _passage(time: Array, w: Array, top: int) -> tuple[int, slice]:
         return 0, slice(0, 5)
     rough = int(np.argmax(w >= 0))
     crossing = int(np.argmax(smooth(w, max(1, (top - rough) // 50)) >= 0))
-    needed = (noise_level(w) / (1e-3 * w[top])) ** 2
+    needed = noise.time * (noise.sigma / (1e-3 * w[top])) ** 2
     reach = (time[top] - time[crossing]) * min(1 / 12, 0.5 * needed / max(top - crossing, 1))
     first = int(np.searchsorted(time, time[crossing] - reach))
     last = int(np.searchsorted(time, time[crossing] + reach))
@@ -821,12 +1024,16 @@ def _zero_time(record: Record, start: Start) -> float:
     """Time of contact by the file's clock."""
     if start.time is not None:
         return start.time
+    if start.clock:
+        return 0.0
     # A file whose first sample is a step or so after time zero has its zero right.
     time = record.clock
     return 0.0 if 0 <= time[0] <= 2 * (time[1] - time[0]) else float(time[0])
 
 
-def zero_interior(record: Record, first: Record, start: Start) -> tuple[Record, list[str]]:
+def zero_interior(
+    record: Record, first: Record, start: Start, levels: dict[str, NoiseLevel]
+) -> tuple[Record, list[str]]:
     """Take from each interior displacement its value where contact starts in `first`.
 
     That is the median of its rest before contact; without a rest it is where a line through the
@@ -835,21 +1042,29 @@ def zero_interior(record: Record, first: Record, start: Start) -> tuple[Record, 
     before = 0 if start.time is None else int(np.searchsorted(first.clock, start.time)) - 2
     inside, notes = dict(record.interior), []
     for node, values in first.interior.items():
+        name = interior_channel(node)
+        noise = levels[name]
         if before >= _MIN_ROWS:
-            zero = float(np.median(values[:before]))
+            zero = _resting_level(values[:before], noise)
+            told = zero.told(noise, "median of") + " before contact"
         else:
-            early = slice(max(before, 0), max(before, 0) + 5)
-            zero = line_at(first.clock[early], values[early], _zero_time(first, start))[0]
-            if abs(zero) < max(3 * noise_level(values), 2e-3 * np.ptp(values)):
+            reach = max(_LEAST_REST, int(np.argmax(values)) // 12)
+            early = slice(max(before, 0), max(before, 0) + reach)
+            at = _zero_time(first, start)
+            zero = _level_on_line(first.clock[early], values[early], at, noise)
+            told = zero.told(noise, "line through") + " from there on"
+            if abs(zero.value) < max(_ELSEWHERE * zero.error, 2e-3 * np.ptp(values)):
                 continue
-        inside[node] = inside[node] - zero
-        if abs(zero) > 1e-3 * np.ptp(values):
-            name = interior_channel(node)
-            notes.append(f"{name} at contact, {engineering(zero, 'm')}, is taken off.")
+        inside[node] = inside[node] - zero.value
+        if abs(zero.value) > 1e-3 * np.ptp(values):
+            size = engineering(zero.value, "m")
+            notes.append(f"{name} at contact, {size}, is taken off ({told}).")
     return replace(record, interior=inside), notes
 
 
-def remove_offset(record: Record, start: Start, impact: bool) -> tuple[Record, list[str]]:
+def remove_offset(
+    record: Record, start: Start, impact: bool, levels: dict[str, NoiseLevel]
+) -> tuple[Record, list[str]]:
     """Take from the stress (and the acceleration) its median before contact."""
     if start.time is None or not (impact or start.free):
         return record, []  # before a slow test nothing shows that the specimen is free
@@ -858,16 +1073,18 @@ def remove_offset(record: Record, start: Start, impact: bool) -> tuple[Record, l
     n = int(before.sum())
     if n < _MIN_REST:
         return record, []
-    rest = record.stress[before]
-    offset = float(np.median(rest))
+    rest, noise = record.stress[before], levels["stress"]
+    offset, scatter = float(np.median(rest)), float(rest.std())
     rise = line_at(np.arange(n, dtype=np.float64), rest, 0.0)[1] * n
-    if abs(rise) > max(0.01 * record.stress.max(), 4 * noise_level(rest) * np.sqrt(12 / n)):
+    doubt = 4 * noise_level(rest) * np.sqrt(12 * noise.time / n)
+    if abs(rise) > max(0.01 * record.stress.max(), doubt):
         told = f"by {engineering(rise, 'Pa')} in the {n} samples before contact"
         return record, [f"The stress drifts {told}, so no offset is taken off."]
-    deviation = engineering(float(rest.std()), "Pa")
+    ratio = f", {abs(offset) / scatter:.2g} times that" if scatter > 0 else ""
     note = (
-        f"The stress before contact, {engineering(offset, 'Pa')} with a standard deviation of "
-        f"{deviation} ({n} samples), is taken off as the sensor's offset."
+        f"The stress before contact, {engineering(offset, 'Pa')}, is taken off as the sensor's "
+        f"offset ({n} samples at rest with a standard deviation of {engineering(scatter, 'Pa')}"
+        f"{ratio})."
     )
     a = record.acceleration
     record = replace(
@@ -878,31 +1095,48 @@ def remove_offset(record: Record, start: Start, impact: bool) -> tuple[Record, l
     return record, [note]
 
 
-def contact_end(stress: Array) -> tuple[int, bool]:
+def contact_end(stress: Array, noise: NoiseLevel) -> tuple[int, bool]:
     """Index after the last sample of the contact with the highest stress, and if it was reached.
 
-    The end is the last return to zero: a mean over a few samples keeps noise from ending it early,
-    and a stress that soon rises again has not ended.
+    The end is the last return to zero: a mean over as many samples as bring the noise to half a
+    percent of the peak, but no more than follow the form of the pulse, keeps noise from ending it
+    early. A stress that soon rises again has not ended, nor one whose mean over the next quarter of
+    the time since the peak is not zero within its error.
     """
     top = int(np.argmax(stress))
-    below = np.flatnonzero(stress[top:] < 0.5 * stress[top])
-    width = max(1, (int(below[0]) if below.size else 0) // 12)
+    peak = float(stress[top])
+    below = np.flatnonzero(stress[top:] < 0.5 * peak)
+    loaded = int(np.count_nonzero(stress > 0.1 * peak))
+    needed = noise.time * (2 * noise.sigma / (0.005 * peak)) ** 2
+    steep = int(below[0]) if below.size else 0
+    width = max(1, steep // 12, int(min(needed, loaded // 24)))
     mean = smooth(stress, width)
-    level = min(0.0025 + 2 * noise_level(stress) / np.sqrt(width) / stress[top], 0.04) * stress[top]
-    end = top
+
+    def zero(samples: int) -> float:
+        """Level that the mean of so many samples stays below at zero stress."""
+        error = noise.sigma * np.sqrt(min(1.0, noise.time / samples))
+        return min(0.0025 * peak + 2 * float(error), 0.04 * peak)
+
+    level, end = zero(width), top
     while True:
         quiet = np.flatnonzero(mean[end:] <= level)
         if not quiet.size:  # a record cut right at the end of contact has returned
-            return len(stress), bool(stress[-1] <= 0.02 * stress[top] + level)
+            return len(stress), bool(stress[-1] <= 0.02 * peak + level)
         end += int(quiet[0])
         ahead = end + max(1, (end - top) // 5)
-        again = np.flatnonzero(mean[end:ahead] > 0.05 * stress[top])
-        if not again.size:
+        again = np.flatnonzero(mean[end:ahead] > 0.05 * peak)
+        tail = stress[end : end + max(4 * width, (end - top) // 4)]
+        if again.size:
+            end += max(1, int(again[-1]))
+        elif len(tail) > width and tail.mean() > zero(len(tail)):
+            end += 1
+        else:
             return end, True
-        end += max(1, int(again[-1]))
 
 
-def cut_to_contact(record: Record, start: Start, impact: bool) -> tuple[Record, list[str]]:
+def cut_to_contact(
+    record: Record, start: Start, impact: bool, levels: dict[str, NoiseLevel]
+) -> tuple[Record, list[str]]:
     """Cut what lies before and after contact; time and displacement are zero where it starts."""
     time, w = record.clock, record.displacement
     zero_time = _zero_time(record, start)
@@ -910,7 +1144,7 @@ def cut_to_contact(record: Record, start: Start, impact: bool) -> tuple[Record, 
     notes: list[str] = []
     end = len(record)
     if impact:
-        found, returned = contact_end(record.stress[first:])
+        found, returned = contact_end(record.stress[first:], levels["stress"])
         end = min(end, first + found + max(3, found // 50)) if returned else end
         if not returned:
             notes.append("Check: the record ends before the stress has returned to zero.")
@@ -918,7 +1152,8 @@ def cut_to_contact(record: Record, start: Start, impact: bool) -> tuple[Record, 
     at = "" if record.time is None else f", {engineering(zero_time, 's')} in the file"
     notes.insert(0, f"Contact starts {start.how}{at}{cut if end - first < len(record) else ''}.")
     if start.zero != 0:
-        notes.append(f"The displacement there, {engineering(start.zero, 'm')}, is taken off.")
+        size, told = engineering(start.zero, "m"), f" ({start.zero_from})" * bool(start.zero_from)
+        notes.append(f"The displacement there, {size}, is taken off{told}.")
     record = replace(
         record,
         time=None if record.time is None else time - zero_time,
