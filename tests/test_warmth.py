@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import subprocess
@@ -118,6 +119,7 @@ def test_what_is_compiled_where_it_is_needed_is_announced_once(
         signatures: tuple[object, ...] = ()
 
     monkeypatch.setattr(warmth, "_cache", lambda: tmp_path)
+    caplog.set_level(logging.WARNING, logger="foamfit")  # a quiet command may have silenced it
     new, known, kept = Loop(), Loop(), Loop()
     known.signatures = ((),)
     for loop in (new, new, known):
