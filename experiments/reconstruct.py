@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 import foamfit as ff
-from foamfit.literature import PublishedSet
+from foamfit.springs.published import PublishedSet
 
 HERE = Path(__file__).parent
 NOISE, SEED = 0.01, 2014

@@ -22,9 +22,9 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import foamfit as ff
-from foamfit.comparison import Comparison, compare, comparison_text
-from foamfit.plots import plot_comparison
-from foamfit.result import load_result
+from foamfit.report.comparison import Comparison, compare, comparison_text
+from foamfit.report.plots import plot_comparison
+from foamfit.results import load_result
 
 HERE = Path(__file__).parent
 TESTS = HERE.parent / "experiments"

@@ -10,10 +10,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import foamfit as ff
-from foamfit.comparison import compare
-from foamfit.explore import LoopPicture, loop_of, rough_guess, turn
-from foamfit.plots import plot_comparison, plot_fit
-from foamfit.result import FitResult
+from foamfit.report.comparison import compare
+from foamfit.report.explore import LoopPicture, loop_of, rough_guess, turn
+from foamfit.report.plots import plot_comparison, plot_fit
+from foamfit.results import FitResult
 
 HERE = Path(__file__).parent
 PICTURES = HERE / "pictures"

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import foamfit as ff
-from foamfit import warmth
-from foamfit.measurement import Measurement, Noise, Specimen, Striker
+from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
+from foamfit.solve import precompile
 
 ROOT = Path(__file__).parent.parent
 EXPERIMENTS = ROOT / "experiments"
@@ -40,10 +40,10 @@ def compiled() -> Iterator[None]:
 
     The loops of implicit steps are compiled beside the first tests.
     """
-    if warmth.compiled():
+    if precompile.compiled():
         yield
         return
-    with warmth.side_by_side() as compile_rest:
+    with precompile.side_by_side() as compile_rest:
         compile_rest()
     with subprocess.Popen([sys.executable, "-c", STIFF]):
         yield

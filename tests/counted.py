@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 
 import foamfit as ff
-from foamfit import kernels
-from foamfit.chain import Drive
-from foamfit.measurement import Measurement, Noise, Specimen, Striker
-from foamfit.motion import plan
-from foamfit.problem import make_params, make_problem
-from foamfit.search import Tracker
+from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
+from foamfit.fitting.problem import make_params, make_problem
+from foamfit.fitting.search import Tracker
+from foamfit.solve.plan import plan
+from foamfit.springs import kernels
+from foamfit.springs.chain import Drive
 
 COUNTS: Counter[str] = Counter()
 
@@ -33,7 +33,7 @@ COUNTS: Counter[str] = Counter()
 def _module(filename: str) -> str:
     """The project's module of a file; empty for any other file."""
     path = Path(filename)
-    return path.stem if path.parent.name == "foamfit" else ""
+    return path.stem if "foamfit" in path.parent.parts[-3:] else ""
 
 
 def _caller() -> str:
@@ -113,7 +113,7 @@ def _dashpot_lines(filename: str) -> frozenset[int]:
 def tracer(frame: Any, event: str, _: Any) -> Any:
     """Count the lines run on which something is reckoned with a dashpot."""
     lines = _dashpot_lines(frame.f_code.co_filename)
-    if not lines or _module(frame.f_code.co_filename) in ("implicit", "ringing"):
+    if not lines or _module(frame.f_code.co_filename) in ("steps", "vibration"):
         return None
     if event == "line" and frame.f_lineno in lines:
         COUNTS["dashpot lines"] += 1

@@ -7,10 +7,10 @@ from typing import Any
 import lmfit
 import numpy as np
 
-from foamfit.chain import Chain
-from foamfit.measurement import Measurement, Specimen, Striker
-from foamfit.result import Curves, FitResult, ParameterEstimate, Switch
-from foamfit.spring import BistableSpring, LinearSpring
+from foamfit.data.measurement import Measurement, Specimen, Striker
+from foamfit.results import Curves, FitResult, ParameterEstimate, Switch
+from foamfit.springs.chain import Chain
+from foamfit.springs.spring import BistableSpring, LinearSpring
 
 HEIGHT, AREA = 1.19e-3, 1.9635e-5
 SPRING = BistableSpring(

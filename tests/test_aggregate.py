@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 import foamfit as ff
-from foamfit import aggregate, kernels, motion
-from foamfit.motion import AGGREGATE, TAYLOR, plan
-from foamfit.simulation import Response
+from foamfit.solve import many
+from foamfit.solve import plan as planned
+from foamfit.solve.plan import AGGREGATE, TAYLOR, plan
+from foamfit.solve.simulation import Response
+from foamfit.springs import kernels
 from reference import Bistable, Chain, Impact, Linear, energy_balance
 from test_simulate import AREA, MODEL_1, built
 
@@ -46,7 +48,7 @@ def chain_of(count: int, spread: float = 0.1, linear: bool = False, drag: float 
 def one_by_one(chain: ff.Chain, speed: float, time: np.ndarray = TIME) -> Response:
     """The same impact with every spring followed through every step, to eleven digits."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(motion, "LEAST_AGGREGATE", 10**9)
+        patch.setattr(planned, "LEAST_AGGREGATE", 10**9)
         response = ff.simulate(chain, ff.Impact(STRIKER, speed), time, rtol=1e-11)
     assert response.method == TAYLOR
     return response
@@ -109,7 +111,7 @@ def effort(count: int, rtol: float = 1e-6) -> tuple[int, int, int, int]:
     chain = built(chain_of(count))
     scene = plan(chain, ff.Impact(STRIKER, 2.1), TIME)
     spent = np.zeros(2, np.int64)
-    _, contact_end, steps, switches = aggregate.integrate_aggregate(
+    _, contact_end, steps, switches = many.integrate_aggregate(
         chain.arrays.rows, chain.arrays.heights, scene.mass[0], 0.0, scene.speed, TIME,
         1e-4 * rtol / count, 10**6, np.empty((2, TIME.size)),
         np.empty((0, 5)), spent,
@@ -206,9 +208,9 @@ def test_elongated_as_one_or_one_by_one(count: int, linear: bool) -> None:
     """Stress, strains and branches are those of the search through all springs at every sample."""
     chain = built(chain_of(count, linear=linear))
     rows, heights = chain.arrays.rows, chain.arrays.heights
-    assert aggregate.holds(rows)
+    assert many.holds(rows)
     found = []
-    for along in (aggregate.equilibrium_along, kernels.equilibrium_along):
+    for along in (many.equilibrium_along, kernels.equilibrium_along):
         stress, strain = np.empty(TO_AND_FRO.size), np.empty((count, TO_AND_FRO.size))
         branches = np.empty(strain.shape, np.int64)
         along(rows, heights, TO_AND_FRO, stress, strain, branches)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from conftest import EXPERIMENTS, synthetic_impact
-from foamfit.audit import audit, describe, largest_motion
-from foamfit.measurement import Measurement, Noise, Specimen, Striker
-from foamfit.reading import read_test
+from foamfit.data.csv_file import read_test
+from foamfit.data.energy import audit, describe, largest_motion
+from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
 
 DATA = Path(os.environ.get("FOAMFIT_DATA", Path(__file__).parents[2] / "shared" / "data"))
 SPECIMEN = Specimen(height=1e-3, area=2e-5)

@@ -16,7 +16,7 @@ from click.testing import CliRunner, Result
 
 from conftest import EXPERIMENTS
 from foamfit.cli import main
-from foamfit.report import STATISTICS
+from foamfit.report.page import STATISTICS
 
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
 FILES = {"fit.json", "parameters.csv", "curves.csv", "report.html", "fit.png", "fit.pdf"}
@@ -527,7 +527,7 @@ def test_a_defect_is_one_line_too(here: Path, monkeypatch: pytest.MonkeyPatch) -
     def broken(*_: object) -> None:
         raise KeyError("two\nlines")
 
-    monkeypatch.setattr("foamfit.reading.read_test", broken)
+    monkeypatch.setattr("foamfit.data.csv_file.read_test", broken)
     result = run("check", "x.csv")
     assert (result.exit_code, result.stdout) == (70, "")
     assert re.fullmatch(r"foamfit: [^\n]*KeyError[^\n]+\n", result.stderr)

@@ -17,7 +17,7 @@ import fabricated
 import foamfit as ff
 from conftest import synthetic_impact
 from foamfit.cli import main
-from foamfit.comparison import (
+from foamfit.report.comparison import (
     Comparison,
     Row,
     Section,
@@ -26,8 +26,8 @@ from foamfit.comparison import (
     recognised,
     write_csv,
 )
-from foamfit.plots import plot_comparison
-from foamfit.result import Correlation, FitResult
+from foamfit.report.plots import plot_comparison
+from foamfit.results import Correlation, FitResult
 
 NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
 

@@ -11,7 +11,8 @@ from scipy.signal import lfilter
 
 from conftest import EXPERIMENTS
 from foamfit import read_test
-from foamfit.conditioning import (
+from foamfit.data.measurement import Specimen, Striker
+from foamfit.data.prepare import (
     Record,
     Window,
     condition,
@@ -22,7 +23,6 @@ from foamfit.conditioning import (
     thin,
 )
 from foamfit.errors import InputError
-from foamfit.measurement import Specimen, Striker
 
 SPECIMEN = Specimen(height=1.19e-3, area=1.9635e-5, mass=5.56e-6)
 STRIKER = Striker(mass=7e-3, velocity=1.75)

@@ -2,7 +2,7 @@
 
 `counted.py` runs the scenes in a process of its own, where the compiled loops are plain Python, and
 counts from outside: what is read of each spring and mass, what is reckoned with each dashpot, which
-functions are called. `implicit` and `ringing` are left out where they only decide, once per run,
+functions are called. `steps` and `vibration` are left out where they only decide, once per run,
 how to step.
 """
 
@@ -47,7 +47,7 @@ def counts(counted: dict[str, dict[str, dict[str, Any]]]) -> dict[str, dict[str,
 
 
 def total(
-    scene: dict[str, Any], start: str, without: tuple[str, ...] = ("implicit", "ringing")
+    scene: dict[str, Any], start: str, without: tuple[str, ...] = ("steps", "vibration")
 ) -> int:
     """Sum of the counts whose names start so."""
     return sum(
@@ -67,7 +67,7 @@ def test_a_linear_spring_costs_no_evaluation_of_the_law(
     assert total(scene, "linear: law evaluated") == 0
     assert total(scene, "linear: other columns read") > 0  # it was there and was counted
     # the choice of the method looks at every spring once per run, whatever its kind
-    assert scene.get("linear: law columns read in ringing", 0) <= 4 * scene["ends"][-1]
+    assert scene.get("linear: law columns read in vibration", 0) <= 4 * scene["ends"][-1]
     law = total(scene, "bistable: law columns read")
     assert law > 0 if chain == "mixed" else law == 0
 
@@ -100,10 +100,8 @@ def test_a_closed_form_scene_takes_no_step(counts: dict[str, dict[str, Any]], na
     assert scene["solver"] == "closed form"
     assert scene["steps"] == 0
     used = {key for key in scene if key.startswith("calls in ")}
-    as_one = (
-        {"calls in aggregate", "calls in polynomial"} if name == "mixed, displacement" else set()
-    )
-    assert used == {"calls in motion", "calls in kernels"} | as_one
+    as_one = {"calls in many", "calls in polynomial"} if name == "mixed, displacement" else set()
+    assert used == {"calls in plan", "calls in kernels"} | as_one
     assert "masses read" not in scene
 
 

@@ -16,16 +16,16 @@ import pytest
 from click.testing import CliRunner
 
 import fabricated
-import foamfit.plots
-import foamfit.result
+import foamfit.report.plots
+import foamfit.results
 from conftest import EXPERIMENTS
 from foamfit import files
 from foamfit.cli import main
-from foamfit.comparison import compare, write_csv
 from foamfit.errors import InputError
 from foamfit.files import check_file, replacing, write_file
-from foamfit.plots import plot_fit
-from foamfit.result import FitResult, check_target, load_result
+from foamfit.report.comparison import compare, write_csv
+from foamfit.report.plots import plot_fit
+from foamfit.results import FitResult, check_target, load_result
 
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
 posix = pytest.mark.skipif(os.name != "posix", reason="signals and permissions of POSIX")
@@ -34,8 +34,8 @@ posix = pytest.mark.skipif(os.name != "posix", reason="signals and permissions o
 @pytest.fixture(autouse=True)
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty working directory, and results of one file that need no time."""
-    monkeypatch.setattr(foamfit.result, "_write", write_json)
-    monkeypatch.setattr(foamfit.plots, "image", lambda *_: b"\x89PNG" + bytes(20))
+    monkeypatch.setattr(foamfit.results, "_write", write_json)
+    monkeypatch.setattr(foamfit.report.plots, "image", lambda *_: b"\x89PNG" + bytes(20))
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -107,7 +107,7 @@ def test_what_is_put_into_the_folder_while_it_is_written_stays(
         write_json(result, folder)
         (here / "r" / "notes.txt").write_text("x")
 
-    monkeypatch.setattr(foamfit.result, "_write", late)
+    monkeypatch.setattr(foamfit.results, "_write", late)
     with pytest.raises(InputError, match=r"notes\.txt"):
         fabricated.result(seed=2).save("r")
     assert load_result(folder)["seed"] == 1
@@ -265,7 +265,7 @@ def test_an_older_result_that_a_killed_process_put_aside_comes_back(
     def fail(*_: object, **__: object) -> None:
         raise RuntimeError
 
-    monkeypatch.setattr(foamfit.result, "_write", fail)
+    monkeypatch.setattr(foamfit.results, "_write", fail)
     with pytest.raises(RuntimeError):
         fabricated.result(seed=2).save("r")
     assert load_result("r")["seed"] == 1
@@ -319,7 +319,7 @@ def test_the_process_that_compiles_is_ended_too(monkeypatch: pytest.MonkeyPatch)
 
     Also while its end is waited for.
     """
-    from foamfit import warmth
+    from foamfit.solve import precompile
 
     begun: list[subprocess.Popen[bytes]] = []
     real = subprocess.Popen
@@ -335,7 +335,7 @@ def test_the_process_that_compiles_is_ended_too(monkeypatch: pytest.MonkeyPatch)
     signal.setitimer(signal.ITIMER_REAL, 0.1)
     began = time.monotonic()
     try:
-        with pytest.raises(KeyboardInterrupt), warmth.side_by_side():
+        with pytest.raises(KeyboardInterrupt), precompile.side_by_side():
             pass
     finally:
         signal.signal(signal.SIGALRM, before)

@@ -11,9 +11,9 @@ import pytest
 
 import foamfit as ff
 from conftest import DATA, needs_data, synthetic_impact, synthetic_loop
-from foamfit import search
-from foamfit.measurement import Measurement, Noise, Specimen
-from foamfit.problem import make_params
+from foamfit.data.measurement import Measurement, Noise, Specimen
+from foamfit.fitting import search
+from foamfit.fitting.problem import make_params
 
 NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
 

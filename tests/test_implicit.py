@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import foamfit as ff
-from foamfit import collocation, implicit, taylor
-from foamfit.motion import NO_DIRECTIONS, NO_SLOPES, RADAU, TAYLOR, Motion, plan
+from foamfit.solve.explicit import taylor
+from foamfit.solve.implicit import collocation, steps
+from foamfit.solve.plan import NO_DIRECTIONS, NO_SLOPES, RADAU, TAYLOR, Motion, plan
 from reference import Bistable, Chain, Impact, Linear, energy_balance
 from test_simulate import (
     AREA,
@@ -304,8 +305,8 @@ def test_the_choice() -> None:
 
 
 def test_explicit_steps_that_fail_are_taken_over(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("foamfit.motion.MOST_RELAXATION", np.inf)
-    monkeypatch.setattr("foamfit.motion.MOST_EXPLICIT", 100)
+    monkeypatch.setattr("foamfit.solve.plan.MOST_RELAXATION", np.inf)
+    monkeypatch.setattr("foamfit.solve.plan.MOST_EXPLICIT", 100)
     got = run(*struck("foam-2", 1e-2), 1e-6, implicit=None)
     assert got.method == RADAU
 
@@ -379,7 +380,7 @@ def test_cost_of_a_long_chain_is_linear(kind: str) -> None:
         scene = plan(built(chain), ff.Impact(7e-3, 2.0), TIME)
         rows = np.array([spring.row for spring in built(chain).springs])
         tally, curves = np.zeros(2, np.int64), np.empty((2, TIME.size))
-        outcome, end, steps, switches = implicit.integrate_implicit(
+        outcome, end, taken, switches = steps.integrate_implicit(
             rows, np.array(chain.heights), scene.ends, scene.mass, scene.drag, scene.top,
             scene.values, scene.speed, scene.time, 3e-8, 10_000, NO_DIRECTIONS, np.zeros((1, 0)),
             curves, NO_SLOPES, np.empty((4, 5)), tally, 1e-6, np.zeros(1),
@@ -388,7 +389,7 @@ def test_cost_of_a_long_chain_is_linear(kind: str) -> None:
         assert outcome == taylor.DONE
         assert switches == 2 * n
         assert tally[1] == n * tally[0]  # one block per spring and correction
-        counts.append((end, stress.max(), tally[0], steps))
+        counts.append((end, stress.max(), tally[0], taken))
     short, long = counts
     # alternating springs in equal parts: the same foam, however finely divided
     assert long[0] == pytest.approx(short[0], rel=1e-3 if kind == "masses" else 1e-6)

@@ -15,18 +15,18 @@ from scipy.optimize import least_squares
 
 import foamfit as ff
 from conftest import AREA, EXPERIMENTS, HEIGHT, synthetic_impact, synthetic_loop
-from foamfit import planning
-from foamfit.chain import Chain, Impact
-from foamfit.checklist import Check, _by_reason, status_of
 from foamfit.cli import main
-from foamfit.insight import FLIGHT, Insight, Section
-from foamfit.insight_plots import plot_information, plot_plan, plot_sensitivities
-from foamfit.intervals import Intervals
-from foamfit.measurement import Measurement, Noise, Specimen, Striker
-from foamfit.problem import Problem, make_params, make_problem
-from foamfit.report import render_report, summary_text
-from foamfit.search import SearchRecord
-from foamfit.verdict import conclude
+from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
+from foamfit.fitting.problem import Problem, make_params, make_problem
+from foamfit.fitting.search import SearchRecord
+from foamfit.report import outlook as planning
+from foamfit.report.identifiability_plots import plot_information, plot_plan, plot_sensitivities
+from foamfit.report.page import render_report, summary_text
+from foamfit.springs.chain import Chain, Impact
+from foamfit.trust.checklist import Check, _by_reason, status_of
+from foamfit.trust.conclude import conclude
+from foamfit.trust.identifiability import FLIGHT, Insight, Section
+from foamfit.trust.intervals import Intervals
 from reference import reference_impact
 
 STRIKER = Striker(mass=7e-3, velocity=1.75)

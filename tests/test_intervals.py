@@ -20,18 +20,27 @@ from scipy.stats import binom
 
 import foamfit as ff
 from conftest import EXPERIMENTS, synthetic_impact
-from foamfit import intervals, modelfit
+from foamfit import one_model
 from foamfit.cli import main
 from foamfit.errors import InputError
-from foamfit.intervals import Choice, assess, block_length, bootstrap, departures, mcmc, profile
-from foamfit.modelfit import Found, judge
-from foamfit.objective import soften
-from foamfit.plots import plot_profiles
-from foamfit.problem import Problem, make_problem
-from foamfit.search import SearchRecord, Tracker
-from foamfit.uncertainty import NoiseProcess, noise_process
-from foamfit.verdict import conclude
-from foamfit.vicinity import Vicinity
+from foamfit.fitting.objective import soften
+from foamfit.fitting.problem import Problem, make_problem
+from foamfit.fitting.search import SearchRecord, Tracker
+from foamfit.one_model import Found, judge
+from foamfit.report.plots import plot_profiles
+from foamfit.trust import intervals
+from foamfit.trust.conclude import conclude
+from foamfit.trust.covariance import NoiseProcess, noise_process
+from foamfit.trust.intervals import (
+    Choice,
+    assess,
+    block_length,
+    bootstrap,
+    departures,
+    mcmc,
+    profile,
+)
+from foamfit.trust.refit import Vicinity
 
 
 def autoregressive(rng: np.random.Generator, n: int, rho: float) -> np.ndarray:
@@ -614,10 +623,10 @@ def test_what_is_within_rounding_of_its_limit_is_at_it(impact, monkeypatch):
     assert "lies at its limit 0" in item.why
     assert item.ci95[1] == 0.0
     values[at] = -0.0
-    assert str(modelfit._on_limits(problem, values)[at]) == "0.0"
+    assert str(one_model._on_limits(problem, values)[at]) == "0.0"
     # What would cost something stays where it is.
-    monkeypatch.setattr(modelfit, "AT_LIMIT", 1.0)
-    assert np.array_equal(modelfit._on_limits(problem, impact.values), impact.values)
+    monkeypatch.setattr(one_model, "AT_LIMIT", 1.0)
+    assert np.array_equal(one_model._on_limits(problem, impact.values), impact.values)
 
 
 def test_a_profile_that_its_limit_cuts_is_not_called_narrow(impact):

@@ -15,12 +15,13 @@ from scipy.signal import lfilter
 
 import foamfit as ff
 from conftest import synthetic_impact, synthetic_loop
-from foamfit import evidence, ladder, modelfit
+from foamfit import auto, one_model
 from foamfit.cli import main
-from foamfit.measurement import Measurement, Outliers, Specimen, Striker
-from foamfit.problem import make_problem
-from foamfit.report import render_report, summary_text
-from foamfit.structure import branch_places, find_structure, neighbours_test, runs_test
+from foamfit.data.measurement import Measurement, Outliers, Specimen, Striker
+from foamfit.fitting.problem import make_problem
+from foamfit.report.page import render_report, summary_text
+from foamfit.trust import evidence
+from foamfit.trust.residual_tests import branch_places, find_structure, neighbours_test, runs_test
 
 HEIGHT, AREA = 1.2e-3, 1.9635e-5
 
@@ -199,7 +200,7 @@ def test_a_clear_structure_is_found(name):
 
 def test_two_bistable_springs_are_told_from_fewer(monkeypatch):
     """With all starts, which two springs need; for time, without the rung of a linear spring."""
-    monkeypatch.setattr(ladder, "LADDER", ("bistable", *ladder.LADDER[2:]))
+    monkeypatch.setattr(auto, "LADDER", ("bistable", *auto.LADDER[2:]))
     test = impact([SOFT, STIFF], HALVES, velocity=4.5)
     result = ff.fit(test, model="auto")
     assert result.ladder.chosen.name == "bistable+bistable without damping"
@@ -230,17 +231,17 @@ def test_a_linear_spring_in_series_adds_combinations_and_no_evidence():
 
 def test_only_models_that_the_test_allows_are_tried():
     _, test = synthetic_impact()
-    assert ladder._models(test) == (list(ladder.LADDER), [])
+    assert auto._models(test) == (list(auto.LADDER), [])
     given = replace(test, specimen=replace(test.specimen, heights=(0.6e-3, 0.59e-3)))
-    models, skipped = ladder._models(given)
+    models, skipped = auto._models(given)
     assert models == ["bistable", "linear+bistable", "bistable+bistable"]
     assert skipped == ["linear+bistable+bistable: [specimen] heights are those of 2 springs"]
     followed = replace(test, interior={1: test.displacement * 0.4})
-    models, skipped = ladder._models(followed)
-    assert models == list(ladder.LADDER[1:])
+    models, skipped = auto._models(followed)
+    assert models == list(auto.LADDER[1:])
     assert "motion was measured" in skipped[0]
     with pytest.raises(ff.InputError, match="no model of the ladder"):
-        ladder._models(replace(test, interior={5: test.displacement}))
+        auto._models(replace(test, interior={5: test.displacement}))
 
 
 def test_a_drive_without_dampers_has_one_rung_for_each_model():
@@ -253,13 +254,13 @@ def test_a_drive_without_dampers_has_one_rung_for_each_model():
 def test_only_the_chosen_rung_gets_the_intervals_that_were_asked_for(monkeypatch):
     """Rungs are weighed with local ones; options reach every rung."""
     given = []
-    original = modelfit.judge
+    original = one_model.judge
 
     def watched(found, choice, tell):
         given.append((found.problem.model.name, choice.method, found.problem.objective.loss))
         return original(found, choice, tell)
 
-    monkeypatch.setattr(ladder.modelfit, "judge", watched)
+    monkeypatch.setattr(auto.one_model, "judge", watched)
     loop = synthetic_loop()[1]
     result = ff.fit(loop, model="auto", starts=4, intervals="profile", loss="huber")
     assert given == [("bistable", "local", "huber"), ("bistable", "profile", "huber")]
@@ -280,7 +281,7 @@ def test_outliers_leave_the_ladder_standing():
     at = test.time[left_out]
     spikes = {"stress": Outliers(left_out, at, stress[left_out])}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ladder, "LADDER", ladder.LADDER[:1])
+        patch.setattr(auto, "LADDER", auto.LADDER[:1])
         result = ff.fit(replace(test, stress=stress, outliers=spikes), model="auto", starts=4)
     assert any("hold a structure" in text for text in result.warnings)
 
@@ -298,7 +299,7 @@ def wavy():
 
 def test_an_interrupted_ladder_keeps_what_is_done(wavy, monkeypatch):
     calls = 0
-    original = modelfit.identify
+    original = one_model.identify
 
     def interrupted(*args):
         nonlocal calls
@@ -307,7 +308,7 @@ def test_an_interrupted_ladder_keeps_what_is_done(wavy, monkeypatch):
             raise KeyboardInterrupt
         return original(*args)
 
-    monkeypatch.setattr(ladder.modelfit, "identify", interrupted)
+    monkeypatch.setattr(auto.one_model, "identify", interrupted)
     result = ff.fit(wavy, model="auto", starts=2)
     assert [rung.model for rung in result.ladder.rungs] == ["bistable"]
     assert (result.stopped, result.ladder.stopped) == ("Ctrl-C", "Ctrl-C")
@@ -321,15 +322,15 @@ def test_an_interrupted_ladder_keeps_what_is_done(wavy, monkeypatch):
 def test_the_time_limit_is_shared_over_the_rungs(wavy, monkeypatch):
     """A clock that gains a second with each look: what is left for a rung shrinks."""
     now = itertools.count(0.0, 1.0)
-    monkeypatch.setattr(ladder.time, "monotonic", lambda: next(now))
+    monkeypatch.setattr(auto.time, "monotonic", lambda: next(now))
     given = []
-    original = modelfit.identify
+    original = one_model.identify
 
     def watched(measurement, model, params, options, progress):
         given.append(options.max_time)
         return original(measurement, model, params, replace(options, max_time=None), progress)
 
-    monkeypatch.setattr(ladder.modelfit, "identify", watched)
+    monkeypatch.setattr(auto.one_model, "identify", watched)
     result = ff.fit(wavy, model="auto", starts=2, max_time=2.5)
     assert given == [1.5, 0.5]
     assert len(result.ladder.rungs) == 2
@@ -345,18 +346,18 @@ def test_a_rung_that_the_time_limit_cut_says_so():
 
 
 def test_a_rung_that_cannot_be_simulated_is_left_out(wavy, monkeypatch):
-    original = modelfit.identify
+    original = one_model.identify
 
     def failing(measurement, model, *rest):
         if model == "linear+bistable":
             raise ff.SimulationError("none could be simulated")
         return original(measurement, model, *rest)
 
-    monkeypatch.setattr(ladder.modelfit, "identify", failing)
-    monkeypatch.setattr(ladder, "LADDER", ladder.LADDER[:2])
+    monkeypatch.setattr(auto.one_model, "identify", failing)
+    monkeypatch.setattr(auto, "LADDER", auto.LADDER[:2])
     result = ff.fit(wavy, model="auto", starts=2)
     assert result.ladder.skipped == ("linear+bistable: none could be simulated",)
-    monkeypatch.setattr(ladder, "LADDER", ladder.LADDER[1:2])
+    monkeypatch.setattr(auto, "LADDER", auto.LADDER[1:2])
     with pytest.raises(ff.SimulationError, match="no rung could be tried"):
         ff.fit(wavy, model="auto", starts=2)
 
@@ -368,7 +369,7 @@ def test_a_rung_that_cannot_be_simulated_is_left_out(wavy, monkeypatch):
 def climbed(wavy):
     """Two rungs, neither of which reaches the noise."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ladder, "LADDER", ladder.LADDER[:2])
+        patch.setattr(auto, "LADDER", auto.LADDER[:2])
         return ff.fit(wavy, model="auto", starts=4)
 
 
@@ -384,7 +385,7 @@ def test_undetermined_parameters_of_the_chosen_model_are_named(climbed):
     """A loop that never closes leaves branches c and e out of every rung."""
     _, test = synthetic_impact(velocity=1.75)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ladder, "LADDER", ladder.LADDER[:1])
+        patch.setattr(auto, "LADDER", auto.LADDER[:1])
         result = ff.fit(test, model="auto", starts=4)
     (sentence,) = [text for text in result.ladder.cautions if "does not determine" in text]
     assert "s1_kc" in sentence

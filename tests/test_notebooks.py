@@ -7,8 +7,8 @@ import pytest
 
 import foamfit as ff
 from conftest import EXPERIMENTS, ROOT, synthetic_impact, synthetic_loop
-from foamfit.explore import NAMES, LoopPicture, Turner, loop_of, points, rough_guess, turn
-from foamfit.measurement import Measurement, Specimen
+from foamfit.data.measurement import Measurement, Specimen
+from foamfit.report.explore import NAMES, LoopPicture, Turner, loop_of, points, rough_guess, turn
 
 NOTEBOOKS = ROOT / "notebooks"
 LISTED = (
@@ -196,7 +196,7 @@ def test_a_fit_that_cannot_be_made_is_said(turner, monkeypatch):
     def refuse(*_, **__):
         raise ff.SimulationError("nothing could be simulated")
 
-    monkeypatch.setattr("foamfit.identification.fit", refuse)
+    monkeypatch.setattr("foamfit.api.fit", refuse)
     turner.fit_from_here()
     said = turner.panel.children[1].value
     assert "No fit: nothing could be simulated" in said

@@ -10,9 +10,8 @@ from scipy.signal import savgol_filter
 
 import foamfit as ff
 from conftest import synthetic_impact, synthetic_loop
-from foamfit.measurement import Noise, Outliers, Striker
-from foamfit.model import Model
-from foamfit.objective import (
+from foamfit.data.measurement import Noise, Outliers, Striker
+from foamfit.fitting.objective import (
     MODEL_ERROR,
     PENALTY,
     Objective,
@@ -22,6 +21,7 @@ from foamfit.objective import (
     default_weights,
     smoothed,
 )
+from foamfit.springs.model import Model
 
 BISTABLE = Model.parse("bistable")
 

@@ -12,7 +12,7 @@ import pytest
 import fabricated
 import foamfit as ff
 from foamfit.errors import InputError
-from foamfit.plots import (
+from foamfit.report.plots import (
     STYLE,
     image,
     laid_out,
@@ -22,7 +22,7 @@ from foamfit.plots import (
     plot_response,
     readable_unit,
 )
-from foamfit.result import FitResult
+from foamfit.results import FitResult
 
 
 def with_curves(result: FitResult, **changed: Any) -> FitResult:

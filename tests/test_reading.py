@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from foamfit.data.csv_file import read_test
 from foamfit.errors import InputError
-from foamfit.reading import read_test
 
 DATA = Path(os.environ.get("FOAMFIT_DATA", Path(__file__).parents[2] / "shared" / "data"))
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the measured data are not here")

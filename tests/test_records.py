@@ -11,13 +11,13 @@ from click.testing import CliRunner
 import fabricated
 import foamfit as ff
 from conftest import synthetic_impact
-from foamfit.audit import audit, describe
 from foamfit.cli import main
+from foamfit.data.csv_file import read_test
+from foamfit.data.energy import audit, describe
+from foamfit.data.measurement import Outliers
 from foamfit.errors import InputError
-from foamfit.measurement import Outliers
-from foamfit.objective import check_drive
-from foamfit.reading import read_test
-from foamfit.report import render_report, summary_text
+from foamfit.fitting.objective import check_drive
+from foamfit.report.page import render_report, summary_text
 
 SPECIMEN = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\n'
 STRIKER = '[striker]\nmass = "1 kg"\nvelocity = "1 m/s"\n'

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 import fabricated
-from foamfit.audit import audit
-from foamfit.report import number, readable, render_report, summary_text
+from foamfit.data.energy import audit
+from foamfit.report.page import number, readable, render_report, summary_text
 
 
 class Page(HTMLParser):

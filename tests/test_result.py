@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import fabricated
-import foamfit.plots
-import foamfit.report
+import foamfit.report.page
+import foamfit.report.plots
 from foamfit.errors import InputError
-from foamfit.result import check_target, load_result
+from foamfit.results import check_target, load_result
 
 FILES = {"fit.json", "parameters.csv", "curves.csv", "report.html", "fit.png", "fit.pdf"}
 KEYS = {
@@ -32,7 +32,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Save without the time that figures take, where the test is about the folder."""
-    for module in (foamfit.plots, foamfit.report):
+    for module in (foamfit.report.plots, foamfit.report.page):
         monkeypatch.setattr(module, "image", lambda *_: b"\x89PNG" + bytes(20))
 
 
@@ -163,7 +163,7 @@ def test_failing_midway_leaves_the_older_result(
     def fail(*_: object, **__: object) -> None:
         raise failure
 
-    monkeypatch.setattr(foamfit.report, "render_report", fail)
+    monkeypatch.setattr(foamfit.report.page, "render_report", fail)
     with pytest.raises(failure):
         fabricated.result(seed=2).save(folder)
     with pytest.raises(failure):

@@ -12,19 +12,19 @@ from scipy.optimize import least_squares
 
 import fabricated
 import foamfit as ff
-import foamfit.plots
-import foamfit.report
+import foamfit.report.page
+import foamfit.report.plots
 from conftest import AREA, HEIGHT, synthetic_impact, synthetic_loop
-from foamfit import uncertainty
 from foamfit.cli import main
-from foamfit.comparison import compare, comparison_text
-from foamfit.measurement import Measurement, Outliers
-from foamfit.model import Model
-from foamfit.objective import LOSSES, Objective, default_weights, influence, soften
-from foamfit.plots import plot_fit
-from foamfit.report import render_report, summary_text
-from foamfit.result import FitResult, load_result
-from foamfit.vicinity import m_estimate
+from foamfit.data.measurement import Measurement, Outliers
+from foamfit.fitting.objective import LOSSES, Objective, default_weights, influence, soften
+from foamfit.report.comparison import compare, comparison_text
+from foamfit.report.page import render_report, summary_text
+from foamfit.report.plots import plot_fit
+from foamfit.results import FitResult, load_result
+from foamfit.springs.model import Model
+from foamfit.trust import covariance
+from foamfit.trust.refit import m_estimate
 
 BISTABLE = Model.parse("bistable")
 NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
@@ -76,7 +76,7 @@ def test_the_standard_error_of_a_soft_loss_is_honest(loss):
         weights, pseudo = m_estimate(level - data, (n,), loss)
         levels.append(level)
         said.append(
-            uncertainty.covariance(jacobian * weights[:, None], pseudo, (n,), size).stderr[0]
+            covariance.covariance(jacobian * weights[:, None], pseudo, (n,), size).stderr[0]
         )
     assert np.mean(said) == pytest.approx(np.std(levels), rel=0.15)
     assert np.std(levels) < 0.7 * np.sqrt((0.9 + 0.1 * 64) / n)  # least squares does worse
@@ -134,7 +134,7 @@ def test_what_stands_at_an_outlier_does_not_matter():
 
 
 def test_outliers_are_in_the_result_and_crossed_in_the_figure(tmp_path, monkeypatch):
-    for module in (foamfit.plots, foamfit.report):  # the folder needs no pictures here
+    for module in (foamfit.report.plots, foamfit.report.page):  # the folder needs no pictures here
         monkeypatch.setattr(module, "image", lambda *_: b"\x89PNG" + bytes(20))
     _, test, at = spoilt_impact()
     result = ff.fit(test, starts=4)
@@ -319,13 +319,13 @@ def test_the_figure_of_a_stopped_fit_says_so():
 
 
 def test_a_stopped_fit_is_never_ok(monkeypatch):
-    from foamfit import modelfit
-    from foamfit.search import SearchStoppedError
+    from foamfit import one_model
+    from foamfit.fitting.search import SearchStoppedError
 
     def stop(*_: object) -> None:
         raise SearchStoppedError
 
-    monkeypatch.setattr(modelfit, "_refine", stop)
+    monkeypatch.setattr(one_model, "_refine", stop)
     result = ff.fit(synthetic_impact()[1], starts=4)
     assert result.stopped == "the time limit"
     assert result.status == "warnings"

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import foamfit as ff
-from foamfit.chain import Drive
-from foamfit.problem import make_problem
-from foamfit.spring import BISTABLE_NAMES, LINEAR_NAMES, Spring
+from foamfit.fitting.problem import make_problem
+from foamfit.springs.chain import Drive
+from foamfit.springs.spring import BISTABLE_NAMES, LINEAR_NAMES, Spring
 
 AREA = 1.9635e-5
 TIME = np.linspace(0.0, 8e-4, 81)

@@ -10,8 +10,8 @@ import pytest
 
 import foamfit as ff
 from conftest import EXPERIMENTS
-from foamfit import simulation
-from foamfit.motion import plan
+from foamfit.solve import simulation
+from foamfit.solve.plan import plan
 
 sys.path.insert(0, str(EXPERIMENTS / "stability"))
 import fresh

@@ -18,14 +18,14 @@ import pytest
 from click.testing import CliRunner, Result
 
 import fabricated
-import foamfit.plots
-import foamfit.report
-import foamfit.result
+import foamfit.report.page
+import foamfit.report.plots
+import foamfit.results
 from conftest import EXPERIMENTS
-from foamfit import identification, terminal
+from foamfit import api, terminal
 from foamfit.cli import main
 from foamfit.errors import InputError
-from foamfit.result import FitResult
+from foamfit.results import FitResult
 from foamfit.terminal import ending_cleanly, printable, without_ctrl_c
 
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
@@ -36,7 +36,7 @@ ODD = "foam \x1b[31mred\x1b[0m\x07\x9b2J\u202eback χ"
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty working directory, and figures that need no time."""
     monkeypatch.chdir(tmp_path)
-    for module in (foamfit.plots, foamfit.report):
+    for module in (foamfit.report.plots, foamfit.report.page):
         monkeypatch.setattr(module, "image", lambda *_: b"\x89PNG" + bytes(20))
     return tmp_path
 
@@ -52,9 +52,9 @@ def write_json(result: FitResult, folder: Path) -> None:
 def quick(monkeypatch: pytest.MonkeyPatch, *, light: bool = True, **changed: object) -> None:
     """Let the fit be there at once, and its folder hold its fit.json alone."""
     made = fabricated.result(**changed)
-    monkeypatch.setattr(identification, "fit", lambda *_, **__: made)
+    monkeypatch.setattr(api, "fit", lambda *_, **__: made)
     if light:
-        monkeypatch.setattr(foamfit.result, "_write", write_json)
+        monkeypatch.setattr(foamfit.results, "_write", write_json)
 
 
 # ---------------------------------------------------------------- encodings
@@ -191,7 +191,7 @@ def broken(error: BaseException):
 def test_only_input_errors_are_the_users(
     here: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException, code: int, words: str
 ) -> None:
-    monkeypatch.setattr(identification, "fit", broken(error))
+    monkeypatch.setattr(api, "fit", broken(error))
     told = run("fit", RECONSTRUCTION, "--out", "r")
     assert (told.exit_code, told.stdout) == (code, "")
     assert re.fullmatch(rf"\n?foamfit: [^\n]*{words}[^\n]*\n", told.stderr)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from foamfit.uncertainty import autocorrelation_time, covariance, half_width, state
+from foamfit.trust.covariance import autocorrelation_time, covariance, half_width, state
 
 
 def ar1(n: int, rho: float, seed: int) -> np.ndarray:

@@ -17,7 +17,10 @@ from numba import typeof, types
 
 import foamfit as ff
 from conftest import EXPERIMENTS
-from foamfit import cli, kernels, series, taylor, warmth
+from foamfit import cli
+from foamfit.solve import precompile
+from foamfit.solve.explicit import series, taylor
+from foamfit.springs import kernels
 
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
 
@@ -33,7 +36,7 @@ def signature(arguments: tuple[Any, ...]) -> tuple[Any, ...]:
 def test_a_fit_calls_what_was_compiled_and_nothing_else() -> None:
     """Every loop that a fit calls has one set of argument types, that of the example."""
     ff.fit(ff.read_test(RECONSTRUCTION), starts=2)
-    calls = warmth._calls()
+    calls = precompile._calls()
     of_python = {
         taylor.integrate, kernels.fill_rows, kernels.stress_along,
         series.equilibrium_tangents, kernels.fault, kernels.total,
@@ -49,8 +52,8 @@ def test_the_pieces_are_those_of_the_integrator() -> None:
 
     Other loops may call `first_crossing` too, with an order that is known when they are compiled.
     """
-    pieces = [(*call, "own") for call in warmth._calls().own]
-    pieces += [(*call, "cached") for call in warmth._calls().pieces]
+    pieces = [(*call, "own") for call in precompile._calls().own]
+    pieces += [(*call, "cached") for call in precompile._calls().pieces]
     for function, arguments, where in pieces:
         made = [kinds for kinds in function.signatures if not any(map(is_literal, kinds))]
         assert made in ([], [signature(arguments)]), function.py_func.__name__
@@ -66,9 +69,9 @@ def test_the_first_use_says_that_it_compiles(
     def quickly() -> Any:
         yield lambda: done.append("rest")
 
-    monkeypatch.setattr(warmth, "side_by_side", quickly)
+    monkeypatch.setattr(precompile, "side_by_side", quickly)
     for ready in (False, True):
-        monkeypatch.setattr(warmth, "compiled", lambda ready=ready: ready)
+        monkeypatch.setattr(precompile, "compiled", lambda ready=ready: ready)
         with cli._compiling(quiet=False) as compile_rest:
             compile_rest()
         assert ("compiling the solver" in capsys.readouterr().err) == (not ready)
@@ -84,7 +87,7 @@ def test_the_other_process_finds_this_package_and_is_stopped(
     class Other(subprocess.Popen):  # type: ignore[type-arg]
         def __init__(self, command: list[str], **options: Any) -> None:
             asked.append(options["env"]["PYTHONPATH"].split(":")[0])
-            assert command[1:] == ["-m", "foamfit.warmth"]
+            assert command[1:] == ["-m", "foamfit.solve.precompile"]
             super().__init__(["sleep", "60"], stdout=options["stdout"])
 
         def terminate(self) -> None:
@@ -92,7 +95,7 @@ def test_the_other_process_finds_this_package_and_is_stopped(
             super().terminate()
 
     monkeypatch.setattr(subprocess, "Popen", Other)
-    with pytest.raises(click.UsageError), warmth.side_by_side():
+    with pytest.raises(click.UsageError), precompile.side_by_side():
         raise click.UsageError("no such file")
     assert asked == [str(Path(ff.__file__).parents[1]), "terminated"]
 
@@ -100,14 +103,14 @@ def test_the_other_process_finds_this_package_and_is_stopped(
 def test_what_was_compiled_of_another_source_is_no_use(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(warmth, "_cache", lambda: tmp_path)
-    assert not warmth.compiled()
+    monkeypatch.setattr(precompile, "_caches", lambda: {tmp_path})
+    assert not precompile.compiled()
     made = [tmp_path / f"taylor.integrate-30.py311.{end}" for end in ("nbi", "1.nbc")]
     for path in made:
         path.touch()
-    assert warmth.compiled()
+    assert precompile.compiled()
     os.utime(made[1], (0.0, 0.0))
-    assert not warmth.compiled()
+    assert not precompile.compiled()
     assert [path.exists() for path in made] == [True, False]
 
 
@@ -118,29 +121,28 @@ def test_what_is_compiled_where_it_is_needed_is_announced_once(
         __name__ = "integrate_slowly"
         signatures: tuple[object, ...] = ()
 
-    monkeypatch.setattr(warmth, "_cache", lambda: tmp_path)
+    monkeypatch.setattr(precompile, "_caches", lambda: {tmp_path})
     caplog.set_level(logging.WARNING, logger="foamfit")  # a quiet command may have silenced it
     new, known, kept = Loop(), Loop(), Loop()
     known.signatures = ((),)
     for loop in (new, new, known):
-        warmth.announce(loop, "the solver of slow scenes")
+        precompile.announce(loop, "the solver of slow scenes")
     (tmp_path / "implicit.integrate_slowly-30.py311.1.nbc").touch()
-    warmth.announce(kept, "the solver of slow scenes")
+    precompile.announce(kept, "the solver of slow scenes")
     assert [record.getMessage() for record in caplog.records] == [
         "foamfit: compiling the solver of slow scenes, once after installation"
     ]
 
 
 def test_every_module_with_compiled_loops_is_known() -> None:
-    package = Path(warmth.__file__).parent
     written = {
-        path.stem
-        for path in package.glob("*.py")
+        path.relative_to(precompile.PACKAGE).with_suffix("").as_posix()
+        for path in precompile.PACKAGE.rglob("*.py")
         if re.search(r"^@(compiled|inner|inlined|piece|maker|once)$", path.read_text(), re.M)
     }
-    assert set(warmth.COMPILED) == written | {"law"}
+    assert set(precompile.COMPILED) == written | {"springs/law"}
 
 
 def test_examples_are_small() -> None:
-    for call in warmth._calls().rest:
+    for call in precompile._calls().rest:
         assert all(np.size(value) <= 1 for value in call[1])

@@ -24,8 +24,8 @@ from numpy.polynomial import chebyshev
 from scipy.optimize import brentq
 
 import foamfit as ff
-from foamfit.chain import Drive
-from foamfit.motion import plan
+from foamfit.solve.plan import plan
+from foamfit.springs.chain import Drive
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 import reference

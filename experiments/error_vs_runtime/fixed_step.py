@@ -1,6 +1,6 @@
 """Fixed-step schemes, compiled: what one would write by hand for the same scenes.
 
-The law is the project's own (`foamfit.kernels`), so that only the integration differs. A branch is
+The law is the project's own (`springs.kernels`), so that only the integration differs. A branch is
 frozen within a step and brought up to date at its end; the step is the sampling interval over a
 whole number. Velocity Verlet takes dashpots at the velocity predicted for the end of the step;
 the implicit midpoint rule is solved by Newton's method with the tridiagonal Jacobian.
@@ -14,7 +14,7 @@ import math
 import numpy as np
 from numba import njit
 
-from foamfit.kernels import (
+from foamfit.springs.kernels import (
     ETA,
     branch_at_strain,
     equilibrate,

@@ -35,7 +35,7 @@ from drawing import draw_scaling, draw_scene
 from scenes import KERNEL, PUBLIC, Competitor, Scene
 
 import foamfit as ff
-from foamfit.motion import plan
+from foamfit.solve.plan import plan
 
 HERE = Path(__file__).parent
 WANTED = 2e-6  # the error at which solvers are compared

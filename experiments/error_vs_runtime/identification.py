@@ -1,9 +1,9 @@
 """Misfit reached against seconds: the project's own search and eight methods of lmfit.
 
-Every method minimises the same residual (`foamfit.objective.Objective`) of the same problems and
+Every method minimises the same residual (`fitting.objective.Objective`) of the same problems and
 is stopped by the same clock. What is recorded is the lowest cost so far against the processor time
 of the one thread that runs, which on an idle machine is the time on the clock. A local method
-starts at a random point of the search's box (`foamfit.search.box_starts`, drawn from the seed) and
+starts at a random point of the search's box (`fitting.search.box_starts`, drawn from the seed) and
 starts again from the next one until the time is up; a global method that ends does so too; and so
 does `foamfit.fit`, with another seed. A run also ends once its cost is within 0.1 % of the best
 known, where nothing is left to gain.
@@ -60,10 +60,10 @@ from identification_report import (
 from numpy.typing import NDArray
 
 import foamfit as ff
-from foamfit.objective import Objective
-from foamfit.problem import Problem, make_problem
-from foamfit.search import box_starts
-from foamfit.space import Space
+from foamfit.fitting.box import Space
+from foamfit.fitting.objective import Objective
+from foamfit.fitting.problem import Problem, make_problem
+from foamfit.fitting.search import box_starts
 
 Array = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from numba import njit
 from scipy.integrate import DOP853, LSODA, Radau
 from scipy.optimize import brentq
 
-from foamfit.kernels import (
+from foamfit.springs.kernels import (
     EPS_A,
     EPS_C,
     EPS_HAT_A,
@@ -43,7 +43,7 @@ from foamfit.kernels import (
     strain_on,
     stress_on,
 )
-from foamfit.law import BISTABLE
+from foamfit.springs.law import BISTABLE
 
 METHODS = {"DOP853": DOP853, "LSODA": LSODA, "Radau": Radau}
 TINY = 4 * np.finfo(float).eps

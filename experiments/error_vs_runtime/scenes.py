@@ -11,8 +11,8 @@ import numpy as np
 import restarted
 
 import foamfit as ff
-from foamfit.chain import Drive
-from foamfit.motion import Plan, plan
+from foamfit.solve.plan import Plan, plan
+from foamfit.springs.chain import Drive
 
 Array = np.ndarray
 Answer = tuple[Array, Array]  # displacement of the top (m) and base stress (Pa), (n,) each

@@ -36,9 +36,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 import foamfit as ff
-from foamfit.ladder import LADDER
-from foamfit.measurement import Measurement, Specimen, Striker
-from foamfit.problem import make_params
+from foamfit.auto import LADDER
+from foamfit.data.measurement import Measurement, Specimen, Striker
+from foamfit.fitting.problem import make_params
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))

@@ -23,9 +23,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 import foamfit as ff
-from foamfit.measurement import Measurement, Specimen, Striker
-from foamfit.model import Model
-from foamfit.objective import Objective
+from foamfit.data.measurement import Measurement, Specimen, Striker
+from foamfit.fitting.objective import Objective
+from foamfit.springs.model import Model
 
 HERE = Path(__file__).parent
 NOISE = 0.01

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from scipy.signal import find_peaks
 
 import foamfit as ff
-from foamfit.kernels import BRANCH_NAMES
-from foamfit.literature import PublishedSet
+from foamfit.springs.kernels import BRANCH_NAMES
+from foamfit.springs.published import PublishedSet
 
 Array = NDArray[np.float64]
 

@@ -38,11 +38,11 @@ from scipy.signal import lfilter
 from scipy.stats import binomtest, norm
 
 import foamfit as ff
-from foamfit.insight import unreached
-from foamfit.measurement import Measurement
-from foamfit.problem import make_problem
-from foamfit.uncertainty import NoiseProcess, parts
-from foamfit.vicinity import Vicinity
+from foamfit.data.measurement import Measurement
+from foamfit.fitting.problem import make_problem
+from foamfit.trust.covariance import NoiseProcess, parts
+from foamfit.trust.identifiability import unreached
+from foamfit.trust.refit import Vicinity
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent / "noise_floor"))

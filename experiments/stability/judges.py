@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import foamfit as ff
-from foamfit.motion import MOST_WORK, Motion, plan
+from foamfit.solve.plan import MOST_WORK, Motion, plan
 
 Scene = tuple[ff.Chain, ff.Impact | ff.StressDrive | ff.DisplacementDrive, NDArray[np.float64]]
 Array = NDArray[np.float64]

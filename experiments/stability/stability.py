@@ -39,7 +39,7 @@ from judges import balance_of, explicit_fits, refined, ripple_of  # noqa: E402
 from scenes import SWEEPS, Point, designed, scene_of, swept  # noqa: E402
 
 import foamfit as ff  # noqa: E402
-from foamfit.motion import MOST_WORK  # noqa: E402
+from foamfit.solve.plan import MOST_WORK  # noqa: E402
 
 RTOL, DESIGNED, SEED = 1e-6, 1550, 4
 ENERGY_BAR = 10.0 * RTOL  # the energy is made of both displacement and stress, over a whole history

@@ -9,22 +9,22 @@ import importlib
 from typing import Any
 
 _HOME = {
-    "BistableSpring": "spring",
-    "LinearSpring": "spring",
-    "Chain": "chain",
-    "Impact": "chain",
-    "StressDrive": "chain",
-    "DisplacementDrive": "chain",
+    "BistableSpring": "springs.spring",
+    "LinearSpring": "springs.spring",
+    "Chain": "springs.chain",
+    "Impact": "springs.chain",
+    "StressDrive": "springs.chain",
+    "DisplacementDrive": "springs.chain",
     "InputError": "errors",
     "SimulationError": "errors",
-    "Response": "simulation",
-    "simulate": "simulation",
-    "published": "literature",
-    "Measurement": "measurement",
-    "read_test": "reading",
-    "FitResult": "result",
-    "fit": "identification",
-    "make_params": "problem",
+    "Response": "solve.simulation",
+    "simulate": "solve.simulation",
+    "published": "springs.published",
+    "Measurement": "data.measurement",
+    "read_test": "data.csv_file",
+    "FitResult": "results",
+    "fit": "api",
+    "make_params": "fitting.problem",
 }
 
 __all__ = sorted(_HOME)

@@ -25,7 +25,7 @@ from foamfit.terminal import TerminatedError, ending_cleanly, say, show_all, wit
 if TYPE_CHECKING:
     import lmfit
 
-    from foamfit.result import FitResult
+    from foamfit.results import FitResult
 
 # Exit codes: the input or the call is wrong; no acceptable fit; a defect (EX_SOFTWARE of
 # sysexits.h). The number of a signal that ended the command is added to the last.
@@ -168,8 +168,8 @@ def check(
         foamfit check TEST.csv --model bistable --plot what.png
         foamfit check PLAN.toml --model bistable --published foam-1/model-1
     """
-    from foamfit.audit import audit, describe
-    from foamfit.reading import read_test
+    from foamfit.data.csv_file import read_test
+    from foamfit.data.energy import audit, describe
 
     if model is None:
         for option, value in (
@@ -181,7 +181,7 @@ def check(
             if value is not None:
                 raise InputError(f"{option} needs --model; give one, as --model bistable")
     if plot is not None:
-        from foamfit.plots import figure_format
+        from foamfit.report.plots import figure_format
 
         check_file(plot)
         figure_format(plot)
@@ -194,7 +194,7 @@ def check(
     if model is None:
         say(description, newline=False)
         return
-    from foamfit.planning import describe_plan, plan_test
+    from foamfit.report.outlook import describe_plan, plan_test
 
     with _compiling(quiet=False) as compile_rest:
         compile_rest()
@@ -203,7 +203,7 @@ def check(
         say(description)
     say(describe_plan(plan))
     if plot is not None:
-        from foamfit.insight_plots import plot_plan
+        from foamfit.report.identifiability_plots import plot_plan
 
         plot_plan(plan, plot)
         say(f"\ndrawn in {plot}")
@@ -331,8 +331,8 @@ def fit(
         foamfit fit TEST.csv --drive displacement --out results/today
         foamfit fit TEST.csv --model linear+bistable --fix s1_k0=60e6
     """
-    from foamfit.model import Model
-    from foamfit.reading import read_test
+    from foamfit.data.csv_file import read_test
+    from foamfit.springs.model import Model
 
     intervals, draws = _intervals(profile, bootstrap, mcmc)
     auto = model.strip() == "auto"
@@ -342,9 +342,9 @@ def fit(
     with _compiling(quiet or as_json) as compile_rest:
         measurement = read_test(test, specimen)
         folder = _result_folder(out, test, specimen, model)
-        from foamfit import identification
-        from foamfit.objective import check_time_shift, choose_drive
-        from foamfit.problem import make_params
+        from foamfit import api
+        from foamfit.fitting.objective import check_time_shift, choose_drive
+        from foamfit.fitting.problem import make_params
 
         if time_shift:
             check_time_shift(measurement, drive or choose_drive(measurement))
@@ -354,7 +354,7 @@ def fit(
             _hold_and_vary(params, model, fix, vary)
         compile_rest()
         with _progress(quiet or as_json) as progress:
-            result = identification.fit(
+            result = api.fit(
                 measurement,
                 model=model,
                 drive=drive,
@@ -390,7 +390,7 @@ def _tell_result(result: FitResult, folder: Path | None, as_json: bool, quiet: b
 
         say(json.dumps(result.to_json_dict(), allow_nan=False))
     elif not quiet:
-        from foamfit.report import summary_text
+        from foamfit.report.page import summary_text
 
         say(summary_text(result))
         if folder is not None:
@@ -399,7 +399,7 @@ def _tell_result(result: FitResult, folder: Path | None, as_json: bool, quiet: b
 
 def _result_folder(out: Path | None, test: Path, specimen: Path | None, model: str) -> Path:
     """Return the folder for a result, which must not be one that would be lost."""
-    from foamfit.result import check_target
+    from foamfit.results import check_target
 
     folder = Path("fits", test.stem, model) if out is None else out
     check_target(folder)
@@ -433,16 +433,16 @@ def _compiling(quiet: bool) -> Iterator[Callable[[], None]]:
     """Compile at first use, beside the body; it calls what is given before it simulates."""
     import logging
 
-    from foamfit import warmth
+    from foamfit.solve import precompile
 
     if quiet:  # what is compiled later is announced by the log
         logging.getLogger("foamfit").setLevel(logging.ERROR)
-    if warmth.compiled():
+    if precompile.compiled():
         yield lambda: None
         return
     if not quiet:
         say("foamfit: compiling the solver, once after installation", err=True)
-    with warmth.side_by_side() as finish:
+    with precompile.side_by_side() as finish:
         yield finish
 
 
@@ -502,13 +502,13 @@ def simulate(scene: Path, out: Path | None, plot: Path | None, rtol: float) -> N
         samples = 501
     Instead of the springs, published = "foam-1/model-3" under [chain] takes a published set.
     """
-    from foamfit.scene import files_of_scene, read_scene, write_response
-    from foamfit.simulation import simulate as run
+    from foamfit.scene_file import files_of_scene, read_scene, write_response
+    from foamfit.solve.simulation import simulate as run
 
     target = Path(scene.with_suffix(".csv").name) if out is None else out
     _check_files((target, plot), files_of_scene(scene))
     if plot is not None:
-        from foamfit.plots import figure_format
+        from foamfit.report.plots import figure_format
 
         figure_format(plot)
     with _compiling(quiet=False) as compile_rest:
@@ -518,7 +518,7 @@ def simulate(scene: Path, out: Path | None, plot: Path | None, rtol: float) -> N
     write_response(response, target)
     say(f"{response.solver}, {response.time.size} samples, written to {target}")
     if plot is not None:
-        from foamfit.plots import plot_response
+        from foamfit.report.plots import plot_response
 
         plot_response(response, plot)
         say(f"drawn in {plot}")
@@ -557,9 +557,9 @@ def compare(
         foamfit compare fits/foam-1/model-1/impact fits/foam-1/model-1/stress
         foamfit compare fits/TEST/bistable --published foam-1/model-1 --plot comparison.png
     """
-    from foamfit.comparison import compare as side_by_side
-    from foamfit.comparison import comparison_text, write_csv
-    from foamfit.plots import figure_format, plot_comparison
+    from foamfit.report.comparison import compare as side_by_side
+    from foamfit.report.comparison import comparison_text, write_csv
+    from foamfit.report.plots import figure_format, plot_comparison
 
     _check_files((plot, table), [p / "fit.json" if p.is_dir() else p for p in results])
     if plot is not None:
@@ -577,6 +577,6 @@ def compare(
 @main.command()
 def published() -> None:
     """Print the published parameter sets and their derived points."""
-    from foamfit.literature import table
+    from foamfit.springs.published import table
 
     say(table())

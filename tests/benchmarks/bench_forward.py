@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 import foamfit as ff
-from foamfit.motion import plan
+from foamfit.solve.plan import plan
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "experiments" / "error_vs_runtime"))
 import scenes as kinds

@@ -1,0 +1,111 @@
+"""The public fit: of one model, or of the simplest that holds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import lmfit
+
+from foamfit.data.measurement import Measurement
+from foamfit.errors import InputError
+from foamfit.one_model import Options, Progress, Tell, identify, judge
+from foamfit.results import FitResult
+
+
+def fit(
+    measurement: Measurement,
+    *,
+    model: str = "bistable",
+    drive: str | None = None,
+    seed: int = 0,
+    starts: int | None = None,
+    max_time: float | None = None,
+    params: lmfit.Parameters | None = None,
+    weights: Mapping[str, float] | None = None,
+    interior_mass: bool = False,
+    time_shift: bool = False,
+    loss: str = "linear",
+    intervals: str = "auto",
+    draws: int | None = None,
+    progress: Progress | None = None,
+    tell: Tell | None = None,
+) -> FitResult:
+    """Identify the parameters of a chain of springs from a test.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        The test; see `foamfit.read_test`.
+    model : str
+        Springs from the base up, joined by "+"; "auto" takes the simplest that holds, see
+        `foamfit.auto.climb`.
+    drive : str, optional
+        "impact", "stress" or "displacement"; by default what the test allows, in this order:
+        impact, displacement.
+    seed : int
+        Same test and seed give the same numbers.
+    starts : int, optional
+        Descents of the search; by default 16 for each spring.
+    max_time : float, optional
+        Seconds after which the best point so far is the result.
+    params : lmfit.Parameters, optional
+        Values, bounds, fixed values and expressions; see `make_params`.
+    weights : mapping, optional
+        Weight of each curve; see `fitting.objective.default_weights`.
+    interior_mass : bool
+        Whether the specimen's mass sits between the springs of a chain, in equal parts; by default
+        it is left out, and the result's notes say what it would change.
+    time_shift : bool
+        Whether the time by which the motion channel is late against the force is fitted too, as
+        the parameter time_shift (s).
+    loss : str
+        "linear" (least squares), or one that gives way to large residuals: "soft_l1", "huber",
+        "cauchy"; see `fitting.objective.soften`.
+    intervals : str
+        What makes the 95 % intervals: "auto" (local covariance, and profiles of the parameters
+        along which the cost is no parabola), "local", "profile", "bootstrap" or "mcmc".
+    draws : int, optional
+        Refits of the bootstrap (by default 500) or steps of the Markov chain (2000).
+    progress : callable, optional
+        Told the fraction done and what is going on.
+    tell : callable, optional
+        Told what the intervals will cost before it is paid.
+
+    Returns
+    -------
+    FitResult
+        Also when Ctrl-C or `max_time` ended the search: the best point ever seen.
+
+    Raises
+    ------
+    InputError
+        If the test cannot feed the drive or a parameter is unknown; the message names it.
+    SimulationError
+        If nothing that was tried could be simulated.
+    """
+    if not isinstance(measurement, Measurement):
+        raise InputError(
+            f"measurement is a {type(measurement).__name__}; give what foamfit.read_test returns"
+        )
+    if params is not None and not isinstance(params, lmfit.Parameters):
+        raise InputError("params must be lmfit.Parameters, as foamfit.make_params returns them")
+    options = Options(
+        drive=drive,
+        seed=seed,
+        starts=starts,
+        max_time=max_time,
+        weights=weights,
+        interior_mass=interior_mass,
+        time_shift=time_shift,
+        loss=loss,
+        intervals=intervals,
+        draws=draws,
+    )
+    progress, tell = progress or (lambda *_: None), tell or (lambda _: None)
+    if model == "auto":
+        if params is not None:
+            raise InputError("params belong to one model; name it instead of 'auto'")
+        from foamfit.auto import climb  # the one fit that has rungs
+
+        return climb(measurement, options, progress, tell)
+    return judge(identify(measurement, model, params, options, progress), options.choice, tell)

@@ -1,0 +1,337 @@
+"""Do mass, velocity, force and motion of a test agree? And what `foamfit check` prints of a test.
+
+The striker brings m v²/(2 A H) per unit volume; what the stress does on the way to the largest
+strain must take it up. The impulse of the force must be the striker's change of momentum.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from foamfit.data.measurement import INTEGRATED, Array, Measurement, Striker, interior_channel
+from foamfit.data.prepare import engineering, line_at, noise_level
+
+
+@dataclass(frozen=True)
+class EnergyAudit:
+    """The energy and momentum of one test; None where the test does not say enough.
+
+    Attributes
+    ----------
+    striker_energy : float or None
+        Kinetic energy of the striker at contact per volume of foam, J/m³.
+    absorbed_energy, dissipated_energy : float or None
+        ∫σ dε up to the largest strain, and over the whole history, J/m³.
+    dissipated_fraction, absorbed_over_striker : float or None
+        Dissipated over absorbed energy, and absorbed over the striker's energy.
+    rebound_velocity : float or None
+        Velocity with which the top leaves, m/s, positive away from the specimen.
+    impulse, momentum_change : float or None
+        ∫F dt over contact, and m (v_in + v_out), N·s.
+    impulse_ratio : float or None
+        The first over the second; one if force, mass and motion agree.
+    motion : str or None
+        Where the displacement came from.
+    missing : tuple of str
+        What could not be computed and what it would need, one sentence each.
+    """
+
+    striker_energy: float | None = None
+    absorbed_energy: float | None = None
+    dissipated_energy: float | None = None
+    dissipated_fraction: float | None = None
+    absorbed_over_striker: float | None = None
+    rebound_velocity: float | None = None
+    impulse: float | None = None
+    momentum_change: float | None = None
+    impulse_ratio: float | None = None
+    motion: str | None = None
+    missing: tuple[str, ...] = ()
+
+    def as_dict(self) -> dict[str, float | str | None]:
+        """Return the audit as plain values; `missing` and `warnings` are joined to one text."""
+        values: dict[str, float | str | None] = asdict(self)
+        return values | {"missing": " ".join(self.missing), "warnings": " ".join(self.warnings())}
+
+    def warnings(self) -> list[str]:
+        """Return one sentence for each balance that does not close."""
+        return self.energy_warnings() + self.impulse_warnings()
+
+    def energy_warnings(self) -> list[str]:
+        """Return one sentence for each balance of energy that does not close."""
+        found, taken = [], self.absorbed_over_striker
+        if taken is not None and taken > 1.05:
+            found.append(
+                f"Check: the foam absorbs {taken:.2f} times the energy that the striker brings, "
+                "which is impossible; mass, velocity, force and motion do not agree."
+            )
+        elif taken is not None and taken < 0.9:
+            found.append(
+                f"Check: the foam absorbs only {taken:.2f} of the energy that the striker brings; "
+                "mass, velocity, force and motion do not agree, or the record ends too early."
+            )
+        if self.dissipated_fraction is not None and self.dissipated_fraction < -0.02:
+            found.append("Check: the loop gives out more energy than it takes up.")
+        return found
+
+    def impulse_warnings(self) -> list[str]:
+        """Return a sentence if the impulse of the force is not the change of momentum."""
+        ratio = self.impulse_ratio
+        if ratio is None or abs(ratio - 1) <= 0.1:
+            return []
+        return [
+            f"Check: the impulse of the force is {ratio:.2f} of the striker's change of "
+            "momentum; mass, the scale of the force and the motion do not agree."
+        ]
+
+    def sentences(self) -> list[str]:
+        """Return what was found, what does not close, and what is missing."""
+        found = []
+        if self.striker_energy is not None:
+            found.append(f"The striker brings {engineering(self.striker_energy, 'J/m³')}.")
+        if self.absorbed_energy is not None:
+            share = ""
+            if self.absorbed_over_striker is not None:
+                share = f", {self.absorbed_over_striker:.2f} of what the striker brings"
+            peak = engineering(self.absorbed_energy, "J/m³")
+            found.append(f"The foam absorbs {peak} up to the largest strain{share}.")
+        if self.dissipated_energy is not None and self.dissipated_fraction is not None:
+            lost = engineering(self.dissipated_energy, "J/m³")
+            found.append(f"It dissipates {lost}, {self.dissipated_fraction:.0%} of that.")
+        if self.rebound_velocity is not None:
+            found.append(f"The striker leaves at {self.rebound_velocity:.3g} m/s.")
+        if self.impulse is not None and self.momentum_change is not None:
+            found.append(
+                f"The impulse of the force is {self.impulse:.4g} N·s, the striker's change of "
+                f"momentum {self.momentum_change:.4g} N·s (ratio {self.impulse_ratio:.2f})."
+            )
+        return [*found, *self.warnings(), *self.missing]
+
+
+def audit(measurement: Measurement) -> EnergyAudit:
+    """Compare what the striker brings with what the specimen takes.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        A conditioned test; whatever it lacks is left None and named in `missing`.
+
+    Returns
+    -------
+    EnergyAudit
+        Energies in J/m³, impulse in N·s.
+    """
+    test, missing = measurement, list[str]()
+    striker, specimen = test.striker or Striker(), test.specimen
+    striker_energy = absorbed = dissipated = ratio = None
+    if striker.mass and striker.velocity:
+        volume = specimen.area * specimen.height
+        striker_energy = striker.mass * striker.velocity**2 / (2 * volume)
+    else:
+        missing.append("The striker's energy needs its mass and velocity.")
+    if test.stress is not None and test.displacement is not None:
+        strain = test.displacement / specimen.height
+        top, largest = largest_motion(test.displacement, test.time)
+        # What precedes the first sample is the triangle from zero at time zero.
+        before = 0.5 * float(max(test.stress[0], 0.0) * max(strain[0], 0.0))
+        absorbed = before + float(np.trapezoid(test.stress[: top + 1], strain[: top + 1]))
+        # The sum ends at a noisy strain, where the stress is highest; the true end is the turn.
+        absorbed += float(test.stress[top]) * (largest / specimen.height - float(strain[top]))
+        if _unloaded(test.stress):
+            dissipated = before + float(np.trapezoid(test.stress, strain))
+        else:
+            missing.append("The dissipated energy needs the unloading.")
+        ratio = absorbed / striker_energy if striker_energy else None
+    else:
+        missing.append("The absorbed energy needs stress and displacement.")
+    rebound = _rebound(test)
+    impulse, change = _momentum(test, striker, rebound)
+    if test.motion == INTEGRATED:
+        missing.append("The motion comes from the force, so the balances check nothing here.")
+    elif change is None:
+        missing.append("The balance of momentum needs an impact of known mass with its rebound.")
+    return EnergyAudit(
+        striker_energy=striker_energy,
+        absorbed_energy=absorbed,
+        dissipated_energy=dissipated,
+        dissipated_fraction=dissipated / absorbed if dissipated is not None and absorbed else None,
+        absorbed_over_striker=ratio,
+        rebound_velocity=rebound,
+        impulse=impulse,
+        momentum_change=change,
+        impulse_ratio=impulse / change if impulse is not None and change else None,
+        motion=test.motion,
+        missing=tuple(missing),
+    )
+
+
+def largest_motion(displacement: Array, time: Array | None = None) -> tuple[int, float]:
+    """Find the turn of a motion: the largest of its samples would be the largest of its noise.
+
+    A quartic is fitted to the samples about the turn that the noise could confuse with it; where
+    the motion is so clean that they are few, the largest sample is the turn.
+
+    Parameters
+    ----------
+    displacement : (n,) array
+        m.
+    time : (n,) array, optional
+        s; without it the samples count as evenly spaced.
+
+    Returns
+    -------
+    index : int
+        The sample at the turn.
+    value : float
+        The displacement there, free of the noise of that sample, m.
+    """
+    floor = displacement.max() - 8.0 * noise_level(displacement)
+    near = np.flatnonzero(displacement >= floor)
+    about = np.arange(near[0], near[-1] + 1)
+    if len(about) < 12:
+        top = int(np.argmax(displacement))
+        return top, float(displacement[top])
+    x = about.astype(np.float64) if time is None else time[about]
+    x = 2.0 * (x - x[0]) / (x[-1] - x[0]) - 1.0
+    turn = np.polyval(np.polyfit(x, displacement[about], 4), x)
+    top = int(np.argmax(turn))
+    return int(about[top]), float(turn[top])
+
+
+def _unloaded(stress: Array) -> bool:
+    return float(stress[-3:].mean()) < 0.1 * float(stress.max())
+
+
+def _rebound(test: Measurement) -> float | None:
+    """Velocity away from the specimen at the end of an impact, from its last samples."""
+    time, w = test.time, test.displacement
+    if test.striker is None or time is None or w is None:
+        return None
+    if test.stress is None or not _unloaded(test.stress):
+        return None
+    last = slice(-max(5, len(w) // 20), None)
+    return -line_at(time[last], w[last], time[-1])[1]
+
+
+def _momentum(
+    test: Measurement, striker: Striker, rebound: float | None
+) -> tuple[float | None, float | None]:
+    """Impulse of the force, and the striker's change of momentum by a motion of its own."""
+    time, stress = test.time, test.stress
+    if test.striker is None or time is None or stress is None:
+        return None, None
+    impulse = test.specimen.area * float(np.trapezoid(stress, time) + 0.5 * stress[0] * time[0])
+    if not (striker.mass and striker.velocity) or rebound is None:
+        return impulse, None
+    if test.motion == INTEGRATED:
+        return impulse, None
+    return impulse, striker.mass * (striker.velocity + rebound)
+
+
+# What `foamfit check` prints.
+
+
+def describe(measurement: Measurement, audit: EnergyAudit) -> str:
+    """Write what the loader understood of a test, for people: a few aligned lines.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        The conditioned test.
+    audit : EnergyAudit
+        Its balance of energy and momentum.
+
+    Returns
+    -------
+    str
+        Text of about thirty lines, without a newline at its end.
+    """
+    test = measurement
+    lines = [("test", test.name), ("file", str(test.path or "none"))]
+    lines += [("specimen", _specimen(test)), ("striker", _striker(test))]
+    lines += _labelled("rows", test.rows.sentences())
+    lines += [("samples", _sampling(test))]
+    lines += _peaks(test)
+    lines += _labelled("noise", noise_sentences(test))
+    lines += _labelled("done", test.notes) + _labelled("energy", audit.sentences())
+    return "\n".join(f"{label:<10}{_wrap(text)}" for label, text in lines)
+
+
+def noise_sentences(measurement: Measurement) -> list[str]:
+    """Say of each channel what its noise is, one standard deviation, and how it is known."""
+    told = []
+    for channel, values in measurement.channels().items():
+        level = measurement.noise.of(channel)
+        if level is not None:
+            sigma = engineering(level.sigma, "Pa" if channel == "stress" else "m")
+            share = level.sigma / (float(np.ptp(values)) or 1.0)
+            slow = f", each follows the others for {level.time:.1f} samples"
+            slow = slow if level.time > 1.0 else ""
+            told.append(
+                f"{channel} {sigma} ({100.0 * share:.2g} % of its range), {level.how}{slow}."
+            )
+    return told
+
+
+def _wrap(text: str) -> str:
+    import textwrap
+
+    return textwrap.fill(text, width=98, initial_indent=" " * 10, subsequent_indent=" " * 12)[10:]
+
+
+def _labelled(label: str, sentences: tuple[str, ...] | list[str]) -> list[tuple[str, str]]:
+    return [(label if i == 0 else "", text) for i, text in enumerate(sentences)]
+
+
+def _specimen(test: Measurement) -> str:
+    s = test.specimen
+    text = f"height {engineering(s.height, 'm')}, area {s.area * 1e6:.4g} mm²"
+    if s.mass:
+        density = s.mass / (s.area * s.height)
+        text += f", mass {engineering(s.mass * 1e3, 'g')} ({density:.4g} kg/m³)"
+    if s.heights:
+        text += f", springs from the base {' + '.join(engineering(h, 'm') for h in s.heights)}"
+    return text
+
+
+def _striker(test: Measurement) -> str:
+    s = test.striker or Striker()
+    mass = engineering(s.mass * 1e3, "g") if s.mass else "mass unknown"
+    speed = f"{s.velocity:.4g} m/s" if s.velocity else "velocity unknown"
+    return f"{mass}, {speed}" if test.striker else "none given"
+
+
+def _sampling(test: Measurement) -> str:
+    time = test.time
+    channels = {"time": time, "stress": test.stress, "displacement": test.displacement}
+    channels |= {interior_channel(node): values for node, values in test.interior.items()}
+    present = [name for name, values in channels.items() if values is not None]
+    n = max(len(values) for values in channels.values() if values is not None)
+    text = f"{n} of {', '.join(present)}"
+    if time is None:
+        return f"{text}; no time, so only slow drives make sense"
+    step = float(np.median(np.diff(time)))
+    end = engineering(float(time[-1]), "s")
+    return f"{text}, every {engineering(step, 's')} from time zero to {end}"
+
+
+def _peaks(test: Measurement) -> list[tuple[str, str]]:
+    lines = []
+    if test.stress is not None:
+        at = _moment(test.time, int(np.argmax(test.stress)))
+        lines.append(("stress", f"peak {engineering(float(test.stress.max()), 'Pa')}{at}"))
+    if test.displacement is not None:
+        top, w = largest_motion(test.displacement, test.time)
+        at = _moment(test.time, top)
+        text = f"peak {w / test.specimen.height:.4g} ({engineering(w, 'm')}){at}, {test.motion}"
+        lines.append(("strain", text))
+    for node, values in test.interior.items():
+        top, w = largest_motion(values, test.time)
+        lines.append((f"mass {node}", f"peak {engineering(w, 'm')}{_moment(test.time, top)}"))
+    return lines
+
+
+def _moment(time: Array | None, sample: int) -> str:
+    return "" if time is None else f" at {engineering(float(time[sample]), 's')}"

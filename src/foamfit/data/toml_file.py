@@ -1,0 +1,245 @@
+"""The TOML beside a test: specimen, striker, columns, noise, window and data, checked and in SI.
+
+[columns] names the column of a channel where its header does not: ``column``, ``unit``, ``scale``
+(a number, or a quantity such as "4444.4 N/V"; negative turns a sign round) and, for displacements,
+``counts_down = true`` (a gap or a position that gets smaller in compression). [data] ``duplicates``
+is "average" (neighbouring rows with one time stamp make one sample) or "refuse".
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+import tomllib
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from foamfit.data.measurement import Noise, Specimen, Striker, interior_node
+from foamfit.data.prepare import Window
+from foamfit.data.units import is_unit, parse_quantity, split_quantity
+from foamfit.errors import InputError
+from foamfit.terminal import printable
+
+_LARGEST = 1_000_000  # characters of a TOML
+_LONGEST = 200  # characters of a name
+# Many keys that are joined by dots.
+_DOTTED = re.compile(r"""(?<![\w"'-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){32}""")
+# Section, key: SI unit and an example.
+_SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
+    "specimen": {
+        "height": ("m", "1.19 mm"),
+        "diameter": ("m", "5 mm"),
+        "area": ("m**2", "19.6 mm^2"),
+        "mass": ("kg", "5.56 mg"),
+        "heights": ("m", "0.7 mm"),
+    },
+    "striker": {"mass": ("kg", "7 g"), "velocity": ("m/s", "1.75 m/s")},
+    "noise": {"stress": ("Pa", "20 kPa"), "displacement": ("m", "2 um")},
+    "window": {"start": ("s", "0.5 ms"), "end": ("s", "2 ms"), "cycle": ("", "1")},
+    "data": {"duplicates": ("", "average")},
+}
+DUPLICATES = ("average", "refuse")
+
+
+@dataclass(frozen=True)
+class Column:
+    """What [columns] says of one channel: its column, and the unit and scale of its numbers.
+
+    `counts_down` says that the column is a gap or a position that gets smaller in compression; the
+    displacement is what it has lost since contact.
+    """
+
+    column: str
+    unit: str | None = None
+    scale: float = 1.0
+    scale_unit: str = ""
+    counts_down: bool = False
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the TOML says, in SI.
+
+    `duplicates` says what becomes of neighbouring rows with the same time stamp: "average" makes
+    one sample of them, "refuse" ends the reading.
+    """
+
+    name: str
+    specimen: Specimen
+    striker: Striker | None
+    noise: Noise
+    window: Window
+    columns: dict[str, Column] = field(default_factory=dict)
+    duplicates: str = "average"
+
+
+def load_toml(path: Path, otherwise: str) -> dict[str, Any]:
+    """Load a TOML file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    otherwise : str
+        What to say where there is none: what it is needed for.
+
+    Raises
+    ------
+    InputError
+        If there is none or it is no TOML.
+    """
+    try:
+        with path.open("rb") as file:
+            raw = file.read(_LARGEST + 1)
+        if len(raw) > _LARGEST:
+            size = path.stat().st_size
+            raise InputError(f"{path}: has {size} characters; a TOML must have {_LARGEST} at most.")
+        text = raw.decode("utf-8-sig")
+        if _DOTTED.search(text):  # tomllib takes a time that grows with the square of their number
+            raise RecursionError
+        return tomllib.loads(text)
+    except RecursionError:
+        raise InputError(
+            f"{path}: is nested too deeply; a TOML of foamfit has few levels."
+        ) from None
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; {otherwise}.") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); give a TOML file.") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: is no UTF-8 text; a TOML file must be.") from None
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: is no valid TOML: {error}.") from None
+
+
+def check_keys(where: str, given: Iterable[str], valid: Iterable[str]) -> None:
+    """Refuse a key that is not valid, and name those that may be meant."""
+    valid = list(valid)
+    for key in given:
+        if key not in valid:
+            near = difflib.get_close_matches(key[:_LONGEST], valid, n=2, cutoff=0.4) or valid
+            key = key if len(key) <= _LONGEST else f"{key[:_LONGEST]} …"
+            raise InputError(f"{where} has no key {key!r}; meant may be {', '.join(near)}.")
+
+
+def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Settings:
+    """Read and check the TOML at `path`.
+
+    Parameters
+    ----------
+    path : Path
+        The TOML.
+    test : Path
+        The test file that it describes.
+    channels : iterable of str
+        What [columns] may name besides displacement_1, displacement_2, …
+
+    Raises
+    ------
+    InputError
+        Naming the file and the key that is wrong or missing.
+    """
+    document = load_toml(path, f"{test.name} needs a TOML with [specimen] height and diameter")
+    check_keys(f"{path}:", document, ["name", "columns", *_SECTIONS])
+    name = document.get("name", test.stem)
+    if not isinstance(name, str) or not name.strip():
+        raise InputError(f"{path}: name = {name!r} is no text; give it in quotation marks.")
+    if len(name) > _LONGEST:
+        raise InputError(
+            f"{path}: name has {len(name)} characters; it must have {_LONGEST} at most."
+        )
+    control = next((c for c in name if not c.isprintable()), None)
+    if control is not None and "name" in document:
+        raise InputError(
+            f"{path}: name has a control character, U+{ord(control):04X}; write it in plain text."
+        )
+    values: dict[str, dict[str, Any]] = {}
+    for section, keys in _SECTIONS.items():
+        table = document.get(section, {})
+        if not isinstance(table, dict):
+            raise InputError(f"{path}: {section} must be a table, [{section}].")
+        check_keys(f"{path}: [{section}]", table, keys)
+        values[section] = {k: _value(path, section, k, v) for k, v in table.items()}
+    return Settings(
+        name=printable(name),
+        specimen=_specimen(path, values["specimen"]),
+        striker=Striker(**values["striker"]) if values["striker"] else None,
+        noise=Noise(**values["noise"]),
+        window=Window(**values["window"]),
+        columns=_columns(path, document.get("columns", {}), channels),
+        **values["data"],
+    )
+
+
+def _value(path: Path, section: str, key: str, value: Any) -> Any:
+    si, example = _SECTIONS[section][key]
+    where = f"{path}: [{section}] {key}"
+    if key == "cycle":
+        if type(value) is not int or value < 1:
+            raise InputError(f"{where} = {value!r} must be a whole number from 1 up.")
+        return value
+    if key == "duplicates":
+        if value not in DUPLICATES:
+            raise InputError(f"{where} = {value!r} must be one of {', '.join(DUPLICATES)}.")
+        return value
+    if key == "heights":
+        if not isinstance(value, list) or not value:
+            raise InputError(f'{where} must be a list like ["0.700 mm", "0.490 mm"], base first.')
+        return tuple(_positive(parse_quantity(v, si, where, example), where, v) for v in value)
+    number = parse_quantity(value, si, where, example)
+    return number if section == "window" else _positive(number, where, value)
+
+
+def _positive(number: float, where: str, value: object) -> float:
+    if not (number > 0 and math.isfinite(number)):
+        raise InputError(f'{where} = "{value}" must be positive.')
+    return number
+
+
+def _specimen(path: Path, values: dict[str, Any]) -> Specimen:
+    if "height" not in values:
+        raise InputError(f'{path}: [specimen] height is missing; give it like height = "1.19 mm".')
+    diameter = values.pop("diameter", None)
+    if diameter is None and "area" not in values:
+        raise InputError(f'{path}: [specimen] needs a diameter = "5 mm" or an area = "19.6 mm^2".')
+    if diameter is not None:
+        area = math.pi * diameter**2 / 4
+        if not math.isclose(values.setdefault("area", area), area, rel_tol=0.02):
+            raise InputError(f"{path}: [specimen] area and diameter disagree; give one of them.")
+    heights = values.get("heights")
+    if heights and not math.isclose(sum(heights), values["height"], rel_tol=0.02):
+        raise InputError(f"{path}: [specimen] heights must add up to height.")
+    return Specimen(**values)
+
+
+def _columns(path: Path, table: Any, channels: Iterable[str]) -> dict[str, Column]:
+    if not isinstance(table, dict):
+        raise InputError(f"{path}: columns must be a table, [columns].")
+    inside = [key for key in table if interior_node(key)]
+    check_keys(f"{path}: [columns]", table, [*channels, *inside])
+    columns: dict[str, Column] = {}
+    for channel, spec in table.items():
+        where = f"{path}: [columns] {channel}"
+        if not isinstance(spec, dict) or not isinstance(spec.get("column"), str):
+            raise InputError(f'{where} must be like {{ column = "Load", unit = "V" }}.')
+        motion = channel == "displacement" or interior_node(channel) is not None
+        check_keys(where, spec, ["column", "unit", "scale", *(["counts_down"] if motion else [])])
+        down = spec.get("counts_down", False)
+        if not isinstance(down, bool):
+            raise InputError(f"{where}: counts_down = {down!r} must be true or false.")
+        unit = spec.get("unit")
+        if unit is not None and (not isinstance(unit, str) or not is_unit(unit)):
+            raise InputError(f'{where}: unit = {unit!r} is unknown; give it like unit = "mm".')
+        scale = _scale(where, spec.get("scale", 1))
+        columns[channel] = Column(spec["column"], unit, *scale, down)
+    return columns
+
+
+def _scale(where: str, scale: Any) -> tuple[float, str]:
+    parts = split_quantity(str(scale))
+    if parts is None or parts[0] in (0.0, math.inf, -math.inf) or not is_unit(parts[1]):
+        raise InputError(f'{where}: scale = {scale!r} must be like -1 or "4444.4 N/V".')
+    return parts

@@ -1,0 +1,241 @@
+"""The coordinates of the search: a box in which every point is an admissible chain.
+
+Logarithms of the stiffnesses and of ε_a, the drop Δσ/σ_a, the place of ε_c between ε_a and one,
+slopes and damping over the scales of the test, a time shift over the largest one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foamfit.data.measurement import Measurement
+from foamfit.springs.model import Model, split_name
+
+Array = NDArray[np.float64]
+
+LAST_STRAIN = 0.999
+
+
+@dataclass(frozen=True)
+class Scales:
+    """The scales of a test that make its parameters dimensionless.
+
+    Attributes
+    ----------
+    stress, strain : float
+        Largest stress (Pa) and overall strain.
+    rate : float
+        Typical strain rate, 1/s; 0 where time is unknown.
+    height : float
+        m.
+    """
+
+    stress: float
+    strain: float
+    rate: float
+    height: float
+
+    @classmethod
+    def of(cls, measurement: Measurement) -> Scales:
+        """Scales of a test with stress and, if known, displacement."""
+        assert measurement.stress is not None
+        height = measurement.specimen.height
+        strain = 0.5
+        if measurement.displacement is not None:
+            strain = min(max(float(np.max(measurement.displacement)) / height, 1e-6), 0.999)
+        rate = 0.0
+        if measurement.time is not None:
+            loaded = measurement.time[measurement.stress > 0.02 * np.max(measurement.stress)]
+            rate = 2.0 * strain / max(float(np.ptp(loaded)), 1e-300) if loaded.size > 1 else 0.0
+        return cls(float(np.max(measurement.stress)), strain, rate, height)
+
+    @property
+    def slope(self) -> float:
+        """Stress over strain, Pa."""
+        return self.stress / self.strain
+
+    @property
+    def eta(self) -> float:
+        """Damping that would carry the whole stress, Pa·s."""
+        return self.stress / self.rate if self.rate > 0.0 else 1.0
+
+    @property
+    def duration(self) -> float:
+        """Time under load, s; 1 where time is unknown."""
+        return 2.0 * self.strain / self.rate if self.rate > 0.0 else 1.0
+
+    def of_parameter(self, name: str, values: dict[str, float]) -> float:
+        """Natural size of a parameter, in its unit: what a change by 100 % means."""
+        spring, short = split_name(name)
+        if short == "eta":
+            return max(abs(values[name]), 0.1 * self.eta)
+        if short == "time_shift":
+            return 0.01 * self.duration
+        if short in ("kh_plus", "kh_minus"):
+            return max(abs(values[name]), 0.1 * self.slope)
+        if short == "dsigma":
+            eps_a = values[f"s{spring + 1}_eps_a"]
+            return values[f"s{spring + 1}_k0"] * eps_a / (1.0 - eps_a)
+        return abs(values[name]) or 1.0
+
+
+# Coordinates of the box: lowest and highest. Stiffnesses are over the largest stress, slopes over
+# stress/strain, all of the test.
+BOX = {
+    "k0": (np.log(1e-3), np.log(1e4)),
+    "kc": (np.log(1e-2), np.log(1e5)),
+    "eps_a": (np.log(1e-3), np.log(0.95)),
+    "eps_c": (0.002, 1.0),
+    "dsigma": (0.0, 0.999),
+    "kh_plus": (0.0, 50.0),
+    "kh_minus": (0.0, 50.0),
+    "eta": (0.0, 10.0),
+    "height": (0.02, 0.98),
+    "time_shift": (-1.0, 1.0),
+}
+# Largest time shift between force and motion, over the time under load.
+LARGEST_SHIFT = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Space:
+    """The box in which the search moves, and the way between it and the vector of parameters.
+
+    Parameters
+    ----------
+    model : Model
+        The springs.
+    scales : Scales
+        Of the test.
+    values : (n,) array
+        Values of the parameters that do not vary (SI); the others are ignored.
+    free : tuple of str
+        Names of the parameters that vary.
+    low, high : (n,) arrays
+        Limits of every parameter, SI.
+    tied : callable or None
+        Completes a vector in which some parameters hang on others.
+    """
+
+    model: Model
+    scales: Scales
+    values: Array
+    free: tuple[str, ...]
+    low: Array
+    high: Array
+    tied: Callable[[Array], Array] | None
+
+    @cached_property
+    def coordinates(self) -> list[tuple[int, str, int]]:
+        """Place, short name, place of the spring's first parameter; what others need is first."""
+        out = []
+        for name in sorted(self.free, key=lambda name: list(BOX).index(split_name(name)[1])):
+            spring, short = split_name(name)
+            first = self.model.index[f"s{spring + 1}_k0"] if spring >= 0 else -1
+            place = self.model.index.get(name, len(self.model.names))  # the nuisance stands last
+            out.append((place, short, first))
+        return out
+
+    @cached_property
+    def box(self) -> tuple[Array, Array]:
+        """Lowest and highest coordinates, (n_free,) each."""
+        pairs = np.array([BOX[short] for _, short, _ in self.coordinates])
+        return pairs[:, 0], pairs[:, 1]
+
+    def _unit(self, short: str) -> float:
+        if short == "height":
+            return self.scales.height
+        if short == "time_shift":
+            return LARGEST_SHIFT * self.scales.duration
+        return self.scales.eta if short == "eta" else self.scales.slope
+
+    def encode(self, values: Array) -> Array:
+        """Coordinates of a vector of parameters, moved into the box."""
+        out = np.empty(len(self.coordinates))
+        for j, (i, short, first) in enumerate(self.coordinates):
+            if short in ("k0", "kc"):
+                out[j] = np.log(max(values[i], 1e-300) / self.scales.stress)
+            elif short == "eps_a":
+                out[j] = np.log(max(values[i], 1e-300))
+            elif short == "eps_c":
+                out[j] = (values[i] - values[first + 3]) / (LAST_STRAIN - values[first + 3])
+            elif short == "dsigma":
+                out[j] = -values[i] / _stress_at_a1(values, first)
+            else:
+                out[j] = values[i] / self._unit(short)
+        low, high = self.box
+        margin = 1e-9 * (high - low)
+        return np.clip(out, low + margin, high - margin)
+
+    def decode(self, point: Array) -> Array:
+        """Vector of parameters (SI) at a point of the box."""
+        values = self.values.copy()
+        for u, (i, short, first) in zip(point, self.coordinates, strict=True):
+            value = self._value(u, short, first, values)
+            values[i] = min(max(value, self.low[i]), self.high[i])
+        return self.complete(values)
+
+    def complete(self, values: Array) -> Array:
+        """Complete a vector by what hangs on others."""
+        return values if self.tied is None else self.tied(values)
+
+    def _value(self, u: float, short: str, first: int, values: Array) -> float:
+        """Parameter of a coordinate, whatever its limits; what it needs of `values` is there."""
+        if short in ("k0", "kc"):
+            return float(np.exp(u)) * self.scales.stress
+        if short == "eps_a":
+            return float(np.exp(u))
+        if short == "eps_c":
+            eps_a = float(values[first + 3])
+            return eps_a + u * (LAST_STRAIN - eps_a)
+        return -u * _stress_at_a1(values, first) if short == "dsigma" else u * self._unit(short)
+
+    def slopes(self, point: Array, values: Array) -> Array:
+        """Derivative of the parameters by the coordinates at a point, (n_values, n_free).
+
+        `values` is the decoded point.
+        """
+        moves = np.zeros((values.size, point.size))
+        for j, (i, short, first) in enumerate(self.coordinates):
+            if short in ("k0", "kc", "eps_a"):
+                moves[i, j] = values[i]
+            elif short == "eps_c":
+                moves[i] = (1.0 - point[j]) * moves[first + 3]
+                moves[i, j] = LAST_STRAIN - values[first + 3]
+            elif short == "dsigma":
+                v = 1.0 - values[first + 3]
+                rise = (
+                    values[first + 3] / v * moves[first]
+                    + values[first] / (v * v) * moves[first + 3]
+                )
+                moves[i] = -point[j] * rise
+                moves[i, j] = -_stress_at_a1(values, first)
+            else:
+                moves[i, j] = self._unit(short)
+            if not self.low[i] <= self._value(point[j], short, first, values) <= self.high[i]:
+                moves[i] = 0.0
+        return self.follow(values, moves, np.full(point.size, 1e-5))
+
+    def follow(self, values: Array, moves: Array, steps: Array) -> Array:
+        """Complete moves (n_values, m) of the parameters by those of what hangs on others.
+
+        Differences of the expressions over `steps` (m,): no simulation is in them.
+        """
+        if self.tied is None:
+            return moves
+        out = np.empty_like(moves)
+        for j, step in enumerate(steps):
+            ahead = self.tied(values + step * moves[:, j])
+            out[:, j] = (ahead - self.tied(values - step * moves[:, j])) / (2.0 * step)
+        # what does not hang on others keeps its move to the last digit
+        return np.where(moves != 0.0, moves, out)
+
+
+def _stress_at_a1(values: Array, first: int) -> float:
+    """σ_a = k0 ε_a/(1-ε_a) of the spring whose parameters start at `first`, Pa."""
+    return float(values[first] * values[first + 3] / (1.0 - values[first + 3]))

@@ -1,0 +1,680 @@
+"""The objective: how far a model's curves are from the measured ones, sample by sample.
+
+Curves are compared in time (or sample by sample along a history), never by interpolating across
+the loop. Two channels were measured, stress and displacement, and perhaps displacements of masses
+inside; what is counted of them, and how much, is in `weights`, so that nothing is counted twice
+silently.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from numbers import Real
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lstsq
+from scipy.ndimage import convolve1d
+
+from foamfit.data.measurement import INTEGRATED, Measurement, NoiseLevel, interior_channel
+from foamfit.data.noise import with_noise
+from foamfit.errors import InputError, SimulationError
+from foamfit.solve.plan import Motion, Plan
+from foamfit.solve.plan import plan as make_plan
+from foamfit.springs import kernels
+from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
+from foamfit.springs.model import Model
+from foamfit.springs.spring import LinearSpring
+
+Array = NDArray[np.float64]
+
+# Of every objective; to them come displacement_1_time … where masses inside were followed.
+CURVES = ("stress_time", "displacement_time", "stress_strain")
+# Those that need a motion.
+MOTION_CURVES = ("displacement_time", "stress_strain")
+DRIVES = ("impact", "stress", "displacement")
+# What a residual is, in units of the curve's scale, where a simulation failed.
+PENALTY = 10.0
+NOWHERE = np.empty(0, np.int64)
+# Share of a channel's range that estimated noise counts for at least. The law has not followed a
+# measured foam closer than 1 % of its range: noise far below that must not let one channel outweigh
+# the other by what is an error of the model in both.
+MODEL_ERROR = 0.005
+# Losses, and the residual (in units of the scale) past which each gives way: those of 95 %
+# efficiency under normal noise for Huber's and Cauchy's (Holland & Welsch 1977, Commun. Stat. A6,
+# 813).
+LOSSES = {"linear": np.inf, "soft_l1": 1.345, "huber": 1.345, "cauchy": 2.385}
+# A trial that needs more steps than this is too stiff to be worth waiting for.
+MAX_STEPS = 20_000
+
+
+def choose_drive(measurement: Measurement) -> str:
+    """Choose the drive: impact if striker and time are known, else displacement.
+
+    Raises
+    ------
+    InputError
+        If the test has neither.
+    """
+    striker = measurement.striker
+    if (
+        striker is not None
+        and striker.mass is not None
+        and striker.velocity
+        and measurement.time is not None
+    ):
+        return "impact"
+    if measurement.displacement is not None:
+        return "displacement"
+    raise InputError(
+        f"{measurement.name}: no drive is possible; give a displacement or strain column, "
+        "or time and a [striker] with mass and velocity"
+    )
+
+
+def check_drive(measurement: Measurement, drive: str) -> None:
+    """Refuse a drive that the test cannot feed.
+
+    Raises
+    ------
+    InputError
+        Naming what is missing.
+    """
+    if drive not in DRIVES:
+        raise InputError(f"drive '{drive}' is unknown; it must be one of {', '.join(DRIVES)}")
+    striker = measurement.striker
+    missing = []
+    if measurement.stress is None:
+        missing.append("a force or stress column")
+    if drive == "impact":
+        if measurement.time is None:
+            missing.append("a time column")
+        if striker is None or striker.mass is None:
+            missing.append("[striker] mass")
+        if striker is None or not striker.velocity:
+            missing.append("[striker] velocity greater than zero")
+    elif measurement.displacement is None:
+        missing.append("a displacement or strain column")
+    if missing:
+        raise InputError(f"{measurement.name}: the {drive} drive needs {' and '.join(missing)}")
+    force = measurement.outliers.get("stress")
+    if drive == "stress" and force is not None and force.clipped_at is not None:
+        raise InputError(
+            f"{measurement.name}: the force is clipped, so it cannot drive the specimen; choose "
+            "the displacement or the impact drive"
+        )
+
+
+def interior_curves(measurement: Measurement, springs: int) -> dict[str, int]:
+    """Curves of the masses inside a chain of so many springs that were followed, and their node."""
+    nodes = sorted(node for node in measurement.interior if node < springs)
+    return {f"{interior_channel(node)}_time": node for node in nodes}
+
+
+def check_interior(measurement: Measurement, springs: int) -> None:
+    """Refuse the displacement of a mass that is not inside a chain of so many springs.
+
+    Raises
+    ------
+    InputError
+        Naming the node. A single spring has nothing inside; the result's notes say so.
+    """
+    wrong = [node for node in sorted(measurement.interior) if node >= springs]
+    if not wrong or springs == 1:
+        return
+    name = interior_channel(wrong[0])
+    top = (
+        f"node {springs} of a {springs}-spring chain is the top, which is the 'displacement' column"
+    )
+    raise InputError(
+        f"{measurement.name}: {name} is no mass inside a chain of {springs} springs: {top}; take "
+        "a model of more springs, or rename or leave out that column"
+    )
+
+
+def default_weights(measurement: Measurement, drive: str, springs: int = 1) -> dict[str, float]:
+    """Weights that count each measured channel once, for a chain of so many springs.
+
+    In the impact drive stress and displacement are compared in time; a displacement that was
+    integrated from the force is no second measurement. In the displacement drive the stress along
+    the measured displacement is the one curve, in the stress drive the displacement. Displacements
+    of masses inside count in all drives: they tell the springs apart.
+    """
+    weights = dict.fromkeys(CURVES, 0.0)
+    weights |= dict.fromkeys(interior_curves(measurement, springs), 1.0)
+    if drive == "impact":
+        weights["stress_time"] = 1.0
+        if measurement.displacement is not None and measurement.motion != INTEGRATED:
+            weights["displacement_time"] = 1.0
+    elif drive == "stress":
+        weights["displacement_time"] = 1.0
+    else:
+        weights["stress_strain"] = 1.0
+    return weights
+
+
+def smoothed(values: Array, window: int) -> Array:
+    """Smooth samples by the parabola through each window of them (Savitzky & Golay 1964).
+
+    Analytical Chemistry 36, 1627; as `scipy.signal.savgol_filter`, whose package takes longer to
+    import than a search.
+
+    Parameters
+    ----------
+    values : (n,) array
+        Evenly sampled.
+    window : int
+        Odd, at most n. The first and the last half of a window lie on its parabola.
+    """
+    half, clock = window // 2, np.arange(float(window))
+    weights, *_ = lstsq(np.vander(half - clock, 3, increasing=True).T, np.array([1.0, 0.0, 0.0]))
+    out = convolve1d(values, weights, mode="constant")
+    for edge, part in ((slice(half), slice(window)), (slice(-half, None), slice(-window, None))):
+        out[edge] = np.polyval(np.polyfit(clock, values[part], 2), clock[edge])
+    return np.asarray(out)
+
+
+def driving_stress(stress: Array, model: Model) -> Array:
+    """Smooth a measured stress (Pa) that is to drive a model.
+
+    The noise of a driving stress is taken for stress that acted, and biases the soft branches
+    (errors in variables): a parabola over a twenty-fifth of the samples takes it off. A chain with
+    a unilateral spring carries no tension.
+    """
+    window = 2 * (stress.size // 50) + 1
+    smooth = smoothed(stress, window) if window > 3 else stress
+    return np.maximum(smooth, 0.0) if "unilateral" in model.kinds else smooth
+
+
+def check_time_shift(measurement: Measurement, drive: str) -> None:
+    """Refuse a time shift where the test has no two channels in time.
+
+    Raises
+    ------
+    InputError
+        Saying what is missing.
+    """
+    missing = None
+    if measurement.time is None:
+        missing = "it has no time"
+    elif measurement.displacement is None or measurement.motion == INTEGRATED:
+        missing = "its motion is not measured apart from the force"
+    if missing:
+        raise InputError(
+            f"{measurement.name}: a time shift between force and motion cannot be fitted in the "
+            f"{drive} drive, {missing}; both channels must be measured in time"
+        )
+
+
+def soften(residual: Array, loss: str) -> Array:
+    """Residuals whose squares sum to the loss: sign(r) c √ρ((r/c)²), shape (n,).
+
+    A search that lowers a sum of squares so lowers Σ c² ρ((r/c)²); ρ(z) is z (linear),
+    2 (√(1+z) - 1) (soft_l1), z up to 1 and 2√z - 1 beyond (huber), ln(1+z) (cauchy), as in
+    `scipy.optimize.least_squares`, and c is in `LOSSES`.
+    """
+    if loss == "linear":
+        return residual
+    width = LOSSES[loss]
+    z = (residual / width) ** 2
+    if loss == "soft_l1":
+        rho = 2.0 * z / (np.sqrt(1.0 + z) + 1.0)
+    elif loss == "huber":
+        rho = np.where(z <= 1.0, z, 2.0 * np.sqrt(z) - 1.0)
+    else:
+        rho = np.log1p(z)
+    return np.asarray(np.sign(residual) * width * np.sqrt(rho))
+
+
+def influence(residual: Array, loss: str) -> tuple[Array, Array]:
+    """Influence ψ(r) = r ρ'(z) of residuals under a loss, and its slope ψ'(r), shapes (n,)."""
+    if loss == "linear":
+        return residual, np.ones_like(residual)
+    z = (residual / LOSSES[loss]) ** 2
+    if loss == "soft_l1":
+        return residual / np.sqrt(1.0 + z), (1.0 + z) ** -1.5
+    if loss == "huber":
+        inside = z <= 1.0
+        return residual / np.sqrt(np.maximum(z, 1.0)), inside.astype(float)
+    return residual / (1.0 + z), (1.0 - z) / (1.0 + z) ** 2
+
+
+def softness(residual: Array, loss: str) -> Array:
+    """Derivative of `soften` by the residual, (n,): ψ over the softened residual, 1 at zero."""
+    soft = soften(residual, loss)
+    near = np.abs(soft) < 1e-8
+    return np.where(near, 1.0, influence(residual, loss)[0] / np.where(near, 1.0, soft))
+
+
+@dataclass(frozen=True, eq=False)
+class Simulated:
+    """The curves of one set of parameters; None where the drive prescribes or the test lacks them.
+
+    `stress_strain` is the stress (Pa) along the measured displacement. `motion` is the run itself.
+    `interior` holds the displacements (m) of the masses inside that the test has too, `slopes` the
+    derivatives (p, n) of the curves by the parameters that were asked for; None where none were.
+    """
+
+    stress_time: Array | None
+    displacement_time: Array | None
+    stress_strain: Array | None
+    motion: Motion
+    interior: dict[str, Array] = field(default_factory=dict)
+    slopes: dict[str, Array] | None = None
+
+    def curve(self, name: str) -> Array | None:
+        """Return a curve by its name in `Objective.curves`."""
+        if name not in CURVES:
+            return self.interior.get(name)
+        values: Array | None = getattr(self, name)
+        return values
+
+
+@dataclass(eq=False)
+class Objective:
+    """Residuals of a model under a drive against a measurement.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        The conditioned test.
+    model : Model
+        The springs.
+    drive : str
+        "impact", "stress" or "displacement".
+    weights : dict
+        Weight of each curve; see `default_weights`. A weight w multiplies the curve's squares.
+    rtol : float
+        Tolerance of the simulation.
+    interior_mass : bool
+        Whether the specimen's mass sits between the springs, in equal parts, as in the paper.
+    time_shift : bool
+        Whether the flat vector of parameters ends, after those of the model, with how late the
+        motion channel is, s.
+    loss : str
+        One of `LOSSES`.
+
+    Attributes
+    ----------
+    curves : tuple of str
+        Names of the curves that can be counted.
+    interior : dict of str to int
+        Those of masses inside, and their node.
+    evaluations, failures : int
+        How many sets of parameters were simulated, and how many of them could not be.
+    """
+
+    measurement: Measurement
+    model: Model
+    drive: str
+    weights: dict[str, float]
+    rtol: float = 1e-6
+    interior_mass: bool = False
+    time_shift: bool = False
+    loss: str = "linear"
+    evaluations: int = field(default=0, init=False)
+    failures: int = field(default=0, init=False)
+
+    def __post_init__(self) -> None:
+        """Make the scenes ready and fix the scale of each curve."""
+        check_drive(self.measurement, self.drive)
+        if self.time_shift:
+            check_time_shift(self.measurement, self.drive)
+        if self.loss not in LOSSES:
+            raise InputError(
+                f"loss '{self.loss}' is unknown; it must be one of {', '.join(LOSSES)}"
+            )
+        self.measurement = with_noise(self.measurement)
+        self.interior = interior_curves(self.measurement, len(self.model.kinds))
+        self.curves = (*CURVES, *self.interior)
+        self._check_weights()
+        self._dashpots = np.array([name.endswith("eta") for name in self.model.names])
+        self._dashpots[-1] = False  # the onsite damper is none of a spring
+        self.time = self._time()
+        loading = self._loading()
+        self._plans = {damped: self._scene(loading, damped=damped) for damped in (False, True)}
+        self._along: dict[bool, Plan] = {}
+        if self.measurement.displacement is not None:
+            along = DisplacementDrive(self.measurement.displacement)
+            self._along = {damped: self._scene(along, damped=damped) for damped in (False, True)}
+        self.measured = self._measured()
+        self.counted = tuple(
+            name
+            for name in self.curves
+            if self.weights[name] > 0 and self.measured[name] is not None
+        )
+        self._inside = any(name in self.interior for name in self.counted)
+        if not self.counted:
+            raise InputError(
+                f"{self.measurement.name}: no curve is left to fit; give one that the "
+                f"{self.drive} drive has a weight above zero"
+            )
+        self.scale = {name: self._scale(name) for name in self.curves}
+        self._kept = {name: self._fitted(name) for name in self.curves}
+        self.sizes = tuple(self._curve(name)[self._kept[name]].size for name in self.counted)
+        self.n_data = sum(self.sizes)
+        # Worse per sample than any curve that stays within ten ranges.
+        self.penalty = max(
+            PENALTY
+            * self.weights[name] ** 0.5
+            * float(np.ptp(self._curve(name)))
+            / self.scale[name]
+            for name in self.counted
+        )
+
+    def _check_weights(self) -> None:
+        for name, weight in self.weights.items():
+            number = isinstance(weight, Real)
+            if name not in self.curves or not number or not 0 <= weight < np.inf:
+                raise InputError(
+                    f"weights: '{name}' = {weight} is not admissible; give "
+                    f"{', '.join(self.curves)} a weight of zero or more"
+                )
+        self.weights = dict.fromkeys(self.curves, 0.0) | self.weights
+
+    def _time(self) -> Array:
+        """Time of the samples, s; their number where the test has no time."""
+        time = self.measurement.time
+        stress = self._stress
+        return np.arange(stress.size, dtype=float) if time is None else time
+
+    @property
+    def _stress(self) -> Array:
+        assert self.measurement.stress is not None  # checked by check_drive
+        return self.measurement.stress
+
+    def _loading(self) -> Drive:
+        if self.drive == "impact":
+            striker = self.measurement.striker
+            assert striker is not None
+            assert striker.mass is not None
+            assert striker.velocity is not None
+            return Impact(striker.mass, striker.velocity)
+        if self.drive == "stress":
+            return StressDrive(driving_stress(self._stress, self.model))
+        assert self.measurement.displacement is not None
+        return DisplacementDrive(self.measurement.displacement)
+
+    def _scene(self, loading: Drive, *, damped: bool) -> Plan:
+        """Make a scene ready; only which springs have a dashpot matters here, not their values.
+
+        Interior masses move in an impact only; along a given motion the springs are in equilibrium.
+        """
+        specimen = self.measurement.specimen
+        count = len(self.model.kinds)
+        springs = [LinearSpring(1.0)] * count
+        heights = [specimen.height / count] * count
+        masses = [0.0] * count
+        if self.interior_mass and count > 1 and isinstance(loading, Impact):
+            if specimen.mass is None:
+                raise InputError(
+                    f"{self.measurement.name}: interior masses need [specimen] mass, "
+                    'like mass = "5.56 mg"'
+                )
+            masses = [specimen.mass / (count - 1)] * (count - 1) + [0.0]
+        chain = Chain(springs, heights, specimen.area, masses)
+        return make_plan(chain, loading, self.time, dashpots=damped, max_steps=MAX_STEPS)
+
+    def _measured(self) -> dict[str, Array | None]:
+        """Measured curves that the drive leaves free."""
+        motion = self.measurement.displacement
+        inside = self.measurement.interior
+        return {
+            "stress_time": None if self.drive == "stress" else self._timed(self._stress),
+            "displacement_time": None if self.drive == "displacement" else motion,
+            "stress_strain": None if motion is None else self._stress,
+            **{name: inside[node] for name, node in self.interior.items()},
+        }
+
+    def _timed(self, values: Array) -> Array | None:
+        return None if self.measurement.time is None else values
+
+    def _curve(self, name: str) -> Array:
+        curve = self.measured[name]
+        assert curve is not None
+        return curve
+
+    @property
+    def nuisance(self) -> tuple[str, ...]:
+        """Names of the parameters that the objective adds to those of the model."""
+        return ("time_shift",) if self.time_shift else ()
+
+    def channel(self, name: str) -> str:
+        """Channel of the test that a curve is compared with."""
+        return name.removesuffix("_time") if name.startswith("displacement") else "stress"
+
+    def measured_size(self, name: str) -> int:
+        """Samples of a curve, outliers and all."""
+        return self._curve(name).size
+
+    def noise(self, name: str) -> NoiseLevel:
+        """Noise of a curve, stated or estimated."""
+        level = self.measurement.noise.of(self.channel(name))
+        assert level is not None  # completed by with_noise
+        return level
+
+    def _scale(self, name: str) -> float:
+        """One standard deviation of a curve's noise; an estimated one not below MODEL_ERROR."""
+        curve = self.measured[name]
+        if curve is None:
+            return 1.0
+        level = self.noise(name)
+        return level.sigma if level.given else max(level.sigma, MODEL_ERROR * float(np.ptp(curve)))
+
+    def _fitted(self, name: str) -> slice | NDArray[np.bool_]:
+        """Samples of a curve that count: all but the outliers of its channel."""
+        outliers = self.measurement.outliers.get(self.channel(name))
+        return slice(None) if outliers is None else ~outliers.left_out
+
+    # ------------------------------------------------------------------ simulation and residual
+
+    def simulate(
+        self, values: Array, *, everything: bool = False, places: NDArray[np.int64] = NOWHERE
+    ) -> Simulated:
+        """Simulate a flat vector of parameters; what is not counted only if `everything`.
+
+        `places` are those of the parameters by which derivatives are wanted.
+
+        Raises
+        ------
+        SimulationError
+            If the parameters are not admissible or the scene has no finite answer.
+        """
+        count = len(self.model.names)
+        springs = self._springs(values[:count], everything, places[places < count])
+        if not self.time_shift:
+            return springs
+        return self._shifted(springs, float(values[count]), places == count)
+
+    def _springs(self, values: Array, everything: bool, places: NDArray[np.int64]) -> Simulated:
+        """Simulate the parameters of the model, on one clock; see `simulate`."""
+        height = self.measurement.specimen.height
+        rows = self.model.rows(values)
+        heights = np.ascontiguousarray(self.model.heights(values, height))
+        if rows is None or not (np.all(heights > 0.0) and values[-1] >= 0.0):
+            raise SimulationError("the parameters are not admissible")
+        # A dashpot at zero is left out, unless a derivative by it is wanted.
+        damped = bool(rows[:, kernels.ETA].any()) or bool(self._dashpots[places].any())
+        drag = float(values[-1]) / height
+        everywhere = everything or self._inside
+        wanted = self.model.directions[places]
+        run = self._plans[damped].run(
+            rows, heights, self.rtol, drag=drag, everything=everywhere, directions=wanted
+        )
+        inside = self.interior if everywhere else {}
+        along = run if self.drive == "displacement" else None
+        if along is None and self._along and (everything or "stress_strain" in self.counted):
+            plan = self._along[damped]
+            along = plan.run(rows, heights, self.rtol, everything=False, directions=wanted)
+        slopes: dict[str, Array] | None = None
+        if run.slopes is not None and (along is None or along.slopes is not None):
+            moved, pressed = run.slopes
+            slopes = {"stress_time": pressed, "displacement_time": moved[:, -1]}
+            slopes |= {name: moved[:, node - 1] for name, node in inside.items()}
+            if along is not None and along.slopes is not None:
+                slopes["stress_strain"] = along.slopes.base_stress
+            for slope in slopes.values():
+                slope[places == values.size - 1] /= height  # site_eta acts through η_site/H
+        return Simulated(
+            stress_time=None if self.drive == "stress" else self._timed(run.base_stress),
+            displacement_time=None if self.drive == "displacement" else run.displacement[-1],
+            stress_strain=None if along is None else along.base_stress,
+            motion=run,
+            interior={name: run.displacement[node - 1] for name, node in inside.items()},
+            slopes=slopes,
+        )
+
+    def _shifted(self, curves: Simulated, late: float, by_shift: NDArray[np.bool_]) -> Simulated:
+        """Curves as channels show them of which the motion is late by so many seconds.
+
+        Slopes are shifted with their curves. Where `by_shift` (n_places,) marks one by the shift
+        itself, that is a difference over one sample: no simulation is in it.
+        """
+        there = {name: curve for name in self.curves if (curve := curves.curve(name)) is not None}
+        slopes: dict[str, Array] | None = None
+        if by_shift.size:
+            step = float(np.median(np.diff(self.time)))
+            own = curves.slopes or {name: np.empty((0, self.time.size)) for name in there}
+            slopes = {}
+            for name in there.keys() & own.keys():
+                out = np.empty((by_shift.size, self.time.size))
+                rows = [self._shift(name, row, late, 0.0) for row in own[name]]
+                out[~by_shift] = np.reshape(rows, (-1, self.time.size))
+                sides = [self._shift(name, there[name], late + side * step) for side in (-0.5, 0.5)]
+                out[by_shift] = (sides[1] - sides[0]) / step
+                slopes[name] = out
+        if late != 0.0:
+            there = {name: self._shift(name, curve, late) for name, curve in there.items()}
+        return replace(
+            curves,
+            stress_time=there.get("stress_time"),
+            displacement_time=there.get("displacement_time"),
+            stress_strain=there.get("stress_strain"),
+            interior={name: there[name] for name in curves.interior},
+            slopes=slopes,
+        )
+
+    def _shift(self, name: str, curve: Array, late: float, speed: float | None = None) -> Array:
+        """One curve, or its derivative, seen by channels of which the motion is late (s).
+
+        Where the clock is that of the force, the motion is seen later; where it is that of the
+        motion (time zero is read off it, or it drives), the force is seen earlier. Before contact
+        the striker comes at its velocity, or at `speed` (m/s), and nothing bears stress; a
+        displacement that was set to zero where the stress starts is so here.
+        """
+        impact, contact = self.drive == "impact", self.measurement.contact
+        by_motion = self.drive == "displacement" or (impact and contact == "motion")
+        if not name.startswith("displacement"):
+            if not by_motion and name != "stress_strain":
+                return curve
+            when = self.time + late
+            earlier = np.interp(when, self.time, curve)
+            return np.where(when < 0.0, 0.0, earlier) if late < 0.0 else earlier
+        if by_motion:
+            return curve
+        before: float | None = None
+        if impact:
+            assert self.measurement.striker is not None  # checked by check_drive
+            before = self.measurement.striker.velocity if speed is None else speed
+        moved = _later(self.time, curve, late, before)
+        if impact and contact == "stress":
+            moved = moved - _later(self.time, curve, late, before, at=0.0)
+        return moved
+
+    def residual(self, values: Array, shift: Array | float = 0.0) -> Array:
+        """Weighted residuals of all counted curves, shape (n_data,), dimensionless.
+
+        Simulated minus measured over the curve's scale, times the root of its weight, softened by
+        the loss; outliers are left out. Parameters that cannot be simulated cost a finite penalty
+        and are counted in `failures`. `shift` (n_data,) is taken off before the loss: data that
+        differ by so much from those that were measured.
+        """
+        return soften(self.differences(values) - shift, self.loss)
+
+    def differences(self, values: Array) -> Array:
+        """Residuals before the loss gives way to large ones, shape (n_data,)."""
+        self.evaluations += 1
+        try:
+            curves = self.simulate(values)
+        except SimulationError:
+            self.failures += 1
+            return np.full(self.n_data, self.penalty)
+        return self._compare(curves)
+
+    def _compare(self, curves: Simulated) -> Array:
+        """Residuals of simulated curves."""
+        parts = []
+        for name in self.counted:
+            simulated = curves.curve(name)
+            assert simulated is not None  # a curve is counted only if the drive leaves it free
+            difference = simulated - self._curve(name)
+            parts.append(difference[self._kept[name]] * self._factor(name))
+        # A stress near the pole of branch c is as bad as none.
+        return np.asarray(np.clip(np.concatenate(parts), -self.penalty, self.penalty))
+
+    def _factor(self, name: str) -> float:
+        """What makes a curve's difference a residual."""
+        return float(self.weights[name] ** 0.5 / self.scale[name])
+
+    def jacobian(self, values: Array, places: NDArray[np.int64]) -> Array:
+        """Derivative of the residual by the parameters at `places`, (n_data, n_places), SI.
+
+        Carried along with the simulation; zeros where the parameters cannot be simulated.
+        """
+        self.evaluations += 1
+        try:
+            curves = self.simulate(values, places=places)
+        except SimulationError:
+            self.failures += 1
+            return np.zeros((self.n_data, places.size))
+        if curves.slopes is None:  # none were asked for
+            return np.zeros((self.n_data, 0))
+        parts = [
+            curves.slopes[name][:, self._kept[name]] * self._factor(name) for name in self.counted
+        ]
+        slopes = np.concatenate(parts, axis=1).T
+        residual = self._compare(curves)
+        slopes[np.abs(residual) >= self.penalty] = 0.0
+        return slopes if self.loss == "linear" else slopes * softness(residual, self.loss)[:, None]
+
+    def jacobian_along(self, values: Array, moves: Array) -> Array:
+        """Derivative of the residual along moves (n_values, m) of the parameters, (n_data, m)."""
+        places = np.flatnonzero(moves.any(axis=1))
+        return self.jacobian(values, places) @ moves[places]
+
+    def kept(self, name: str) -> NDArray[np.intp]:
+        """Samples of a curve that stand in the residual, in their order: all but outliers."""
+        return np.arange(self.measured_size(name))[self._kept[name]]
+
+    def misfit(self, curves: Simulated) -> dict[str, float | None]:
+        """RMS of simulated minus measured over the measured range, per curve; None if not there.
+
+        Outliers are left out. A motion that was integrated from the force is there only if it is
+        counted.
+        """
+        derived = MOTION_CURVES if self.measurement.motion == INTEGRATED else ()
+        there = [name for name in self.curves if name in self.counted or name not in derived]
+        return {name: self.off(curves, name) if name in there else None for name in self.curves}
+
+    def off(self, curves: Simulated, name: str) -> float | None:
+        """RMS of simulated minus measured over the measured range of one curve, if it is there."""
+        measured, simulated = self.measured[name], curves.curve(name)
+        if measured is None or simulated is None:
+            return None
+        miss = (simulated - measured)[self._kept[name]]
+        return float(np.sqrt(np.mean(miss**2)) / np.ptp(measured))
+
+
+def _later(
+    time: Array, curve: Array, late: float, before: float | None, *, at: float | None = None
+) -> Array:
+    """Motion (m) seen `late` seconds later, at the samples or at one time; straight past its ends.
+
+    `before` is the velocity (m/s) ahead of the first sample, by default that of its first step.
+    """
+    when = (time if at is None else np.array([at])) - late
+    first = (curve[1] - curve[0]) / (time[1] - time[0]) if before is None else before
+    last = (curve[-1] - curve[-2]) / (time[-1] - time[-2])
+    inside = np.interp(when, time, curve)
+    ahead, after = np.minimum(when - time[0], 0.0), np.maximum(when - time[-1], 0.0)
+    return np.asarray(inside + first * ahead + last * after)

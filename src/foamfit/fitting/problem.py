@@ -1,0 +1,282 @@
+"""What is fitted: the parameters of a model, their bounds, and the objective that they feed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import lmfit
+import numpy as np
+from numpy.typing import NDArray
+
+from foamfit.data.measurement import Measurement
+from foamfit.errors import InputError
+from foamfit.fitting.box import LARGEST_SHIFT, Scales, Space
+from foamfit.fitting.objective import Objective, check_interior, choose_drive, default_weights
+from foamfit.springs.model import Model, split_name
+
+Array = NDArray[np.float64]
+
+
+def make_params(
+    measurement: Measurement,
+    model: str | Model = "bistable",
+    drive: str | None = None,
+    *,
+    time_shift: bool = False,
+) -> lmfit.Parameters:
+    """Parameters of a model for a test, with bounds from its scales; change them, then `fit`.
+
+    One damper varies in the impact drive: the dashpot of a single spring, and in a chain the onsite
+    damper of the striker, as in the paper. The other drives are rate-independent unless told
+    otherwise. Heights are the specimen's where it states them, else they vary with their sum fixed.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        The test.
+    model : str or Model
+        For example "linear+bistable".
+    drive : str, optional
+        "impact", "stress" or "displacement"; see `fitting.objective.choose_drive`.
+    time_shift : bool
+        Whether the time by which the motion channel is late is a parameter too.
+
+    Returns
+    -------
+    lmfit.Parameters
+        Values in SI, named s1_k0 … site_eta.
+    """
+    model = Model.parse(model) if isinstance(model, str) else model
+    drive = choose_drive(measurement) if drive is None else drive
+    scales = Scales.of(measurement)
+    stress, slope = scales.stress, scales.slope
+    guess = {
+        "k0": (3.0 * slope, 1e-3 * stress, 1e4 * stress),
+        "kc": (20.0 * slope, 1e-2 * stress, 1e5 * stress),
+        "dsigma": (-0.1 * stress, -10.0 * stress, 0.0),
+        "eps_a": (0.15 * scales.strain, 1e-3, 0.95),
+        "eps_c": (0.8 * scales.strain, 2e-3, 0.999),
+        "kh_plus": (slope, 0.0, 100.0 * slope),
+        "kh_minus": (0.3 * slope, 0.0, 100.0 * slope),
+        "eta": (0.0, 0.0, 10.0 * scales.eta),
+    }
+    params = lmfit.Parameters()
+    count = len(model.kinds)
+    for name in model.names:
+        spring, short = split_name(name)
+        if short == "height":
+            continue
+        value, low, high = guess[short]
+        vary = short != "eta" or (drive == "impact" and (spring >= 0) == (count == 1))
+        params.add(name, value=value, min=low, max=high, vary=vary)
+    _add_heights(params, measurement, model)
+    if time_shift:
+        most = LARGEST_SHIFT * scales.duration
+        params.add("time_shift", value=0.0, min=-most, max=most)
+    for name in model.names:
+        if name.endswith("_dsigma"):
+            own = name.removesuffix("dsigma")
+            eps_a = params[own + "eps_a"].value
+            params[name].value = -0.2 * params[own + "k0"].value * eps_a / (1.0 - eps_a)
+    return params
+
+
+def _add_heights(params: lmfit.Parameters, measurement: Measurement, model: Model) -> None:
+    """Heights of a chain: the specimen's, or varied with their sum fixed."""
+    count = len(model.kinds)
+    if count == 1:
+        return
+    specimen = measurement.specimen
+    if specimen.heights is not None:
+        if len(specimen.heights) != count:
+            raise InputError(
+                f"{measurement.name}: [specimen] heights has {len(specimen.heights)} values for "
+                f"a model of {count} springs; give one per spring, base first"
+            )
+        for i, height in enumerate(specimen.heights, start=1):
+            params.add(f"s{i}_height", value=height, vary=False)
+        return
+    low = 0.02 * specimen.height
+    for i in range(1, count):
+        value = specimen.height / count
+        params.add(f"s{i}_height", value=value, min=low, max=specimen.height - low)
+    params.add(f"s{count}_height", expr=_rest_of_height(measurement, model))
+
+
+def _rest_of_height(measurement: Measurement, model: Model) -> str:
+    """Expression of the last spring's height: what the others leave of the specimen."""
+    others = [f"s{i}_height" for i in range(1, len(model.kinds))]
+    return " - ".join([repr(measurement.specimen.height), *others])
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What a fit works on, and the way between lmfit's parameters and the flat vector."""
+
+    measurement: Measurement
+    model: Model
+    objective: Objective
+    params: lmfit.Parameters
+    scales: Scales
+    notes: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all parameters in the order of the flat vector: the model's, the nuisance."""
+        return (*self.model.names, *self.objective.nuisance)
+
+    @property
+    def index(self) -> dict[str, int]:
+        """Place of each parameter in the flat vector."""
+        return {name: i for i, name in enumerate(self.names)}
+
+    @cached_property
+    def linear(self) -> Problem:
+        """The same problem without a soft loss, for derivatives of the plain residuals."""
+        if self.objective.loss == "linear":
+            return self
+        return replace(self, objective=replace(self.objective, loss="linear"))
+
+    def vector(self, params: lmfit.Parameters | None = None) -> Array:
+        """Flat vector of these parameters, or of the problem's own."""
+        values = (self.params if params is None else params).valuesdict()
+        return np.array([values[name] for name in self.names])
+
+    def put(self, values: Array) -> None:
+        """Write a flat vector into the parameters that vary."""
+        for name, value in zip(self.names, values, strict=True):
+            if self.params[name].expr is None:
+                self.params[name].value = float(value)
+        self.params.update_constraints()
+
+    def free(self) -> tuple[str, ...]:
+        """Names of the parameters that vary."""
+        return tuple(name for name in self.names if self.params[name].vary)
+
+    def tied(self) -> Callable[[Array], Array] | None:
+        """Completion of a vector by the expressions among the parameters; None if there is none."""
+        tied = [name for name in self.names if self.params[name].expr is not None]
+        if not tied:
+            return None
+        places = [self.index[name] for name in tied]
+        rest = _rest_of_height(self.measurement, self.model)
+        if [self.params[name].expr for name in tied] == [rest]:
+            return self._last_height
+        scratch = self.params.copy()
+
+        def complete(values: Array) -> Array:
+            for name in self.free():
+                scratch[name].value = values[self.index[name]]
+            scratch.update_constraints()
+            for name, place in zip(tied, places, strict=True):
+                values[place] = scratch[name].value
+            return values
+
+        return complete
+
+    def _last_height(self, values: Array) -> Array:
+        """Complete the heights to that of the specimen; the expression itself, but fast."""
+        count = len(self.model.kinds)
+        first = self.model.index["s1_height"]
+        others = values[first : first + count - 1]
+        values[first + count - 1] = self.measurement.specimen.height - others.sum()
+        return values
+
+    def space(self) -> Space:
+        """The box in which the search moves."""
+        return Space(
+            model=self.model,
+            scales=self.scales,
+            values=self.vector(),
+            free=self.free(),
+            low=np.array([self.params[name].min for name in self.names]),
+            high=np.array([self.params[name].max for name in self.names]),
+            tied=self.tied(),
+        )
+
+    def sizes(self, names: tuple[str, ...], values: Array) -> Array:
+        """Natural sizes of some parameters at a point."""
+        at = dict(zip(self.names, map(float, values), strict=True))
+        return np.array([self.scales.of_parameter(name, at) for name in names])
+
+    def slopes(self, values: Array, names: tuple[str, ...]) -> Array:
+        """Derivative of the residual by some parameters at a point, (n_data, n_names), per SI unit.
+
+        Exact; see `Objective.jacobian`. Parameters that hang on these by expressions move with
+        them.
+        """
+        places = np.array([self.index[name] for name in names])
+        steps = 1e-5 * self.sizes(names, values)
+        moves = np.zeros((values.size, places.size))
+        moves[places, np.arange(places.size)] = 1.0
+        moves = self.space().follow(values, moves, steps)
+        return self.objective.jacobian_along(values, moves)
+
+
+def _check_held(params: lmfit.Parameters) -> None:
+    """Refuse by name a held value that no spring can have."""
+    for name, parameter in params.items():
+        if parameter.vary or parameter.expr is not None:
+            continue
+        value, short = parameter.value, split_name(name)[1]
+        wanted, fine = {
+            "eps_a": ("between 0 and 1", 0.0 < value < 1.0),
+            "eps_c": ("between 0 and 1", 0.0 < value < 1.0),
+            "dsigma": ("zero or negative", value <= 0.0),
+            "kh_plus": ("zero or positive", value >= 0.0),
+            "kh_minus": ("zero or positive", value >= 0.0),
+            "eta": ("zero or positive", value >= 0.0),
+            "time_shift": ("finite", bool(np.isfinite(value))),
+        }.get(short, ("positive", value > 0.0))
+        if not fine:
+            raise InputError(f"{name} = {value:g} is not admissible: it must be {wanted}")
+
+
+def make_problem(
+    measurement: Measurement,
+    model_name: str,
+    drive: str | None,
+    params: lmfit.Parameters | None,
+    weights: Mapping[str, float] | None,
+    interior_mass: bool,
+    *,
+    time_shift: bool = False,
+    loss: str = "linear",
+) -> Problem:
+    """Make a problem ready; see `foamfit.fit` for the arguments.
+
+    Raises
+    ------
+    InputError
+        If the test cannot feed the drive or a parameter is unknown; the message names it.
+    """
+    model = Model.parse(model_name)
+    drive = choose_drive(measurement) if drive is None else drive
+    count = len(model.kinds)
+    check_interior(measurement, count)
+    notes: tuple[str, ...] = ()
+    if interior_mass and (count == 1 or drive != "impact"):
+        why = "a single spring has none" if count == 1 else f"none moves in the {drive} drive"
+        notes = (f"Interior masses were asked for, but {why}; the fit is the same without them.",)
+        interior_mass = False
+    chosen = default_weights(measurement, drive, count) if weights is None else dict(weights)
+    objective = Objective(
+        measurement, model, drive, chosen,
+        interior_mass=interior_mass, time_shift=time_shift, loss=loss,
+    )  # fmt: skip
+    measurement = objective.measurement  # with the noise of each channel
+    wanted = make_params(measurement, model, drive, time_shift=time_shift)
+    for name in params or ():
+        if name not in wanted:
+            raise InputError(
+                f"parameter '{name}' is not one of the model {model.name}; "
+                f"its parameters are {', '.join(wanted)}"
+            )
+    for name in params or ():
+        wanted[name] = params[name]  # type: ignore[index]
+    _check_held(wanted)
+    if not any(parameter.vary for parameter in wanted.values()):
+        raise InputError("no parameter varies; let at least one vary")
+    return Problem(measurement, model, objective, wanted, Scales.of(measurement), notes)

@@ -1,0 +1,492 @@
+"""The lean search: start values read from the curve, and a descent from the best of many.
+
+The search moves in the box of `fitting.box`, so that no start needs luck and no step can leave
+what the law admits. It first fits the loop (stress along the measured motion, closed form, cheap)
+and only then the curves of the drive itself.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import qmc
+
+from foamfit.data.measurement import Measurement
+from foamfit.fitting.box import Scales, Space
+from foamfit.fitting.objective import Objective, smoothed
+
+Array = NDArray[np.float64]
+Progress = Callable[[float, str], None]
+
+LOOP_SAMPLES = 240
+CURVE_STARTS = 300
+# Valleys of the loop whose cost on the drive's curves is within this factor of the best go on.
+PROMISING = 100.0
+# Pitches at which the ringing of an interior mass is tried, up to twice the stiffness and its half.
+PITCHES = np.geomspace(1.0, 2.0, 71)[1:]
+
+
+class SearchStoppedError(Exception):
+    """The time is up; the best point so far is the answer."""
+
+
+# What ends a search, refits or a chain before they are done: what was found is kept.
+STOPPING = (SearchStoppedError, KeyboardInterrupt)
+
+
+def what_stopped(error: BaseException) -> str:
+    """Say what has raised one of `STOPPING`."""
+    return "the time limit" if isinstance(error, SearchStoppedError) else "Ctrl-C"
+
+
+@dataclass(frozen=True)
+class SearchRecord:
+    """How a search went.
+
+    Attributes
+    ----------
+    seed, starts : int
+        What it was asked for.
+    began : float
+        `time.perf_counter` at its start, s.
+    costs : tuple of (float, int)
+        Final costs of the descents on the drive's curves, best first, and how many descents on the
+        loop led to each.
+    stopped : str or None
+        What ended it before its time: "the time limit", "Ctrl-C".
+    """
+
+    seed: int
+    starts: int
+    began: float
+    costs: tuple[tuple[float, int], ...] = ()
+    stopped: str | None = None
+
+    @property
+    def agreeing(self) -> int:
+        """How many descents led to the best cost, within 2 %."""
+        return sum(count for cost, count in self.costs if cost <= 1.02 * self.costs[0][0])
+
+
+@dataclass(eq=False)
+class Tracker:
+    """Counts and times the evaluations of an objective and keeps the best point ever seen.
+
+    `ends` holds the parameters at which the descents on the drive's curves ended.
+    """
+
+    objective: Objective
+    deadline: float | None = None
+    best_values: Array | None = None
+    best_cost: float = np.inf
+    ends: list[Array] = field(default_factory=list)
+
+    def residual(self, values: Array, shift: Array | float = 0.0) -> Array:
+        """Residual of the objective; raises SearchStoppedError once the time is up."""
+        residual = self.consider(values, shift)
+        if self.deadline is not None and time.monotonic() > self.deadline:
+            raise SearchStoppedError
+        return residual
+
+    def slopes(self, space: Space, point: Array) -> Array:
+        """Derivative of the residual by the coordinates of a point, (n_data, n_free)."""
+        values = space.decode(point)
+        moves = space.slopes(point, values)
+        return self.objective.jacobian_along(values, moves)
+
+    def consider(self, values: Array, shift: Array | float = 0.0) -> Array:
+        """Residual of the objective, whatever the time; with a shift, that of other data."""
+        failures = self.objective.failures
+        residual = self.objective.residual(values, shift)
+        cost = float(residual @ residual)
+        if np.any(shift):
+            return residual
+        if cost < self.best_cost and self.objective.failures == failures:
+            self.best_cost, self.best_values = cost, values.copy()
+        return residual
+
+
+# ---------------------------------------------------------------- starts
+
+
+def smooth_loop(measurement: Measurement) -> Measurement:
+    """Smooth and thin the measured loop, for the first descent only."""
+    motion, stress = measurement.displacement, measurement.stress
+    assert motion is not None
+    assert stress is not None
+    window = max(motion.size // 60, 1) * 2 + 1
+    if window > 3:
+        motion = smoothed(motion, window)
+    keep = np.unique(np.linspace(0, motion.size - 1, min(motion.size, LOOP_SAMPLES)).astype(int))
+    time = measurement.time
+    return replace(
+        measurement,
+        displacement=motion[keep],
+        stress=stress[keep],
+        time=None if time is None else time[keep],
+        outliers={},  # bridged, and smoothed over
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """Loading and unloading stress (Pa) as functions of strain, read from a measured loop."""
+
+    strain: Array
+    stress: Array
+
+    @cached_property
+    def peak(self) -> int:
+        """Sample of the largest strain."""
+        return int(np.argmax(self.strain))
+
+    def loading(self, strain: float) -> float:
+        """Stress on the way up, Pa."""
+        up = np.maximum.accumulate(self.strain[: self.peak + 1])
+        return float(np.interp(strain, up, self.stress[: self.peak + 1]))
+
+    def unloading(self, strain: float) -> float:
+        """Stress on the way down, Pa."""
+        down = np.maximum.accumulate(self.strain[self.peak :][::-1])
+        return float(np.interp(strain, down, self.stress[self.peak :][::-1]))
+
+
+def read_spring(loop: Loop, marks: Array, scales: Scales) -> Array:
+    """Read a bistable spring off a loop, given where on it A1, C1 and C2 are taken to lie.
+
+    Parameters
+    ----------
+    loop : Loop
+        Of the spring.
+    marks : (5,) array
+        In [0, 1]: places of A1, C1 and C2 between their neighbours, shares of the stress at C2 and
+        of the damping.
+    scales : Scales
+        Of the test.
+
+    Returns
+    -------
+    (8,) array
+        k0 … kh_minus, eta (SI): initial slope from A1, k_h+ from A1 to C1, k_c through C1 and C2,
+        k_h- from C2 towards rest.
+    """
+    last = float(loop.strain[loop.peak])
+    eps_a = min((0.02 + 0.85 * marks[0]) * last, 0.9)
+    sigma_a = max(loop.loading(eps_a), 0.005 * scales.stress)
+    hat_c = eps_a + (0.15 + 1.1 * marks[1]) * max(last - eps_a, 1e-3)  # perhaps never reached
+    seen = min(hat_c, max(last, eps_a + 1e-3))
+    kh_plus = max((loop.loading(seen) - sigma_a) / (seen - eps_a), 0.0)
+    sigma_hat_c = sigma_a + kh_plus * (hat_c - eps_a)
+    eps_c = eps_a + (0.2 + 0.8 * marks[2]) * (hat_c - eps_a)
+    sigma_c = loop.unloading(eps_c) * (0.5 + marks[3])
+    sigma_c = min(max(sigma_c, 0.02 * sigma_a), 0.98 * sigma_a)
+    return np.array(
+        [
+            sigma_a * (1.0 - eps_a) / eps_a,
+            _stiffness_between(hat_c - eps_c, sigma_c, sigma_hat_c),
+            sigma_c - sigma_a,
+            eps_a,
+            eps_c,
+            kh_plus,
+            sigma_c / eps_c,
+            0.1 * scales.eta * marks[4] ** 2,
+        ]
+    )
+
+
+def _stiffness_between(rise: float, low: float, high: float) -> float:
+    """k_c of a branch c that rises by a strain `rise` from stress `low` to `high` (Pa).
+
+    The larger root of rise (k+low)(k+high) = k (high-low); the nearest k_c if there is none.
+    """
+    gain = max(high - low, 1e-9 * high)
+    rise = max(rise, 1e-6)
+    b = gain - rise * (low + high)
+    discriminant = b * b - 4.0 * rise * rise * low * high
+    if b <= 0.0 or discriminant < 0.0:
+        return float(np.sqrt(low * high))
+    return float((b + np.sqrt(discriminant)) / (2.0 * rise))
+
+
+def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> list[Array]:
+    """Vectors of parameters read off the measured loop, from a Latin hypercube of marks.
+
+    Linear springs take a share of the largest displacement; each bistable spring is then read off
+    what is left with marks of its own. Springs in series that each follow the loop follow it
+    together.
+    """
+    assert loop.displacement is not None
+    assert loop.stress is not None
+    kinds, index = space.model.kinds, space.model.index
+    count = len(kinds)
+    marks = qmc.LatinHypercube(7 * count, rng=rng).random(CURVE_STARTS)
+    starts = []
+    for mark in marks:
+        values = space.values.copy()
+        heights = np.full(count, space.scales.height / count)
+        if count > 1:
+            given = [index[f"s{i}_height"] for i in range(1, count + 1)]
+            for i, at in enumerate(given):
+                if space.model.names[at] in space.free:
+                    values[at] = heights[i] * (0.3 + 1.4 * mark[7 * i + 5])
+            values = space.complete(values)
+            heights = np.maximum(values[given], 1e-3 * space.scales.height)
+        motion = loop.displacement.copy()
+        for i, kind in enumerate(kinds):
+            if kind != "bistable":
+                share = 10.0 ** (-3.0 + 2.7 * mark[7 * i + 6])
+                k0 = heights[i] * space.scales.stress / (share * motion.max())
+                values[index[f"s{i + 1}_k0"]] = k0
+                motion = motion - heights[i] * loop.stress / k0
+        soft = sum(h for h, kind in zip(heights, kinds, strict=True) if kind == "bistable")
+        for i, kind in enumerate(kinds):
+            if kind == "bistable":
+                first = index[f"s{i + 1}_k0"]
+                own = Loop(motion / soft, loop.stress)
+                values[first : first + 8] = read_spring(own, mark[7 * i : 7 * i + 5], space.scales)
+        starts.append(space.encode(values))
+    return starts
+
+
+def box_starts(space: Space, rng: np.random.Generator, count: int) -> list[Array]:
+    """Latin hypercube over the inner part of the box, whatever the curve looks like."""
+    low, high = (edge.copy() for edge in space.box)
+    for j, (_, short, _) in enumerate(space.coordinates):
+        if short in ("kh_plus", "kh_minus"):
+            high[j] = 4.0
+        elif short == "eta":
+            high[j] = 0.3
+        elif short == "time_shift":
+            low[j], high[j] = -0.3, 0.3
+        elif short in ("k0", "kc"):
+            low[j], high[j] = np.log(0.3), np.log(300.0)
+    return list(low + (high - low) * qmc.LatinHypercube(low.size, rng=rng).random(count))
+
+
+# ---------------------------------------------------------------- descent
+
+
+def _cost(item: tuple[float, Array]) -> float:
+    return item[0]
+
+
+def descend(
+    tracker: Tracker, space: Space, start: Array, iterations: int, enough: float = 1e-5
+) -> tuple[float, Array]:
+    """Levenberg-Marquardt descent inside the box; returns (cost, coordinates) of its end.
+
+    Coordinates at an edge of the box that the gradient presses outwards are held. The damping
+    follows the gain ratio (Nielsen 1999, IMM-REP-1999-05). It ends when two steps in a row lower
+    the cost by less than the share `enough`.
+    """
+    low, high = space.box
+
+    def cost_at(point: Array) -> tuple[float, Array]:
+        residual = tracker.residual(space.decode(point))
+        return float(residual @ residual), residual
+
+    point = start
+    cost, residual = cost_at(point)
+    damping, growth, idle = 1e-3, 2.0, 0
+    jacobian = tracker.slopes(space, point)
+    for _ in range(iterations):
+        gradient = jacobian.T @ residual
+        held = ((point <= low) & (gradient > 0.0)) | ((point >= high) & (gradient < 0.0))
+        free = np.flatnonzero(~held)
+        if free.size == 0:
+            break
+        normal = jacobian[:, free].T @ jacobian[:, free]
+        scale = np.maximum(np.diag(normal), 1e-12 * max(float(np.trace(normal)), 1e-300))
+        step = np.zeros(point.size)
+        step[free] = -np.linalg.solve(normal + damping * np.diag(scale), gradient[free])
+        trial = np.clip(point + step, low, high)
+        moved = trial - point
+        expected = -float(moved @ (2.0 * gradient + jacobian.T @ (jacobian @ moved)))
+        new_cost, new_residual = cost_at(trial)
+        if new_cost < cost:
+            gain = (cost - new_cost) / max(expected, 1e-300)
+            idle = idle + 1 if cost - new_cost < enough * cost else 0
+            point, cost, residual = trial, new_cost, new_residual
+            damping *= max(1.0 / 3.0, 1.0 - (2.0 * min(gain, 1.0) - 1.0) ** 3)
+            growth = 2.0
+            if idle == 2:
+                break
+            jacobian = tracker.slopes(space, point)
+        else:
+            damping *= growth
+            growth *= 2.0
+            if damping > 1e8 or float(np.max(np.abs(moved))) < 1e-9:
+                break
+    return cost, point
+
+
+def rank(tracker: Tracker, space: Space, points: list[Array]) -> list[tuple[float, Array]]:
+    """Points of the box with their costs, cheapest first."""
+    ranked = []
+    for point in points:
+        residual = tracker.residual(space.decode(point))
+        ranked.append((float(residual @ residual), point))
+    return sorted(ranked, key=_cost)
+
+
+def spread_out(space: Space, points: list[Array], count: int) -> list[Array]:
+    """Choose `count` of the ranked points: the best, then the best of each range of ε_a.
+
+    Where branch d is about as stiff as branch a, the valleys of the cost differ by where A1 lies.
+    """
+    marks = [j for j, (_, short, _) in enumerate(space.coordinates) if short == "eps_a"]
+    if not marks:
+        return points[:count]
+    places = np.array([point[marks[0]] for point in points])
+    edges = np.quantile(places, np.linspace(0, 1, count + 1)[1:-1])
+    strata = np.searchsorted(edges, places)
+    first = [int(np.argmax(strata == stratum)) for stratum in np.unique(strata)]
+    chosen = list(dict.fromkeys([*sorted(first), *range(len(points))]))[:count]
+    return [points[i] for i in sorted(chosen)]
+
+
+def valleys(ends: list[tuple[float, Array]], apart: float = 1e-3) -> list[tuple[int, Array]]:
+    """Ends of descents, best first, one of each cost with their number: one cost, one valley."""
+    chosen: list[tuple[int, Array]] = []
+    last = 0.0
+    for cost, point in sorted(ends, key=_cost):
+        if chosen and cost <= (1.0 + apart) * last:
+            chosen[-1] = (chosen[-1][0] + 1, chosen[-1][1])
+        else:
+            chosen.append((1, point))
+            last = cost
+    return chosen
+
+
+def search(
+    tracker: Tracker,
+    space: Space,
+    *,
+    starts: int,
+    rng: np.random.Generator,
+    progress: Progress,
+) -> list[tuple[float, int]]:
+    """Search for the best parameters; the tracker keeps them.
+
+    Parameters
+    ----------
+    tracker : Tracker
+        Of the objective of the drive.
+    space : Space
+        The box.
+    starts : int
+        Descents on the loop; the best quarter of them go on to the curves of the drive.
+    rng : Generator
+        Source of all chance.
+    progress : callable
+        Told the fraction done and what is going on.
+
+    Returns
+    -------
+    list of (float, int)
+        Final costs of the descents on the drive's curves, best first, and how many descents on the
+        loop led to each.
+
+    Raises
+    ------
+    SearchStoppedError
+        When the time is up.
+    """
+    points = [space.encode(space.values), *box_starts(space, rng, CURVE_STARTS // 3)]
+    if tracker.objective.measurement.displacement is not None:
+        ends = _search_loop(tracker, space, points, starts, rng, progress)
+        counts = {id(point): count for count, point in valleys(ends)}
+        points = [point for _, point in valleys(ends)]
+    else:
+        counts = {}
+    ranked = rank(tracker, space, points)
+    if tracker.objective.interior_mass:
+        progress(0.7, "ringing")
+        ranked = sorted(ranked + _scan_ringing(tracker, space, points[0]), key=_cost)
+    promising = [item for item in ranked if item[0] <= PROMISING * ranked[0][0]]
+    points = [point for _, point in valleys(promising)][: max(3, starts // 4)]
+    out = []
+    for i, point in enumerate(points):
+        progress(0.7 + 0.25 * i / len(points), "curves")
+        cost, end = descend(tracker, space, point, 60)
+        tracker.ends.append(space.decode(end))
+        out.append((cost, counts.get(id(point), 1)))
+    return sorted(out)
+
+
+def salvage(tracker: Tracker, space: Space, rng: np.random.Generator) -> None:
+    """Give a search that was stopped before its first success a point that can be simulated."""
+    for point in [space.encode(space.values), *box_starts(space, rng, CURVE_STARTS // 3)]:
+        if tracker.best_values is not None:
+            return
+        tracker.consider(space.decode(point))
+
+
+def _search_loop(
+    tracker: Tracker,
+    space: Space,
+    points: list[Array],
+    starts: int,
+    rng: np.random.Generator,
+    progress: Progress,
+) -> list[tuple[float, Array]]:
+    """Descend on the smoothed loop, from the curve's own starts too; returns costs and ends.
+
+    However this ends, the best point of the loop is handed to the tracker.
+    """
+    objective = tracker.objective
+    loop = smooth_loop(objective.measurement)
+    along = Objective(
+        loop, objective.model, "displacement", {"stress_strain": 1.0},
+        time_shift=objective.time_shift, loss=objective.loss,
+    )  # fmt: skip
+    inner = Tracker(along, tracker.deadline)
+    try:
+        ranked = rank(inner, space, points + curve_starts(space, loop, rng))
+        points = [point for _, point in ranked]
+        ends = []
+        for i, point in enumerate(spread_out(space, points, starts)):
+            progress(0.7 * i / starts, "loop")
+            ends.append(descend(inner, space, point, 40))
+    finally:
+        objective.evaluations += inner.objective.evaluations
+        objective.failures += inner.objective.failures
+        if inner.best_values is not None:
+            tracker.consider(inner.best_values)
+    return ends
+
+
+def _scan_ringing(tracker: Tracker, space: Space, start: Array) -> list[tuple[float, Array]]:
+    """Points along the valley of the massless chain, ranked by the curves with interior masses.
+
+    An interior mass rings on a stiff linear spring, and the cost has a valley for every cycle that
+    the simulated ringing gains on the measured one: no descent crosses from one to the next. The
+    massless chain fixes all that does not ring, for each stiffness of a linear spring in turn.
+    """
+    ringing = tracker.objective
+    quiet = replace(ringing, interior_mass=False)
+    massless = Tracker(quiet, tracker.deadline)
+    _, start = descend(massless, space, start, 40)
+    out: list[tuple[float, Array]] = []
+    for spring, kind in enumerate(space.model.kinds, start=1):
+        name = f"s{spring}_k0"
+        if kind == "bistable" or name not in space.free:
+            continue
+        at = space.model.index[name]
+        for pitches in (PITCHES, 1.0 / PITCHES):
+            values = space.decode(start)
+            for stiffness in values[at] * pitches:
+                values[at] = np.clip(stiffness, space.low[at], space.high[at])
+                free = tuple(other for other in space.free if other != name)
+                held = replace(space, values=values.copy(), free=free)
+                _, point = descend(massless, held, held.encode(values), 3, enough=1e-3)
+                values = held.decode(point)
+                out += rank(tracker, space, [space.encode(values)])
+    ringing.evaluations += quiet.evaluations
+    ringing.failures += quiet.failures
+    return out

@@ -1,0 +1,613 @@
+"""What an experiment will tell, before it is fitted or even made: `foamfit check --model`.
+
+At start values of the parameters: the velocity that closes the loop of each spring, the standard
+errors to expect, and which channel is worth measuring better. All errors suppose that the model
+follows the foam down to the noise; what the model leaves unexplained makes them larger.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foamfit.data.measurement import Measurement, Noise, NoiseLevel, Striker
+from foamfit.data.prepare import engineering
+from foamfit.data.toml_file import read_settings
+from foamfit.errors import InputError, SimulationError
+from foamfit.fitting.problem import Problem, make_problem
+from foamfit.fitting.search import Tracker, search
+from foamfit.results import ParameterEstimate, load_result
+from foamfit.solve.simulation import simulate
+from foamfit.springs import kernels
+from foamfit.springs.chain import Chain, Impact
+from foamfit.springs.model import Model, split_name, unit_of
+from foamfit.springs.published import published
+from foamfit.springs.spring import BistableSpring
+from foamfit.trust import covariance
+from foamfit.trust.checklist import ESTIMATED
+from foamfit.trust.conclude import state_of
+from foamfit.trust.identifiability import Insight, look, unreached, visited
+
+Array = NDArray[np.float64]
+
+# Descents of the quick search for start values, for each spring.
+QUICK_STARTS = 4
+# Velocities tried for closing a loop, over the planned one; and how well it is found.
+SLOWEST, FASTEST, CLOSE = 1e-2, 30.0, 1e-5
+# A test is looked at this much faster than what closes its loop.
+BEYOND = 1.05
+# Of a planned test: samples, and noise over the range where none is stated.
+SAMPLES, NOISE = 501, 0.01
+WIDTH = 98
+GUESSED = "the best"  # how a source begins that is no knowledge
+
+
+@dataclass(frozen=True, eq=False)
+class Outlook:
+    """What to expect of a test.
+
+    Attributes
+    ----------
+    velocity : float or None
+        Of the striker, m/s; None in other drives.
+    expected : dict of str to ParameterEstimate
+        Start values with expected standard errors and states, of the parameters that vary.
+    visited : dict
+        Branches that each spring goes through.
+    insight : Insight or None
+        The sensitivities; None if no parameter leaves a trace.
+    """
+
+    velocity: float | None
+    expected: dict[str, ParameterEstimate]
+    visited: dict[str, tuple[str, ...]]
+    insight: Insight | None
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What is to be said of an experiment before it is fitted.
+
+    Attributes
+    ----------
+    problem : Problem
+        The test and its model.
+    values : (n,) array
+        The point that everything holds at, SI.
+    source : str
+        Where it comes from.
+    outlook : Outlook
+        The experiment as planned.
+    closing : dict of str to (float or None)
+        For each bistable spring the velocity (m/s) from which on its loop closes; None if none up
+        to 30 times the planned one does. Empty in other drives than the impact.
+    beyond : Outlook or None
+        The same experiment 5 % faster than what closes all loops, where it now leaves one open.
+    noise : dict of str to NoiseLevel
+        Of each counted curve.
+    """
+
+    problem: Problem
+    values: Array
+    source: str
+    outlook: Outlook
+    closing: dict[str, float | None]
+    beyond: Outlook | None
+    noise: dict[str, NoiseLevel]
+
+
+def make_plan(problem: Problem, values: Array, source: str) -> Plan:
+    """Look ahead at an experiment from a point of the parameters.
+
+    Parameters
+    ----------
+    problem : Problem
+        The test and its model; its measured curves count by their range and noise only.
+    values : (n,) array
+        Start values, SI, in the order of the model's names.
+    source : str
+        Where they come from, for the reader.
+    """
+    noise = {name: problem.objective.noise(name) for name in problem.objective.counted}
+    sd = {name: level.sigma * level.time**0.5 for name, level in noise.items()}
+    outlook = expect(problem, values, sd)
+    closing: dict[str, float | None] = {}
+    beyond = None
+    if problem.objective.drive == "impact":
+        chain, striker = chain_of(problem, values), _striker(problem.measurement)
+        closing = {
+            f"s{i}": closing_velocity(chain, striker, i)
+            for i, kind in enumerate(problem.model.kinds, start=1)
+            if kind == "bistable"
+        }
+        fast = [v for v in closing.values() if v is not None]
+        if fast and striker.velocity is not None and max(fast) > striker.velocity:
+            quicker = faster(problem, values, BEYOND * max(fast), sd)
+            beyond = expect(quicker, values, sd)
+    return Plan(problem, values, source, outlook, closing, beyond, noise)
+
+
+# ---------------------------------------------------------------- start values
+
+
+def start_values(problem: Problem, seed: int = 0) -> tuple[Array, str]:
+    """Best point of a few quick descents from the measured loop, and what it is."""
+    tracker = Tracker(problem.objective)
+    starts = QUICK_STARTS * len(problem.model.kinds)
+    rng = np.random.default_rng(seed)
+    search(tracker, problem.space(), starts=starts, rng=rng, progress=lambda *_: None)
+    if tracker.best_values is None:
+        raise SimulationError(
+            f"{problem.measurement.name}: no start value could be simulated; give some by "
+            "--published or --params"
+        )
+    curves = problem.objective.simulate(tracker.best_values, everything=True)
+    misfit = problem.objective.misfit(curves)
+    worst = max(misfit[name] or 0.0 for name in problem.objective.counted)
+    return tracker.best_values, (
+        f"{GUESSED} of {starts} quick descents from the measured loop (misfit {worst:.1%} of range)"
+    )
+
+
+def published_values(problem: Problem, name: str) -> tuple[Array, str]:
+    """Start values of a published set, its heights scaled to the specimen, its damping left out.
+
+    Raises
+    ------
+    InputError
+        If there is no such set or it has other springs.
+    """
+    if name not in published:
+        known = ", ".join(published)
+        raise InputError(f"there is no published set '{name}'; there are {known}")
+    item, values = published[name], problem.vector()
+    if [kind == "bistable" for kind in problem.model.kinds] != [
+        isinstance(spring, BistableSpring) for spring in item.chain.springs
+    ]:
+        raise InputError(f"{name} is a {item.model}, not a {problem.model.name}; give --model")
+    for full in problem.model.names:
+        spring, short = split_name(full)
+        if short == "height":
+            share = item.chain.heights[spring] / item.chain.height
+            new = share * problem.measurement.specimen.height
+        else:
+            new = 0.0 if short == "eta" else getattr(item.chain.springs[spring], short)
+        if problem.params[full].vary or short == "eta":
+            values[problem.model.index[full]] = new
+    return problem.space().complete(values), f"published {name}, without its numerical damping"
+
+
+def result_values(problem: Problem, folder: Path) -> tuple[Array, str]:
+    """Start values of an earlier result, from its folder or its fit.json.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read or has other springs.
+    """
+    content = load_result(folder)
+    given = content.get("parameters", {})
+    missing = [name for name in problem.names if name not in given]
+    if missing:
+        raise InputError(
+            f"{folder} has no {missing[0]}; it is a {content.get('model')}, not a "
+            f"{problem.model.name}"
+        )
+    values = np.array([float(given[name]["value"]) for name in problem.names])
+    return problem.space().complete(values), f"the result in {folder}"
+
+
+# ---------------------------------------------------------------- a test that is not made yet
+
+
+def planned_test(settings_file: Path) -> Measurement:
+    """Make room for the test that a TOML plans; `simulated_test` fills in its curves.
+
+    Parameters
+    ----------
+    settings_file : Path
+        With [specimen] height and diameter and [striker] mass and velocity; [noise] counts.
+
+    Raises
+    ------
+    InputError
+        If something is missing; the message names it.
+    """
+    settings = read_settings(settings_file, settings_file, channels=())
+    striker = settings.striker or Striker()
+    for key, value in (("mass", striker.mass), ("velocity", striker.velocity)):
+        if not value:
+            raise InputError(f"{settings_file}: [striker] {key} is missing; a plan needs it")
+    return Measurement(
+        name=f"{settings.name} (planned)",
+        path=settings_file,
+        data_sha256="",
+        time=np.linspace(0.0, 1e-3, SAMPLES),
+        stress=np.linspace(0.0, 1e6, SAMPLES),
+        displacement=np.linspace(0.0, 0.1 * settings.specimen.height, SAMPLES),
+        specimen=settings.specimen,
+        striker=striker,
+        noise=settings.noise,
+        motion="measured",
+        notes=("Nothing is measured yet: the curves are simulated.",),
+    )
+
+
+def simulated_test(like: Measurement, chain: Chain, striker: Striker) -> Measurement:
+    """Replace the curves of a test by a simulated impact, over as many samples as it has.
+
+    Noise that is not stated becomes 1 % of the range of its curve.
+    """
+    assert striker.mass is not None
+    assert striker.velocity is not None
+    count = SAMPLES if like.time is None else like.time.size
+    drive = Impact(striker.mass, striker.velocity)
+    time = np.linspace(0.0, _duration(chain, drive), count)
+    response = simulate(chain, drive, time)
+    stress, motion = response.base_stress, response.displacement[-1]
+    noise = Noise(
+        like.noise.stress or NOISE * float(np.ptp(stress)),
+        like.noise.displacement or NOISE * float(np.ptp(motion)),
+    )
+    inside = {node: response.displacement[node - 1] for node in like.interior}
+    return replace(
+        like, time=time, stress=stress, displacement=motion, interior=inside, striker=striker,
+        noise=noise, outliers={}, contact="file",
+    )  # fmt: skip
+
+
+def _duration(chain: Chain, drive: Impact) -> float:
+    """Duration of the contact of an impact, s."""
+    end = 4.0 * chain.height / drive.velocity
+    for _ in range(20):
+        response = simulate(chain, drive, np.linspace(0.0, end, 16))
+        if response.contact_end is not None:
+            return response.contact_end
+        end *= 2.0
+    raise SimulationError("the striker does not come back; check its mass and the damping")
+
+
+# ---------------------------------------------------------------- the questions
+
+
+def chain_of(problem: Problem, values: Array) -> Chain:
+    """Chain of a flat vector of parameters, with the interior masses that the problem has."""
+    specimen, count = problem.measurement.specimen, len(problem.model.kinds)
+    chain = problem.model.chain(values, specimen.height, specimen.area)
+    if not problem.objective.interior_mass or count == 1:
+        return chain
+    assert specimen.mass is not None  # checked by the objective
+    masses = [specimen.mass / (count - 1)] * (count - 1) + [0.0]
+    return Chain(chain.springs, chain.heights, chain.area, masses, chain.site_damping)
+
+
+def closing_velocity(chain: Chain, striker: Striker, spring: int) -> float | None:
+    """Velocity (m/s) from which on an impact closes the loop of a spring: it snaps, and snaps back.
+
+    By bisection of forward runs, to 1e-5. With light interior masses that ring, loops may close and
+    open again above it.
+
+    Parameters
+    ----------
+    chain : Chain
+        What is struck.
+    striker : Striker
+        Its mass, and the planned velocity from which the search starts.
+    spring : int
+        1 at the base.
+
+    Returns
+    -------
+    float or None
+        None if no velocity from a hundredth to thirty times the planned one parts open from closed.
+    """
+    assert striker.mass is not None
+    assert striker.velocity is not None
+    low = high = striker.velocity
+    while closes(chain, Impact(striker.mass, low), spring):
+        high, low = low, low / 1.25
+        if low < SLOWEST * striker.velocity:
+            return None
+    while not closes(chain, Impact(striker.mass, high), spring):
+        low, high = high, high * 1.25
+        if high > FASTEST * striker.velocity:
+            return None
+    while high - low > CLOSE * high:
+        middle = 0.5 * (low + high)
+        if closes(chain, Impact(striker.mass, middle), spring):
+            high = middle
+        else:
+            low = middle
+    return high
+
+
+def closes(chain: Chain, drive: Impact, spring: int) -> bool:
+    """Whether a spring (1 at the base) comes to branch e in an impact."""
+    end = 2.0 * chain.height / drive.velocity
+    for _ in range(20):
+        try:
+            response = simulate(chain, drive, np.linspace(0.0, end, 16))
+        except SimulationError:  # past the end of a branch: nothing is closed there
+            return False
+        mine = response.switches[response.switches[:, 1] == spring - 1]
+        if np.any(mine[:, 3] == kernels.E):
+            return True
+        if response.contact_end is not None:
+            return False
+        end *= 2.0
+    return False
+
+
+def faster(problem: Problem, values: Array, velocity: float, noise: Mapping[str, float]) -> Problem:
+    """Return the same problem at another velocity of the striker, its curves simulated."""
+    test = problem.measurement
+    loud = {name.startswith("displacement"): value for name, value in noise.items()}
+    test = replace(test, noise=Noise(loud.get(False), loud.get(True)))
+    striker = replace(_striker(test), velocity=velocity)
+    test = simulated_test(test, chain_of(problem, values), striker)
+    return make_problem(
+        test, problem.model.name, "impact", problem.params, problem.objective.weights,
+        problem.objective.interior_mass,
+    )  # fmt: skip
+
+
+def expect(problem: Problem, values: Array, noise: Mapping[str, float]) -> Outlook:
+    """Standard errors and states to expect at a point, from the Fisher information.
+
+    Parameters
+    ----------
+    problem : Problem
+        The experiment.
+    values : (n,) array
+        Where the parameters are taken to lie, SI.
+    noise : mapping
+        One standard deviation of each counted curve, SI.
+    """
+    lost, params = unreached(problem, values), problem.params
+    names = tuple(n for n in problem.names if params[n].vary and n not in lost)
+    insight = None
+    if names:
+        insight = look(problem, values, names, problem.slopes(values, names), noise)
+    expected = {}
+    for name in problem.free():
+        value, unit = float(values[problem.index[name]]), unit_of(name)
+        if name in lost or insight is None:
+            why = f"branch {lost[name]} of spring {split_name(name)[0] + 1} is not reached"
+            expected[name] = ParameterEstimate(value, None, None, unit, True, "not determined", why)
+            continue
+        stderr = float(insight.stderr[names.index(name)])
+        half = covariance.half_width(stderr, problem.objective.n_data - len(names))
+        limits = (params[name].min, params[name].max)
+        state, why = state_of(name, value, (value - half, value + half), insight, limits)
+        told = state != "not determined"
+        expected[name] = ParameterEstimate(
+            value, stderr if told else None, None, unit, True, state, why
+        )
+    seen = visited(problem, problem.objective.simulate(values, everything=True))
+    impact = problem.objective.drive == "impact"
+    velocity = _striker(problem.measurement).velocity if impact else None
+    return Outlook(velocity, expected, seen, insight)
+
+
+def worth(insight: Insight) -> dict[str, dict[str, float]]:
+    """Standard error of each parameter if a curve's noise were halved, over the present one."""
+    now = insight.stderr
+    out = {}
+    for curve in insight.curves:
+        then = insight.stderr_with(curve)
+        pairs = zip(insight.names, then, now, strict=True)
+        out[curve] = {name: float(a / b) for name, a, b in pairs if np.isfinite(b)}
+    return out
+
+
+def _striker(test: Measurement) -> Striker:
+    assert test.striker is not None  # the impact drive has one
+    return test.striker
+
+
+# ---------------------------------------------------------------- in words
+
+
+def describe_plan(plan: Plan) -> str:
+    """Write a plan for people: at most 100 columns wide, no newline at the end."""
+    out = [("model", f"{plan.problem.model.name}, {plan.problem.objective.drive} drive")]
+    out.append(("start", f"{plan.source}; all that follows holds there"))
+    told = (
+        f"{_spoken(name)} {engineering(level.sigma, _unit(name))} "
+        f"({'stated' if level.given else 'estimated'})"
+        for name, level in plan.noise.items()
+    )
+    out.append(("noise", ", ".join(told)))
+    out += [("", text) for text in _unexplained(plan)]
+    out += [("loop" if i == 0 else "", text) for i, text in enumerate(closing_sentences(plan))]
+    if plan.outlook.insight is not None:
+        worths = list(worth_sentences(plan.outlook.insight))
+        out += [("channels" if i == 0 else "", text) for i, text in enumerate(worths)]
+        out.append(("least", plan.outlook.insight.sentence()))
+    text = "\n".join(f"{label:<10}{_wrap(sentence)}" for label, sentence in out)
+    return "\n".join([text, "", *_table(plan), "", *_reasons(plan)]).rstrip()
+
+
+def _unexplained(plan: Plan) -> Iterator[str]:
+    """Warn where the start values leave more than the noise: then the errors are too small."""
+    objective, at = plan.problem.objective, 0
+    residual = objective.differences(plan.values)
+    for (name, level), size in zip(plan.noise.items(), objective.sizes, strict=True):
+        noise = level.sigma
+        rms = float(np.sqrt(np.mean(residual[at : at + size] ** 2)))
+        rms *= objective.scale[name] / objective.weights[name] ** 0.5
+        at += size
+        if rms > ESTIMATED * noise:
+            yield (
+                f"The start values leave {rms / noise:.1f} times the noise of {_spoken(name)}, so "
+                "the errors to expect are larger than those below."
+            )
+
+
+def closing_sentences(plan: Plan) -> Iterator[str]:
+    """Say for each bistable spring how far it goes, and what would close its loop."""
+    velocity = plan.outlook.velocity
+    guessed = [name for name, item in plan.outlook.expected.items() if "reached" in item.why]
+    for spring, seen in plan.outlook.visited.items():
+        if "a" not in seen:
+            continue
+        at = f"At {velocity:.4g} m/s" if velocity is not None else "In this test"
+        mine = [name for name in guessed if name.startswith(f"{spring}_")]
+        text = f"{at} the loop of spring {spring[1:]} closes"
+        if "e" not in seen:
+            last = seen[-1] if "c" not in seen else "c"
+            text = f"{at} spring {spring[1:]} turns back on branch {last}"
+        if velocity is None:
+            strain, stress = _needed(plan, int(spring[1:]))
+            closing = f"an overall strain of {strain:.3g} ({engineering(stress, 'Pa')})"
+        else:
+            found = plan.closing.get(spring)
+            closing = "" if found is None else f"{found:.4g} m/s"
+        if not closing:
+            yield f"{text}; no velocity that was tried decides whether its loop closes."
+        elif "e" in seen:
+            yield f"{text}, as it does from {closing} on."
+        elif mine and plan.source.startswith(GUESSED):
+            yield (
+                f"{text}. That its loop would close from {closing} on is a guess: this test does "
+                f"not tell {', '.join(mine)}."
+            )
+        else:
+            yield f"{text}; from {closing} on its loop closes."
+
+
+def _needed(plan: Plan, spring: int) -> tuple[float, float]:
+    """Overall strain, and stress (Pa), at which a spring of a slow chain comes to its C1."""
+    chain = chain_of(plan.problem, plan.values)
+    soft = chain.springs[spring - 1]
+    assert isinstance(soft, BistableSpring)
+    stress = soft.sigma_hat_c
+    path = np.linspace(0.0, stress, 400)
+    strains = [
+        soft.eps_hat_c if i == spring - 1 else float(other.strain(path)[-1])
+        for i, other in enumerate(chain.springs)
+    ]
+    return float(np.dot(chain.heights, strains)) / chain.height, stress
+
+
+def worth_sentences(insight: Insight) -> Iterator[str]:
+    """Say what halving the noise of each channel would bring, and which is worth it most."""
+    ratios = worth(insight)
+    gains = {
+        curve: float(np.mean([1.0 - r for r in of.values()])) for curve, of in ratios.items() if of
+    }
+    for curve, of in ratios.items():
+        best = sorted(of, key=lambda name: of[name])[:3]
+        most = ", ".join(f"{name} by {1.0 - of[name]:.0%}" for name in best if of[name] < 0.98)
+        yield (
+            f"Half the noise of {_spoken(curve)} narrows the intervals by "
+            f"{gains.get(curve, 0.0):.0%} on average{f', most {most}' if most else ''}."
+        )
+    if len(gains) > 1:
+        first = max(gains, key=lambda curve: gains[curve])
+        yield f"The channel worth measuring better is {_spoken(first)}."
+    elif gains:
+        yield f"Only {_spoken(next(iter(gains)))} is compared in this drive."
+
+
+def _table(plan: Plan) -> list[str]:
+    """Align the expected standard errors, beside those of the faster test where there is one."""
+    from foamfit.report.page import readable
+
+    outlooks = [plan.outlook] + ([plan.beyond] if plan.beyond is not None else [])
+    heads = [
+        "expected" if o.velocity is None else f"expected at {o.velocity:.4g} m/s" for o in outlooks
+    ]
+    table = [["parameter", "unit", *(x for head in heads for x in (head, "state"))]]
+    for name in plan.outlook.expected:
+        shown = [readable(name, outlook.expected[name]) for outlook in outlooks]
+        cells = [x for item in shown for x in (_with_error(item.value, item.stderr), item.state)]
+        table.append([name, shown[0].unit, *cells])
+    widths = [max(len(row[i]) for row in table) for i in range(len(table[0]))]
+    return [
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in table
+    ]
+
+
+def _with_error(value: str, stderr: str) -> str:
+    return f"{value} ± {stderr}" if stderr else value
+
+
+def _reasons(plan: Plan) -> Iterator[str]:
+    for name, item in plan.outlook.expected.items():
+        if item.state != "determined":
+            yield from textwrap.wrap(
+                f"{name}: {item.state}, {item.why}.", WIDTH, subsequent_indent="  "
+            )
+
+
+def _unit(curve: str) -> str:
+    return "m" if curve.startswith("displacement") else "Pa"
+
+
+def _spoken(name: str) -> str:
+    return name.replace("_", "-")
+
+
+def _wrap(text: str) -> str:
+    return textwrap.fill(text, width=WIDTH, initial_indent=" " * 10, subsequent_indent=" " * 12)[
+        10:
+    ]
+
+
+def plan_test(
+    test: Path,
+    specimen: Path | None,
+    model: str,
+    drive: str | None,
+    *,
+    published_set: str | None = None,
+    result: Path | None = None,
+) -> Plan:
+    """Read a test, or a TOML that plans one, and look ahead.
+
+    Parameters
+    ----------
+    test : Path
+        A CSV; or a TOML, which then needs one of the sources of start values.
+    specimen : Path or None
+        See `foamfit.read_test`.
+    model, drive
+        See `foamfit.fit`.
+    published_set : str, optional
+        A published set to start from.
+    result : Path, optional
+        An earlier result to start from.
+
+    Raises
+    ------
+    InputError
+        If something is missing or wrong; the message names it.
+    """
+    from foamfit.data.csv_file import read_test
+
+    model = Model.parse(model).name
+    made = test.suffix.lower() != ".toml"
+    if not made and published_set is None and result is None:
+        raise InputError(
+            f"{test} plans a test without data; say by --published or --params what foam it is"
+        )
+    measurement = read_test(test, specimen) if made else planned_test(test)
+    problem = make_problem(measurement, model, drive, None, None, interior_mass=False)
+    if published_set is not None:
+        values, source = published_values(problem, published_set)
+    elif result is not None:
+        values, source = result_values(problem, result)
+    else:
+        values, source = start_values(problem)
+    if not made:
+        chain = chain_of(problem, values)
+        measurement = simulated_test(measurement, chain, _striker(measurement))
+        problem = make_problem(measurement, model, drive, None, None, interior_mass=False)
+    return make_plan(problem, values, source)

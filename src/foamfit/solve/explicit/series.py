@@ -1,0 +1,671 @@
+"""The Taylor series in time of a chain on fixed branches, and of its derivatives by parameters.
+
+On one branch the law is either a straight line or σ (1 - x) = k x, so every coefficient of strains,
+stresses and motion follows from the lower ones by a short recurrence. The recurrence of the
+derivatives is the same one, linearised about the motion: with T the series of the slope dσ/dε,
+
+    δσ_n = Σ_j T_{n-j} δx_j + (∂σ/∂k)_n δk,      x = ε - x0.
+
+The law is continuous at its switches, so the derivatives pass from branch to branch without a jump.
+
+The nodes are those masses that are there. Between two of them lies a group of springs in series,
+which carry one stress: massless nodes have no state. In a group of several springs those without
+dashpot share the elongation by their compliances, at every order of the series.
+"""
+
+# mypy: disallow-untyped-decorators=False, warn-return-any=False
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from foamfit.solve.polynomial import value_at
+from foamfit.springs.kernels import (
+    EPS_A,
+    K0,
+    KC,
+    KIND,
+    OPEN,
+    SIGMA_C,
+    A,
+    Array,
+    Branches,
+    D,
+    E,
+    Row,
+    branch_shape,
+    compiled,
+    inlined,
+    inner,
+    interval,
+    maker,
+    once,
+    piece,
+)
+from foamfit.springs.law import BISTABLE
+
+# What is known of the top node.
+FREE, VISCOUS, STRESS, MOTION = range(4)
+# Rows of the series of a chain: displacement and velocity of the nodes above the groups, strain and
+# stress of the springs, common stress of the groups, slope T = dσ/dε of the springs.
+W, V, EPS, SIG, GROUP, TILT, N_SERIES = range(7)
+# Columns of `Links.law`: slope k of the branch that a spring is on, its origins x0 and s0, the
+# spring's dashpot and height: what parameters move; then whether the branch is curved, the strains
+# between which the spring stays on it, and what a step keeps of a curved one: 1/(1 - x) at its
+# start.
+SLOPE, ORIGIN, OFFSET, DASHPOT, HEIGHT, N_MOVES = range(6)
+CURVED, LOW, HIGH, ROOM, N_LAW = range(N_MOVES, 10)
+# What a direction of derivatives moves, besides a spring's own parameters 0 … 7 (k0 … eta): its
+# height, or (of no spring, -1) the onsite damping of the top.
+OWN_ETA, OWN_HEIGHT, DRAG = 7, 8, 9
+
+
+class Links(NamedTuple):
+    """A chain on the branches that its springs are on.
+
+    `law` (springs, N_LAW) is what `enter` writes, with dashpots in Pa·s and heights in m; `ends`
+    (groups,) is one past the last spring of each group and `mass` (groups,) the areal mass of the
+    node above it, kg/m²; `drag` is the onsite damping of the top, η_site/H in Pa·s/m, `top` what is
+    known of it.
+
+    The series of such a chain are an array (N_SERIES, springs, order + 2) of Taylor coefficients:
+    order 0 of W, V and EPS is the state. W, V and GROUP use a column for each group; the last
+    coefficient of SIG, GROUP and TILT is not used.
+    """
+
+    law: Array
+    ends: Branches
+    mass: Array
+    drag: float
+    top: int
+
+
+class Tangents(NamedTuple):
+    """Derivatives of a chain and of its series in p directions.
+
+    law (p, springs, N_MOVES) holds those of the first columns of `Links.law`, `drag` (p,) those of
+    the onsite damping, series (p, N_SERIES, springs, order + 2) those of the series but for TILT;
+    `live` (p,) is 1 for those that have left zero.
+    """
+
+    law: Array
+    drag: Array
+    live: Array
+    series: Array
+
+
+@inner
+def enter(rows: Array, i: int, branch: int, law: Array) -> None:
+    """Write the branch that spring i enters."""
+    curved, law[i, SLOPE], law[i, ORIGIN], law[i, OFFSET] = branch_shape(rows[i], branch)
+    law[i, CURVED] = 1.0 if curved else 0.0
+    law[i, LOW], law[i, HIGH] = interval(rows[i], branch)
+
+
+@inner
+def branch_derivative(row: Row, branch: int, own: int) -> tuple[float, float, float]:
+    """Derivatives of (k, x0, s0) of a branch of eq. 2 by a spring's own parameter k0 … kh_minus.
+
+    Across an open gap nothing acts, whatever the spring is.
+    """
+    if branch == OPEN:
+        return 0.0, 0.0, 0.0
+    if row[KIND] != BISTABLE or branch == A:
+        return (1.0 if own == 0 else 0.0), 0.0, 0.0
+    eps_a, v = row[EPS_A], 1.0 - row[EPS_A]
+    d_sigma_a = (eps_a / v if own == 0 else 0.0) + (row[K0] / (v * v) if own == 3 else 0.0)
+    if branch == D:
+        return (1.0 if own == 5 else 0.0), (1.0 if own == 3 else 0.0), d_sigma_a
+    d_sigma_c = d_sigma_a + (1.0 if own == 2 else 0.0)
+    d_eps_c = 1.0 if own == 4 else 0.0
+    if branch == E:
+        return (1.0 if own == 6 else 0.0), d_eps_c, d_sigma_c
+    d_kc = 1.0 if own == 1 else 0.0
+    stiff = row[KC] + row[SIGMA_C]
+    d_eps_star = d_eps_c - (row[KC] * d_sigma_c - row[SIGMA_C] * d_kc) / (stiff * stiff)
+    return d_kc, d_eps_star, 0.0
+
+
+@inner
+def enter_tangents(rows: Array, i: int, branch: int, directions: Branches, d: Tangents) -> None:
+    """Write the derivatives of the branch that spring i enters."""
+    for p in range(directions.shape[0]):
+        if directions[p, 0] == i and directions[p, 1] < OWN_ETA:
+            dk, dx0, ds0 = branch_derivative(rows[i], branch, directions[p, 1])
+            d.law[p, i, SLOPE], d.law[p, i, ORIGIN], d.law[p, i, OFFSET] = dk, dx0, ds0
+            if dk != 0.0 or dx0 != 0.0 or ds0 != 0.0:
+                d.live[p] = 1.0
+
+
+@maker
+def make_series(count: int, order: int, directions: Branches) -> tuple[Array, Tangents]:
+    """Make the series of a chain at rest, and derivatives, of branches that are yet to be entered.
+
+    All is zero but what the directions say.
+    """
+    p = directions.shape[0]
+    series, ways = np.zeros((1 + p, N_SERIES, count, order + 2)), np.zeros((2, p))
+    d = Tangents(np.zeros((p, count, N_MOVES)), ways[0], ways[1], series[1:])
+    for q in range(p):
+        i, what = directions[q, 0], directions[q, 1]
+        if what >= OWN_ETA:
+            d.live[q] = 1.0
+        if what == OWN_ETA:
+            d.law[q, i, DASHPOT] = 1.0
+        elif what == OWN_HEIGHT:
+            d.law[q, i, HEIGHT] = 1.0
+        elif what == DRAG:
+            d.drag[q] = 1.0
+    return series[0], d
+
+
+# ---------------------------------------------------------------- the motion
+
+
+@inner
+def springs_of(ends: Branches, g: int) -> tuple[np.int64, np.int64]:
+    """First spring of a group, and one past its last."""
+    first = ends[g - 1] if g > 0 else ends[0] - ends[0]
+    return first, ends[g]
+
+
+@inlined
+def _product(x: Array, y: Array, i: int, n: int) -> float:
+    """Σ x_j y_{n-j} of spring i for j from 1 to n - 1."""
+    even = odd = 0.0  # two sums at once
+    for j in range(1, n - 1, 2):
+        even += x[i, j] * y[i, n - j]
+        odd += x[i, j + 1] * y[i, n - j - 1]
+    if n % 2 == 0:
+        even += x[i, n - 1] * y[i, 1]
+    return even + odd
+
+
+@inlined
+def _stress_term(law: Array, i: int, eps: Array, sig: Array, n: int) -> float:
+    """Order n of a spring's stress from its strain up to order n."""
+    k = law[i, SLOPE]
+    if n > 0:
+        if law[i, CURVED] == 0.0:
+            return k * eps[i, n]
+        known = _product(eps, sig, i, n)
+        return ((k + sig[i, 0]) * eps[i, n] + known) * law[i, ROOM]
+    x = eps[i, 0] - law[i, ORIGIN]
+    if law[i, CURVED] == 0.0:
+        return law[i, OFFSET] + k * x
+    law[i, ROOM] = 1.0 / (1.0 - x) if x < 1.0 else math.inf
+    return k * x * law[i, ROOM]
+
+
+@inlined
+def _strain_term(law: Array, i: int, eps: Array, sig: Array, n: int) -> tuple[float, float]:
+    """Order n >= 1 of a spring's strain as (known part, compliance): ε_n = known + compliance σ_n.
+
+    The compliance of a flat branch is infinite.
+    """
+    k = law[i, SLOPE]
+    if law[i, CURVED] == 0.0:
+        return 0.0, (1.0 / k if k > 0.0 else math.inf)
+    stiff = k + sig[i, 0]
+    known = _product(eps, sig, i, n)
+    return -known / stiff, (1.0 - (eps[i, 0] - law[i, ORIGIN])) / stiff
+
+
+@once
+def _share_elongation(
+    law: Array,
+    i0: int,
+    i1: int,
+    eps: Array,
+    sig: Array,
+    u_n: float,
+    n: int,
+) -> float:
+    """Order n >= 1 of the common stress of a group that has springs without dashpot.
+
+    Fills the strains of those springs; a flat branch takes up all that the others leave.
+    """
+    compliance, rest, flat = 0.0, u_n, -1
+    for i in range(i0, i1):
+        if law[i, DASHPOT] > 0.0:
+            rest -= law[i, HEIGHT] * eps[i, n]
+            continue
+        known, soft = _strain_term(law, i, eps, sig, n)
+        eps[i, n] = known  # so far
+        rest -= law[i, HEIGHT] * known
+        if soft < math.inf:
+            compliance += law[i, HEIGHT] * soft
+        elif flat < 0:
+            flat = i
+    s_n = 0.0 if flat >= 0 else rest / compliance
+    for i in range(i0, i1):
+        if law[i, DASHPOT] == 0.0:
+            sig[i, n] = s_n
+            if law[i, CURVED] != 0.0:
+                x = eps[i, 0] - law[i, ORIGIN]
+                eps[i, n] += (1.0 - x) / (law[i, SLOPE] + sig[i, 0]) * s_n
+            elif law[i, SLOPE] > 0.0:
+                eps[i, n] += s_n / law[i, SLOPE]
+    if flat >= 0:
+        eps[flat, n] = rest / law[flat, HEIGHT]
+    return s_n
+
+
+@inlined
+def _damped_term(
+    law: Array,
+    i0: int,
+    i1: int,
+    sig: Array,
+    rate_n: float,
+    push_n: float,
+    drag: float,
+    n: int,
+) -> float:
+    """Order n of the common stress of a group in which every spring has a dashpot.
+
+    Σ = (rate + Σ h_i σ_i/η_i) / Σ h_i/η_i; under a viscous top (drag > 0), whose rate is
+    (push - Σ)/drag, `rate_n` leaves that node out.
+    """
+    total, weight = rate_n, 0.0
+    for i in range(i0, i1):
+        total += law[i, HEIGHT] * sig[i, n] / law[i, DASHPOT]
+        weight += law[i, HEIGHT] / law[i, DASHPOT]
+    if drag > 0.0:
+        total += push_n / drag
+        weight += 1.0 / drag
+    return total / weight
+
+
+@inlined
+def _group_term(
+    law: Array,
+    i0: int,
+    i1: int,
+    eps: Array,
+    sig: Array,
+    u_n: float,
+    rate_n: float,
+    push_n: float,
+    drag: float,
+    n: int,
+) -> float:
+    """Order n of the common stress of a group whose elongation u and its rate are known."""
+    if i1 - i0 == 1:
+        if n > 0:
+            eps[i0, n] = u_n * (1.0 / law[i0, HEIGHT])  # the quotient waits for nothing
+        sig[i0, n] = _stress_term(law, i0, eps, sig, n)
+        if law[i0, DASHPOT] == 0.0:
+            return sig[i0, n]
+        return _damped_term(law, i0, i1, sig, rate_n, push_n, drag, n)
+    damped, first = 0, -1
+    for i in range(i0, i1):
+        if law[i, DASHPOT] > 0.0:
+            damped += 1
+        elif first < 0 or (law[i, CURVED] == 0.0 and law[i, SLOPE] == 0.0):
+            first = i  # a flat branch knows the common stress without rounding (0 in an open gap)
+        if n == 0 or law[i, DASHPOT] > 0.0:
+            sig[i, n] = _stress_term(law, i, eps, sig, n)
+    if damped == i1 - i0:
+        return _damped_term(law, i0, i1, sig, rate_n, push_n, drag, n)
+    if n == 0:
+        return sig[first, 0]
+    return _share_elongation(law, i0, i1, eps, sig, u_n, n)
+
+
+@once
+def _stressed_term(
+    law: Array, i0: int, i1: int, eps: Array, sig: Array, s_n: float, n: int
+) -> bool:
+    """Order n of the strains of a group whose stress is prescribed; false if it cannot be."""
+    for i in range(i0, i1):
+        if law[i, DASHPOT] > 0.0 or n == 0:
+            sig[i, n] = _stress_term(law, i, eps, sig, n)
+            continue
+        known, soft = _strain_term(law, i, eps, sig, n)
+        if soft == math.inf:
+            return False
+        eps[i, n] = known + soft * s_n
+        sig[i, n] = s_n
+    return True
+
+
+@inner
+def is_bare(links: Links) -> bool:
+    """Whether every spring is undamped and alone between two masses."""
+    if links.top != FREE or links.ends.size != links.law.shape[0]:
+        return False
+    damped = 0
+    for i in range(links.ends.size):
+        damped += links.law[i, DASHPOT] > 0.0
+    return damped == 0
+
+
+@inlined
+def expand_bare(links: Links, s: Array, push: Array, order: int) -> None:
+    """Fill the series of a chain that `is_bare`, as `expand` does, asking less at each order."""
+    law, _, mass, drag, _ = links
+    w, v, eps, sig, group = s[W], s[V], s[EPS], s[SIG], s[GROUP]
+    last = mass.size - 1
+    for n in range(order + 1):
+        share = 1.0 / (n + 1)
+        for i in range(last + 1):
+            eps[i, n] = (w[i, n] - (w[i - 1, n] if i > 0 else 0.0)) * (1.0 / law[i, HEIGHT])
+            sig[i, n] = group[i, n] = _stress_term(law, i, eps, sig, n)
+        for i in range(last + 1):
+            net = -sig[i, n]
+            if i < last:
+                net += sig[i + 1, n]
+            else:
+                net += push[n] if n < 2 else 0.0
+                if drag > 0.0:
+                    net -= drag * v[i, n]
+            v[i, n + 1] = net * (share / mass[i])
+            w[i, n + 1] = v[i, n] * share
+
+
+@inner
+def expand(links: Links, s: Array, push: Array, motion: Array, order: int) -> bool:
+    """Fill the series up to `order`; false if a prescribed stress meets a flat branch.
+
+    `push` (2,) is the stress on the top and its rate, `motion` (2,) its displacement and rate.
+    """
+    law, ends, mass, drag, top = links
+    w, v, eps, sig, group = s[W], s[V], s[EPS], s[SIG], s[GROUP]
+    last = ends.size - 1
+    for n in range(order + 1):
+        push_n = push[n] if n < 2 else 0.0
+        share = 1.0 / (n + 1)
+        if top == MOTION:
+            w[last, n] = motion[n] if n < 2 else 0.0
+            v[last, n] = motion[1] if n == 0 else 0.0
+        for g in range(last + 1):
+            i0, i1 = springs_of(ends, g)
+            stressed = g == last and top == STRESS
+            if stressed:
+                group[g, n] = push_n
+                if not _stressed_term(law, i0, i1, eps, sig, push_n, n):
+                    return False
+            else:
+                viscous = g == last and top == VISCOUS
+                u_n, rate_n = w[g, n], (0.0 if viscous else v[g, n])
+                if g > 0:
+                    u_n -= w[g - 1, n]
+                    rate_n -= v[g - 1, n]
+                group[g, n] = _group_term(
+                    law, i0, i1, eps, sig, u_n, rate_n, push_n, drag if viscous else 0.0, n
+                )
+            if i1 - i0 > 1 or stressed:
+                for i in range(i0, i1):
+                    if law[i, DASHPOT] > 0.0:
+                        eps[i, n + 1] = (group[g, n] - sig[i, n]) * share / law[i, DASHPOT]
+        for g in range(last + 1):
+            if g < last or top == FREE:
+                net = (group[g + 1, n] if g < last else push_n) - group[g, n]
+                if g == last and drag > 0.0:
+                    net -= drag * v[g, n]
+                v[g, n + 1] = net * (share / mass[g])
+                w[g, n + 1] = v[g, n] * share
+            elif top == VISCOUS:
+                v[g, n] = (push_n - group[g, n]) / drag
+                w[g, n + 1] = v[g, n] * share
+    return True
+
+
+# ---------------------------------------------------------------- its derivatives
+
+
+@inner
+def _fill_tilt(law: Array, i: int, sig: Array, tilt: Array, order: int) -> None:
+    """Series T of dσ/dε of a spring: k on a straight branch, (k + σ)²/k on a curved one."""
+    k = law[i, SLOPE]
+    tilt[i, 0] = k
+    if law[i, CURVED] == 0.0:
+        for n in range(1, order + 1):
+            tilt[i, n] = 0.0
+        return
+    stiff = k + sig[i, 0]
+    tilt[i, 0] = stiff * stiff / k
+    for n in range(1, order + 1):
+        tilt[i, n] = (2.0 * stiff * sig[i, n] + _product(sig, sig, i, n)) / k
+
+
+@inlined
+def _known_tangent(law: Array, s: Array, m: Array, d: Array, i: int, n: int) -> float:
+    """Order n of δσ of a spring, but for the term T_0 δε_n."""
+    eps, sig, tilt = s[EPS], s[SIG], s[TILT]
+    known = -tilt[i, n] * m[i, ORIGIN]
+    if law[i, CURVED] == 0.0:
+        known += (eps[i, n] - (law[i, ORIGIN] if n == 0 else 0.0)) * m[i, SLOPE]
+        known += m[i, OFFSET] if n == 0 else 0.0
+    else:
+        known += sig[i, n] / law[i, SLOPE] * m[i, SLOPE]
+        if n > 0:
+            known += d[EPS, i, 0] * tilt[i, n] + _product(d[EPS], tilt, i, n)
+    if law[i, DASHPOT] == 0.0 and n + 2 < tilt.shape[1]:  # a dashpot of zero: what it would take
+        known += (n + 1) * eps[i, n + 1] * m[i, DASHPOT]
+    return known
+
+
+@inner
+def _share_tangent(
+    law: Array, tilt: Array, d: Array, i0: int, i1: int, rest: float, n: int
+) -> float:
+    """Order n of the derivative of a group's stress, where some springs have no dashpot.
+
+    `rest` is that of the elongation, but for the moves of the springs. Fills their δε and δσ, whose
+    known parts must be in d[SIG].
+    """
+    eps, sig = d[EPS], d[SIG]
+    compliance, flat = 0.0, -1
+    for i in range(i0, i1):
+        if law[i, DASHPOT] > 0.0:
+            rest -= law[i, HEIGHT] * eps[i, n]
+        elif tilt[i, 0] > 0.0:
+            compliance += law[i, HEIGHT] / tilt[i, 0]
+            rest += law[i, HEIGHT] / tilt[i, 0] * sig[i, n]
+        elif flat < 0:
+            flat = i
+    common = sig[flat, n] if flat >= 0 else rest / compliance
+    for i in range(i0, i1):
+        if law[i, DASHPOT] == 0.0 and i != flat:
+            soft = 1.0 / tilt[i, 0] if tilt[i, 0] > 0.0 else 0.0
+            eps[i, n] = (common - sig[i, n]) * soft
+            sig[i, n] = common
+    if flat >= 0:  # the flat branch takes up all that the others leave
+        eps[flat, n] = (rest - common * compliance) / law[flat, HEIGHT]
+    return common
+
+
+@inner
+def _damped_tangent(
+    links: Links, s: Array, m: Array, drag: float, d: Array, g: int, i0: int, i1: int, n: int
+) -> float:
+    """Order n of the derivative of `_damped_term`."""
+    law, viscous = links.law, g == links.ends.size - 1 and links.top == VISCOUS
+    total, weight = (0.0 if viscous else d[V, g, n]), 0.0
+    if g > 0:
+        total -= d[V, g - 1, n]
+    if viscous:  # v of the top is (push - Σ)/drag
+        total -= s[V, g, n] / links.drag * drag
+        weight = 1.0 / links.drag
+    for i in range(i0, i1):
+        share = law[i, HEIGHT] / law[i, DASHPOT]
+        change = (m[i, HEIGHT] - share * m[i, DASHPOT]) / law[i, DASHPOT]
+        total += share * d[SIG, i, n] + change * (s[SIG, i, n] - s[GROUP, g, n])
+        weight += share
+    return total / weight
+
+
+@inlined
+def _group_tangent(links: Links, s: Array, m: Array, drag: float, d: Array, g: int, n: int) -> None:
+    """Order n of the derivative of a group's stress and of its strains that are no state."""
+    law, tilt = links.law, s[TILT]
+    i0, i1 = springs_of(links.ends, g)
+    stressed = g == links.ends.size - 1 and links.top == STRESS
+    rest = d[W, g, n] - (d[W, g - 1, n] if g > 0 else 0.0)
+    single = i1 - i0 == 1 and not stressed
+    damped = 0
+    for i in range(i0, i1):
+        damped += law[i, DASHPOT] > 0.0
+        rest -= s[EPS, i, n] * m[i, HEIGHT]
+        known = _known_tangent(law, s, m, d, i, n)
+        if single:
+            d[EPS, i, n] = rest * (1.0 / law[i, HEIGHT])
+        elif stressed and law[i, DASHPOT] == 0.0:
+            d[EPS, i, n] = -known / tilt[i, 0]
+        if single or stressed or law[i, DASHPOT] > 0.0:
+            known += tilt[i, 0] * d[EPS, i, n]
+        d[SIG, i, n] = known
+    if stressed:
+        d[GROUP, g, n] = 0.0
+    elif damped == i1 - i0:
+        d[GROUP, g, n] = _damped_tangent(links, s, m, drag, d, g, i0, i1, n)
+    elif single:
+        d[GROUP, g, n] = d[SIG, i0, n]
+    else:
+        d[GROUP, g, n] = _share_tangent(law, tilt, d, i0, i1, rest, n)
+
+
+@once
+def _expand_tangent(links: Links, s: Array, m: Array, drag: float, d: Array, order: int) -> None:
+    """Fill the derivatives in one direction, that moves `m` and `drag`, up to `order`."""
+    law, last = links.law, links.ends.size - 1
+    w, v = d[W], d[V]
+    for n in range(order + 1):
+        share = 1.0 / (n + 1)
+        for g in range(last + 1):
+            _group_tangent(links, s, m, drag, d, g, n)
+            i0, i1 = springs_of(links.ends, g)
+            if i1 - i0 > 1 or (g == last and links.top == STRESS):
+                for i in range(i0, i1):
+                    if law[i, DASHPOT] > 0.0:
+                        flow = (s[GROUP, g, n] - s[SIG, i, n]) / law[i, DASHPOT]
+                        net = d[GROUP, g, n] - d[SIG, i, n] - flow * m[i, DASHPOT]
+                        d[EPS, i, n + 1] = net * share / law[i, DASHPOT]
+        for g in range(last + 1):
+            net = -d[GROUP, g, n]
+            if g < last:
+                net += d[GROUP, g + 1, n]
+            elif links.top == VISCOUS:
+                v[g, n] = (net - s[V, g, n] * drag) / links.drag
+            elif links.drag > 0.0 or drag != 0.0:
+                net -= links.drag * v[g, n] + s[V, g, n] * drag
+            if g < last or links.top == FREE:
+                v[g, n + 1] = net * (share / links.mass[g])
+            if g < last or links.top in (FREE, VISCOUS):
+                w[g, n + 1] = v[g, n] * share
+
+
+@piece
+def expand_tangents(links: Links, s: Array, d: Tangents, order: int) -> None:
+    """Fill the derivatives up to `order`, after `expand`; those that are still zero stay so."""
+    for i in range(links.law.shape[0]):
+        _fill_tilt(links.law, i, s[SIG], s[TILT], order)
+    for p in range(d.drag.size):
+        if d.live[p] > 0.0:
+            _expand_tangent(links, s, d.law[p], d.drag[p], d.series[p], order)
+
+
+# ---------------------------------------------------------------- the end of a step
+
+
+@inner
+def advance(s: Array, groups: int, order: int, span: float) -> None:
+    """Carry the state, order 0 of W, V and EPS, over a step of length `span`."""
+    for row in range(W, EPS + 1):
+        for i in range(s.shape[1] if row == EPS else groups):
+            s[row, i, 0] = value_at(s[row, i], order, span)
+
+
+@piece
+def advance_tangents(d: Tangents, groups: int, order: int, span: float) -> None:
+    """Carry the derivatives of the state over a step of length `span`."""
+    for p in range(d.drag.size):
+        if d.live[p] > 0.0:
+            advance(d.series[p], groups, order, span)
+
+
+# ---------------------------------------------------------------- without inertia and damping
+
+
+@compiled
+def equilibrium_tangents(
+    rows: Array,
+    heights: Array,
+    eps: Array,
+    branches: Branches,
+    moved: bool,
+    directions: Branches,
+) -> tuple[Array, Array]:
+    """Derivatives along a history of springs in series, undamped and massless.
+
+    Parameters
+    ----------
+    rows, heights : arrays
+        The springs.
+    eps, branches : (springs, n) arrays
+        Their strains and branches.
+    moved : bool
+        Whether the displacement of the top is prescribed, or else the stress.
+    directions : (p, 2) array
+        See `explicit.taylor.integrate`.
+
+    Returns
+    -------
+    tuple of arrays
+        Derivatives of the displacements above the springs (p, springs, n), m, and of the common
+        stress (p, n), Pa, per unit of the parameters.
+    """
+    count, n = eps.shape
+    size = directions.shape[0]
+    out_w, out_s = np.empty((size, count, n)), np.empty((size, n))
+    law, branch = np.empty((count, N_LAW)), np.full(count, -1)
+    change = np.zeros((size, 3))  # of k, x0 and s0 of the branch that the direction's spring is on
+    slope, soft = np.empty(count), np.empty(count + 1)
+    for j in range(n):
+        flat = -1
+        soft[0] = 0.0  # compliance of the springs below each node
+        for i in range(count):
+            if branches[i, j] != branch[i]:
+                branch[i] = branches[i, j]
+                enter(rows, i, branch[i], law)
+                for p in range(size):
+                    if directions[p, 0] == i and directions[p, 1] < OWN_ETA:
+                        change[p, 0], change[p, 1], change[p, 2] = branch_derivative(
+                            rows[i], branch[i], directions[p, 1]
+                        )
+            x = eps[i, j] - law[i, ORIGIN]
+            slope[i] = law[i, SLOPE]
+            if law[i, CURVED] != 0.0:
+                slope[i] /= (1.0 - x) * (1.0 - x)
+            soft[i + 1] = soft[i]
+            if slope[i] > 0.0:
+                soft[i + 1] += heights[i] / slope[i]
+            elif flat < 0:
+                flat = i
+        for p in range(size):
+            i = directions[p, 0]
+            known = longer = 0.0  # δσ at fixed strain, δ of the elongation at fixed stress
+            if i >= 0 and directions[p, 1] == OWN_HEIGHT:
+                longer = eps[i, j]
+            elif i >= 0:
+                x = eps[i, j] - law[i, ORIGIN]
+                factor = x / (1.0 - x) if law[i, CURVED] != 0.0 else x
+                known = factor * change[p, 0] - slope[i] * change[p, 1] + change[p, 2]
+                longer = -heights[i] * known / slope[i] if slope[i] > 0.0 else 0.0
+            common = gap = 0.0
+            if moved and flat < 0:
+                common = -longer / float(soft[count])
+            elif moved:  # a flat branch takes up all that the others leave
+                common = known if i == flat else 0.0
+                gap = -longer - common * float(soft[count])
+            out_s[p, j] = common
+            for node in range(count):
+                own = longer if 0 <= i <= node else 0.0
+                out_w[p, node, j] = own + common * soft[node + 1]
+                if 0 <= flat <= node:
+                    out_w[p, node, j] += gap
+    return out_w, out_s

@@ -1,0 +1,708 @@
+"""The compiled integrator: Taylor series from switch to switch.
+
+A step is as long as the series of `explicit.series` allow at the wanted tolerance; switches of
+branch, the end of contact and the samples are roots and values of the same polynomials. No branch
+changes inside a step. Derivatives by parameters are carried along where they are asked for.
+"""
+
+# mypy: disallow-untyped-decorators=False, warn-return-any=False
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from foamfit.solve.explicit.series import (
+    CURVED,
+    DASHPOT,
+    EPS,
+    FREE,
+    GROUP,
+    HEIGHT,
+    HIGH,
+    LOW,
+    MOTION,
+    N_LAW,
+    ORIGIN,
+    SIG,
+    SLOPE,
+    STRESS,
+    VISCOUS,
+    Links,
+    Tangents,
+    V,
+    W,
+    advance,
+    advance_tangents,
+    enter,
+    enter_tangents,
+    expand,
+    expand_bare,
+    expand_tangents,
+    is_bare,
+    make_series,
+    springs_of,
+)
+from foamfit.solve.polynomial import (
+    LEAST_TRUNCATION,
+    fill_values,
+    first_crossing,
+    order_for,
+    slope_at,
+    value_at,
+)
+from foamfit.springs.kernels import (
+    ETA,
+    Array,
+    Branches,
+    above,
+    below,
+    branch_at_strain,
+    compiled,
+    first_branch,
+    inlined,
+    inner,
+    piece,
+)
+
+__all__ = ["FREE", "MOTION", "STRESS", "VISCOUS", "integrate"]
+
+# Outcomes.
+DONE, TOO_MANY_STEPS, STEP_UNDERFLOW, FLAT_UNDER_STRESS, NOT_FINITE = range(5)
+# Strains closer than this to the end of a branch are at it.
+CLOSE = 1e-13
+MOST_ORDERS = 24
+# The base stress is followed to its own size where that is at least so much of the springs'
+# stresses: what has not come through to the base yet is not worth a step.
+LEAST_BASE = 1e-6
+# Truncation of derivatives, relative to what they were so far, over that of the motion.
+OF_TANGENTS = 1e3
+
+
+class Samples(NamedTuple):
+    """The curves to fill, over the samples t (n,).
+
+    curves (1 + springs or 1, n) holds the base stress, Pa, then the displacements above each spring
+    or of the top alone, m; slopes (p, …) are their derivatives in p directions.
+    """
+
+    t: Array
+    curves: Array
+    slopes: Array
+
+
+# ---------------------------------------------------------------- the length of a step
+
+
+@inlined
+def _tail(
+    law: Array, s: Array, n: int, per_reach: float, per_load: float, per_base: float
+) -> float:
+    """Largest coefficient of order n among strains, stresses and base stress, over their scales."""
+    worst = abs(s[GROUP, 0, n]) * per_base
+    for i in range(law.shape[0]):
+        worst = max(worst, abs(s[EPS, i, n]) * law[i, HEIGHT] * per_reach)
+        worst = max(worst, abs(s[SIG, i, n]) * per_load)
+    return worst
+
+
+@inner
+def is_apart(links: Links) -> bool:
+    """Whether the base stress may be much smaller than the springs' stresses, or change faster.
+
+    So it is where a mass hides the base from the blow, or a dashpot acts there.
+    """
+    return links.ends.size > 1 or links.law[0, DASHPOT] > 0.0
+
+
+@inlined
+def step_length(
+    links: Links,
+    s: Array,
+    push: Array,
+    order: int,
+    tol: float,
+    span: float,
+    w_scale: float,
+    s_scale: float,
+    b_scale: float,
+) -> float:
+    """Longest step within `span` whose last two terms fall below `tol` of motion and stress.
+
+    The base stress is measured by its own size: by that of all springs if `b_scale` is infinite.
+    """
+    reach, load = w_scale, max(s_scale, abs(push[0]))
+    for _ in range(60):  # at rest the only scale is what the step itself reaches
+        tried = span
+        if w_scale == 0.0 or s_scale == 0.0:
+            top = links.ends.size - 1
+            reach = max(w_scale, abs(s[W, top, 1]) * span if links.top != STRESS else 0.0)
+            load = max(s_scale, max(abs(push[0]), abs(push[1]) * span))
+            for i in range(links.law.shape[0]):
+                reach = max(reach, links.law[i, HEIGHT] * abs(s[EPS, i, 1]) * span)
+                load = max(load, abs(s[SIG, i, 1]) * span)
+        per_reach = 1.0 / reach if reach > 0.0 else 0.0
+        per_load = 1.0 / load if load > 0.0 else 0.0
+        base = b_scale
+        if b_scale < math.inf:
+            base = max(b_scale, abs(value_at(s[GROUP, 0], order, span)), LEAST_BASE * load)
+        per_base = 1.0 / base if base > 0.0 else 0.0
+        for n in (order - 1, order):
+            tail = _tail(links.law, s, n, per_reach, per_load, per_base)
+            if tail * span**n > tol:
+                span = (tol / tail) ** (1.0 / n)
+        if span >= 0.5 * tried:
+            break
+        if w_scale > 0.0 and s_scale > 0.0 and base == b_scale:
+            break
+    return span
+
+
+@piece
+def tangent_length(
+    heights: Array, d: Tangents, order: int, tol: float, span: float, sizes: Array
+) -> float:
+    """Longest step within `span` whose last two terms fall below `tol` of the derivatives so far.
+
+    A vibration or relaxation that the motion itself does not show may be in its derivatives: steps
+    that are too long for it let these grow without bound. `sizes` (p, 2) holds the largest
+    elongation and base stress of each direction.
+    """
+    for p in range(d.drag.size):
+        if d.live[p] == 0.0:
+            continue
+        for part in range(2):
+            for _ in range(2):  # what a step that is too long reaches is too large
+                bar = tail = before = 0.0
+                for i in range(heights.size if part == 0 else 1):
+                    c = d.series[p, EPS, i] if part == 0 else d.series[p, GROUP, 0]
+                    weight, power = heights[i] if part == 0 else 1.0, 1.0
+                    for n in range(order // 2 + 1):
+                        bar = max(bar, weight * abs(c[n]) * power)
+                        power *= span
+                    before = max(before, weight * abs(c[order - 1]))
+                    tail = max(tail, weight * abs(c[order]))
+                size, longest = max(sizes[p, part], bar), span
+                bar = tol * size
+                if before * span ** (order - 1) > bar:
+                    span = (bar / before) ** (1.0 / (order - 1))
+                if tail * span**order > bar:
+                    span = (bar / tail) ** (1.0 / order)
+                if span == longest:
+                    break
+            sizes[p, part] = size
+    return span
+
+
+@piece
+def first_switch(law: Array, s: Array, order: int, span: float) -> tuple[float, int, int]:
+    """First switch of branch within `span`: when, which spring (-1: none), on which side."""
+    spring, side = -1, 0
+    for i in range(law.shape[0]):
+        when, where = first_crossing(s[EPS, i], order, law[i, LOW], law[i, HIGH], span)
+        if where != 0 and (spring < 0 or when < span):
+            span, spring, side = when, i, where
+    return span, spring, side
+
+
+@inner
+def _enough(
+    law: Array,
+    s: Array,
+    order: int,
+    span: float,
+    tol: float,
+    w_scale: float,
+    s_scale: float,
+    b_scale: float,
+) -> int:
+    """Orders that are enough over a step that a switch or a sample made short."""
+    base = max(b_scale, LEAST_BASE * s_scale)
+    if w_scale == 0.0 or s_scale == 0.0 or span == 0.0:
+        return order
+    tail, power, per_span = 0.0, span**order, 1.0 / span
+    while order > 2:
+        tail += _tail(law, s, order, 1.0 / w_scale, 1.0 / s_scale, 1.0 / base) * power
+        if tail > tol:
+            break
+        power *= per_span
+        order -= 1
+    return order
+
+
+# ---------------------------------------------------------------- samples
+
+
+@inner
+def first_past(t: Array, first: int, end: float, last: bool) -> int:
+    """First sample from `first` on at the time `end` or later; where it is the `last`, later."""
+    low, high, step = first, first, 1
+    while high < t.size and (t[high] < end or (last and t[high] == end)):
+        low, high = high + 1, high + step
+        step *= 2
+    high = min(high, t.size)
+    while low < high:
+        mid = (low + high) // 2
+        if t[mid] < end or (last and t[mid] == end):
+            low = mid + 1
+        else:
+            high = mid
+    return low
+
+
+@inner
+def fill_line(at: float, rate: float, t: Array, now: float, out: Array) -> None:
+    """Write at + rate (t - now) to `out`."""
+    for j in range(t.size):
+        out[j] = at + rate * (t[j] - now)
+
+
+@piece
+def sample(
+    links: Links, s: Array, order: int, out: Samples, first: int, last: int, now: float, c: Array
+) -> None:
+    """Write base stress and displacements at the samples first … last-1 of a step; c is scratch."""
+    law, nodes = links.law, out.curves.shape[0] - 1
+    fill_values(s[GROUP, 0], order, out.t, first, last, now, out.curves[0])
+    if nodes == 1 and links.top != STRESS:
+        fill_values(s[W, links.ends.size - 1], order, out.t, first, last, now, out.curves[1])
+        return
+    for n in range(order + 1):
+        c[n] = 0.0
+    count = law.shape[0]
+    for i in range(count):
+        for n in range(order + 1):
+            c[n] += law[i, HEIGHT] * s[EPS, i, n]
+        if nodes > 1 or i == count - 1:
+            fill_values(c, order, out.t, first, last, now, out.curves[min(1 + i, nodes)])
+
+
+@piece
+def sample_tangents(
+    links: Links,
+    s: Array,
+    d: Tangents,
+    order: int,
+    out: Samples,
+    first: int,
+    last: int,
+    now: float,
+    c: Array,
+) -> None:
+    """Write the derivatives of base stress and displacements at some samples of a step."""
+    law, nodes, top = links.law, out.curves.shape[0] - 1, links.ends.size - 1
+    count = law.shape[0]
+    for p in range(d.drag.size):
+        slopes = out.slopes[p]
+        if d.live[p] == 0.0:
+            for i in range(nodes + 1):
+                fill_line(0.0, 0.0, out.t[first:last], now, slopes[i, first:last])
+            continue
+        fill_values(d.series[p, GROUP, 0], order, out.t, first, last, now, slopes[0])
+        if nodes == 1 and links.top != STRESS:
+            fill_values(d.series[p, W, top], order, out.t, first, last, now, slopes[1])
+            continue
+        for n in range(order + 1):
+            c[n] = 0.0
+        for i in range(count):
+            for n in range(order + 1):
+                c[n] += law[i, HEIGHT] * d.series[p, EPS, i, n] + d.law[p, i, HEIGHT] * s[EPS, i, n]
+            if nodes > 1 or i == count - 1:
+                fill_values(c, order, out.t, first, last, now, slopes[min(1 + i, nodes)])
+
+
+@inner
+def _mend_kink(out: Samples, s: Array, d: Tangents, knot: int) -> None:
+    """A dashpot feels the mean rate where the prescribed motion has a kink."""
+    before, after = out.t[knot] - out.t[knot - 1], out.t[knot + 1] - out.t[knot]
+    share = before / (before + after)
+    out.curves[0, knot] += share * (s[GROUP, 0, 0] - out.curves[0, knot])
+    for p in range(d.drag.size):
+        out.slopes[p, 0, knot] += share * (d.series[p, GROUP, 0, 0] - out.slopes[p, 0, knot])
+
+
+@inner
+def before_contact(curves: Array, t: Array, speed: float) -> int:
+    """Fill the samples before contact, at time 0, and return how many these are.
+
+    Nothing presses and only the striker moves.
+    """
+    rows = curves.shape[0]
+    none = rows - rows  # not the literals, which are types: compiled anew
+    done = first_past(t, none, 0.0, none > 0)
+    for i in range(rows):
+        fill_line(0.0, speed if i == rows - 1 else 0.0, t[:done], 0.0, curves[i, :done])
+    return done
+
+
+# ---------------------------------------------------------------- the end of contact
+
+
+@inner
+def fly(curves: Array, t: Array, first: int, t_end: float, w_end: Array, speed: float) -> None:
+    """After contact the chain keeps its shape and moves with the striker; nothing presses."""
+    fill_line(0.0, 0.0, t[first:], t_end, curves[0, first:])
+    for i in range(curves.shape[0] - 1):
+        fill_line(w_end[i], speed, t[first:], t_end, curves[1 + i, first:])
+
+
+@inner
+def _delay(s: Array, d: Tangents, order: int, span: float, late: Array) -> None:
+    """Derivative of the time at which the base stress meets zero at the end of a step.
+
+    Where a unilateral spring has just opened it is that of the step before, which brought it there.
+    """
+    fall = slope_at(s[GROUP, 0], order, span)
+    if fall == 0.0:
+        return
+    for p in range(d.drag.size):
+        late[p] = -value_at(d.series[p, GROUP, 0], order, span) / fall
+
+
+@piece
+def depart(
+    links: Links,
+    s: Array,
+    d: Tangents,
+    order: int,
+    more: int,
+    span: float,
+    now: float,
+    out: Samples,
+    done: int,
+    room: Array,
+) -> None:
+    """Fill the samples after contact, which ends at the end of this step, at the time `now`.
+
+    A later end (room[0], by direction) leaves the nodes as they move until then, and the top with
+    the velocity that it has then. The rest of `room` (3, …) is scratch.
+    """
+    late, rate, place = room[0], room[1], room[2]
+    law, nodes, groups = links.law, out.curves.shape[0] - 1, links.ends.size
+    count, top = law.shape[0], groups - 1
+    pull = slope_at(s[V, top], order, span)
+    speed = moved = 0.0
+    for i in range(count):
+        speed += law[i, HEIGHT] * slope_at(s[EPS, i], order, span)
+        rate[min(i, nodes - 1)] = speed
+    advance(s, groups, order, span)
+    advance_tangents(d, groups, more, span)
+    for i in range(count):
+        moved += law[i, HEIGHT] * s[EPS, i, 0]
+        place[min(i, nodes - 1)] = moved
+    away = s[V, top, 0]
+    fly(out.curves, out.t, done, now, place, away)
+    for p in range(d.drag.size):
+        moved = 0.0
+        for i in range(count):
+            moved += law[i, HEIGHT] * d.series[p, EPS, i, 0] + d.law[p, i, HEIGHT] * s[EPS, i, 0]
+            place[min(i, nodes - 1)] = moved
+        for node in range(nodes):
+            place[node] += (rate[node] - away) * late[p]
+        faster = d.series[p, V, top, 0] + pull * late[p]
+        fly(out.slopes[p], out.t, done, now, place, faster)
+
+
+# ---------------------------------------------------------------- the state between steps
+
+
+@inner
+def settle(links: Links, s: Array) -> None:
+    """Share the elongation of undamped groups anew, so that rounding does not pile up."""
+    law = links.law
+    for g in range(links.ends.size):
+        i0, i1 = springs_of(links.ends, g)
+        plain = not (g == links.ends.size - 1 and links.top == STRESS)
+        if i1 - i0 == 1:
+            continue
+        compliance = 0.0
+        miss = s[W, g, 0] - (s[W, g - 1, 0] if g > 0 else 0.0)
+        for i in range(i0, i1):
+            slope = _slope_now(law, i, s[EPS, i, 0])
+            plain = plain and law[i, DASHPOT] == 0.0 and slope > 0.0
+            compliance += law[i, HEIGHT] / slope
+            miss -= law[i, HEIGHT] * s[EPS, i, 0]
+        if plain:
+            for i in range(i0, i1):
+                s[EPS, i, 0] += miss / compliance / _slope_now(law, i, s[EPS, i, 0])
+
+
+@inner
+def _slope_now(law: Array, i: int, eps: float) -> float:
+    """Slope dσ/dε on the branch that spring i is on."""
+    k, y = law[i, SLOPE], 1.0 - (eps - law[i, ORIGIN])
+    return k / (y * y) if law[i, CURVED] != 0.0 else k
+
+
+@inner
+def switch(
+    rows: Array,
+    branches: Branches,
+    law: Array,
+    s: Array,
+    d: Tangents,
+    directions: Branches,
+    order: int,
+    span: float,
+    now: float,
+    spring: int,
+    side: int,
+    log: Array,
+    switches: int,
+) -> int:
+    """Change the branch of a spring, and of all that end theirs at the same time; counts them."""
+    for i in range(branches.size):
+        low, high, eps = law[i, LOW], law[i, HIGH], s[EPS, i, 0]
+        out = 0
+        if i == spring:
+            out = side
+        elif eps >= high - CLOSE and slope_at(s[EPS, i], order, span) > 0.0:
+            out = 1
+        elif eps <= low + CLOSE and slope_at(s[EPS, i], order, span) < 0.0:
+            out = -1
+        if out == 0:
+            continue
+        entered = above(branches[i]) if out > 0 else below(branches[i])
+        s[EPS, i, 0] = high if out > 0 else low
+        if switches < log.shape[0]:
+            log[switches, 0], log[switches, 1] = now, i
+            log[switches, 2], log[switches, 3] = branches[i], entered
+            log[switches, 4] = s[EPS, i, 0]
+        switches += 1
+        branches[i] = entered
+        enter(rows, i, entered, law)
+        enter_tangents(rows, i, entered, directions, d)
+    return switches
+
+
+# ---------------------------------------------------------------- from step to step
+
+
+@inner
+def _prescribe(
+    top: int, values: Array, t: Array, knot: int, now: float, push: Array, motion: Array
+) -> float:
+    """Write what the top is given between samples knot and knot + 1; returns when that ends."""
+    horizon, rate = t[t.size - 1], 0.0
+    if t.size > 1:
+        horizon = t[knot + 1]
+        rate = (values[knot + 1] - values[knot]) / (t[knot + 1] - t[knot])
+    driven = motion if top == MOTION else push
+    driven[0], driven[1] = values[knot] + rate * (now - t[knot]), rate
+    return horizon
+
+
+@piece
+def first_lift(s: Array, order: int, first: bool, pressed: bool, span: float) -> tuple[float, bool]:
+    """When within `span` the base stress meets zero again, and whether it does.
+
+    Before the blow has come through to the base (`pressed`) rounding alone may do so; only in the
+    first step can it come and go.
+    """
+    base = s[GROUP, 0]
+    when, where = first_crossing(base, order, 0.0, math.inf, span)
+    if pressed and base[0] <= 0.0 and base[1] <= 0.0:
+        when, where = 0.0, -1  # a unilateral spring has just opened
+    if where != 0 and when <= span and (pressed or (first and when > 0.0)):
+        return when, True
+    return span, False
+
+
+@inner
+def begin(
+    rows: Array,
+    heights: Array,
+    start: Array,
+    directions: Branches,
+    branches: Branches,
+    law: Array,
+    s: Array,
+    d: Tangents,
+) -> None:
+    """Write the state at the first sample: branches, strains and their derivatives."""
+    for i in range(branches.size):
+        branches[i] = first_branch(rows[i])
+        if start.shape[1] > 0:
+            s[EPS, i, 0] = start[0, i]
+            branches[i] = branch_at_strain(rows[i], branches[i], start[0, i])
+            for p in range(directions.shape[0]):
+                d.series[p, EPS, i, 0] = start[1 + p, i]
+                if start[1 + p, i] != 0.0:
+                    d.live[p] = 1.0
+        law[i, DASHPOT], law[i, HEIGHT] = rows[i, ETA], heights[i]
+        enter(rows, i, branches[i], law)
+        enter_tangents(rows, i, branches[i], directions, d)
+
+
+@inner
+def _loaded(s: Array, s_scale: float) -> float:
+    """Largest stress so far."""
+    for i in range(s.shape[1]):
+        s_scale = max(s_scale, abs(s[SIG, i, 0]))
+    return s_scale
+
+
+@inner
+def _reached(links: Links, s: Array, w_scale: float) -> tuple[float, float]:
+    """Largest displacement so far, and a number that is finite only if the state is."""
+    top = links.ends.size - 1
+    total = s[W, top, 0]
+    if links.top != STRESS:
+        w_scale = max(w_scale, abs(s[W, top, 0]))
+    for i in range(links.law.shape[0]):
+        w_scale = max(w_scale, links.law[i, HEIGHT] * abs(s[EPS, i, 0]))
+        total += s[EPS, i, 0]
+    return w_scale, total
+
+
+@compiled
+def integrate(
+    rows: Array,
+    heights: Array,
+    ends: Branches,
+    mass: Array,
+    drag: float,
+    top: int,
+    values: Array,
+    speed: float,
+    t: Array,
+    tol: float,
+    max_steps: int,
+    directions: Branches,
+    start: Array,
+    curves: Array,
+    slopes: Array,
+    log: Array,
+) -> tuple[int, float, int, int]:
+    """Integrate a chain over the samples t.
+
+    Parameters
+    ----------
+    rows : (springs, columns) array
+        The springs, base first; see `springs.kernels`.
+    heights : (springs,) array
+        m.
+    ends : (groups,) array
+        One past the last spring of each group; a node lies above each group.
+    mass : (groups,) array
+        Areal mass m/A of the node above each group, kg/m².
+    drag : float
+        Onsite damping of the top, η_site/H, Pa·s/m.
+    top : int
+        FREE (a mass), VISCOUS (no mass, but the onsite damper), STRESS or MOTION.
+    values : (n,) array
+        Prescribed stress (Pa) or, for MOTION, displacement (m) of the top; zeros in an impact.
+    speed : float
+        Velocity of the striker at contact, m/s; 0 = no impact. Contact then ends with base stress.
+    t : (n,) array
+        Samples, s; an impact starts at 0, every other drive at t[0].
+    tol, max_steps
+        Truncation of a step relative to the motion so far; bound on steps.
+    directions : (p, 2) array
+        What derivatives are carried along: spring and its own parameter, or OWN_HEIGHT, or -1 and
+        DRAG.
+    start : (1 + p, springs or 0) array
+        The strains from which the springs start, never loaded before, and their derivatives; none
+        where they start from rest.
+    curves, slopes : arrays
+        Filled; see `Samples`. The derivatives have p = 0 where none are wanted.
+    log : (m, 5) array
+        Filled with the switches: time, spring, branch left, branch entered, strain.
+
+    Returns
+    -------
+    tuple
+        Outcome, end of contact (NaN if none; where there is no answer, how far it came), steps
+        taken, switches (also those past the log).
+    """
+    tol = max(tol, LEAST_TRUNCATION)
+    count, groups, size = rows.shape[0], ends.size, directions.shape[0]
+    struck, tangent, order = speed > 0.0, size > 0, order_for(tol, MOST_ORDERS)
+    links = Links(np.empty((count, N_LAW)), ends, mass, drag, top)
+    law, out = links.law, Samples(t, curves, slopes)
+    s, d = make_series(count, order, directions)
+    branches = np.empty(count, np.int64)
+    room = np.empty((6, max(order + 1, max(size, curves.shape[0]))))
+    late, c, push, motion = room[0], room[3], room[4], room[5]
+    sizes = np.zeros((size, 2))
+    push[0] = push[1] = 0.0
+    for p in range(size):
+        late[p] = 0.0
+    begin(rows, heights, start, directions, branches, law, s, d)
+    bare, apart = is_bare(links), is_apart(links)
+    w_scale, s_scale, b_scale, pressed, knot, stalled = 0.0, 0.0, math.inf, False, 0, 0
+    switches = count - count  # a whole number, and no constant: one type to compile for
+    now, done = (0.0 if struck else t[0]), 0
+    if struck:
+        s[V, groups - 1, 0] = speed
+        done = before_contact(curves, t, speed)
+        for p in range(size):
+            before_contact(slopes[p], t, 0.0)
+    for step in range(max_steps):
+        if done == t.size:
+            return DONE, math.nan, step, switches
+        fresh, horizon = False, t[t.size - 1]
+        if not struck:
+            while knot < t.size - 2 and now >= t[knot + 1]:
+                knot += 1
+                fresh = True
+            horizon = _prescribe(top, values, t, knot, now, push, motion)
+        if bare:
+            expand_bare(links, s, push, order)
+        elif not expand(links, s, push, motion, order):
+            return FLAT_UNDER_STRESS, now, step, switches
+        if step > 0:
+            s_scale = _loaded(s, s_scale)
+        if apart:
+            b_scale = max(b_scale if step > 0 else 0.0, abs(s[GROUP, 0, 0]))
+        span = step_length(links, s, push, order, tol, horizon - now, w_scale, s_scale, b_scale)
+        if not math.isfinite(span) or not math.isfinite(s[GROUP, 0, order]):
+            return NOT_FINITE, now, step, switches
+        span, spring, side = first_switch(law, s, order, span)
+        leaves = False
+        if struck:
+            pressed = pressed or s[GROUP, 0, 0] > tol * s_scale
+            span, leaves = first_lift(s, order, step == 0, pressed, span)
+            spring = -1 if leaves else spring
+        least = order
+        if spring >= 0 or leaves or now + span >= horizon:  # not its own error ended the step
+            least = _enough(law, s, order, span, 1e-3 * tol, w_scale, s_scale, b_scale)
+        more = min(least + 2, order)  # for what is, in time, a derivative of these
+        if tangent:
+            expand_tangents(links, s, d, more)
+            shorter = tangent_length(heights, d, more, OF_TANGENTS * tol, span, sizes)
+            if shorter < span:
+                span, spring, leaves = shorter, -1, False
+        end = now + span
+        stalled = stalled + 1 if span == 0.0 else 0
+        if (end <= now and span > 0.0) or stalled > 4 * count + 8:
+            return STEP_UNDERFLOW, now, step, switches
+        last = end >= horizon and not leaves and spring < 0
+        end = horizon if last else end
+        if top == MOTION and knot > 0 and fresh:
+            _mend_kink(out, s, d, knot)
+        first, done = done, first_past(t, done, end, last)
+        if first < done:
+            sample(links, s, least, out, first, done, now, c)
+        if tangent:
+            sample_tangents(links, s, d, more, out, first, done, now, c)
+            if leaves or spring >= 0:  # the base stress may end with this step
+                _delay(s, d, more, span, late)
+        if leaves:
+            depart(links, s, d, order, more, span, end, out, done, room)
+            return DONE, end, step + 1, switches
+        now = end
+        advance(s, groups, order, span)
+        if tangent:
+            advance_tangents(d, groups, more, span)
+        w_scale, total = _reached(links, s, w_scale)
+        if not math.isfinite(total):
+            return NOT_FINITE, now, step, switches
+        settle(links, s)
+        if spring >= 0:
+            switches = switch(
+                rows, branches, law, s, d, directions, order, span, now, spring, side,
+                log, switches,
+            )  # fmt: skip
+    return TOO_MANY_STEPS, now, max_steps, switches

@@ -1,0 +1,5 @@
+"""Implicit steps for stiff scenes: collocation of order 9, from switch to switch.
+
+`collocation` is one step, `steps` goes from step to step, `vibration` tells what steps cannot show.
+A newcomer may skip all of it.
+"""

@@ -1,0 +1,562 @@
+"""The compiled integrator of an impact on many undamped, massless springs: as one spring.
+
+Such springs carry one stress S, and on its branch the strain of each is known in closed form. Their
+common elongation is therefore a function of the stress alone,
+
+    w = F(S) = Σ h_i ε_i(S),        μ w'' = -S - drag w',
+
+analytic as far as the nearest pole of a curved branch (-k). Its Taylor polynomial about an anchor
+stress stands for all springs: a spring that switches takes its terms out and puts others in, which
+costs the same in a chain of ten springs and of a thousand. The whole sum is made anew only where
+the stress nears the end of the polynomial's reach. The next spring to switch is found in a
+tournament of the switching stresses. So a run costs little more than in proportion to its springs,
+where following every spring through every step costs their number squared.
+
+In time a step is a Taylor series again, with powers of the series of S put into the polynomial.
+It goes regularly through the turning point of the motion and through any damping of the top.
+"""
+
+# mypy: disallow-untyped-decorators=False, warn-return-any=False
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from foamfit.solve.explicit.taylor import (
+    DONE,
+    NOT_FINITE,
+    STEP_UNDERFLOW,
+    TOO_MANY_STEPS,
+    before_contact,
+    first_past,
+    fly,
+)
+from foamfit.solve.polynomial import (
+    LEAST_TRUNCATION,
+    fill_values,
+    first_crossing,
+    order_for,
+    value_and_slope,
+    value_at,
+)
+from foamfit.springs.kernels import (
+    ETA,
+    K0,
+    KC,
+    KH_MINUS,
+    KH_PLUS,
+    KIND,
+    Array,
+    Branches,
+    above,
+    below,
+    branch_shape,
+    compiled,
+    first_branch,
+    inner,
+    maker,
+    strains_on,
+    stress_interval,
+)
+from foamfit.springs.law import BISTABLE, UNILATERAL
+
+# A step of Newton's method so small, in distances to the nearest pole, is the last: what it leaves
+# is about its square.
+NEAR = 3e-8
+# Degree of the polynomial of the elongation, and how far from its anchor it is used, in distances
+# to the nearest pole: what it leaves out is below 0.125**17 < 1e-15 of the elongation.
+DEGREE, REACH = 16, 0.125
+# Springs whose switching stresses differ by less than this share switch together.
+CLOSE = 1e-13
+# Past so many times the least slope, and so many anchors, no room is left on a curved branch.
+FAR, MOST_ANCHORS = 1e30, 1000
+# Orders by which the time of the next event is guessed.
+GUESS = 3
+# Columns of `Group.law` and of `Group.place`.
+CURVED, SLOPE, ORIGIN, OFFSET, N_LAW = range(5)
+ANCHOR, UNIT, LEAST, N_PLACE = range(4)
+
+
+class Group(NamedTuple):
+    """Springs in series under one stress, on the branches that they are on.
+
+    `rows` (springs, columns), `heights` (springs,) in m, `branches` (springs,); `law` (springs,
+    N_LAW) the shapes of the branches. `upper` and `lower` hold in their second halves the stresses
+    at which each spring leaves its branch upwards and, negative, downwards; every entry before is
+    the lesser of its two children, so that the first is the next to be met. `sum` (DEGREE + 1,) is
+    the elongation as a polynomial of (S - anchor)/unit, with both, Pa, in `place`, and the least
+    first slope of a branch.
+    """
+
+    rows: Array
+    heights: Array
+    branches: Branches
+    law: Array
+    upper: Array
+    lower: Array
+    sum: Array
+    place: Array
+
+
+class Runs(NamedTuple):
+    """Histories to fill: stress (n,), strains and branches (springs or 0, n).
+
+    `since` (springs,) is the sample from which each spring has been on its branch.
+    """
+
+    sigma: Array
+    eps: Array
+    history: Branches
+    since: Branches
+
+
+class Step(NamedTuple):
+    """Series in time of stress s, displacement w and velocity v of the top; order 0 is the state.
+
+    `powers` (order + 1, order + 1) are those of the series of (S - S(0))/unit, from the first on,
+    `shifted` (DEGREE + 1,) is the polynomial of the elongation about S(0).
+    """
+
+    s: Array
+    w: Array
+    v: Array
+    powers: Array
+    shifted: Array
+
+
+@compiled
+def holds(rows: Array) -> bool:
+    """Tell whether every spring has one strain at each stress on its branch, and no dashpot."""
+    for i in range(rows.shape[0]):
+        if rows[i, ETA] > 0.0 or rows[i, KIND] == UNILATERAL:
+            return False
+        if rows[i, KIND] == BISTABLE and not (rows[i, KH_PLUS] > 0.0 and rows[i, KH_MINUS] > 0.0):
+            return False
+    return True
+
+
+# ---------------------------------------------------------------- the springs as one
+
+
+@inner
+def _put(tree: Array, i: int, value: float) -> None:
+    """Set an entry of a tournament."""
+    at = tree.size // 2 + i
+    tree[at] = value
+    while at > 1:
+        at //= 2
+        tree[at] = min(tree[2 * at], tree[2 * at + 1])
+
+
+@inner
+def _winner(tree: Array) -> int:
+    """Which entry of a tournament is the least."""
+    at = 1
+    while at < tree.size // 2:
+        at = 2 * at if tree[2 * at] == tree[at] else 2 * at + 1
+    return at - tree.size // 2
+
+
+@inner
+def _enter(group: Group, i: int, branch: int) -> None:
+    """Put a spring on a branch."""
+    curved, slope, origin, offset = branch_shape(group.rows[i], branch)
+    group.branches[i] = branch
+    group.law[i, CURVED] = 1.0 if curved else 0.0
+    group.law[i, SLOPE], group.law[i, ORIGIN], group.law[i, OFFSET] = slope, origin, offset
+    low, high = stress_interval(group.rows[i], branch)
+    _put(group.upper, i, high)
+    _put(group.lower, i, -low)
+
+
+@inner
+def _add(group: Group, i: int, share: float) -> None:
+    """Add a share (1 or -1) of a spring's elongation to the sum.
+
+    On a curved branch ε = x0 + 1 - k/(k + S), a geometric series.
+    """
+    k, x0, s0 = group.law[i, SLOPE], group.law[i, ORIGIN], group.law[i, OFFSET]
+    anchor, unit, height = group.place[ANCHOR], group.place[UNIT], share * group.heights[i]
+    if group.law[i, CURVED] == 0.0:
+        group.sum[0] += height * (x0 + (anchor - s0) / k)
+        group.sum[1] += height * unit / k
+        return
+    ratio = unit / (k + anchor)
+    group.sum[0] += height * (x0 + anchor / (k + anchor))
+    term = height * k / (k + anchor) * ratio
+    for m in range(1, DEGREE + 1):
+        group.sum[m] += term
+        term *= -ratio
+
+
+@inner
+def _anchor(group: Group, stress: float, rising: bool) -> None:
+    """Make the sum anew about an anchor ahead of the stress, which is then within its reach."""
+    least = group.place[LEAST]
+    ahead = REACH if rising else -REACH
+    group.place[ANCHOR] = (stress + ahead * least) / (1.0 - ahead)
+    group.place[UNIT] = least + group.place[ANCHOR]
+    for m in range(DEGREE + 1):
+        group.sum[m] = 0.0
+    for i in range(group.heights.size):
+        _add(group, i, 1.0)
+
+
+@inner
+def _swap(group: Group, i: int, branch: int) -> None:
+    """Put a spring on another branch, and its elongation there in the place of that before."""
+    _add(group, i, -1.0)
+    _enter(group, i, branch)
+    _add(group, i, 1.0)
+
+
+@maker
+def _make_group(rows: Array, heights: Array) -> Group:
+    """Make room for springs as one; `_begin` fills it."""
+    count, leaves = heights.size, 1
+    while leaves < count:
+        leaves *= 2
+    return Group(
+        rows, heights, np.zeros(count, np.int64), np.zeros((count, N_LAW)),
+        np.empty(2 * leaves), np.empty(2 * leaves), np.zeros(DEGREE + 1), np.zeros(N_PLACE),
+    )  # fmt: skip
+
+
+@inner
+def _begin(group: Group) -> None:
+    """Put all springs on their first branches, free of stress."""
+    rows = group.rows
+    for at in range(group.upper.size):
+        group.upper[at] = group.lower[at] = math.inf
+    least = math.inf
+    for i in range(rows.shape[0]):
+        _enter(group, i, first_branch(rows[i]))
+        least = min(least, rows[i, K0])
+        if rows[i, KIND] == BISTABLE:
+            least = min(least, rows[i, KC])
+    group.place[LEAST] = least
+    _anchor(group, 0.0, least > 0.0)
+
+
+@inner
+def _strain(group: Group, i: int, stress: float) -> float:
+    """Strain of a spring on its branch."""
+    k, x0 = group.law[i, SLOPE], group.law[i, ORIGIN]
+    if group.law[i, CURVED] == 0.0:
+        return x0 + (stress - group.law[i, OFFSET]) / k
+    return x0 + stress / (k + stress)
+
+
+@inner
+def _switch(
+    group: Group, stress: float, rising: bool, now: float, log: Array, switches: int
+) -> int:
+    """Change the branches of all springs that leave theirs at this stress; counts them."""
+    tree = group.upper if rising else group.lower
+    met = (stress if rising else -stress) + CLOSE * abs(stress)
+    while tree[1] <= met:
+        i = _winner(tree)
+        left = group.branches[i]
+        entered = above(left) if rising else below(left)
+        if switches < log.shape[0]:
+            log[switches, 0], log[switches, 1] = now, i
+            log[switches, 2], log[switches, 3] = left, entered
+            log[switches, 4] = _strain(group, i, stress)
+        switches += 1
+        _swap(group, i, entered)
+    return switches
+
+
+# ---------------------------------------------------------------- a step in time
+
+
+@inner
+def _next_order(group: Group, now: Step, n: int, mass: float, drag: float) -> None:
+    """Find the coefficients n > 0 of a step from the lower ones.
+
+    The displacement follows from the velocity, the velocity from the stress, and the stress from
+    w_n = Σ_m g_m [S^m]_n, in which its own coefficient stands with g_1 alone.
+    """
+    g, x = now.shifted, now.powers
+    now.w[n] = now.v[n - 1] / n
+    now.v[n] = -(now.s[n - 1] + drag * now.v[n - 1]) / (mass * n)
+    step = (now.s[0] - group.place[ANCHOR]) / group.place[UNIT]
+    for m in range(DEGREE - 1, n - 1, -1):  # one more pass of Horner's shift
+        g[m] += step * g[m + 1]
+    rest = now.w[n]
+    for m in range(2, n + 1):
+        power = 0.0
+        for j in range(1, n - m + 2):
+            power += x[1, j] * x[m - 1, n - j]
+        x[m, n] = power
+        rest -= g[m] * power
+    x[1, n] = rest / g[1]
+    now.s[n] = x[1, n] * group.place[UNIT]
+
+
+@inner
+def _start(group: Group, now: Step) -> None:
+    """Find order 0: the displacement, from the stress."""
+    step = (now.s[0] - group.place[ANCHOR]) / group.place[UNIT]
+    now.shifted[DEGREE] = group.sum[DEGREE]
+    for m in range(DEGREE - 1, -1, -1):
+        now.shifted[m] = group.sum[m] + step * now.shifted[m + 1]
+    now.w[0] = now.shifted[0]
+
+
+@inner
+def _longest(c: Array, n: int, limit: float, span: float) -> float:
+    """Step within `span` at which the terms n - 1 and n of a series are below a limit."""
+    for m in (n - 1, n):
+        if abs(c[m]) * span**m > limit:
+            span = (limit / abs(c[m])) ** (1.0 / m)
+    return span
+
+
+@inner
+def _expand(
+    group: Group,
+    now: Step,
+    mass: float,
+    drag: float,
+    low: float,
+    high: float,
+    span: float,
+    s_limit: float,
+    w_limit: float,
+) -> tuple[int, float]:
+    """Expand a step until its terms fall below the limits: orders found, and the longest step.
+
+    The first orders tell about when the next event comes; the step is a little longer than that.
+    """
+    _start(group, now)
+    most = now.s.size - 1
+    n = min(GUESS, most)
+    for m in range(1, n + 1):
+        _next_order(group, now, m, mass, drag)
+    span = min(1.02 * first_crossing(now.s, n, low, high, span)[0], span)
+    while n < most:
+        fine = _longest(now.s, n, s_limit, span) == span
+        if fine and _longest(now.w, n, w_limit, span) == span:
+            break
+        n += 1
+        _next_order(group, now, n, mass, drag)
+    return n, _longest(now.w, n, w_limit, _longest(now.s, n, s_limit, span))
+
+
+@inner
+def _sample(
+    group: Group, now: Step, order: int, t: Array, first: int, last: int, begin: float,
+    curves: Array,
+) -> None:  # fmt: skip
+    """Write base stress and displacements at the samples first … last-1 of a step."""
+    if first == last:
+        return
+    fill_values(now.s, order, t, first, last, begin, curves[0])
+    if curves.shape[0] == 2:
+        fill_values(now.w, order, t, first, last, begin, curves[1])
+        return
+    for j in range(first, last):
+        _shape(group, curves[0, j], curves[1:, j])
+
+
+@inner
+def _shape(group: Group, stress: float, nodes: Array) -> None:
+    """Write the displacement above each spring, or of the top alone."""
+    place = 0.0
+    for i in range(group.heights.size):
+        place += group.heights[i] * _strain(group, i, stress)
+        nodes[min(i, nodes.size - 1)] = place
+
+
+@inner
+def _scales(group: Group, mass: float, drag: float, speed: float) -> tuple[float, float]:
+    """Least ranges of stress and displacement to be expected of a first impact on the springs."""
+    compliance = group.sum[1] / group.place[UNIT]
+    w = speed * math.sqrt(mass * compliance)
+    if drag > 0.0:
+        w = min(w, speed * mass / drag)
+    stress = min(w / compliance, group.upper[1])
+    return stress, stress * compliance
+
+
+@compiled
+def integrate_aggregate(
+    rows: Array,
+    heights: Array,
+    mass: float,
+    drag: float,
+    speed: float,
+    t: Array,
+    tol: float,
+    max_steps: int,
+    curves: Array,
+    log: Array,
+    effort: Branches,
+) -> tuple[int, float, int, int]:
+    """Integrate an impact on springs without dashpots or masses between them, over the samples t.
+
+    Parameters
+    ----------
+    rows : (springs, columns) array
+        The springs, base first, as `holds` wants them; see `springs.kernels`.
+    heights : (springs,) array
+        m.
+    mass, drag : float
+        Areal mass, kg/m², and onsite damping η_site/H, Pa·s/m, of the top.
+    speed : float
+        Velocity of the striker at contact, at the time 0, m/s.
+    t : (n,) array
+        Samples, s.
+    tol, max_steps
+        Truncation of a step relative to the motion; bound on steps.
+    curves : (1 + springs or 1, n) array
+        Filled with the base stress, Pa, and the displacements above each spring, or of the top
+        alone, m.
+    log : (m, 5) array
+        Filled with the switches: time, spring, branch left, branch entered, strain.
+    effort : (2,) array
+        Added to: sums over all springs, and orders of all steps.
+
+    Returns
+    -------
+    tuple
+        Outcome, end of contact (NaN if none; where there is no answer, how far it came), steps
+        taken, switches (also those past the log).
+    """
+    tol = max(tol, LEAST_TRUNCATION)
+    count, group, order = heights.size, _make_group(rows, heights), order_for(tol, DEGREE)
+    now = Step(
+        np.zeros(order + 1), np.zeros(order + 1), np.zeros(order + 1),
+        np.zeros((order + 1, order + 1)), np.zeros(DEGREE + 1),
+    )  # fmt: skip
+    _begin(group)
+    s_scale, w_scale = _scales(group, mass, drag, speed)
+    effort[0] += 1
+    done = before_contact(curves, t, speed)
+    begin, switches, stalled, horizon = 0.0, 0, 0, t[t.size - 1]
+    now.v[0] = speed
+    for step in range(max_steps):
+        if done == t.size:
+            return DONE, math.nan, step, switches
+        reach = REACH * group.place[UNIT]
+        high = min(group.upper[1], group.place[ANCHOR] + reach)
+        low = max(-group.lower[1], group.place[ANCHOR] - reach, 0.0)
+        n, span = _expand(
+            group, now, mass, drag, low, high, horizon - begin, tol * s_scale, tol * w_scale
+        )
+        effort[1] += n
+        if not math.isfinite(span) or not math.isfinite(now.s[n]):
+            return NOT_FINITE, begin, step, switches
+        span, side = first_crossing(now.s, n, low, high, span)
+        end = begin + span
+        stalled = stalled + 1 if end <= begin else 0
+        if stalled > 4 * count + 8:
+            return STEP_UNDERFLOW, begin, step, switches
+        last = end >= horizon and side == 0
+        first, done = done, first_past(t, done, horizon if last else end, last)
+        _sample(group, now, n, t, first, done, begin, curves)
+        begin = end
+        stress, velocity = value_at(now.s, n, span), value_at(now.v, n, span)
+        if side > 0:
+            stress = max(high, now.s[0])
+        elif side < 0:
+            stress = min(low, now.s[0])
+        now.s[0], now.v[0] = stress, velocity
+        if side < 0 and stress <= 0.0:
+            w_end = np.zeros(curves.shape[0] - 1)
+            _shape(group, 0.0, w_end)
+            fly(curves, t, done, begin, w_end, velocity)
+            return DONE, begin, step + 1, switches
+        s_scale = max(s_scale, stress)
+        w_scale = max(w_scale, now.w[0])
+        if side != 0:
+            switches = _switch(group, stress, side > 0, begin, log, switches)
+            if abs(stress - group.place[ANCHOR]) >= reach * (1.0 - 1e-12):
+                _anchor(group, stress, side > 0)
+                effort[0] += 1
+    return TOO_MANY_STEPS, begin, max_steps, switches
+
+
+# ---------------------------------------------------------------- a known elongation
+
+
+@inner
+def _stress_at(group: Group, elongation: float, guess: float) -> tuple[float, float]:
+    """Stress at an elongation within the reach of the sum, by Newton's method, and its slope."""
+    unit, slope = group.place[UNIT], 1.0
+    x = (guess - group.place[ANCHOR]) / unit
+    for _ in range(50):
+        value, slope = value_and_slope(group.sum, DEGREE, x)
+        step = (elongation - value) / slope
+        x += step
+        if abs(step) < NEAR:
+            break
+    return group.place[ANCHOR] + unit * x, unit / slope
+
+
+@inner
+def _write(group: Group, i: int, first: int, last: int, runs: Runs) -> None:
+    """Write strains and branch of a spring over the samples that it was on it, if wanted."""
+    if runs.eps.shape[0] == 0:
+        return
+    strains_on(group.rows[i], group.branches[i], runs.sigma[first:last], runs.eps[i, first:last])
+    runs.history[i, first:last] = group.branches[i]
+
+
+@inner
+def _pass(group: Group, stress: float, rising: bool, j: int, runs: Runs) -> None:
+    """Change the branches of all springs that leave theirs at this stress, before sample j."""
+    tree = group.upper if rising else group.lower
+    met = (stress if rising else -stress) + CLOSE * abs(stress)
+    while tree[1] <= met:
+        i = _winner(tree)
+        _write(group, i, runs.since[i], j, runs)
+        runs.since[i] = j
+        _swap(group, i, above(group.branches[i]) if rising else below(group.branches[i]))
+
+
+@compiled
+def equilibrium_along(
+    rows: Array, heights: Array, top: Array, sigma: Array, eps: Array, history: Branches
+) -> bool:
+    """Springs in series, as `holds` wants them, along a history of the top's displacement (m).
+
+    Fills the common stress (n,), the strains and the branches (springs or 0, n), as does
+    `springs.kernels.equilibrium_along`, which goes through all springs at every trial. False, and
+    nothing of use filled, where the sum does not reach: past all room on a curved branch, or under
+    a tension beyond the least slope, which a spring on a straight branch may bear.
+    """
+    count, group = heights.size, _make_group(rows, heights)
+    runs = Runs(sigma, eps, history, np.zeros(count, np.int64))
+    _begin(group)
+    stress, place, slope, end, edge = 0.0, 0.0, 0.0, 0.0, 0.0
+    rose, stale = True, True
+    for j in range(top.size):
+        rising, there = top[j] >= place, False
+        stale, rose = stale or rising != rose, rising
+        for _ in range(4 * count + MOST_ANCHORS):
+            anchor, reach = group.place[ANCHOR], REACH * group.place[UNIT]
+            if stale:
+                end = min(group.upper[1], anchor + reach)
+                if not rising:
+                    end = max(-group.lower[1], anchor - reach)
+                edge = value_at(group.sum, DEGREE, (end - anchor) / group.place[UNIT])
+            there = top[j] <= edge if rising else top[j] >= edge
+            stale = not there
+            if there or not abs(end) < FAR * group.place[LEAST]:
+                break
+            stress = end
+            _pass(group, stress, rising, j, runs)
+            if abs(stress - anchor) >= reach * (1.0 - 1e-12):
+                _anchor(group, stress, rising)
+        if not there:
+            return False
+        guess = stress + slope * (top[j] - place)
+        stress, slope = _stress_at(group, top[j], min(guess, end) if rising else max(guess, end))
+        sigma[j], place = stress, top[j]
+    for i in range(count):
+        _write(group, i, runs.since[i], top.size, runs)
+    return True

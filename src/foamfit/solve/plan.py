@@ -1,0 +1,434 @@
+"""A scene made ready, and its motion by the least solver that it needs."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from foamfit.errors import InputError, SimulationError
+from foamfit.solve import many, precompile
+from foamfit.solve.explicit import series, taylor
+from foamfit.solve.explicit.series import equilibrium_tangents
+from foamfit.solve.implicit import steps, vibration
+from foamfit.springs import kernels
+from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
+from foamfit.springs.law import BISTABLE
+from foamfit.springs.spring import as_samples
+
+Array = NDArray[np.float64]
+Directions = NDArray[np.int64]
+
+CLOSED_FORM, FIRST_ORDER, SECOND_ORDER = "closed form", "first order", "second order"
+TAYLOR, RADAU, AGGREGATE = "Taylor series", "Radau IIA", "aggregate"
+MAX_STEPS = 2_000_000
+# Explicit steps are given up where something relaxes, or vibrates, so many times (in radians) while
+# the scene lasts, or after so many steps.
+MOST_RELAXATION, MOST_VIBRATION, MOST_EXPLICIT = 1e4, 1e5, 200_000
+# Bounds on steps times springs (seconds, not hours): for all but the samples of a drive, before
+# explicit steps are given up, and for everything.
+MOST_WORK, MOST_EXPLICIT_WORK, MOST_SAMPLED = 1_500_000, 500_000, 10_000_000
+# Truncation of a step over the wanted error: of explicit steps with masses inside, where every
+# switch makes errors grow (five hundredfold over 56 of them), in any other impact and along a
+# drive; a margin costs little, since the order grows with it. Of implicit steps with masses inside
+# and without; of springs that count as one, whose errors add up.
+OF_MASSES, OF_IMPACT, ALONG_DRIVE = 1e-4, 1e-3, 1e-4
+OF_MASSES_IMPLICIT, IMPLICIT, AS_ONE = 3e-2, 3e-4, 1e-4
+# Truncation of implicit steps that rounding leaves room for.
+LEAST_IMPLICIT = 1e-14
+# From so many springs on, those that carry one stress count as one: in an impact, and where their
+# elongation is prescribed.
+LEAST_AGGREGATE, LEAST_ELONGATED = 9, 3
+# Switches that are kept, of springs that do not count as one.
+LOGGED = 1024
+
+_OUTCOMES = {
+    taylor.TOO_MANY_STEPS: "the bound of {steps} steps was reached: something in the scene is "
+    "too fast to be followed (a light mass or a heavy dashpot)",
+    taylor.STEP_UNDERFLOW: "the step shrank to nothing near t = {time:g} s: there the scene "
+    "changes faster than numbers can tell (a strain at the end of its branch, a very light mass, "
+    "or many springs on a flat branch)",
+    taylor.FLAT_UNDER_STRESS: "a prescribed stress acts on a flat branch (kh_plus or kh_minus = 0) "
+    "that nothing slows; give the top a mass or the spring a dashpot",
+    taylor.NOT_FINITE: "a stress or strain is no longer finite: the drive goes past the end of a "
+    "branch (strain 1 on branch a, 1 + eps_star on branch c)",
+}
+
+
+NO_DIRECTIONS: Directions = np.empty((0, 2), np.int64)
+NO_SWITCHES = np.empty((0, 5))
+_NOTHING = np.zeros(1)
+# Tops under which springs start from rest, and what they start from.
+_RESTING, _AT_REST = (taylor.FREE, taylor.VISCOUS), np.zeros((1, 0))
+# Outcomes of explicit steps after which implicit ones are tried.
+_WRONG_TOOL = (taylor.TOO_MANY_STEPS, taylor.STEP_UNDERFLOW)
+NO_SLOPES = np.empty((0, 0, 0))
+
+
+class Slopes(NamedTuple):
+    """Derivatives of displacement (p, nodes, n_t) and base stress (p, n_t) in p directions."""
+
+    displacement: Array
+    base_stress: Array
+
+
+class Motion(NamedTuple):
+    """The bare outcome of a run; see `Response`. `slopes` is None where none were asked for."""
+
+    displacement: Array
+    base_stress: Array
+    contact_end: float
+    switches: Array
+    steps: int
+    method: str = CLOSED_FORM
+    slopes: Slopes | None = None
+    unresolved: float = 0.0  # vibrations that were damped out, relative to the ranges
+
+
+class Plan(NamedTuple):
+    """A scene made ready to run many times with other springs: what does not change between runs.
+
+    Attributes
+    ----------
+    solver : str
+        The least solver.
+    height : float
+        H, m.
+    ends, mass : arrays
+        The groups of springs and the areal masses between them; see `explicit.taylor.integrate`.
+    drag : float
+        η_site/H, Pa·s/m.
+    top : int
+        What is known of the top; see `explicit.taylor`.
+    values, time : (n,) arrays
+        The drive and its samples.
+    speed : float
+        Velocity of the striker, m/s; 0 = no impact.
+    margin : float
+        Truncation of an explicit step over the wanted error.
+    max_steps, max_explicit : int
+        Bounds on steps, and on explicit ones that implicit ones may take over from.
+    plain : bool
+        Whether one mass bounces once: it has neither dashpot nor damper, nor a mass inside.
+    implicit : bool or None
+        Whether to take implicit steps; None = where explicit ones are the wrong tool.
+    """
+
+    solver: str
+    height: float
+    ends: NDArray[np.int64]
+    mass: Array
+    drag: float
+    top: int
+    values: Array
+    time: Array
+    speed: float
+    margin: float
+    max_steps: int
+    max_explicit: int
+    plain: bool = False
+    implicit: bool | None = None
+
+    def run(
+        self,
+        rows: Array,
+        heights: Array,
+        rtol: float = 1e-6,
+        *,
+        drag: float | None = None,
+        everything: bool = True,
+        directions: Directions = NO_DIRECTIONS,
+    ) -> Motion:
+        """Run the scene with the springs in `rows` (n_springs, columns) and their heights (m).
+
+        `drag` replaces the scene's own. With `everything` false only the base stress and the
+        displacement of the top, shape (1, n_t), are sure to be there. `directions` (p, 2) are those
+        of the derivatives to carry along; see `explicit.series`.
+
+        Raises
+        ------
+        SimulationError
+            If the scene has no finite answer; the message says why.
+        """
+        if self.solver == CLOSED_FORM:
+            return self._closed_form(rows, heights, everything, directions)
+        p, time = len(directions), self.time
+        curves = np.empty((1 + len(heights) if everything else 2, time.size))
+        slopes = np.empty((p, *curves.shape)) if p else NO_SLOPES
+        bounces = self.plain and not drag and self.implicit is None
+        stiff = not bounces and self._is_stiff(rows, heights, drag)
+        drag = self.drag if drag is None else drag
+        if p == 0 and not stiff and len(heights) >= LEAST_AGGREGATE and self._is_one(rows):
+            return self._aggregate(rows, heights, rtol, drag, curves)
+        start = _AT_REST if self.top in _RESTING else self._start(rows, heights, directions)
+        log = np.empty((LOGGED, 5)) if everything else NO_SWITCHES
+        if not stiff:
+            precompile.announce(taylor.integrate, "the solver")
+            ending = taylor.integrate(
+                rows, heights, self.ends, self.mass, drag, self.top, self.values, self.speed, time,
+                self.margin * rtol, self.max_explicit if self.implicit is None else self.max_steps,
+                directions, start, curves, slopes, log,
+            )  # fmt: skip
+            if self.implicit is False or ending[0] not in _WRONG_TOOL:
+                return _motion(TAYLOR, ending, curves, slopes, log)
+        margin = OF_MASSES_IMPLICIT if len(self.ends) > 1 else IMPLICIT
+        lost = np.zeros(1)
+        precompile.announce(steps.integrate_implicit, "the solver of stiff scenes")
+        ending = steps.integrate_implicit(
+            rows, heights, self.ends, self.mass, drag, self.top, self.values, self.speed, time,
+            max(margin * rtol, LEAST_IMPLICIT), self.max_steps, directions, start, curves, slopes,
+            log, np.zeros(2, np.int64), rtol, lost,
+        )  # fmt: skip
+        return _motion(RADAU, ending, curves, slopes, log, float(lost[0]))
+
+    def _closed_form(
+        self, rows: Array, heights: Array, everything: bool, directions: Directions
+    ) -> Motion:
+        """Undamped and massless: one stress in all springs; or one spring under known motion."""
+        moved, wanted = self.top == taylor.MOTION, everything or len(directions) > 0
+        if moved:
+            top = np.array(self.values)
+            stress, strain, branches = self._stretched(rows, heights, wanted)
+            fine = True
+        else:
+            stress, top = np.array(self.values), np.empty(self.time.size)
+            strain, branches = _room(len(heights) if wanted else 0, self.time.size)
+            fine = kernels.strains_along(rows, heights, stress, top, strain, branches)
+        slopes: Slopes | None = None
+        if len(directions):
+            slopes = Slopes(
+                *equilibrium_tangents(rows, heights, strain, branches, moved, directions)
+            )
+        eta = rows[0, kernels.ETA]
+        if moved and len(heights) == 1 and stress.size > 1 and (eta > 0.0 or slopes is not None):
+            rate = np.gradient(strain[0], self.time)
+            stress = stress + eta * rate
+            for p, (_, what) in enumerate(directions):
+                if slopes is not None and what == series.OWN_ETA:
+                    slopes.base_stress[p] += rate
+                elif slopes is not None and what == series.OWN_HEIGHT:
+                    slopes.base_stress[p] -= eta * rate / heights[0]
+        if not (fine and math.isfinite(kernels.total(stress))):
+            raise SimulationError(_OUTCOMES[taylor.NOT_FINITE])
+        if not everything:
+            if slopes is not None:
+                slopes = Slopes(slopes.displacement[:, -1:], slopes.base_stress)
+            return Motion(top[None, :], stress, math.nan, NO_SWITCHES, 0, CLOSED_FORM, slopes)
+        nodes = heights[:, None] * strain
+        for i in range(1, len(nodes)):  # np.cumsum takes six times as long
+            nodes[i] += nodes[i - 1]
+        switches = _switches(self.time, strain, branches)
+        return Motion(nodes, stress, math.nan, switches, 0, CLOSED_FORM, slopes)
+
+    def _stretched(
+        self, rows: Array, heights: Array, wanted: bool
+    ) -> tuple[Array, Array, NDArray[np.int64]]:
+        """Stress, strains and branches (the last two if `wanted`) under a known motion."""
+        count, n = len(heights), self.time.size
+        if count == 1:
+            strain = self.values / heights
+            stress, history = kernels.stress_along(rows[0], strain)
+            return stress, strain[None, :], history[None, :]
+        stress = np.empty(n)
+        if count >= LEAST_ELONGATED and many.holds(rows):
+            strain, branches = _room(count if wanted else 0, n)
+            if many.equilibrium_along(rows, heights, self.values, stress, strain, branches):
+                return stress, strain, branches
+        strain, branches = _room(count, n)
+        kernels.equilibrium_along(rows, heights, self.values, stress, strain, branches)
+        miss = np.abs(heights @ strain - self.values).max()
+        if not miss <= 1e-9 * (self.height + np.abs(self.values).max()):
+            raise SimulationError(_OUTCOMES[taylor.NOT_FINITE])
+        return stress, strain, branches
+
+    def _aggregate(
+        self, rows: Array, heights: Array, rtol: float, drag: float, curves: Array
+    ) -> Motion:
+        """Springs under one stress count as one: one step to a switch."""
+        log, tolerance = np.empty((4 * len(heights) + 64, 5)), AS_ONE * rtol / len(heights)
+        precompile.announce(many.integrate_aggregate, "the solver of many springs")
+        ending = many.integrate_aggregate(
+            rows, heights, self.mass[0], drag, self.speed, self.time, tolerance, self.max_steps,
+            curves, log, np.zeros(2, np.int64),
+        )  # fmt: skip
+        return _motion(AGGREGATE, ending, curves, NO_SLOPES, log)
+
+    def _start(self, rows: Array, heights: Array, directions: Directions) -> Array:
+        """Strains (1 + p, springs) in equilibrium with the first sample, and their derivatives.
+
+        Under a stress, a spring that a dashpot holds starts from rest.
+        """
+        start = np.zeros((1 + len(directions), len(heights)))
+        first = self.ends[-2] if len(self.ends) > 1 else 0
+        rows, heights, moved = rows[first:], heights[first:], self.top == taylor.MOTION
+        stress, (strain, branches) = self.values[:1].copy(), _room(len(heights), 1)
+        if moved:
+            kernels.equilibrium_along(rows, heights, self.values[:1], stress, strain, branches)
+        else:
+            kernels.strains_along(rows, heights, stress, np.empty(1), strain, branches)
+            held = rows[:, kernels.ETA] > 0.0
+            strain[held] = 0.0  # a dashpot holds its spring where it is
+            if not np.isfinite(strain).all():
+                raise SimulationError(_OUTCOMES[taylor.NOT_FINITE])
+            branches[held, 0] = np.where(
+                rows[held, kernels.KIND] == BISTABLE, kernels.A, kernels.LINE
+            )
+        start[0, first:] = strain[:, 0]
+        own = np.flatnonzero(directions[:, 0] >= first)
+        if len(own):
+            local = directions[own] - np.array([first, 0])
+            above, _ = equilibrium_tangents(rows, heights, strain, branches, moved, local)
+            longer = np.diff(above[:, :, 0], axis=1, prepend=0.0)
+            for p, (spring, what) in enumerate(local):
+                longer[p, spring] -= strain[spring, 0] if what == series.OWN_HEIGHT else 0.0
+            start[1 + own, first:] = longer / heights
+        return start
+
+    def _is_one(self, rows: Array) -> bool:
+        """Tell whether an impact acts on springs so many and so plain that they count as one."""
+        return (
+            len(self.ends) == 1
+            and self.top == taylor.FREE
+            and self.speed > 0.0
+            and bool(many.holds(rows))
+        )
+
+    def hurry(self, rows: Array, heights: Array, drag: float) -> tuple[float, float]:
+        """Vibration and relaxation (radians) that explicit steps would have to go through."""
+        return vibration.hurry_of(
+            rows, heights, self.ends, self.mass, drag, self.top, self.speed, self.time
+        )
+
+    def _is_stiff(self, rows: Array, heights: Array, drag: float | None) -> bool:
+        """Tell whether explicit steps would have to follow what is long over."""
+        if self.implicit is not None:
+            return self.implicit
+        if self.speed > 0.0 and vibration.parts_faintly(rows, heights, self.mass[-1]):
+            return True
+        swings, decays = self.hurry(rows, heights, self.drag if drag is None else drag)
+        return bool(swings > MOST_VIBRATION or decays > MOST_RELAXATION)
+
+
+def _motion(
+    method: str,
+    ending: tuple[int, float, int, int],
+    curves: Array,
+    slopes: Array,
+    log: Array,
+    unresolved: float = 0.0,
+) -> Motion:
+    """Gather what an integrator found, or say why it found nothing."""
+    outcome, time, steps, switches = ending
+    if outcome != taylor.DONE:
+        raise SimulationError(_OUTCOMES[outcome].format(steps=steps, time=time))
+    slope = None if slopes is NO_SLOPES else Slopes(slopes[:, 1:], slopes[:, 0])
+    seen = log if log is NO_SWITCHES else log[:switches]
+    return Motion(curves[1:], curves[0], time, seen, steps, method, slope, unresolved)
+
+
+def _room(count: int, n: int) -> tuple[Array, NDArray[np.int64]]:
+    """Room for the strains and branches of springs along a history."""
+    return np.empty((count, n)), np.empty((count, n), np.int64)
+
+
+def _switches(time: Array, strain: Array, branches: NDArray[np.int64]) -> Array:
+    """List the changes of branch between samples, at the later sample."""
+    samples, springs = np.nonzero((branches[:, 1:] != branches[:, :-1]).T)
+    out, later = np.empty((samples.size, 5)), samples + 1
+    out[:, 0], out[:, 1], out[:, 4] = time[later], springs, strain[springs, later]
+    out[:, 2], out[:, 3] = branches[springs, samples], branches[springs, later]
+    return out
+
+
+def _time(t: ArrayLike) -> Array:
+    time = as_samples(t, "t")  # a copy of one compiled type: writable
+    if time.ndim != 1 or time.size == 0:
+        raise InputError("t must be a one-dimensional array with at least one sample")
+    at = kernels.fault(time)
+    if at >= 0 and not math.isfinite(time[at]):
+        raise InputError(f"t must be finite; sample {at} is not")
+    if at >= 0:
+        raise InputError(f"t must increase; sample {at} is not later than the one before it")
+    return time
+
+
+def plan(
+    chain: Chain,
+    drive: Drive,
+    t: ArrayLike,
+    *,
+    dashpots: bool = False,
+    max_steps: int = MAX_STEPS,
+) -> Plan:
+    """Find what a scene needs: the nodes that have a state, and the least solver.
+
+    Parameters
+    ----------
+    chain : Chain
+        Only its heights, area, masses, site damping and which springs have a dashpot count.
+    drive : Impact, StressDrive or DisplacementDrive
+        How it is loaded.
+    t : (n_t,) array
+        Samples, s, increasing.
+    dashpots : bool
+        Whether to reckon with a dashpot in every spring, also where it is zero.
+    max_steps : int
+        Bound on steps; there are others on steps times springs.
+
+    Raises
+    ------
+    ValueError
+        If t does not increase or has not one value per sample of the drive.
+    """
+    time = _time(t)
+    above = chain.masses[-1]
+    speed, values = 0.0, _NOTHING
+    top = taylor.FREE
+    if isinstance(drive, Impact):
+        above += drive.mass
+        speed = drive.velocity
+    else:
+        name = "stress" if isinstance(drive, StressDrive) else "displacement"
+        values = np.array(drive.stress if isinstance(drive, StressDrive) else drive.displacement)
+        if values.size != time.size:
+            raise InputError(
+                f"{name} has {values.size} samples and t has {time.size}: give one value per sample"
+            )
+        if isinstance(drive, DisplacementDrive):
+            above = 0.0
+            top = taylor.MOTION
+        elif above == 0.0:
+            top = taylor.VISCOUS if chain.site_damping > 0.0 else taylor.STRESS
+    ends, masses = chain.arrays.top, np.array([above / chain.area])
+    if chain.arrays.heavy:
+        inside = np.flatnonzero(chain.arrays.masses[:-1] > 0.0)
+        ends = np.append(inside + 1, ends)
+        masses = np.append(chain.arrays.masses[inside] / chain.area, masses)
+    damped = dashpots or chain.arrays.damped or top == taylor.VISCOUS
+    if len(ends) > 1 or above > 0.0:
+        solver = SECOND_ORDER
+    elif damped and not (top == taylor.MOTION and len(chain.springs) == 1):
+        solver = FIRST_ORDER
+    else:
+        solver = CLOSED_FORM
+    count = len(chain.springs)
+    most = min(MOST_WORK // count + 2 * time.size + 8 * count, MOST_SAMPLED // count)
+    most = max(min(max_steps, most), 1)
+    explicit = min(MOST_EXPLICIT, MOST_EXPLICIT_WORK // count) + 20 * time.size
+    return Plan(
+        solver=solver,
+        height=chain.height,
+        ends=ends,
+        mass=masses,
+        drag=chain.site_damping / chain.height,
+        top=top,
+        values=values,
+        time=time,
+        speed=speed,
+        margin=OF_MASSES if len(ends) > 1 else OF_IMPACT if speed > 0.0 else ALONG_DRIVE,
+        max_steps=most,
+        max_explicit=min(most, explicit),
+        plain=speed > 0.0 and len(ends) == 1 and not damped and chain.site_damping == 0.0,
+    )

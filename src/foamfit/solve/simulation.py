@@ -1,0 +1,362 @@
+"""Forward simulation: a chain under a drive, by the least solver that the scene needs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from foamfit.errors import InputError, SimulationError
+from foamfit.solve.explicit import series
+from foamfit.solve.plan import (
+    AGGREGATE,
+    CLOSED_FORM,
+    MOST_WORK,
+    NO_DIRECTIONS,
+    RADAU,
+    SECOND_ORDER,
+    Directions,
+    Motion,
+    Plan,
+    Slopes,
+    plan,
+)
+from foamfit.springs import kernels
+from foamfit.springs.chain import Chain, Drive, check_scene
+from foamfit.springs.law import BISTABLE
+from foamfit.springs.spring import (
+    BISTABLE_NAMES,
+    LINEAR_NAMES,
+    BistableSpring,
+    as_number,
+)
+
+Array = NDArray[np.float64]
+
+_RINGING = (
+    "masses vibrate too fast to be followed, by up to {size:.1g} of the range: ask for no smaller "
+    "rtol than that, give the springs heavier dashpots, or leave the masses out"
+)
+# From so many steps on, or switches under masses, and where steps are implicit, several masses are
+# inside, or dashpots below a mass, a motion is run again to check it; so it is where a strain comes
+# so close to the end of its branch.
+FEW_STEPS, FEW_SWITCHES, CLOSE = 1000, 32, 1e-3
+LOST = 0.03  # so large a difference is not mended by still shorter steps
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """What a chain does under a drive.
+
+    Attributes
+    ----------
+    time : (n_t,) array
+        s.
+    displacement : (n_springs, n_t) array
+        Downward displacement w_i of the node above each spring, m.
+    base_stress : (n_t,) array
+        Stress at the sensor, Σ_1, Pa; zero outside contact.
+    height : float
+        Overall height H, m.
+    contact_end : float or None
+        When an impact's base stress returned to zero, s; None if it has not, or in other drives.
+    solver : str
+        "closed form", "first order" or "second order": the least that the scene needs.
+    method : str
+        "closed form", "Taylor series" (explicit steps), "aggregate" (the same, for many springs
+        that carry one stress) or "Radau IIA" (implicit steps, where light masses or dashpots make
+        the scene stiff; a vibration too fast to be followed is damped out, and refused where it
+        would exceed rtol).
+    switches : (m, 5) array
+        Time (s), spring (0 at the base), branch left, branch entered, strain of that spring.
+    steps : int
+        Steps of the integrator; 0 for the closed form.
+    sensitivities : dict of str to Sensitivity
+        Derivatives by the parameters that were asked for.
+    """
+
+    time: Array
+    displacement: Array
+    base_stress: Array
+    height: float
+    contact_end: float | None
+    solver: str
+    method: str
+    switches: Array
+    steps: int
+    sensitivities: dict[str, Sensitivity] = field(default_factory=dict)
+
+    @property
+    def strain(self) -> Array:
+        """Overall strain w_N/H, (n_t,)."""
+        top: Array = self.displacement[-1]
+        return top / self.height
+
+
+def _verified(
+    scene: Plan,
+    rows: Array,
+    heights: Array,
+    rtol: float,
+    directions: Directions = NO_DIRECTIONS,
+) -> Motion:
+    """Run a scene; where masses make its errors grow, follow it again by shorter steps and compare.
+
+    Raises
+    ------
+    SimulationError
+        If the scene has no answer within `rtol`; the message says why.
+    """
+    motion = scene.run(rows, heights, rtol, directions=directions)
+    inside = len(scene.ends) > 2 or _damped_below_a_mass(scene, rows)
+    many = _many(scene, motion, FEW_STEPS) or inside or motion.method == RADAU
+    if scene.speed > 0.0 and not many and not _hard(scene, rows, heights):
+        return motion
+    motion = _resolved(scene, rows, heights, rtol, directions, motion)
+    lost = motion.unresolved
+    if lost > 0.7 * rtol:  # the comparison below leaves 0.3
+        scene = scene._replace(implicit=False)
+        # an explicit step goes through two or three radians
+        if max(scene.hurry(rows, heights, scene.drag)) / 3.0 > MOST_WORK / len(heights):
+            raise SimulationError(_RINGING.format(size=lost))
+        motion = _followed(scene, rows, heights, rtol, directions, lost)
+    room = _room_at_peak(scene, rows, heights, motion, rtol)
+    if 0.3 * rtol * room < 1e-15:
+        raise SimulationError(
+            f"a strain comes within {room:.1g} of the end of its branch, 1 + eps_star: there "
+            f"rounding alone makes errors above rtol = {rtol:g}"
+        )
+    forced = 0 if scene.speed > 0.0 else scene.time.size
+    many = _many(scene, motion, FEW_STEPS + 2 * forced) or inside or room < CLOSE
+    many = many and scene.solver == SECOND_ORDER
+    if not (many or motion.method == RADAU) or rtol < 1e-12:  # no finer run could tell
+        return motion
+    miss = math.inf
+    for factor in (1e-2, 1e-4, 1e-6):
+        if rtol * factor < 1e-14:
+            break
+        finer = _followed(scene, rows, heights, rtol * factor, directions, lost)
+        miss = max(
+            _difference(finer.displacement, motion.displacement),
+            _difference(finer.base_stress, motion.base_stress),
+        )
+        if miss <= 0.3 * rtol and min(finer.unresolved, motion.unresolved) <= rtol:
+            return finer if finer.unresolved <= rtol else motion
+        if factor < 1e-2 and miss > LOST:
+            break
+        motion = finer
+    raise SimulationError(
+        "vibrations let the least error grow: two runs with shorter steps each differ by "
+        f"{miss:.1g} of the range; ask for a larger rtol, give the springs heavier dashpots, or "
+        "leave the masses out"
+    )
+
+
+def _resolved(
+    scene: Plan, rows: Array, heights: Array, rtol: float, directions: Directions, motion: Motion
+) -> Motion:
+    """Take shorter implicit steps where these follow the vibrations that longer ones have lost.
+
+    What many damped masses have lost together is overestimated: shorter steps may show that.
+    """
+    by_implicit = scene._replace(implicit=True)
+    for factor in (1e-2, 1e-4):
+        if motion.unresolved <= 0.7 * rtol or rtol * factor < 1e-14:
+            break
+        try:
+            finer = by_implicit.run(rows, heights, rtol * factor, directions=directions)
+        except SimulationError:
+            break
+        if finer.unresolved <= 0.7 * rtol:
+            return finer
+    return motion
+
+
+def _followed(
+    scene: Plan, rows: Array, heights: Array, rtol: float, directions: Directions, lost: float
+) -> Motion:
+    """Run a scene; where explicit steps follow what implicit ones lost, that is why they fail."""
+    try:
+        return scene.run(rows, heights, rtol, directions=directions)
+    except SimulationError:
+        if scene.implicit is not False:
+            raise
+        raise SimulationError(_RINGING.format(size=lost)) from None
+
+
+def _many(scene: Plan, motion: Motion, few: int) -> bool:
+    """Whether a motion took many steps (those of springs under one stress are but switches)."""
+    shaken = len(scene.ends) > 1 and len(motion.switches) > FEW_SWITCHES
+    return (motion.steps > few or shaken) and motion.method != AGGREGATE
+
+
+def _damped_below_a_mass(scene: Plan, rows: Array) -> bool:
+    """Whether dashpots at the base feel how fast a mass inside moves."""
+    return len(scene.ends) > 1 and bool((rows[: scene.ends[0], kernels.ETA] > 0.0).any())
+
+
+def _difference(one: Array, other: Array) -> float:
+    """Largest difference of two motions over the range of the first, rest included."""
+    span = max(float(one.max()), 0.0) - min(float(one.min()), 0.0)
+    return float(np.abs(one - other).max()) / span if span > 0.0 else 0.0
+
+
+def _room(rows: Array, heights: Array, displacement: Array) -> float:
+    """Least distance, in strain, of a spring on branch c from its end at 1 + ε_*."""
+    strain = np.diff(displacement, axis=0, prepend=0.0).max(axis=1) / heights
+    bistable = (rows[:, kernels.KIND] == BISTABLE) & (strain > rows[:, kernels.EPS_C])
+    return float(np.where(bistable, 1.0 - (strain - rows[:, kernels.EPS_STAR]), 1.0).min())
+
+
+def _hard(scene: Plan, rows: Array, heights: Array) -> bool:
+    """Whether a blow may bring a spring close to the end of its branch c."""
+    brought = 0.5 * float(scene.mass[-1]) * scene.speed**2
+    return brought >= 6.0 * float(heights.dot(rows[:, kernels.KC]))
+
+
+def _room_at_peak(scene: Plan, rows: Array, heights: Array, motion: Motion, rtol: float) -> float:
+    """Room at the peak of an impact that may come close to the end of a branch.
+
+    The peak of a hard blow is so short that no sample need lie in it: it is closed in on. In
+    equilibrium all springs are longest together.
+    """
+    if scene.solver == CLOSED_FORM:
+        peak = int(motion.displacement[-1].argmax())
+        return _room(rows, heights, motion.displacement[:, peak : peak + 1])
+    room = _room(rows, heights, motion.displacement)
+    bistable = rows[:, kernels.KIND] == BISTABLE
+    if scene.speed == 0.0 or not bistable.any():
+        return room
+    if not _hard(scene, rows, heights):
+        return room
+    low, high = 0.0, float(scene.time[-1])
+    for _ in range(12):
+        grid = np.linspace(low, high, 201)
+        top = scene._replace(time=grid).run(rows, heights, rtol).displacement
+        room = min(room, _room(rows, heights, top))
+        at = int(top[-1].argmax())
+        low, high = float(grid[max(at - 1, 0)]), float(grid[min(at + 1, 200)])
+        if high - low < 1e-15 * high or at == 200:
+            break
+    return room
+
+
+@dataclass(frozen=True, eq=False)
+class Sensitivity:
+    """Derivative of a response by one parameter, in SI, at fixed times.
+
+    Attributes
+    ----------
+    displacement : (n_springs, n_t) array
+        m per unit of the parameter.
+    base_stress : (n_t,) array
+        Pa per unit of the parameter. At a switch of branch its slope jumps, not its value; it jumps
+        where contact ends.
+    """
+
+    displacement: Array
+    base_stress: Array
+
+
+def _direction(chain: Chain, name: str) -> tuple[int, int]:
+    """Spring and own parameter, or height, or onsite damper, that a name like "s1_kc" means."""
+    if name == "site_eta":
+        return -1, series.DRAG
+    prefix, _, short = name.partition("_")
+    known = [f"s{i}" for i in range(1, len(chain.springs) + 1)]
+    if prefix in known:
+        spring = known.index(prefix)
+        own = BISTABLE_NAMES if isinstance(chain.springs[spring], BistableSpring) else LINEAR_NAMES
+        if short == "height":
+            return spring, series.OWN_HEIGHT
+        if short in own:
+            return spring, BISTABLE_NAMES.index(short)
+    raise InputError(
+        f"sensitivities: '{name}' is not a parameter of this chain; give names like s1_k0, "
+        "s2_height or site_eta"
+    )
+
+
+def _sensitivities(
+    chain: Chain, names: Sequence[str], directions: Directions, slopes: Slopes
+) -> dict[str, Sensitivity]:
+    """Name the derivatives of a run; η_site acts through η_site/H, and so does every height."""
+    out = {}
+    drag = chain.site_damping / chain.height
+    for p, name in enumerate(names):
+        moved, pressed = slopes.displacement[p], slopes.base_stress[p]
+        if directions[p, 1] == series.DRAG:
+            moved, pressed = moved / chain.height, pressed / chain.height
+        elif directions[p, 1] == series.OWN_HEIGHT and drag > 0.0:
+            moved = moved - drag / chain.height * slopes.displacement[-1]
+            pressed = pressed - drag / chain.height * slopes.base_stress[-1]
+        out[name] = Sensitivity(moved, pressed)
+    return out
+
+
+def simulate(
+    chain: Chain,
+    drive: Drive,
+    t: ArrayLike,
+    rtol: float = 1e-6,
+    *,
+    sensitivities: Sequence[str] = (),
+) -> Response:
+    """Simulate a chain under a drive.
+
+    Parameters
+    ----------
+    chain : Chain
+        Springs, heights, area, masses, onsite damper.
+    drive : Impact, StressDrive or DisplacementDrive
+        An impact starts at t = 0 (before, the striker is on its way); the sampled drives start
+        from rest at t[0] and are linear between samples, where a dashpot feels the mean rate.
+    t : (n_t,) array
+        Samples, s, increasing.
+    rtol : float
+        Wanted error of displacement and base stress relative to their range.
+    sensitivities : sequence of str
+        Parameters by which the response is differentiated: s1_k0 … s2_eta, s1_height, site_eta.
+
+    Returns
+    -------
+    Response
+        Past the end of contact the base stress is zero and the chain flies with the striker.
+
+    Raises
+    ------
+    ValueError
+        If something is not admissible; the message names it.
+    SimulationError
+        If the scene has no finite answer, or none to the wanted error; the message says why.
+    """
+    check_scene(chain, drive)
+    if not 1e-14 <= as_number(rtol, "rtol") <= 1e-1:
+        raise InputError(f"rtol = {rtol:g} is not admissible: it must be between 1e-14 and 0.1")
+    directions = NO_DIRECTIONS
+    if sensitivities:
+        wanted = [_direction(chain, name) for name in sensitivities]
+        longer = any(what == series.OWN_HEIGHT for _, what in wanted)
+        if longer and chain.site_damping > 0.0:  # the onsite damper acts over the whole height
+            wanted.append((-1, series.DRAG))
+        directions = np.array(wanted)
+    scene = plan(chain, drive, t, dashpots=any(name.endswith("_eta") for name in sensitivities))
+    motion = _verified(scene, chain.arrays.rows, chain.arrays.heights, rtol, directions)
+    return Response(
+        time=scene.time,
+        displacement=motion.displacement,
+        base_stress=motion.base_stress,
+        height=chain.height,
+        contact_end=None if math.isnan(motion.contact_end) else motion.contact_end,
+        solver=scene.solver,
+        method=motion.method,
+        switches=motion.switches,
+        steps=motion.steps,
+        sensitivities=(
+            {} if motion.slopes is None
+            else _sensitivities(chain, sensitivities, directions, motion.slopes)
+        ),
+    )  # fmt: skip

@@ -1,0 +1,198 @@
+"""A chain of springs and masses under a drive: what is simulated, not how."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from foamfit.errors import InputError
+from foamfit.springs.spring import BistableSpring, LinearSpring, Spring, as_number, as_samples
+
+Array = NDArray[np.float64]
+
+
+def _finite(value: object, name: str, least: float, strict: bool) -> float:
+    number = as_number(value, name)
+    if not math.isfinite(number) or number < least or (strict and number == least):
+        wanted = f"greater than {least:g}" if strict else f"at least {least:g}"
+        raise InputError(f"{name} = {number:g} is not admissible: it must be finite and {wanted}")
+    return number
+
+
+def _listed(values: Any, name: str, wanted: str) -> tuple[Any, ...]:
+    """Return what must be a sequence as a tuple."""
+    try:
+        if not isinstance(values, str | bytes):
+            return tuple(values)
+    except TypeError:
+        pass
+    raise InputError(
+        f"{name} = {values!r} is not admissible: it must be a sequence of {wanted}, base first"
+    )
+
+
+class ChainArrays(NamedTuple):
+    """A chain as the kernels know it.
+
+    rows (n_springs, columns) are the springs, heights (m) and masses (kg) are (n_springs,), top
+    (1,) is the number of springs; `heavy` tells whether there are masses inside, `damped` dashpots.
+    """
+
+    rows: Array
+    heights: Array
+    masses: Array
+    top: NDArray[np.int64]
+    heavy: bool
+    damped: bool
+
+
+@dataclass(frozen=True, init=False)
+class Chain:
+    """Springs from the base up, with the masses between and above them.
+
+    Parameters
+    ----------
+    springs : sequence of BistableSpring or LinearSpring
+        Base first.
+    heights : sequence of float
+        Height h_i of each spring, m.
+    area : float
+        Cross-section A, m².
+    masses : sequence of float, optional
+        Mass above each spring, kg; 0 = massless. Left out = all massless.
+    site_damping : float
+        The onsite damper η_site of the paper on the top mass, Pa·s.
+
+    Raises
+    ------
+    ValueError
+        If something is not admissible; the message names it.
+    """
+
+    springs: tuple[Spring, ...]
+    heights: tuple[float, ...]
+    area: float
+    masses: tuple[float, ...] = ()
+    site_damping: float = 0.0
+
+    def __init__(
+        self,
+        springs: Sequence[Spring],
+        heights: Sequence[float],
+        area: float,
+        masses: Sequence[float] | None = None,
+        site_damping: float = 0.0,
+    ) -> None:
+        """Check and freeze the chain."""
+        springs = _listed(springs, "springs", "BistableSpring or LinearSpring")
+        n = len(springs)
+        if n == 0:
+            raise InputError("springs is empty: a chain needs at least one spring")
+        for i, spring in enumerate(springs, start=1):
+            if not isinstance(spring, BistableSpring | LinearSpring):
+                raise InputError(
+                    f"springs: spring {i} is a {type(spring).__name__}; "
+                    "it must be a BistableSpring or a LinearSpring"
+                )
+        heights = _listed(heights, "heights", "numbers")
+        masses = _listed([0.0] * n if masses is None else masses, "masses", "numbers")
+        for name, values in (("heights", heights), ("masses", masses)):
+            if len(values) != n:
+                raise InputError(
+                    f"{name} has {len(values)} values for {n} springs: give one per spring"
+                )
+        put = object.__setattr__
+        put(self, "springs", tuple(springs))
+        put(self, "heights", tuple(_finite(h, "heights", 0.0, True) for h in heights))
+        put(self, "area", _finite(area, "area", 0.0, True))
+        put(self, "masses", tuple(_finite(m, "masses", 0.0, False) for m in masses))
+        put(self, "site_damping", _finite(site_damping, "site_damping", 0.0, False))
+
+    @cached_property
+    def height(self) -> float:
+        """Overall height H = Σ h_i, m."""
+        return math.fsum(self.heights)
+
+    @cached_property
+    def arrays(self) -> ChainArrays:
+        """The chain as the kernels know it."""
+        return ChainArrays(
+            rows=np.array([spring.row for spring in self.springs]),
+            heights=np.array(self.heights),
+            masses=np.array(self.masses),
+            top=np.array([len(self.springs)]),
+            heavy=any(mass > 0.0 for mass in self.masses[:-1]),
+            damped=any(spring.eta > 0.0 for spring in self.springs),
+        )
+
+
+def _samples(values: ArrayLike, name: str) -> Array:
+    samples = as_samples(values, name)
+    if samples.ndim != 1 or samples.size == 0:
+        raise InputError(f"{name} must be a one-dimensional array with at least one sample")
+    if not np.all(np.isfinite(samples)):
+        at = int(np.argmin(np.isfinite(samples)))
+        raise InputError(f"{name} must be finite; sample {at} is {samples[at]}")
+    samples.setflags(write=False)
+    return samples
+
+
+@dataclass(frozen=True)
+class Impact:
+    """A striker of `mass` (kg) meets the top of the chain with `velocity` (m/s) at t = 0."""
+
+    mass: float
+    velocity: float
+
+    def __post_init__(self) -> None:
+        """Refuse what is not admissible, by name."""
+        object.__setattr__(self, "mass", _finite(self.mass, "mass", 0.0, True))
+        object.__setattr__(self, "velocity", _finite(self.velocity, "velocity", 0.0, True))
+
+
+@dataclass(frozen=True, eq=False)
+class StressDrive:
+    """A stress history (Pa), sampled at t and linear in between, acts on the top, from rest."""
+
+    stress: Array
+
+    def __post_init__(self) -> None:
+        """Check and freeze the samples."""
+        object.__setattr__(self, "stress", _samples(self.stress, "stress"))
+
+
+@dataclass(frozen=True, eq=False)
+class DisplacementDrive:
+    """The displacement of the top (m), sampled at t and linear between samples, is prescribed."""
+
+    displacement: Array
+
+    def __post_init__(self) -> None:
+        """Check and freeze the samples."""
+        object.__setattr__(self, "displacement", _samples(self.displacement, "displacement"))
+
+
+Drive = Impact | StressDrive | DisplacementDrive
+
+
+def check_scene(chain: object, drive: object) -> None:
+    """Refuse what is no chain or no drive.
+
+    Raises
+    ------
+    ValueError
+        Naming which.
+    """
+    if not isinstance(chain, Chain):
+        raise InputError(f"chain is a {type(chain).__name__}; it must be a Chain")
+    if not isinstance(drive, Drive):
+        raise InputError(
+            f"drive is a {type(drive).__name__}; it must be an Impact, a StressDrive or a "
+            "DisplacementDrive"
+        )

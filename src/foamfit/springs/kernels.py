@@ -1,0 +1,526 @@
+"""The compiled loops: the law of a spring along a history, and a chain in equilibrium.
+
+A spring is one row of numbers (`Row`); a chain is an array of rows, base first. The branch that a
+spring is on is its whole memory: a and d belong to the paper's flag a, c and e to its flag c
+(eq. 3). Everything is SI. The integration in time is in `explicit.taylor`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from foamfit.springs.law import BISTABLE, LINEAR, UNILATERAL, admissible, derived_points
+
+Array = NDArray[np.float64]
+Row = Array
+Branches = NDArray[np.int64]
+
+# Division by zero gives infinity, as in NumPy; every loop that can meet it says what it does then.
+compiled = njit(cache=True, error_model="numpy")
+# For what only other loops call: without the bridge to Python, which takes long to compile; without
+# counting who holds an array, which takes long to run; with a product and a sum in one rounding,
+# which is faster and no less exact; and with the body put where it is called.
+_BRIDGELESS: dict[str, Any] = {
+    "error_model": "numpy",
+    "no_cfunc_wrapper": True,
+    "no_cpython_wrapper": True,
+    "fastmath": {"contract"},
+}
+_COUNTLESS: dict[str, Any] = {**_BRIDGELESS, "_nrt": False}
+maker = njit(**_BRIDGELESS, cache=True)
+inner = njit(**_COUNTLESS)
+inlined = njit(**_COUNTLESS, forceinline=True)
+# For long loops that are called from one place: read apart, compiled as a part of the caller.
+once = njit(error_model="numpy", inline="always")
+# A piece of a loop (as is what makes its arrays) that is compiled apart from it; see
+# `solve.precompile`.
+piece = njit(**_COUNTLESS, cache=True)
+
+# Columns of a row.
+KIND, K0, KC, EPS_A, EPS_C, KH_PLUS, KH_MINUS, ETA = range(8)
+SIGMA_A, SIGMA_C, EPS_STAR, EPS_HAT_A, EPS_HAT_C, SIGMA_HAT_A, SIGMA_HAT_C, N_COLUMNS = range(8, 16)
+
+# Branches: of the bistable spring, of a linear one, and of a unilateral one out of contact.
+A, D, C, E, LINE, OPEN = range(6)
+BRANCH_NAMES = ("a", "d", "c", "e", "line", "open")
+
+_derived_points = inner(derived_points)
+_admissible = inner(admissible)
+
+
+@compiled
+def fill_bistable(
+    row: Row,
+    k0: float,
+    kc: float,
+    dsigma: float,
+    eps_a: float,
+    eps_c: float,
+    kh_plus: float,
+    kh_minus: float,
+    eta: float,
+) -> bool:
+    """Write a bistable spring into `row`; false, and nothing written, if it is not admissible."""
+    if not (_admissible(k0, kc, dsigma, eps_a, eps_c, kh_plus, kh_minus) and eta >= 0.0):
+        return False
+    sigma_a, sigma_c, eps_star, hat_a, hat_c = _derived_points(
+        k0, kc, dsigma, eps_a, eps_c, kh_plus, kh_minus
+    )
+    row[KIND] = BISTABLE
+    row[K0], row[KC], row[EPS_A], row[EPS_C] = k0, kc, eps_a, eps_c
+    row[KH_PLUS], row[KH_MINUS], row[ETA] = kh_plus, kh_minus, eta
+    row[SIGMA_A], row[SIGMA_C], row[EPS_STAR] = sigma_a, sigma_c, eps_star
+    row[EPS_HAT_A], row[EPS_HAT_C] = hat_a, hat_c
+    row[SIGMA_HAT_A] = -math.inf if hat_a == -math.inf else k0 * hat_a / (1.0 - hat_a)
+    row[SIGMA_HAT_C] = sigma_a + kh_plus * (hat_c - eps_a)
+    return True
+
+
+@compiled
+def fill_linear(row: Row, k0: float, eta: float, unilateral: bool) -> bool:
+    """Write a linear spring into `row`; false, and nothing written, if it is not admissible."""
+    if not (0.0 < k0 < math.inf and eta >= 0.0):
+        return False
+    row[KIND] = UNILATERAL if unilateral else LINEAR
+    row[K0], row[ETA] = k0, eta
+    return True
+
+
+@compiled
+def fill_rows(kinds: Branches, values: Array, rows: Array) -> bool:
+    """Write the springs of a flat vector of parameters into `rows`; false if one is not admissible.
+
+    A bistable spring takes eight values (k0 … kh_minus, eta), a linear one two (k0, eta).
+    """
+    at = 0
+    for i in range(kinds.size):
+        if kinds[i] == BISTABLE:
+            p = values[at : at + 8]
+            fine = fill_bistable(rows[i], p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7])
+            at += 8
+        else:
+            fine = fill_linear(rows[i], values[at], values[at + 1], kinds[i] == UNILATERAL)
+            at += 2
+        if not fine:
+            return False
+    return True
+
+
+def bistable_row(*parameters: float) -> Row:
+    """Make the row of an admissible bistable spring from k0 … kh_minus, eta (SI)."""
+    row = np.zeros(N_COLUMNS)
+    fill_bistable(row, *parameters)
+    return row
+
+
+def linear_row(k0: float, eta: float, unilateral: bool) -> Row:
+    """Make the row of an admissible linear spring (SI)."""
+    row = np.zeros(N_COLUMNS)
+    fill_linear(row, k0, eta, unilateral)
+    return row
+
+
+# ---------------------------------------------------------------- the law of one spring
+
+
+@inner
+def branch_shape(row: Row, branch: int) -> tuple[bool, float, float, float]:
+    """Return (curved, slope k, strain origin x0, stress origin s0) of a branch of eq. 2.
+
+    Curved (a and c): σ = k x/(1-x) with x = ε - x0. Straight (d, e, linear): σ = s0 + k (ε - x0).
+    """
+    if branch == A:
+        return True, row[K0], 0.0, 0.0
+    if branch == C:
+        return True, row[KC], row[EPS_STAR], 0.0
+    if branch == D:
+        return False, row[KH_PLUS], row[EPS_A], row[SIGMA_A]
+    if branch == E:
+        return False, row[KH_MINUS], row[EPS_C], row[SIGMA_C]
+    if branch == LINE:
+        return False, row[K0], 0.0, 0.0
+    return False, 0.0, 0.0, 0.0
+
+
+@inner
+def stress_on(row: Row, branch: int, eps: float) -> float:
+    """Stress on a branch (eq. 2); infinite at or past the pole of a curved one."""
+    curved, k, x0, s0 = branch_shape(row, branch)
+    x = eps - x0
+    if not curved:
+        return s0 + k * x
+    return k * x / (1.0 - x) if x < 1.0 else math.inf
+
+
+@inner
+def strain_on(row: Row, branch: int, sigma: float) -> float:
+    """Strain on a branch, the inverse of eq. 2; on a flat branch its end where it is entered."""
+    curved, k, x0, s0 = branch_shape(row, branch)
+    if curved:
+        return x0 + sigma / (k + sigma) if sigma > -k else -math.inf
+    return x0 + (sigma - s0) / k if k > 0.0 else x0
+
+
+@inner
+def slope_on(row: Row, branch: int, eps: float) -> float:
+    """Slope dσ/dε of eq. 2 on a branch."""
+    curved, k, x0, _ = branch_shape(row, branch)
+    return k / (1.0 - (eps - x0)) ** 2 if curved else k
+
+
+@inner
+def interval(row: Row, branch: int) -> tuple[float, float]:
+    """Strains (low, high) at which a spring leaves a branch."""
+    if branch == A:
+        return -math.inf, row[EPS_A]
+    if branch == D:
+        return row[EPS_A], row[EPS_HAT_C]
+    if branch == C:
+        return row[EPS_C], math.inf
+    if branch == E:
+        return row[EPS_HAT_A], row[EPS_C]
+    if branch == LINE:
+        return (0.0 if row[KIND] == UNILATERAL else -math.inf), math.inf
+    return -math.inf, 0.0
+
+
+@inner
+def stress_interval(row: Row, branch: int) -> tuple[float, float]:
+    """Stresses (low, high) at which a spring leaves a branch."""
+    if branch == A:
+        return -math.inf, row[SIGMA_A]
+    if branch == D:
+        return row[SIGMA_A], row[SIGMA_HAT_C]
+    if branch == C:
+        return row[SIGMA_C], math.inf
+    if branch == E:
+        return row[SIGMA_HAT_A], row[SIGMA_C]
+    if branch == LINE:
+        return (0.0 if row[KIND] == UNILATERAL else -math.inf), math.inf
+    return -math.inf, 0.0
+
+
+@inner
+def above(branch: int) -> int:
+    """Name the branch that a spring enters when it leaves `branch` upwards in strain."""
+    if branch == A:
+        return D
+    return C if branch in (D, E) else LINE
+
+
+@inner
+def below(branch: int) -> int:
+    """Name the branch that a spring enters when it leaves `branch` downwards in strain."""
+    if branch == C:
+        return E
+    return A if branch in (D, E) else OPEN
+
+
+@inner
+def first_branch(row: Row) -> int:
+    """Branch of a spring at rest."""
+    return A if row[KIND] == BISTABLE else LINE
+
+
+@inner
+def branch_at_strain(row: Row, branch: int, eps: float) -> int:
+    """Branch at strain `eps` of a spring that was last seen on `branch` (eqs. 2 and 3)."""
+    if row[KIND] == LINEAR:
+        return LINE
+    if row[KIND] == UNILATERAL:
+        return LINE if eps >= 0.0 else OPEN
+    if branch in (A, D):
+        if eps < row[EPS_A]:
+            return A
+        return D if eps <= row[EPS_HAT_C] else C
+    if eps > row[EPS_C]:
+        return C
+    return E if eps >= row[EPS_HAT_A] else A
+
+
+@inner
+def branch_at_stress(row: Row, branch: int, sigma: float) -> int:
+    """Branch at stress `sigma` of a spring that was last seen on `branch` (eqs. 2 and 3)."""
+    if row[KIND] == LINEAR:
+        return LINE
+    if row[KIND] == UNILATERAL:
+        return LINE if sigma >= 0.0 else OPEN
+    if branch in (A, D):
+        if sigma < row[SIGMA_A]:
+            return A
+        if row[KH_PLUS] == 0.0:
+            return A if sigma == row[SIGMA_A] else C
+        return D if sigma <= row[SIGMA_HAT_C] else C
+    if sigma > row[SIGMA_C]:
+        return C
+    if row[KH_MINUS] == 0.0:
+        return C if sigma == row[SIGMA_C] else A
+    return E if sigma >= row[SIGMA_HAT_A] else A
+
+
+@inner
+def stresses_on(row: Row, branch: int, eps: Array, sigma: Array) -> None:
+    """Fill the stresses at many strains on one branch."""
+    curved, k, x0, s0 = branch_shape(row, branch)
+    if not curved:
+        for j in range(eps.size):
+            sigma[j] = s0 + k * (eps[j] - x0)
+        return
+    for j in range(eps.size):
+        x = eps[j] - x0
+        sigma[j] = k * x / (1.0 - x) if x < 1.0 else math.inf
+
+
+@inner
+def strains_on(row: Row, branch: int, sigma: Array, eps: Array) -> None:
+    """Fill the strains at many stresses on one branch; -inf where a spring cannot have any."""
+    curved, k, x0, s0 = branch_shape(row, branch)
+    if curved:
+        for j in range(sigma.size):
+            eps[j] = x0 + sigma[j] / (k + sigma[j]) if sigma[j] > -k else -math.inf
+    elif k > 0.0:
+        for j in range(sigma.size):
+            eps[j] = x0 + (sigma[j] - s0) * (1.0 / k)
+    else:
+        for j in range(sigma.size):
+            eps[j] = -math.inf if branch == OPEN else x0
+
+
+@inner
+def _follow_strain(row: Row, eps: Array, sigma: Array, history: Branches) -> None:
+    """Fill stress and branch along the strains of one spring from rest, a branch at a time."""
+    branch, first = first_branch(row), 0
+    while first < eps.size:
+        branch = branch_at_strain(row, branch, eps[first])
+        low, high = interval(row, branch)
+        last = first + 1
+        while last < eps.size and low < eps[last] < high:
+            last += 1
+        stresses_on(row, branch, eps[first:last], sigma[first:last])
+        history[first:last] = branch
+        first = last
+
+
+@inner
+def _follow_stress(row: Row, sigma: Array, eps: Array, history: Branches) -> None:
+    """Fill strain and branch along the stresses of one spring from rest, a branch at a time."""
+    branch, first = first_branch(row), 0
+    while first < sigma.size:
+        branch = branch_at_stress(row, branch, sigma[first])
+        low, high = stress_interval(row, branch)
+        last = first + 1
+        while last < sigma.size and low < sigma[last] < high:
+            last += 1
+        strains_on(row, branch, sigma[first:last], eps[first:last])
+        history[first:last] = branch
+        first = last
+
+
+@compiled
+def stress_along(row: Row, eps: Array) -> tuple[Array, Branches]:
+    """Stress and branch of one spring along a strain history, from rest."""
+    sigma = np.empty(eps.size)
+    branches = np.empty(eps.size, np.int64)
+    _follow_strain(row, eps, sigma, branches)
+    return sigma, branches
+
+
+@compiled
+def tangent_along(row: Row, eps: Array, branches: Branches) -> Array:
+    """Slope dσ/dε at each sample of a strain history whose branches are known."""
+    slope = np.empty(eps.size)
+    for j in range(eps.size):
+        slope[j] = slope_on(row, branches[j], eps[j])
+    return slope
+
+
+# ---------------------------------------------------------------- springs in series, in equilibrium
+
+
+@inner
+def _series_strain(
+    rows: Array, branches: Branches, heights: Array, sigma: float, eps: Array
+) -> tuple[float, float, float]:
+    """Fill the strains of springs in series under one stress.
+
+    Returns elongation, compliance, and the size of the terms that the elongation is made of.
+    """
+    total = 0.0
+    compliance = 0.0
+    size = 0.0
+    for i in range(rows.shape[0]):
+        branch = branch_at_stress(rows[i], branches[i], sigma)
+        if branch == OPEN:
+            eps[i] = -math.inf
+        else:
+            eps[i] = strain_on(rows[i], branch, sigma)
+            compliance += heights[i] / slope_on(rows[i], branch, eps[i])
+        total += heights[i] * eps[i]
+        size += heights[i] * abs(eps[i])
+    return total, compliance, size
+
+
+@inner
+def _bracket(
+    rows: Array, branches: Branches, heights: Array, elongation: float, sigma: float, eps: Array
+) -> tuple[float, float]:
+    """Stresses (low, high) between which springs in series reach `elongation`."""
+    step = 1e-3 * abs(sigma)
+    for i in range(rows.shape[0]):
+        step = max(step, 1e-6 * rows[i, K0])
+    low = high = sigma
+    for _ in range(200):
+        if _series_strain(rows, branches, heights, low, eps)[0] <= elongation:
+            break
+        high = low
+        low -= step
+        step *= 2.0
+    for _ in range(200):
+        if _series_strain(rows, branches, heights, high, eps)[0] >= elongation:
+            break
+        low = high
+        high += step
+        step *= 2.0
+    return low, high
+
+
+@maker
+def _split_jump(
+    rows: Array,
+    branches: Branches,
+    heights: Array,
+    elongation: float,
+    low: float,
+    high: float,
+    eps: Array,
+) -> float:
+    """Share out an elongation that lies inside a jump at one stress; returns that stress.
+
+    Flat branches (k_h± = 0) share it from the base up. Where a unilateral spring opens, the stress
+    is zero and the gap takes what the other springs leave.
+    """
+    upper = np.empty(eps.size)
+    _series_strain(rows, branches, heights, high, upper)
+    rest = elongation - _series_strain(rows, branches, heights, low, eps)[0]
+    for i in range(eps.size):
+        if eps[i] == -math.inf and rows[i, KIND] == UNILATERAL:
+            rest = elongation - _series_strain(rows, branches, heights, 0.0, eps)[0]
+            eps[i] += rest / heights[i]
+            return 0.0
+    for i in range(eps.size):
+        gain = min(max(rest / heights[i], 0.0), upper[i] - eps[i])
+        eps[i] += gain
+        rest -= heights[i] * gain
+    return 0.5 * (low + high)
+
+
+@maker
+def equilibrate(
+    rows: Array, branches: Branches, heights: Array, elongation: float, sigma: float, eps: Array
+) -> float:
+    """Common stress of undamped springs in series at a given elongation; fills their strains.
+
+    Along a monotone stretch each spring follows one monotone function of the common stress, so the
+    sum of their elongations has one root, whatever switches lie on the way. Newton's method finds
+    it, from the eighth trial on inside a shrinking bracket. Where the root lies in a jump of that
+    function (k_h± = 0), the springs share it from the base up. `branches` is brought up to date.
+    """
+    found = False
+    low, high = -math.inf, math.inf
+    for trial_number in range(200):
+        total, compliance, size = _series_strain(rows, branches, heights, sigma, eps)
+        miss = total - elongation
+        if abs(miss) <= 2e-15 * (size + abs(elongation)) and math.isfinite(total):
+            found = True
+            break
+        if miss > 0.0:
+            high = min(high, sigma)
+        else:
+            low = max(low, sigma)
+        trial = sigma - miss / compliance
+        if trial_number == 8:  # a kink or a jump: bracket it
+            low, high = _bracket(rows, branches, heights, elongation, sigma, eps)
+        if trial_number >= 8 and not low < trial < high:
+            trial = 0.5 * (low + high)
+            if trial in (low, high):  # neighbouring numbers: nothing lies between them
+                found = abs(miss) <= 1e-12 * (size + abs(elongation))
+                break
+        elif not low < trial < high:
+            trial = 0.5 * (low + high) if math.isfinite(low) and math.isfinite(high) else sigma
+        sigma = trial
+    if not found:
+        sigma = _split_jump(rows, branches, heights, elongation, low, high, eps)
+    for i in range(eps.size):
+        branches[i] = branch_at_strain(rows[i], branches[i], eps[i])
+    return sigma
+
+
+@compiled
+def equilibrium_along(
+    rows: Array, heights: Array, top: Array, sigma: Array, eps: Array, history: Branches
+) -> None:
+    """Springs in series, undamped and massless, along a history of the top's displacement (m).
+
+    Fills the common stress (n,), the strains and the branches (springs, n).
+    """
+    count, n = rows.shape[0], top.size
+    branches = np.empty(count, np.int64)
+    now = np.empty(count)
+    for i in range(count):
+        branches[i] = first_branch(rows[i])
+    last = 0.0
+    for j in range(n):
+        last = equilibrate(rows, branches, heights, top[j], last, now)
+        sigma[j] = last
+        for i in range(count):
+            eps[i, j] = now[i]
+            history[i, j] = branches[i]
+
+
+@compiled
+def strains_along(
+    rows: Array, heights: Array, sigma: Array, top: Array, eps: Array, history: Branches
+) -> bool:
+    """Springs in series along a history of their stress.
+
+    Fills the displacement of the top (n,), m, and strains and branches (springs or 0, n). False if
+    a spring cannot have its stress; its strain is -inf then.
+    """
+    n, kept, total = sigma.size, eps.shape[0] > 0, 0.0
+    strain, branches = np.empty(n), np.empty(n, np.int64)
+    for i in range(rows.shape[0]):
+        if kept:
+            strain, branches = eps[i], history[i]
+        _follow_stress(rows[i], sigma, strain, branches)
+        if i == 0:
+            for j in range(n):
+                top[j] = heights[i] * strain[j]
+        else:
+            for j in range(n):
+                top[j] += heights[i] * strain[j]
+    for j in range(n):
+        total += top[j]
+    return math.isfinite(total)
+
+
+@compiled
+def fault(t: Array) -> int:
+    """First sample that is not finite, or not later than the one before it; -1 if there is none."""
+    for j in range(t.size):
+        if not math.isfinite(t[j]) or (j > 0 and t[j] <= t[j - 1]):
+            return j
+    return -1
+
+
+@compiled
+def total(values: Array) -> float:
+    """Sum of an array; finite only if all of it is."""
+    out = 0.0
+    for value in values:
+        out += value
+    return out

@@ -1,0 +1,83 @@
+"""The formulas of the seven-parameter law (eqs. 2, 4 and 5), each written once.
+
+Plain Python on numbers: `springs.spring` calls it as it stands, `springs.kernels` compiles it.
+"""
+
+from __future__ import annotations
+
+import math
+
+# The kinds of spring that the kernels tell apart.
+BISTABLE, LINEAR, UNILATERAL = 0, 1, 2
+
+
+def derived_points(
+    k0: float,
+    kc: float,
+    dsigma: float,
+    eps_a: float,
+    eps_c: float,
+    kh_plus: float,
+    kh_minus: float,
+) -> tuple[float, float, float, float, float]:
+    """Derive (σ_a, σ̄_c, ε_*, ε̂_a, ε̂_c) of a bistable spring in closed form.
+
+    Both quadratics are written about the known end of their branch (C2 for ε̂_c, A1 for ε̂_a),
+    where their coefficients hold no difference of nearly equal numbers.
+
+    Returns
+    -------
+    tuple of float
+        σ_a and σ̄_c in Pa; the strains ε_*, ε̂_a (eq. 4; -inf where branch e never meets
+        branch a) and ε̂_c (eq. 5).
+    """
+    sigma_a = k0 * eps_a / (1.0 - eps_a)
+    sigma_c = sigma_a + dsigma
+    eps_star = eps_c - sigma_c / (kc + sigma_c)
+
+    # Eq. 5, c = d. With y = ε - ε_c and u = 1 - (ε_c - ε_*) = kc/(kc + σ̄_c):
+    # u kh+ y² + (kc - u² kh+ + u gap) y - u² gap = 0, one root y >= 0.
+    gap = kh_plus * (eps_c - eps_a) - dsigma
+    u = kc / (kc + sigma_c)
+    b = kc - u * u * kh_plus + u * gap
+    root = math.sqrt(b * b + 4.0 * u * kh_plus * u * u * gap)
+    y = 2.0 * u * u * gap / (b + root) if b >= 0.0 else (root - b) / (2.0 * u * kh_plus)
+
+    # Eq. 4, a = e. With z = ε_a - ε and v = 1 - ε_a:
+    # v kh- z² + (v² kh- + v fall - k0) z + v² fall = 0, the smaller root z >= 0, if any.
+    fall = kh_minus * (eps_c - eps_a) - dsigma
+    v = 1.0 - eps_a
+    b = v * v * kh_minus + v * fall - k0
+    discriminant = b * b - 4.0 * v * kh_minus * v * v * fall
+    if fall == 0.0:
+        eps_hat_a = eps_a
+    elif b < 0.0 and discriminant >= 0.0:
+        eps_hat_a = eps_a - 2.0 * v * v * fall / (math.sqrt(discriminant) - b)
+    else:
+        eps_hat_a = -math.inf
+    return sigma_a, sigma_c, eps_star, eps_hat_a, eps_c + y
+
+
+def admissible(
+    k0: float,
+    kc: float,
+    dsigma: float,
+    eps_a: float,
+    eps_c: float,
+    kh_plus: float,
+    kh_minus: float,
+) -> bool:
+    """Tell whether the seven parameters are admissible (model: 0 < ε_a < ε_c, -1 < Δσ/σ_a <= 0, …).
+
+    The remaining conditions, ε_c < 1 + ε_*, ε̂_c >= ε_c and a loop of non-negative area, follow
+    from these: branch d lies above C2 and branch e below A1.
+    """
+    return (
+        0.0 < k0 < math.inf
+        and 0.0 < kc < math.inf
+        and 0.0 < eps_a < 1.0
+        and eps_a < eps_c < math.inf
+        and -k0 * eps_a / (1.0 - eps_a) < dsigma <= 0.0
+        and 0.0 <= kh_plus < math.inf
+        and 0.0 <= kh_minus < math.inf
+    )

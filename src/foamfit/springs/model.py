@@ -1,0 +1,178 @@
+"""The parameters of a model: their names, units, bounds and how they become springs.
+
+A model names its springs from the base up, joined by "+": "bistable", "linear+bistable", … Its
+parameters are one flat vector in SI: for each spring its own (prefix s1_, s2_, …), then the heights
+of a chain, then `site_eta`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foamfit.errors import InputError
+from foamfit.solve.explicit import series
+from foamfit.springs import kernels
+from foamfit.springs.chain import Chain
+from foamfit.springs.spring import (
+    BISTABLE_NAMES,
+    LINEAR_NAMES,
+    BistableSpring,
+    LinearSpring,
+    Spring,
+)
+
+Array = NDArray[np.float64]
+
+KINDS = ("bistable", "linear", "unilateral")
+UNITS = {
+    "k0": "Pa",
+    "kc": "Pa",
+    "dsigma": "Pa",
+    "eps_a": "",
+    "eps_c": "",
+    "kh_plus": "Pa",
+    "kh_minus": "Pa",
+    "eta": "Pa s",
+    "height": "m",
+    "time_shift": "s",
+}
+
+# The branches of which a test must have reached one for the parameter to leave a trace in it.
+BRANCHES = {
+    "k0": "a",
+    "eps_a": "d",
+    "kh_plus": "d",
+    "kc": "c",
+    "eps_c": "e",
+    "dsigma": "e",
+    "kh_minus": "e",
+}
+
+
+@dataclass(frozen=True)
+class Model:
+    """Springs from the base up and the flat vector of their parameters.
+
+    Parameters
+    ----------
+    kinds : tuple of str
+        "bistable", "linear" or "unilateral" (linear without tension) for each spring.
+    """
+
+    kinds: tuple[str, ...]
+
+    @classmethod
+    def parse(cls, name: str) -> Model:
+        """Read a model's name, for example "linear+bistable".
+
+        Raises
+        ------
+        InputError
+            If a spring in it is unknown.
+        """
+        if not isinstance(name, str):
+            raise InputError(f"model = {name!r} must be a text like 'linear+bistable'")
+        kinds = tuple(part.strip() for part in name.split("+"))
+        for kind in kinds:
+            if kind not in KINDS:
+                raise InputError(
+                    f"model '{name}': '{kind}' is not a spring; "
+                    f"join {', '.join(KINDS)} by '+', from the base up"
+                )
+        return cls(kinds)
+
+    @property
+    def name(self) -> str:
+        """The model's name, springs from the base up."""
+        return "+".join(self.kinds)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of all parameters in the order of the flat vector."""
+        names = [
+            f"s{i}_{short}"
+            for i, kind in enumerate(self.kinds, start=1)
+            for short in (BISTABLE_NAMES if kind == "bistable" else LINEAR_NAMES)
+        ]
+        if len(self.kinds) > 1:
+            names += [f"s{i}_height" for i in range(1, len(self.kinds) + 1)]
+        return (*names, "site_eta")
+
+    @cached_property
+    def index(self) -> dict[str, int]:
+        """Place of each parameter in the flat vector."""
+        return {name: i for i, name in enumerate(self.names)}
+
+    @cached_property
+    def directions(self) -> NDArray[np.int64]:
+        """What each parameter moves, (n, 2): spring and own parameter; see `explicit.series`."""
+        out = []
+        for name in self.names:
+            spring, short = split_name(name)
+            if short == "height":
+                out.append((spring, series.OWN_HEIGHT))
+            elif spring < 0:
+                out.append((-1, series.DRAG))
+            else:
+                out.append((spring, BISTABLE_NAMES.index(short)))
+        return np.array(out)
+
+    @cached_property
+    def _codes(self) -> NDArray[np.int64]:
+        return np.array([KINDS.index(kind) for kind in self.kinds])
+
+    def rows(self, values: Array) -> Array | None:
+        """Springs as the kernels know them, (n_springs, columns); None if one is not admissible."""
+        rows = np.zeros((len(self.kinds), kernels.N_COLUMNS))
+        return rows if kernels.fill_rows(self._codes, values, rows) else None
+
+    def heights(self, values: Array, total: float) -> Array:
+        """Heights of the springs (m) in a specimen of height `total`."""
+        count = len(self.kinds)
+        return values[-1 - count : -1] if count > 1 else np.array([total])
+
+    def springs(self, values: Array) -> tuple[Spring, ...]:
+        """Springs of a flat vector of parameters.
+
+        Raises
+        ------
+        ValueError
+            If one is not admissible; the message names the parameter.
+        """
+        springs: list[Spring] = []
+        at = 0
+        for kind in self.kinds:
+            if kind == "bistable":
+                springs.append(BistableSpring(*map(float, values[at : at + 8])))
+                at += 8
+            else:
+                k0, eta = map(float, values[at : at + 2])
+                springs.append(LinearSpring(k0, eta, kind == "unilateral"))
+                at += 2
+        return tuple(springs)
+
+    def chain(self, values: Array, height: float, area: float) -> Chain:
+        """Chain, massless inside, of a flat vector of parameters."""
+        return Chain(
+            self.springs(values),
+            [float(h) for h in self.heights(values, height)],
+            area,
+            site_damping=float(values[-1]),
+        )
+
+
+def split_name(name: str) -> tuple[int, str]:
+    """Split "s2_kh_plus" into (1, "kh_plus"); (-1, "eta") for "site_eta", (-1, "time_shift")."""
+    if name in ("site_eta", "time_shift"):
+        return -1, name.removeprefix("site_")
+    prefix, short = name.split("_", 1)
+    return int(prefix[1:]) - 1, short
+
+
+def unit_of(name: str) -> str:
+    """Unit of a parameter, SI; "" for a strain."""
+    return UNITS[split_name(name)[1]]

@@ -1,0 +1,191 @@
+"""The published parameter sets (Tables 1-3 of Thevamaran, Fraternali & Daraio 2014)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from foamfit.springs.chain import Chain
+from foamfit.springs.spring import BistableSpring, LinearSpring, Spring
+
+MPA, MM, MG = 1e6, 1e-3, 1e-6
+
+
+@dataclass(frozen=True)
+class PublishedSet:
+    """One published model of one specimen, SI.
+
+    Attributes
+    ----------
+    name : str
+        For example "foam-1/model-2".
+    model : str
+        Springs from the base up, for example "linear+bistable".
+    chain : Chain
+        Springs, heights, area; the specimen's mass sits between the springs of a two-spring model;
+        the published damping is the onsite damper of the striker.
+    eta : float or None
+        The published damping coefficient, Pa·s.
+    damping_ratio : float or None
+        The damping ratio that the paper states.
+    specimen_mass, density : float
+        kg and kg/m³.
+    striker_mass, striker_velocity : float
+        kg and m/s.
+    """
+
+    name: str
+    model: str
+    chain: Chain
+    eta: float | None
+    damping_ratio: float | None
+    specimen_mass: float
+    density: float
+    striker_mass: float
+    striker_velocity: float
+
+    @property
+    def bistable(self) -> BistableSpring:
+        """The bistable spring of the set."""
+        spring = self.chain.springs[-1]
+        assert isinstance(spring, BistableSpring)
+        return spring
+
+    def damping_ratio_by_formula(self) -> float | None:
+        """ζ = η/(2 H √(ρ k_c)) with ρ = m_striker/(A H), the paper's definition."""
+        if self.eta is None:
+            return None
+        height = self.chain.height
+        density = self.striker_mass / (self.chain.area * height)
+        return self.eta / (2.0 * height * math.sqrt(density * self.bistable.kc))
+
+
+def _bistable(
+    k0: float,
+    drop: float,
+    eps_a: float,
+    eps_c: float,
+    kh_plus: float,
+    kh_minus: float,
+    kc: float,
+) -> BistableSpring:
+    """Make a spring of Tables 2 and 3: k0 in MPa, Δσ/σ_a, ε_a, ε_c, slopes over k0."""
+    slope = k0 * MPA
+    return BistableSpring(
+        k0=slope,
+        kc=kc * slope,
+        dsigma=drop * slope * eps_a / (1.0 - eps_a),
+        eps_a=eps_a,
+        eps_c=eps_c,
+        kh_plus=kh_plus * slope,
+        kh_minus=kh_minus * slope,
+    )
+
+
+_AREA = math.pi / 4.0 * (5.0 * MM) ** 2
+_FOAM_1 = {"specimen_mass": 5.56 * MG, "density": 238.0, "striker_velocity": 1.75}
+_FOAM_2 = {"specimen_mass": 5.05 * MG, "density": 232.0, "striker_velocity": 4.44}
+
+
+def _one_spring(name: str, kh_minus: float, eta: float | None, ratio: float | None) -> PublishedSet:
+    spring = _bistable(5.50, -0.20, 0.14, 0.31, 2.60, kh_minus, 15.0)
+    chain = Chain([spring], [1.190 * MM], _AREA, site_damping=eta or 0.0)
+    return PublishedSet(name, "bistable", chain, eta, ratio, striker_mass=7e-3, **_FOAM_1)
+
+
+def _model_3() -> PublishedSet:
+    springs: list[Spring] = [
+        LinearSpring(60 * MPA),
+        _bistable(2.0, -0.32, 0.35, 0.71, 3.40, 0.525, 30.0),
+    ]
+    chain = Chain(springs, [0.700 * MM, 0.490 * MM], _AREA, [5.56 * MG, 0.0], site_damping=3e2)
+    return PublishedSet(
+        "foam-1/model-3", "linear+bistable", chain, 3e2, 0.0297, striker_mass=7e-3, **_FOAM_1
+    )
+
+
+def _foam_2() -> PublishedSet:
+    springs: list[Spring] = [
+        LinearSpring(250 * MPA, unilateral=True),
+        _bistable(5.75, -0.80, 0.40, 0.70, 6.00, 0.200, 40.0),
+    ]
+    chain = Chain(springs, [0.350 * MM, 0.756 * MM], _AREA, [5.05 * MG, 0.0], site_damping=1e4)
+    return PublishedSet(
+        "foam-2", "linear+bistable", chain, 1e4, 0.525, striker_mass=7e-3, **_FOAM_2
+    )
+
+
+class _Sets(dict[str, PublishedSet]):
+    """Published sets by their names; a name that is none of them is refused with those that are."""
+
+    def __missing__(self, name: object) -> PublishedSet:
+        raise KeyError(f"there is no published set {name!r}; there are {', '.join(self)}")
+
+
+published: dict[str, PublishedSet] = _Sets(
+    (item.name, item)
+    for item in (
+        _one_spring("foam-1/model-1", 0.450, None, None),
+        _one_spring("foam-1/model-2", 0.425, 1e4, 0.894),
+        _model_3(),
+        _foam_2(),
+    )
+)
+
+
+def table() -> str:
+    """Return the published sets and their derived points as text, in the paper's units."""
+    lines = ["Published parameter sets (Thevamaran, Fraternali & Daraio 2014, Tables 2 and 3)", ""]
+    head = ("set", "spring", "k0", "ds/s_a", "eta", "eps_a", "eps_c", "h", "kh+/k0", "kh-/k0")
+    widths = (16, 12, 8, 8, 9, 7, 7, 7, 7, 7, 6)
+    lines.append(_line((*head, "kc/k0"), widths))
+    lines.append(_line(("", "", "MPa", "", "Pa s", "", "", "mm", "", "", ""), widths))
+    for item in published.values():
+        for spring, height in zip(item.chain.springs, item.chain.heights, strict=True):
+            lines.append(_line(_published_row(item, spring, height), widths))
+    lines += ["", "Derived points of the bistable springs", ""]
+    points = ("sigma_a", "sigma_c", "eps_star", "eps_hat_a", "eps_hat_c", "sigma_hat_c")
+    columns = (16, 12, 12, 12, 12, 12, 12)
+    lines.append(_line(("set", *points), columns))
+    lines.append(_line(("", "MPa", "MPa", "", "", "", "MPa"), columns))
+    for item in published.values():
+        cells = [item.name]
+        for point in points:
+            value = getattr(item.bistable, point)
+            scale = MPA if point.startswith("sigma") else 1.0
+            cells.append("none" if value is None else f"{value / scale:.6f}")
+        lines.append(_line(tuple(cells), columns))
+    lines += ["", "Damping ratio eta/(2 H sqrt(rho kc)), rho = m_striker/(A H)", ""]
+    for item in published.values():
+        ratio = item.damping_ratio_by_formula()
+        if ratio is not None and item.damping_ratio is not None:
+            agrees = math.isclose(ratio, item.damping_ratio, rel_tol=2e-3)
+            verdict = "agrees" if agrees else "does not follow from the paper's own table"
+            lines.append(f"{item.name:<16}{ratio:.3g}   (paper {item.damping_ratio}: {verdict})")
+    return "\n".join(lines)
+
+
+def _line(cells: tuple[str, ...], widths: tuple[int, ...]) -> str:
+    """Set the cells of a row right-aligned, the first one left-aligned."""
+    rest = (f"{cell:>{width}}" for cell, width in zip(cells[1:], widths[1:], strict=True))
+    return f"{cells[0]:<{widths[0]}}{''.join(rest)}".rstrip()
+
+
+def _published_row(item: PublishedSet, spring: Spring, height: float) -> tuple[str, ...]:
+    h = f"{height / MM:.3f}"
+    if isinstance(spring, LinearSpring):
+        kind = "unilateral" if spring.unilateral else "linear"
+        return (item.name, kind, f"{spring.k0 / MPA:g}", "", "", "", "", h, "", "", "")
+    return (
+        item.name,
+        "bistable",
+        f"{spring.k0 / MPA:g}",
+        f"{spring.dsigma / spring.sigma_a:.2f}",
+        "-" if item.eta is None else f"{item.eta:g}",
+        f"{spring.eps_a:g}",
+        f"{spring.eps_c:g}",
+        h,
+        f"{spring.kh_plus / spring.k0:.3g}",
+        f"{spring.kh_minus / spring.k0:.3g}",
+        f"{spring.kc / spring.k0:.3g}",
+    )

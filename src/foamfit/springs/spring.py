@@ -1,0 +1,335 @@
+"""One mesoscopic spring: the seven-parameter bistable law (eqs. 1-5) and the linear spring."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from foamfit.errors import InputError, SimulationError
+from foamfit.springs.law import BISTABLE, LINEAR, UNILATERAL, derived_points
+
+if TYPE_CHECKING:
+    from foamfit.springs.kernels import Row
+
+Array = NDArray[np.float64]
+
+# Parameters of the two kinds of spring, in their order.
+BISTABLE_NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus", "eta")
+LINEAR_NAMES = ("k0", "eta")
+
+
+def _require(holds: bool, name: str, value: float, wanted: str) -> None:
+    if not holds:
+        raise InputError(f"{name} = {value:g} is not admissible: it must be {wanted}")
+
+
+def as_number(value: object, name: str) -> float:
+    """Return a value as a float, finite or not.
+
+    Raises
+    ------
+    ValueError
+        If it is no real number; the message names it.
+    """
+    try:
+        if not isinstance(value, str | bytes):
+            return float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        pass
+    raise InputError(f"{name} = {value!r} is not admissible: it must be a number")
+
+
+def as_samples(values: ArrayLike, name: str) -> Array:
+    """Return values as a new array of floats, contiguous and writable.
+
+    Raises
+    ------
+    ValueError
+        If they are no real numbers; the message names them.
+    """
+    try:
+        if np.asarray(values).dtype.kind in "biuf":
+            return np.array(values, dtype=np.float64, order="C")
+    except (TypeError, ValueError):  # rows of several lengths
+        pass
+    raise InputError(f"{name} must be an array of numbers")
+
+
+def _as_history(values: ArrayLike, name: str) -> Array:
+    history = np.ascontiguousarray(as_samples(values, name))
+    if history.ndim > 1:
+        raise InputError(f"{name} must be one history (one dimension), not {history.ndim}")
+    if not np.all(np.isfinite(history)):
+        raise InputError(f"{name} must be finite; sample {_first(~np.isfinite(history))} is not")
+    return np.atleast_1d(history)
+
+
+def _first(mask: NDArray[np.bool_]) -> int:
+    return int(np.argmax(np.atleast_1d(mask)))
+
+
+@dataclass(frozen=True)
+class BistableSpring:
+    """The hysteretic bistable spring of eqs. 2-5 with a dashpot in parallel.
+
+    Parameters
+    ----------
+    k0 : float
+        k_0, first slope of branch a, at zero stress, Pa.
+    kc : float
+        k_c, first slope of the densified branch c, at zero stress, Pa.
+    dsigma : float
+        Δσ = σ̄_c - σ_a, Pa; not positive.
+    eps_a : float
+        ε_a, strain at A1, where snapping starts.
+    eps_c : float
+        ε_c, strain at C2, where snap-back starts.
+    kh_plus : float
+        k_h+, slope of the snap-buckling branch d, A1→C1, Pa.
+    kh_minus : float
+        k_h-, slope of the snap-back branch e, C2→A2, Pa.
+    eta : float
+        η, dashpot in parallel, Pa·s.
+
+    Raises
+    ------
+    ValueError
+        If a parameter is not admissible; the message names it.
+    """
+
+    k0: float
+    kc: float
+    dsigma: float
+    eps_a: float
+    eps_c: float
+    kh_plus: float
+    kh_minus: float
+    eta: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse what is not admissible, by name."""
+        for item in fields(self):
+            value = as_number(getattr(self, item.name), item.name)
+            _require(math.isfinite(value), item.name, value, "finite")
+            object.__setattr__(self, item.name, value)
+        _require(self.k0 > 0, "k0", self.k0, "positive")
+        _require(self.kc > 0, "kc", self.kc, "positive")
+        _require(0 < self.eps_a < 1, "eps_a", self.eps_a, "between 0 and 1")
+        _require(
+            self.eps_c > self.eps_a, "eps_c", self.eps_c, f"greater than eps_a = {self.eps_a:g}"
+        )
+        sigma_a = self.k0 * self.eps_a / (1 - self.eps_a)
+        _require(
+            -sigma_a < self.dsigma <= 0,
+            "dsigma",
+            self.dsigma,
+            f"greater than -sigma_a = {-sigma_a:g} and at most 0",
+        )
+        _require(self.kh_plus >= 0, "kh_plus", self.kh_plus, "zero or positive")
+        _require(self.kh_minus >= 0, "kh_minus", self.kh_minus, "zero or positive")
+        _require(self.eta >= 0, "eta", self.eta, "zero or positive")
+
+    @property
+    def seven(self) -> tuple[float, float, float, float, float, float, float]:
+        """The seven parameters of the law in their order, SI."""
+        return (
+            self.k0,
+            self.kc,
+            self.dsigma,
+            self.eps_a,
+            self.eps_c,
+            self.kh_plus,
+            self.kh_minus,
+        )
+
+    @property
+    def sigma_a(self) -> float:
+        """σ_a, stress at A1, Pa."""
+        return derived_points(*self.seven)[0]
+
+    @property
+    def sigma_c(self) -> float:
+        """σ̄_c, stress at C2, Pa."""
+        return derived_points(*self.seven)[1]
+
+    @property
+    def eps_star(self) -> float:
+        """ε_*, strain at which branch c starts from zero stress (eq. 2)."""
+        return derived_points(*self.seven)[2]
+
+    @property
+    def eps_hat_a(self) -> float | None:
+        """ε̂_a, strain at A2 (eq. 4); None where branch e never meets branch a."""
+        eps_hat_a = derived_points(*self.seven)[3]
+        return eps_hat_a if math.isfinite(eps_hat_a) else None
+
+    @property
+    def eps_hat_c(self) -> float:
+        """ε̂_c, strain at C1 (eq. 5)."""
+        return derived_points(*self.seven)[4]
+
+    @property
+    def sigma_hat_a(self) -> float | None:
+        """Stress at A2, Pa; None where branch e never meets branch a."""
+        eps_hat_a = self.eps_hat_a
+        return None if eps_hat_a is None else self.k0 * eps_hat_a / (1 - eps_hat_a)
+
+    @property
+    def sigma_hat_c(self) -> float:
+        """Stress at C1, Pa."""
+        return self.sigma_a + self.kh_plus * (self.eps_hat_c - self.eps_a)
+
+    @property
+    def kind(self) -> int:
+        """The kind of spring that the kernels know."""
+        return BISTABLE
+
+    @cached_property
+    def row(self) -> Row:
+        """The spring as the kernels know it."""
+        from foamfit.springs import kernels
+
+        return kernels.bistable_row(*self.seven, self.eta)
+
+    def stress(self, strain: ArrayLike) -> Array:
+        """Stress (Pa) of the spring without its dashpot along a strain history, shape (n,).
+
+        One flag is carried along the history (eqs. 2 and 3); the first sample starts with flag a.
+        A single strain gives a single stress.
+
+        Raises
+        ------
+        SimulationError
+            If a strain is at or past the end of its branch (1 on a, 1 + ε_* on c).
+        """
+        return _along_strain(self, strain)[0].reshape(np.shape(strain))
+
+    def strain(self, stress: ArrayLike) -> Array:
+        """Strain of the spring along a stress history (Pa), shape (n,); the inverse of `stress`.
+
+        Where a branch is flat (k_h± = 0) a stress beyond it jumps to the next branch.
+
+        Raises
+        ------
+        SimulationError
+            If a tension is beyond the pole of branch a (-k0).
+        """
+        return _along_stress(self, stress).reshape(np.shape(stress))
+
+    def tangent(self, strain: ArrayLike) -> Array:
+        """Slope dσ/dε (Pa) on the branch of each sample of a strain history, shape (n,)."""
+        from foamfit.springs import kernels
+
+        history = _as_history(strain, "strain")
+        slope = kernels.tangent_along(self.row, history, _along_strain(self, history)[1])
+        return slope.reshape(np.shape(strain))
+
+    def branches(self, strain: ArrayLike) -> NDArray[np.str_]:
+        """Name the branch, "a", "d", "c" or "e", of each sample of a strain history, shape (n,)."""
+        from foamfit.springs import kernels
+
+        names = np.array(kernels.BRANCH_NAMES)[_along_strain(self, strain)[1]]
+        return names.reshape(np.shape(strain))
+
+
+@dataclass(frozen=True)
+class LinearSpring:
+    """The linear spring S1 of the two-spring models, σ = k0 ε, with a dashpot in parallel.
+
+    Parameters
+    ----------
+    k0 : float
+        Slope, Pa.
+    eta : float
+        η, dashpot in parallel, Pa·s.
+    unilateral : bool
+        If true the spring carries no tension.
+
+    Raises
+    ------
+    ValueError
+        If a parameter is not admissible; the message names it.
+    """
+
+    k0: float
+    eta: float = 0.0
+    unilateral: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse what is not admissible, by name."""
+        for name in ("k0", "eta"):
+            value = as_number(getattr(self, name), name)
+            _require(math.isfinite(value), name, value, "finite")
+            object.__setattr__(self, name, value)
+        _require(self.k0 > 0, "k0", self.k0, "positive")
+        _require(self.eta >= 0, "eta", self.eta, "zero or positive")
+
+    @property
+    def kind(self) -> int:
+        """The kind of spring that the kernels know."""
+        return UNILATERAL if self.unilateral else LINEAR
+
+    @cached_property
+    def row(self) -> Row:
+        """The spring as the kernels know it."""
+        from foamfit.springs import kernels
+
+        return kernels.linear_row(self.k0, self.eta, self.unilateral)
+
+    def stress(self, strain: ArrayLike) -> Array:
+        """Stress (Pa) of the spring without its dashpot along a strain history, shape (n,)."""
+        return _along_strain(self, strain)[0].reshape(np.shape(strain))
+
+    def strain(self, stress: ArrayLike) -> Array:
+        """Strain along a stress history (Pa), shape (n,).
+
+        Raises
+        ------
+        SimulationError
+            If a unilateral spring is asked for its strain under tension, which it cannot carry.
+        """
+        return _along_stress(self, stress).reshape(np.shape(stress))
+
+    def tangent(self, strain: ArrayLike) -> Array:
+        """Slope dσ/dε (Pa) at each sample of a strain history, shape (n,)."""
+        from foamfit.springs import kernels
+
+        history = _as_history(strain, "strain")
+        slope = kernels.tangent_along(self.row, history, _along_strain(self, history)[1])
+        return slope.reshape(np.shape(strain))
+
+
+Spring = BistableSpring | LinearSpring
+
+
+def _along_strain(spring: Spring, strain: ArrayLike) -> tuple[Array, NDArray[np.int64]]:
+    from foamfit.springs import kernels
+
+    history = _as_history(strain, "strain")
+    stress, branches = kernels.stress_along(spring.row, history)
+    if not np.all(np.isfinite(stress)):
+        at = _first(~np.isfinite(stress))
+        raise SimulationError(
+            f"strain {history[at]:g} (sample {at}) is at or past the end of its branch, "
+            "where the stress is infinite: 1 on branch a, 1 + eps_star on branch c"
+        )
+    return stress, branches
+
+
+def _along_stress(spring: Spring, stress: ArrayLike) -> Array:
+    from foamfit.springs import kernels
+
+    history = _as_history(stress, "stress")
+    strain, none = np.empty(history.size), np.empty((0, history.size))
+    row = spring.row[None, :]  # of height 1: its elongation is its strain
+    if not kernels.strains_along(row, np.ones(1), history, strain, none, none.astype(np.int64)):
+        at = _first(~np.isfinite(strain))
+        raise SimulationError(
+            f"stress {history[at]:g} Pa (sample {at}) is a tension that the spring cannot carry"
+        )
+    return strain

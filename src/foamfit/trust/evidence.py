@@ -1,0 +1,228 @@
+"""What speaks for a model: AICc and BIC by the samples and the parameters that count.
+
+Neither correlated residuals nor combinations of parameters that the curves do not fix are evidence.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foamfit.fitting.problem import Problem
+from foamfit.results import FitResult
+from foamfit.springs import kernels
+from foamfit.trust.covariance import NOTHING, autocorrelation_time
+from foamfit.trust.residual_tests import branch_places, neighbours_test, runs_test
+
+Array = NDArray[np.float64]
+
+# Residuals are structureless where neither test of their order rejects it at this level.
+LEVEL = 0.05
+# By how much AICc and BIC must both fall for a richer model to be preferred: "strong" evidence of
+# Kass & Raftery (1995), J. Am. Stat. Assoc. 90, 773.
+MARGIN = 6.0
+# Below this misfit (over the range) residuals are the simulation's own error.
+EXACT = 1e-5
+
+
+def rung_name(model: str, damping: str) -> str:
+    """Model and damping in words."""
+    return model if damping == "none" else f"{model} {damping} damping"
+
+
+@dataclass(frozen=True, eq=False)
+class Tried:
+    """A fitted rung, and what is needed to weigh it against the others.
+
+    Attributes
+    ----------
+    result : FitResult
+        Its result.
+    damping : str
+        As in `Rung`.
+    residual : (n_data,) array
+        At the best point, curve after curve.
+    counted : tuple of str
+        Names of the curves.
+    sizes : tuple of int
+        Samples of each curve.
+    spans : tuple of float
+        Measured range of each curve, in the unit of its residual.
+    places : tuple of (n,) arrays of str
+        Branches that the springs are on at each counted sample of each curve.
+    grams : (n_curves, k, k) array
+        JᵀJ of each curve, J the derivative of the residual by the varied parameters over their
+        natural sizes.
+    seconds : float
+        Run time.
+    """
+
+    result: FitResult
+    damping: str
+    residual: Array
+    counted: tuple[str, ...]
+    sizes: tuple[int, ...]
+    spans: tuple[float, ...]
+    places: tuple[NDArray[np.str_], ...]
+    grams: Array
+    seconds: float
+
+    @property
+    def name(self) -> str:
+        """Model and damping in words."""
+        return rung_name(self.result.model, self.damping)
+
+    @property
+    def curves(self) -> list[Array]:
+        """Residual of each curve."""
+        return np.split(self.residual, np.cumsum(self.sizes)[:-1])
+
+    @property
+    def floor(self) -> float:
+        """Chi-square of the simulation's own error."""
+        pairs = zip(self.sizes, self.spans, strict=True)
+        return sum(size * (EXACT * span) ** 2 for size, span in pairs)
+
+    @property
+    def chisqr(self) -> float:
+        """Chi-square, not less than that of the simulation's own error."""
+        return max(float(self.residual @ self.residual), self.floor)
+
+    @property
+    def taus(self) -> list[float]:
+        """Autocorrelation time of each curve, samples."""
+        return [autocorrelation_time(part) for part in self.curves]
+
+    @property
+    def runs_p(self) -> float:
+        """p-value of the runs tests of all curves together (Bonferroni)."""
+        return min(1.0, len(self.sizes) * min(runs_test(part) for part in self.curves))
+
+    @property
+    def neighbours_p(self) -> float:
+        """p-value of the neighbours tests of all curves together (Bonferroni)."""
+        return min(1.0, len(self.sizes) * min(neighbours_test(part) for part in self.curves))
+
+    @property
+    def structureless(self) -> bool:
+        """Whether nothing but noise is left."""
+        return self.chisqr <= self.floor or min(self.runs_p, self.neighbours_p) >= LEVEL
+
+    def states(self, state: str) -> tuple[str, ...]:
+        """Names of the parameters in a state."""
+        return tuple(n for n, item in self.result.parameters.items() if item.state == state)
+
+
+def weigh(problem: Problem, result: FitResult, damping: str, seconds: float) -> Tried:
+    """Take from a fit what is needed to compare it."""
+    objective = problem.objective
+    values, names = problem.vector(), problem.free()
+    jacobian = problem.slopes(values, names) * problem.sizes(names, values)
+    parts = np.split(jacobian, np.cumsum(objective.sizes)[:-1])
+    spans = tuple(
+        objective.weights[name] ** 0.5 * _range(objective.measured[name]) / objective.scale[name]
+        for name in objective.counted
+    )
+    stress = problem.measurement.stress
+    assert stress is not None
+    switches = objective.simulate(values, everything=True).motion.switches
+    places = branch_places(
+        problem.model.kinds, switches, objective.time, stress, kernels.BRANCH_NAMES
+    )
+    return Tried(
+        result=result,
+        damping=damping,
+        residual=objective.residual(values),
+        counted=objective.counted,
+        sizes=objective.sizes,
+        spans=spans,
+        places=tuple(places[objective.kept(name)] for name in objective.counted),
+        grams=np.array([part.T @ part for part in parts]),
+        seconds=seconds,
+    )
+
+
+def _range(curve: Array | None) -> float:
+    return 0.0 if curve is None else float(np.ptp(curve))
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What speaks for a rung, all rungs by one measure of the noise."""
+
+    rank: int
+    aicc: float
+    bic: float
+
+    def beats(self, other: Evidence) -> bool:
+        """Whether AICc and BIC both speak for this one, strongly."""
+        return self.aicc < other.aicc - MARGIN and self.bic < other.bic - MARGIN
+
+
+def reference_of(tried: Sequence[Tried]) -> Tried:
+    """The rung whose residuals are taken for the noise: that of the least chi-square.
+
+    One measure for all, as the variance inflation of the global model in QAICc (Burnham & Anderson
+    2002, Model Selection and Multimodel Inference, section 2.5): what a simpler rung leaves over is
+    not noise, and criteria with samples counted differently cannot be compared.
+    """
+    return min(tried, key=lambda one: one.chisqr)
+
+
+def effective_samples(reference: Tried) -> float:
+    """Effective samples n/τ of all curves."""
+    pairs = zip(reference.sizes, reference.taus, strict=True)
+    return float(sum(size / tau for size, tau in pairs))
+
+
+def effective_parameters(grams: Array, reference: Tried) -> int:
+    """How many combinations of its parameters the curves fix against the noise.
+
+    The rank of the Jacobian, counted against the noise: a direction counts if its 95 % interval is
+    narrower than ±`NOTHING` natural sizes, the limit at which a parameter is called not determined.
+    Where a linear spring in series only bends the branches of a bistable one, such directions are
+    combinations that leave no trace.
+
+    Parameters
+    ----------
+    grams : (n_curves, k, k) array
+        See `Tried`.
+    reference : Tried
+        Its residuals are the noise.
+    """
+    information = np.zeros(grams.shape[1:])
+    for gram, part, tau in zip(grams, reference.curves, reference.taus, strict=True):
+        variance = max(float(part @ part), 1e-300) / part.size
+        information += gram / (variance * tau)
+    singular = np.sqrt(np.maximum(np.linalg.eigvalsh(information), 0.0))
+    return max(int(np.count_nonzero(NOTHING * singular > 1.96)), 1)
+
+
+def evidence(one: Tried, reference: Tried) -> Evidence:
+    """AICc and BIC of a rung: n_eff ln(χ²/n) and the penalty for its effective parameters."""
+    n_eff = effective_samples(reference)
+    rank = effective_parameters(one.grams, reference)
+    fit = n_eff * math.log(max(one.chisqr, 1e-300) / one.residual.size)
+    room = n_eff - rank - 1.0
+    aicc = fit + 2.0 * rank + 2.0 * rank * (rank + 1.0) / room if room > 0.0 else math.inf
+    return Evidence(rank, aicc, fit + rank * math.log(max(n_eff, 1.0)))
+
+
+def choose(tried: Sequence[Tried]) -> tuple[int, list[Evidence]]:
+    """Index of the simplest rung that no richer one beats, and the evidence for each."""
+    reference = reference_of(tried)
+    found = [evidence(one, reference) for one in tried]
+    best = 0
+    for i in range(1, len(tried)):
+        if found[i].beats(found[best]):
+            best = i
+    return best, found
+
+
+def least(values: Sequence[float]) -> int:
+    """Index of the least value."""
+    return min(range(len(values)), key=values.__getitem__)
