@@ -23,8 +23,8 @@ from pathlib import Path
 
 import foamfit as ff
 from foamfit.report.comparison import Comparison, compare, comparison_text
-from foamfit.report.plots import plot_comparison
-from foamfit.results import load_result
+from foamfit.report.comparison_plot import plot_comparison
+from foamfit.report.folder import load_result
 
 HERE = Path(__file__).parent
 TESTS = HERE.parent / "experiments"

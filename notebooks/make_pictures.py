@@ -10,10 +10,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import foamfit as ff
+from foamfit.api import FitResult
 from foamfit.report.comparison import compare
+from foamfit.report.comparison_plot import plot_comparison
 from foamfit.report.explore import LoopPicture, loop_of, rough_guess, turn
-from foamfit.report.plots import plot_comparison, plot_fit
-from foamfit.results import FitResult
+from foamfit.report.plots import plot_fit
 
 HERE = Path(__file__).parent
 PICTURES = HERE / "pictures"

@@ -7,8 +7,9 @@ from typing import Any
 import lmfit
 import numpy as np
 
+from foamfit.api import FitResult
 from foamfit.data.measurement import Measurement, Specimen, Striker
-from foamfit.results import Curves, FitResult, ParameterEstimate, Switch
+from foamfit.results import Curves, ParameterEstimate, Switch
 from foamfit.springs.chain import Chain
 from foamfit.springs.spring import BistableSpring, LinearSpring
 

@@ -16,6 +16,7 @@ from click.testing import CliRunner
 import fabricated
 import foamfit as ff
 from conftest import synthetic_impact
+from foamfit.api import FitResult
 from foamfit.cli import main
 from foamfit.report.comparison import (
     Comparison,
@@ -26,8 +27,8 @@ from foamfit.report.comparison import (
     recognised,
     write_csv,
 )
-from foamfit.report.plots import plot_comparison
-from foamfit.results import Correlation, FitResult
+from foamfit.report.comparison_plot import plot_comparison
+from foamfit.results import Correlation
 
 NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
 

@@ -16,16 +16,18 @@ import pytest
 from click.testing import CliRunner
 
 import fabricated
+import foamfit.report.folder
 import foamfit.report.plots
 import foamfit.results
 from conftest import EXPERIMENTS
 from foamfit import files
+from foamfit.api import FitResult
 from foamfit.cli import main
 from foamfit.errors import InputError
 from foamfit.files import check_file, replacing, write_file
 from foamfit.report.comparison import compare, write_csv
+from foamfit.report.folder import check_target, load_result
 from foamfit.report.plots import plot_fit
-from foamfit.results import FitResult, check_target, load_result
 
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
 posix = pytest.mark.skipif(os.name != "posix", reason="signals and permissions of POSIX")
@@ -34,7 +36,7 @@ posix = pytest.mark.skipif(os.name != "posix", reason="signals and permissions o
 @pytest.fixture(autouse=True)
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty working directory, and results of one file that need no time."""
-    monkeypatch.setattr(foamfit.results, "_write", write_json)
+    monkeypatch.setattr(foamfit.report.folder, "_write", write_json)
     monkeypatch.setattr(foamfit.report.plots, "image", lambda *_: b"\x89PNG" + bytes(20))
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -107,7 +109,7 @@ def test_what_is_put_into_the_folder_while_it_is_written_stays(
         write_json(result, folder)
         (here / "r" / "notes.txt").write_text("x")
 
-    monkeypatch.setattr(foamfit.results, "_write", late)
+    monkeypatch.setattr(foamfit.report.folder, "_write", late)
     with pytest.raises(InputError, match=r"notes\.txt"):
         fabricated.result(seed=2).save("r")
     assert load_result(folder)["seed"] == 1
@@ -265,7 +267,7 @@ def test_an_older_result_that_a_killed_process_put_aside_comes_back(
     def fail(*_: object, **__: object) -> None:
         raise RuntimeError
 
-    monkeypatch.setattr(foamfit.results, "_write", fail)
+    monkeypatch.setattr(foamfit.report.folder, "_write", fail)
     with pytest.raises(RuntimeError):
         fabricated.result(seed=2).save("r")
     assert load_result("r")["seed"] == 1

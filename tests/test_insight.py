@@ -20,7 +20,8 @@ from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
 from foamfit.fitting.problem import Problem, make_params, make_problem
 from foamfit.fitting.search import SearchRecord
 from foamfit.report import outlook as planning
-from foamfit.report.identifiability_plots import plot_information, plot_plan, plot_sensitivities
+from foamfit.report.identifiability_plots import plot_information, plot_sensitivities
+from foamfit.report.outlook_plot import plot_plan
 from foamfit.report.page import render_report, summary_text
 from foamfit.springs.chain import Chain, Impact
 from foamfit.trust.checklist import Check, _by_reason, status_of

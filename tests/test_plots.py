@@ -11,6 +11,7 @@ import pytest
 
 import fabricated
 import foamfit as ff
+from foamfit.api import FitResult
 from foamfit.errors import InputError
 from foamfit.report.plots import (
     STYLE,
@@ -22,7 +23,6 @@ from foamfit.report.plots import (
     plot_response,
     readable_unit,
 )
-from foamfit.results import FitResult
 
 
 def with_curves(result: FitResult, **changed: Any) -> FitResult:

@@ -10,7 +10,8 @@ import pytest
 
 import fabricated
 from foamfit.data.energy import audit
-from foamfit.report.page import number, readable, render_report, summary_text
+from foamfit.report.page import render_report, summary_text
+from foamfit.report.readable import number, readable
 
 
 class Page(HTMLParser):

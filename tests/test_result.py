@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 import fabricated
+import foamfit.report.folder
 import foamfit.report.page
 import foamfit.report.plots
 from foamfit.errors import InputError
-from foamfit.results import check_target, load_result
+from foamfit.report.folder import check_target, load_result
 
 FILES = {"fit.json", "parameters.csv", "curves.csv", "report.html", "fit.png", "fit.pdf"}
 KEYS = {
@@ -163,7 +164,7 @@ def test_failing_midway_leaves_the_older_result(
     def fail(*_: object, **__: object) -> None:
         raise failure
 
-    monkeypatch.setattr(foamfit.report.page, "render_report", fail)
+    monkeypatch.setattr(foamfit.report.folder, "render_report", fail)
     with pytest.raises(failure):
         fabricated.result(seed=2).save(folder)
     with pytest.raises(failure):

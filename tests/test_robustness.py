@@ -15,13 +15,14 @@ import foamfit as ff
 import foamfit.report.page
 import foamfit.report.plots
 from conftest import AREA, HEIGHT, synthetic_impact, synthetic_loop
+from foamfit.api import FitResult
 from foamfit.cli import main
 from foamfit.data.measurement import Measurement, Outliers
 from foamfit.fitting.objective import LOSSES, Objective, default_weights, influence, soften
 from foamfit.report.comparison import compare, comparison_text
+from foamfit.report.folder import load_result
 from foamfit.report.page import render_report, summary_text
 from foamfit.report.plots import plot_fit
-from foamfit.results import FitResult, load_result
 from foamfit.springs.model import Model
 from foamfit.trust import covariance
 from foamfit.trust.refit import m_estimate

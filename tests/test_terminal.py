@@ -18,14 +18,15 @@ import pytest
 from click.testing import CliRunner, Result
 
 import fabricated
+import foamfit.report.folder
 import foamfit.report.page
 import foamfit.report.plots
 import foamfit.results
 from conftest import EXPERIMENTS
 from foamfit import api, terminal
+from foamfit.api import FitResult
 from foamfit.cli import main
 from foamfit.errors import InputError
-from foamfit.results import FitResult
 from foamfit.terminal import ending_cleanly, printable, without_ctrl_c
 
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
@@ -54,7 +55,7 @@ def quick(monkeypatch: pytest.MonkeyPatch, *, light: bool = True, **changed: obj
     made = fabricated.result(**changed)
     monkeypatch.setattr(api, "fit", lambda *_, **__: made)
     if light:
-        monkeypatch.setattr(foamfit.results, "_write", write_json)
+        monkeypatch.setattr(foamfit.report.folder, "_write", write_json)
 
 
 # ---------------------------------------------------------------- encodings

@@ -22,7 +22,7 @@ _HOME = {
     "published": "springs.published",
     "Measurement": "data.measurement",
     "read_test": "data.csv_file",
-    "FitResult": "results",
+    "FitResult": "api",
     "fit": "api",
     "make_params": "fitting.problem",
 }

@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 
 import lmfit
 
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError
 from foamfit.one_model import Options, Progress, Tell, identify, judge
-from foamfit.results import FitResult
+from foamfit.report.folder import save_result
+from foamfit.results import Fit
+
+
+class FitResult(Fit):
+    """Everything that a fit found, and how it is written; its fields are those of `results.Fit`."""
+
+    def save(self, folder: str | Path) -> Path:
+        """Write the result folder whole, as `report.folder.save_result` does; returns it."""
+        return save_result(self, folder)
 
 
 def fit(
@@ -107,5 +117,7 @@ def fit(
             raise InputError("params belong to one model; name it instead of 'auto'")
         from foamfit.auto import climb  # the one fit that has rungs
 
-        return climb(measurement, options, progress, tell)
-    return judge(identify(measurement, model, params, options, progress), options.choice, tell)
+        found = climb(measurement, options, progress, tell)
+    else:
+        found = judge(identify(measurement, model, params, options, progress), options.choice, tell)
+    return FitResult(**vars(found))

@@ -11,9 +11,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import lmfit
 
@@ -23,7 +22,7 @@ from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.objective import choose_drive
 from foamfit.fitting.problem import make_params
 from foamfit.one_model import Found, Options, Progress, Tell
-from foamfit.results import FitResult
+from foamfit.results import Fit, Ladder, Rung, rung_name
 from foamfit.springs.model import Model, split_name
 from foamfit.trust.evidence import (
     MARGIN,
@@ -33,7 +32,6 @@ from foamfit.trust.evidence import (
     effective_samples,
     least,
     reference_of,
-    rung_name,
     weigh,
 )
 from foamfit.trust.intervals import Choice
@@ -46,136 +44,12 @@ LADDER = ("bistable", "linear+bistable", "bistable+bistable", "linear+bistable+b
 PATIENCE = 2
 
 
-@dataclass(frozen=True)
-class Rung:
-    """One model of the ladder and the evidence for it.
-
-    Attributes
-    ----------
-    model : str
-        Springs from the base up.
-    damping : str
-        "with", "without" (every dashpot held at zero) or "none" where the drive has none to vary.
-    misfit : dict
-        As `FitResult.misfit`.
-    chisqr : float
-        Sum of the squared residuals.
-    n_vary : int
-        Parameters that were varied.
-    rank : int
-        How many combinations of them the curves fix: what AICc and BIC count.
-    n_eff : float
-        Effective samples by its own residuals. AICc and BIC use `Ladder.n_eff`, one for all.
-    aicc, bic : float
-        Infinite where there are too few effective samples for so many parameters.
-    runs_p : float
-        p-value of the runs test: the chance that noise without structure has as few runs.
-    neighbours_p : float
-        p-value of the neighbours test: the same by size, where the runs test goes by sign.
-    not_determined, weak : tuple of str
-        Names of the parameters in these states.
-    seconds : float
-        Run time.
-    stopped : str or None
-        What ended the search before its time.
-    chosen : bool
-        Whether the result is that of this rung.
-    why : str
-        Why it was chosen or not.
-    """
-
-    model: str
-    damping: str
-    misfit: dict[str, float | None]
-    chisqr: float
-    n_vary: int
-    rank: int
-    n_eff: float
-    aicc: float
-    bic: float
-    runs_p: float
-    neighbours_p: float
-    not_determined: tuple[str, ...]
-    weak: tuple[str, ...]
-    seconds: float
-    stopped: str | None
-    chosen: bool
-    why: str
-
-    @property
-    def name(self) -> str:
-        """Model and damping in words."""
-        return rung_name(self.model, self.damping)
-
-
-@dataclass(frozen=True)
-class Ladder:
-    """The rungs that were tried, and what the comparison says.
-
-    Attributes
-    ----------
-    rungs : tuple of Rung
-        From the simplest up.
-    n_eff : float
-        Effective samples that AICc and BIC use.
-    noise_from : str
-        The rung of the least chi-square: its residuals are taken for the noise.
-    ended : str
-        Why the climb ended.
-    stopped : str or None
-        "the time limit" or "Ctrl-C" if that ended it.
-    skipped : tuple of str
-        Rungs that could not be tried, and why.
-    sentences : tuple of str
-        What the comparison says.
-    cautions : tuple of str
-        Those of them that are warnings.
-    """
-
-    rungs: tuple[Rung, ...]
-    n_eff: float
-    noise_from: str
-    ended: str
-    stopped: str | None
-    skipped: tuple[str, ...]
-    sentences: tuple[str, ...]
-    cautions: tuple[str, ...]
-
-    @property
-    def chosen(self) -> Rung:
-        """The rung whose result was taken."""
-        return next(rung for rung in self.rungs if rung.chosen)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the content of `ladder` in fit.json."""
-        return asdict(self)
-
-    def rows(self) -> Iterator[list[object]]:
-        """Rows of ladder.csv, the header first; a list of names is joined by blanks."""
-        curves = [
-            name
-            for name in self.rungs[0].misfit
-            if any(rung.misfit.get(name) is not None for rung in self.rungs)
-        ]
-        rest = [name for name in Rung.__dataclass_fields__ if name not in ("model", "misfit")]
-        yield ["model", "damping", *(f"misfit_{name}" for name in curves), *rest[1:]]
-        for rung in self.rungs:
-            cells = [getattr(rung, name) for name in rest]
-            plain = [" ".join(cell) if isinstance(cell, tuple) else cell for cell in cells]
-            finite = [
-                None if isinstance(cell, float) and not math.isfinite(cell) else cell
-                for cell in plain
-            ]
-            misfits = [rung.misfit.get(name) for name in curves]
-            yield [rung.model, finite[0], *misfits, *finite[1:]]
-
-
 def _dampers(params: lmfit.Parameters) -> list[str]:
     """Names of the dampers that vary."""
     return [name for name in params if split_name(name)[1] == "eta" and params[name].vary]
 
 
-def _carry(params: lmfit.Parameters, model: Model, below: FitResult | None) -> None:
+def _carry(params: lmfit.Parameters, model: Model, below: Fit | None) -> None:
     """Start from the springs of the rung below, the top one first; in place.
 
     A new linear spring starts short and stiff, so that the chain does what it did below.
@@ -205,7 +79,7 @@ def _carry(params: lmfit.Parameters, model: Model, below: FitResult | None) -> N
 # ---------------------------------------------------------------- the climb
 
 
-def climb(measurement: Measurement, options: Options, progress: Progress, tell: Tell) -> FitResult:
+def climb(measurement: Measurement, options: Options, progress: Progress, tell: Tell) -> Fit:
     """Fit ever richer models until one holds; this is `foamfit.fit` with model="auto".
 
     The time limit is that of all rungs together. The time limit and Ctrl-C keep what is done. Rungs
@@ -213,7 +87,7 @@ def climb(measurement: Measurement, options: Options, progress: Progress, tell: 
 
     Returns
     -------
-    FitResult
+    Fit
         That of the chosen rung, with its `ladder`.
 
     Raises
@@ -374,7 +248,7 @@ def _models(measurement: Measurement) -> tuple[list[str], list[str]]:
 
 def _conclude(
     tried: Sequence[Tried], ended: str, stopped: str | None, skipped: tuple[str, ...], took: float
-) -> FitResult:
+) -> Fit:
     """Result of the chosen rung with the whole ladder."""
     best, found = choose(tried)
     reference = reference_of(tried)

@@ -25,7 +25,7 @@ from foamfit.terminal import TerminatedError, ending_cleanly, say, show_all, wit
 if TYPE_CHECKING:
     import lmfit
 
-    from foamfit.results import FitResult
+    from foamfit.api import FitResult
 
 # Exit codes: the input or the call is wrong; no acceptable fit; a defect (EX_SOFTWARE of
 # sysexits.h). The number of a signal that ended the command is added to the last.
@@ -203,7 +203,7 @@ def check(
         say(description)
     say(describe_plan(plan))
     if plot is not None:
-        from foamfit.report.identifiability_plots import plot_plan
+        from foamfit.report.outlook_plot import plot_plan
 
         plot_plan(plan, plot)
         say(f"\ndrawn in {plot}")
@@ -399,7 +399,7 @@ def _tell_result(result: FitResult, folder: Path | None, as_json: bool, quiet: b
 
 def _result_folder(out: Path | None, test: Path, specimen: Path | None, model: str) -> Path:
     """Return the folder for a result, which must not be one that would be lost."""
-    from foamfit.results import check_target
+    from foamfit.report.folder import check_target
 
     folder = Path("fits", test.stem, model) if out is None else out
     check_target(folder)
@@ -559,7 +559,8 @@ def compare(
     """
     from foamfit.report.comparison import compare as side_by_side
     from foamfit.report.comparison import comparison_text, write_csv
-    from foamfit.report.plots import figure_format, plot_comparison
+    from foamfit.report.comparison_plot import plot_comparison
+    from foamfit.report.plots import figure_format
 
     _check_files((plot, table), [p / "fit.json" if p.is_dir() else p for p in results])
     if plot is not None:

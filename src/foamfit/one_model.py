@@ -25,7 +25,7 @@ from foamfit.fitting.search import (
     search,
     what_stopped,
 )
-from foamfit.results import FitResult
+from foamfit.results import Fit
 from foamfit.springs.model import Model, split_name
 from foamfit.trust.conclude import conclude
 from foamfit.trust.covariance import AT_LIMIT
@@ -147,7 +147,7 @@ def identify(
     return Found(problem, tracker, record)
 
 
-def judge(found: Found, choice: Choice, tell: Tell) -> FitResult:
+def judge(found: Found, choice: Choice, tell: Tell) -> Fit:
     """Make the intervals that were chosen, and say what is to be said of the best point."""
     intervals, record = Intervals(), found.record
     try:
@@ -158,7 +158,7 @@ def judge(found: Found, choice: Choice, tell: Tell) -> FitResult:
         return _finish(found, replace(found.record, stopped="Ctrl-C"), Intervals())
 
 
-def _finish(found: Found, record: SearchRecord, intervals: Intervals) -> FitResult:
+def _finish(found: Found, record: SearchRecord, intervals: Intervals) -> Fit:
     """Order the springs, write the point into the parameters, and conclude."""
     values = _on_limits(found.problem, _ordered(found.problem, found.values))
     found.problem.put(values)

@@ -1,43 +1,24 @@
-"""What was identified: the result of a fit and the folder that it is written to."""
+"""What a fit found: data only. Saving and drawing are in `report`."""
 
 from __future__ import annotations
 
-import csv
-import json
 import math
-import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import lmfit
 import numpy as np
 from numpy.typing import NDArray
 
-from foamfit.data.measurement import interior_channel
-from foamfit.errors import InputError
-from foamfit.files import reason, replacing
-
-if TYPE_CHECKING:
-    import lmfit
-
-    from foamfit.auto import Ladder
-    from foamfit.data.measurement import Measurement, Outliers
-    from foamfit.springs.chain import Chain
-    from foamfit.springs.spring import BistableSpring
-    from foamfit.trust.checklist import Check
-    from foamfit.trust.identifiability import Insight
-    from foamfit.trust.intervals import Intervals
+from foamfit.data.measurement import Measurement
+from foamfit.springs.chain import Chain
+from foamfit.springs.spring import BistableSpring
+from foamfit.trust.identifiability import Insight
+from foamfit.trust.intervals import Intervals
 
 SCHEMA = 1
-# All that `FitResult.save` may write.
-RESULT_FILES = frozenset(
-    {
-        "fit.json", "parameters.csv", "curves.csv", "profiles.csv", "ladder.csv", "fit.png",
-        "fit.pdf", "report.html",
-    }
-)  # fmt: skip
 DERIVED_POINTS = ("sigma_a", "sigma_c", "eps_star", "eps_hat_a", "eps_hat_c")
 
 Array = NDArray[np.float64]
@@ -102,9 +83,166 @@ class Switch:
     stress: float  # Pa
 
 
+@dataclass(frozen=True)
+class Check:
+    """One question to a fit.
+
+    Attributes
+    ----------
+    key : str
+        Short name.
+    question : str
+        Put so that "yes" is good.
+    answer : bool or None
+        None where the test or the search does not allow to tell.
+    sentence : str
+        What the answer rests on.
+    warnings : tuple of str
+        What a reader must know if the answer is no, one sentence each; empty otherwise.
+    fatal : bool
+        Whether a "no" means that no acceptable fit was found.
+    """
+
+    key: str
+    question: str
+    answer: bool | None
+    sentence: str
+    warnings: tuple[str, ...] = ()
+    fatal: bool = False
+
+
+def rung_name(model: str, damping: str) -> str:
+    """Model and damping in words."""
+    return model if damping == "none" else f"{model} {damping} damping"
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One model of the ladder and the evidence for it.
+
+    Attributes
+    ----------
+    model : str
+        Springs from the base up.
+    damping : str
+        "with", "without" (every dashpot held at zero) or "none" where the drive has none to vary.
+    misfit : dict
+        As `Fit.misfit`.
+    chisqr : float
+        Sum of the squared residuals.
+    n_vary : int
+        Parameters that were varied.
+    rank : int
+        How many combinations of them the curves fix: what AICc and BIC count.
+    n_eff : float
+        Effective samples by its own residuals. AICc and BIC use `Ladder.n_eff`, one for all.
+    aicc, bic : float
+        Infinite where there are too few effective samples for so many parameters.
+    runs_p : float
+        p-value of the runs test: the chance that noise without structure has as few runs.
+    neighbours_p : float
+        p-value of the neighbours test: the same by size, where the runs test goes by sign.
+    not_determined, weak : tuple of str
+        Names of the parameters in these states.
+    seconds : float
+        Run time.
+    stopped : str or None
+        What ended the search before its time.
+    chosen : bool
+        Whether the result is that of this rung.
+    why : str
+        Why it was chosen or not.
+    """
+
+    model: str
+    damping: str
+    misfit: dict[str, float | None]
+    chisqr: float
+    n_vary: int
+    rank: int
+    n_eff: float
+    aicc: float
+    bic: float
+    runs_p: float
+    neighbours_p: float
+    not_determined: tuple[str, ...]
+    weak: tuple[str, ...]
+    seconds: float
+    stopped: str | None
+    chosen: bool
+    why: str
+
+    @property
+    def name(self) -> str:
+        """Model and damping in words."""
+        return rung_name(self.model, self.damping)
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """The rungs that were tried, and what the comparison says.
+
+    Attributes
+    ----------
+    rungs : tuple of Rung
+        From the simplest up.
+    n_eff : float
+        Effective samples that AICc and BIC use.
+    noise_from : str
+        The rung of the least chi-square: its residuals are taken for the noise.
+    ended : str
+        Why the climb ended.
+    stopped : str or None
+        "the time limit" or "Ctrl-C" if that ended it.
+    skipped : tuple of str
+        Rungs that could not be tried, and why.
+    sentences : tuple of str
+        What the comparison says.
+    cautions : tuple of str
+        Those of them that are warnings.
+    """
+
+    rungs: tuple[Rung, ...]
+    n_eff: float
+    noise_from: str
+    ended: str
+    stopped: str | None
+    skipped: tuple[str, ...]
+    sentences: tuple[str, ...]
+    cautions: tuple[str, ...]
+
+    @property
+    def chosen(self) -> Rung:
+        """The rung whose result was taken."""
+        return next(rung for rung in self.rungs if rung.chosen)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the content of `ladder` in fit.json."""
+        return asdict(self)
+
+    def rows(self) -> Iterator[list[object]]:
+        """Rows of ladder.csv, the header first; a list of names is joined by blanks."""
+        curves = [
+            name
+            for name in self.rungs[0].misfit
+            if any(rung.misfit.get(name) is not None for rung in self.rungs)
+        ]
+        rest = [name for name in Rung.__dataclass_fields__ if name not in ("model", "misfit")]
+        yield ["model", "damping", *(f"misfit_{name}" for name in curves), *rest[1:]]
+        for rung in self.rungs:
+            cells = [getattr(rung, name) for name in rest]
+            plain = [" ".join(cell) if isinstance(cell, tuple) else cell for cell in cells]
+            finite = [
+                None if isinstance(cell, float) and not math.isfinite(cell) else cell
+                for cell in plain
+            ]
+            misfits = [rung.misfit.get(name) for name in curves]
+            yield [rung.model, finite[0], *misfits, *finite[1:]]
+
+
 @dataclass(frozen=True, eq=False)
-class FitResult:
-    """Everything that a fit found; `save` writes it as a folder."""
+class Fit:
+    """Everything that a fit found."""
 
     measurement: Measurement
     model: str
@@ -136,8 +274,6 @@ class FitResult:
     @property
     def bistable_springs(self) -> dict[str, BistableSpring]:
         """The bistable springs of the chain by their prefix, "s1" at the base."""
-        from foamfit.springs.spring import BistableSpring
-
         return {
             f"s{i}": spring
             for i, spring in enumerate(self.chain.springs, start=1)
@@ -156,7 +292,7 @@ class FitResult:
             name: {point: getattr(spring, point) for point in DERIVED_POINTS}
             for name, spring in self.bistable_springs.items()
         }
-        content: dict[str, Any] = _plain(
+        content: dict[str, Any] = plain(
             {
                 "schema": SCHEMA,
                 "foamfit": version("foamfit"),
@@ -198,215 +334,15 @@ class FitResult:
         )
         return content
 
-    def save(self, folder: str | Path) -> Path:
-        """Write the result folder whole, replacing an older one at the end.
 
-        Parameters
-        ----------
-        folder : str or Path
-            Where to; made with its parents. What stood there must be empty or a result folder that
-            holds nothing else.
-
-        Returns
-        -------
-        Path
-            The folder, with ``fit.json``, ``parameters.csv``, ``curves.csv``, ``fit.png``,
-            ``fit.pdf`` and ``report.html``; with profiles also ``profiles.csv``, of a ladder also
-            ``ladder.csv``.
-
-        Raises
-        ------
-        InputError
-            If something else stands there or it cannot be written; nothing is changed then.
-        """
-        folder = Path(folder)
-        check_target(folder)
-        try:
-            with replacing(folder.resolve()) as fresh:
-                _write(self, fresh)
-                check_target(folder)  # what has been put there in the meantime stays
-        except OSError as error:
-            raise InputError(
-                f"the result cannot be written to {folder}: {reason(error)}; choose another folder"
-            ) from error
-        return folder
-
-
-def check_target(folder: str | Path) -> None:
-    """Raise InputError unless `folder` is free, empty or an older result that may be replaced."""
-    folder = Path(folder)
-    try:
-        place = folder.resolve()
-        here = Path.cwd()
-        if place.exists() and any(place.samefile(at) for at in (here, *here.parents)):
-            raise InputError(
-                f"{folder} is the current directory or holds it, and a result folder is replaced "
-                "as a whole; choose a folder of its own"
-            )
-        if place.is_dir():
-            _check_replaceable(folder, place)
-        elif os.path.lexists(place):
-            raise InputError(f"{folder} is a file; choose a new or an empty folder")
-        there = next(path for path in place.parents if path.exists())
-        if not there.is_dir():
-            raise InputError(
-                f"{folder} cannot be written: {there} is a file; choose another folder"
-            )
-        if not os.access(there, os.W_OK | os.X_OK):
-            raise InputError(
-                f"{folder} cannot be written: Permission denied in {there}; choose another folder"
-            )
-    except (OSError, RuntimeError) as error:  # also a link to itself
-        raise InputError(
-            f"{folder} cannot be written: {reason(error)}; choose another folder"
-        ) from error
-
-
-def _check_replaceable(folder: Path, place: Path) -> None:
-    """Refuse a folder that is there, at `place`, and must not or cannot be replaced."""
-    if place.is_mount():
-        raise InputError(f"{folder} is a mount point and cannot be replaced; name a folder in it")
-    if not os.access(place, os.W_OK | os.X_OK):
-        raise InputError(f"{folder} cannot be written: Permission denied; choose another folder")
-    there = sorted(place.iterdir())
-    if there and not _is_of_fit(place / "fit.json"):
-        raise InputError(
-            f"{folder} is not empty and holds no foamfit result (no fit.json of foamfit), so it is "
-            "not replaced; choose a new or an empty folder"
-        )
-    for path in there:
-        if not is_written(path):
-            raise InputError(
-                f"{folder} holds {path.name}, which foamfit did not write, so it is not replaced; "
-                "move that or choose another folder"
-            )
-
-
-def is_written(path: Path) -> bool:
-    """Whether something in a result folder is what a fit writes there."""
-    return path.name in RESULT_FILES and path.is_file() and not path.is_symlink()
-
-
-def _is_of_fit(path: Path) -> bool:
-    """Whether a fit.json is that of a fit, of this version or another one."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):  # neither UTF-8 nor JSON
-        return False
-    return isinstance(content, dict) and {"schema", "foamfit"} <= content.keys()
-
-
-def load_result(folder: str | Path) -> dict[str, Any]:
-    """Read the ``fit.json`` of a result folder.
-
-    Parameters
-    ----------
-    folder : str or Path
-        The result folder, or its ``fit.json``.
-
-    Returns
-    -------
-    dict
-        The content of ``fit.json``; values are SI.
-
-    Raises
-    ------
-    InputError
-        If there is no ``fit.json`` that this version of foamfit understands.
-    """
-    path = Path(folder)
-    if path.is_dir():
-        path = path / "fit.json"
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(
-            f"{folder} is not a result folder: {path.name} cannot be read "
-            f"({error.strerror or error})"
-        ) from error
-    except ValueError as error:  # neither UTF-8 nor JSON
-        raise InputError(f"{path} is not valid JSON: {error}") from error
-    if not isinstance(content, dict) or "schema" not in content:
-        raise InputError(f"{path} is not the result of a fit (it has no schema number)")
-    if content["schema"] != SCHEMA:
-        raise InputError(
-            f"{path} has schema {content['schema']}, this foamfit reads schema {SCHEMA}"
-        )
-    return content
-
-
-def _write(result: FitResult, folder: Path) -> None:
-    from foamfit.report.page import render_report
-    from foamfit.report.plots import image, laid_out, plot_fit
-
-    text = json.dumps(result.to_json_dict(), indent=2, ensure_ascii=False, allow_nan=False)
-    # A name that is no UTF-8 keeps its bytes as an escape of JSON.
-    (folder / "fit.json").write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
-    _write_table(folder / "parameters.csv", _parameter_rows(result.parameters))
-    _write_table(folder / "curves.csv", _curve_rows(result.curves, result.measurement.outliers))
-    if result.intervals is not None and result.intervals.profiles:
-        _write_table(folder / "profiles.csv", _profile_rows(result.intervals))
-    if result.ladder is not None:
-        _write_table(folder / "ladder.csv", result.ladder.rows())
-    figure = plot_fit(result)
-    with laid_out(figure):
-        png, pdf = image(figure, "png"), image(figure, "pdf")
-    (folder / "fit.png").write_bytes(png)
-    (folder / "fit.pdf").write_bytes(pdf)
-    page = render_report(result, fit_png=png)
-    (folder / "report.html").write_text(page, encoding="utf-8", errors="replace")
-
-
-def _write_table(path: Path, rows: Iterable[Iterable[object]]) -> None:
-    with path.open("w", encoding="utf-8", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows(rows)
-
-
-def _parameter_rows(parameters: Mapping[str, ParameterEstimate]) -> Iterator[list[object]]:
-    yield [
-        "name", "value", "stderr", "ci95_low", "ci95_high", "unit", "state", "why", "ci95_method"
-    ]  # fmt: skip
-    for name, p in parameters.items():
-        low, high = p.ci95 or (None, None)
-        numbers = (_plain(number) for number in (p.value, p.stderr, low, high))
-        yield [name, *numbers, p.unit, p.state, p.why, p.ci95_method]
-
-
-def _profile_rows(intervals: Intervals) -> Iterator[Iterable[object]]:
-    yield ["name", "value", "chi2", "chi2 of the 95 % cut", "complete"]
-    for profile in intervals.profiles:
-        for value, rise in zip(profile.values.tolist(), profile.rises.tolist(), strict=True):
-            yield [profile.name, value, rise, profile.cut, profile.complete]
-
-
-def _curve_rows(curves: Curves, outliers: Mapping[str, Outliers]) -> Iterator[Iterable[object]]:
-    columns: dict[str, Array | None] = {
-        "time (s)": curves.time,
-        "measured stress (Pa)": curves.measured_stress,
-        "fitted stress (Pa)": curves.stress,
-        "measured displacement (m)": curves.measured_displacement,
-        "fitted displacement (m)": curves.displacement,
-        "stress along measured displacement (Pa)": curves.stress_along,
-    }
-    for node, (measured, fitted) in curves.interior.items():
-        columns[f"measured {interior_channel(node)} (m)"] = measured
-        columns[f"fitted {interior_channel(node)} (m)"] = fitted
-    for channel, found in outliers.items():
-        columns[f"outliers of {channel} left out"] = found.left_out.astype(int)
-    there = {name: column for name, column in columns.items() if column is not None}
-    yield there.keys()
-    # Python floats are written with as many digits as they have, numpy's with their type's name.
-    yield from zip(*(column.tolist() for column in there.values()), strict=True)
-
-
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Return `value` in the types of JSON, with None for every number that is not finite."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

@@ -20,14 +20,15 @@ from typing import Any
 
 from foamfit.errors import InputError
 from foamfit.files import write_file
-from foamfit.report.page import readable
-from foamfit.results import FitResult, ParameterEstimate, load_result
+from foamfit.report.folder import load_result
+from foamfit.report.readable import readable
+from foamfit.results import Fit, ParameterEstimate
 from foamfit.springs.model import Model
 from foamfit.springs.published import MM, MPA, PublishedSet
 from foamfit.springs.published import published as published_sets
 from foamfit.springs.spring import BISTABLE_NAMES, LINEAR_NAMES, LinearSpring
 
-Result = FitResult | Mapping[str, Any] | str | Path
+Result = Fit | Mapping[str, Any] | str | Path
 
 # What is read of a result, and of each of its parameters.
 CONTENT = {"test": str, "model": str, "drive": str, "status": str, "parameters": Mapping}
@@ -172,7 +173,7 @@ def compare(results: Sequence[Result], published: str | None = None) -> Comparis
 
     Parameters
     ----------
-    results : sequence of FitResult, path or mapping
+    results : sequence of Fit, path or mapping
         Fits, result folders, or what `load_result` gives.
     published : str, optional
         A published set to put all of them beside. Without it, each result goes beside the set that
@@ -220,7 +221,7 @@ def _plain(text: str) -> str:
 
 
 def _side(result: Result) -> _Side:
-    if isinstance(result, FitResult):
+    if isinstance(result, Fit):
         content: Mapping[str, Any] = result.to_json_dict()
     else:
         content = result if isinstance(result, Mapping) else load_result(result)

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from foamfit.api import FitResult
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError
 from foamfit.report.plots import BLUE, GREY, STYLE, VERMILION
-from foamfit.results import FitResult
 from foamfit.springs.spring import BistableSpring
 
 Array = NDArray[np.float64]

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foamfit.report.plots import BLUE, GREY, INSIDE, STYLE, VERMILION, readable_unit, save
+from foamfit.report.plots import BLUE, GREY, INSIDE, STYLE, VERMILION, save
+from foamfit.report.readable import readable_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, FigureBase
 
-    from foamfit.report.outlook import Plan
     from foamfit.trust.identifiability import Insight, Section
 
 Array = NDArray[np.float64]
@@ -50,8 +50,8 @@ def plot_sensitivities(insight: Insight, path: str | Path | None = None) -> Figu
     from matplotlib.figure import Figure
 
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(7.0, _strips_height(insight)), layout="constrained")
-        _draw_sensitivities(figure, insight)
+        figure = Figure(figsize=(7.0, strips_height(insight)), layout="constrained")
+        draw_sensitivities(figure, insight)
     return save(figure, path)
 
 
@@ -73,47 +73,25 @@ def plot_information(
     from matplotlib.figure import Figure
 
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(7.0, _cells_height(insight)), layout="constrained")
-        _draw_information(figure, insight, correlation)
+        figure = Figure(figsize=(7.0, cells_height(insight)), layout="constrained")
+        draw_information(figure, insight, correlation)
     return save(figure, path)
 
 
-def plot_plan(plan: Plan, path: str | Path | None = None) -> Figure:
-    """Draw sensitivities, information and correlation of a planned experiment in one figure."""
-    import matplotlib
-    from matplotlib.figure import Figure
-
-    insight = plan.outlook.insight
-    with matplotlib.rc_context(STYLE):
-        if insight is None:
-            figure = Figure(figsize=(4.0, 1.0), layout="constrained")
-            figure.text(0.5, 0.5, "no parameter leaves a trace in the curves", ha="center")
-            return save(figure, path)
-        heights = [_strips_height(insight), _cells_height(insight)]
-        figure = Figure(figsize=(7.0, sum(heights) + 0.3), layout="constrained")
-        name = " ".join(plan.problem.measurement.name.split())[:70]
-        figure.suptitle(
-            f"{name} · {plan.problem.model.name} · before the fit", x=0.012, ha="left",
-            fontsize=8.5, weight="bold", parse_math=False,
-        )  # fmt: skip
-        halves = figure.subfigures(2, 1, height_ratios=heights, squeeze=False)[:, 0]
-        _draw_sensitivities(halves[0], insight)
-        _draw_information(halves[1], insight, None)
-    return save(figure, path)
-
-
-def _strips_height(insight: Insight) -> float:
+def strips_height(insight: Insight) -> float:
+    """Height of the strips, inches."""
     return 0.75 + STRIP * len(insight.names)
 
 
-def _cells_height(insight: Insight) -> float:
+def cells_height(insight: Insight) -> float:
+    """Height of the matrices, inches."""
     return 1.15 + CELL * len(insight.names)
 
 
 # ---------------------------------------------------------------- sensitivities
 
 
-def _draw_sensitivities(figure: FigureBase, insight: Insight) -> None:
+def draw_sensitivities(figure: FigureBase, insight: Insight) -> None:
     """Set all rows of a curve in one panel: as panels of their own they take seconds to lay out."""
     k = len(insight.names)
     axes = figure.subplots(1, len(insight.curves), sharey=True, squeeze=False)[0]
@@ -164,7 +142,8 @@ def _color(curve: str) -> str:
 # ---------------------------------------------------------------- information and correlation
 
 
-def _draw_information(figure: FigureBase, insight: Insight, correlation: Array | None) -> None:
+def draw_information(figure: FigureBase, insight: Insight, correlation: Array | None) -> None:
+    """Draw what `plot_information` shows into a figure or a part of one."""
     parts, shares = insight.shares()
     told = [c for c in range(len(parts)) if np.nanmax(shares[:, c], initial=0.0) > 0.005]
     parts, shares = tuple(parts[c] for c in told), shares[:, told]

@@ -21,7 +21,9 @@ from foamfit.data.toml_file import read_settings
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.search import Tracker, search
-from foamfit.results import ParameterEstimate, load_result
+from foamfit.report.folder import load_result
+from foamfit.report.readable import readable
+from foamfit.results import ParameterEstimate
 from foamfit.solve.simulation import simulate
 from foamfit.springs import kernels
 from foamfit.springs.chain import Chain, Impact
@@ -517,8 +519,6 @@ def worth_sentences(insight: Insight) -> Iterator[str]:
 
 def _table(plan: Plan) -> list[str]:
     """Align the expected standard errors, beside those of the faster test where there is one."""
-    from foamfit.report.page import readable
-
     outlooks = [plan.outlook] + ([plan.beyond] if plan.beyond is not None else [])
     heads = [
         "expected" if o.velocity is None else f"expected at {o.velocity:.4g} m/s" for o in outlooks

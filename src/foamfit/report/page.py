@@ -6,7 +6,6 @@ import base64
 import math
 import textwrap
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
@@ -19,13 +18,12 @@ from foamfit.report.plots import (
     plot_fit,
     plot_profiles,
     plot_residuals,
-    readable_unit,
 )
+from foamfit.report.readable import Readable, number, readable, readable_unit
 
 if TYPE_CHECKING:
-    from foamfit.auto import Ladder
     from foamfit.data.measurement import Measurement
-    from foamfit.results import FitResult, ParameterEstimate
+    from foamfit.results import Fit, Ladder
 
 CURVES = {
     "stress_time": "stress-time",
@@ -47,11 +45,6 @@ POINTS = (  # attribute of the spring, symbol and its index, meaning, unit
     ("eps_hat_c", ("ε̂", "c"), "strain at C1, where branches d and c meet", ""),
     ("sigma_hat_c", ("σ̂", "c"), "stress at C1", "Pa"),
 )
-SYMBOLS = {
-    "k0": ("k", "0"), "kc": ("k", "c"), "dsigma": ("Δσ", ""), "eps_a": ("ε", "a"),
-    "eps_c": ("ε", "c"), "kh_plus": ("k", "h+"), "kh_minus": ("k", "h−"), "eta": ("η", ""),
-    "height": ("h", ""), "site_eta": ("η", "site"), "time_shift": ("Δt", ""),
-}  # fmt: skip
 STATISTICS = {
     "n_data": "data points", "n_effective": "effective samples", "n_vary": "parameters varied",
     "chisqr": "χ²", "redchi": "reduced χ²", "aic": "AIC", "aicc": "AICc", "bic": "BIC",
@@ -82,32 +75,12 @@ CITATION = (
 )
 
 
-@dataclass(frozen=True)
-class Readable:
-    """A parameter in the unit in which it reads well, its numbers rounded to its uncertainty."""
-
-    name: str
-    symbol: tuple[str, str]  # and its index
-    value: str
-    stderr: str
-    interval: str
-    unit: str
-    state: str
-    why: str
-    method: str = ""
-
-    @property
-    def with_error(self) -> str:
-        """The value with its standard error, where there is one."""
-        return f"{self.value} ± {self.stderr}" if self.stderr else self.value
-
-
-def render_report(result: FitResult, *, fit_png: bytes | None = None) -> str:
+def render_report(result: Fit, *, fit_png: bytes | None = None) -> str:
     """Return the report as one HTML page that needs nothing else.
 
     Parameters
     ----------
-    result : FitResult
+    result : Fit
         What to report.
     fit_png : bytes, optional
         The figure of `plots.plot_fit` as PNG, if it is there already.
@@ -159,12 +132,12 @@ def render_report(result: FitResult, *, fit_png: bytes | None = None) -> str:
     )
 
 
-def summary_text(result: FitResult) -> str:
+def summary_text(result: Fit) -> str:
     """Return what the command prints after a fit: plain text, at most 100 columns wide.
 
     Parameters
     ----------
-    result : FitResult
+    result : Fit
         What to sum up.
 
     Returns
@@ -217,7 +190,7 @@ def _reasons(rows: list[Readable]) -> list[str]:
     return lines
 
 
-def _checks(result: FitResult) -> Iterator[str]:
+def _checks(result: Fit) -> Iterator[str]:
     """Give the checklist, and what the test tells least."""
     if result.checklist:
         yield ""
@@ -232,7 +205,7 @@ def _checks(result: FitResult) -> Iterator[str]:
         yield from _wrap("", sentence)
 
 
-def _insight_figures(result: FitResult) -> list[tuple[str, float]]:
+def _insight_figures(result: Fit) -> list[tuple[str, float]]:
     """Give the figures of what the test can tell; none where it tells nothing."""
     if result.insight is None:
         return []
@@ -243,76 +216,10 @@ def _insight_figures(result: FitResult) -> list[tuple[str, float]]:
     return [_figure(image(figure, "png", COARSE), COARSE) for figure in figures]
 
 
-def readable(name: str, p: ParameterEstimate) -> Readable:
-    """Return a parameter as it is to be read.
-
-    Parameters
-    ----------
-    name : str
-        Its name, for example "s1_k0".
-    p : ParameterEstimate
-        Its value in SI; it is shown with the digits that its standard error leaves (two of the
-        error), or with four where there is none.
-    """
-    factor, unit = readable_unit(p.value or p.stderr or 0.0, p.unit)
-    value = p.value / factor
-    interval = stderr = ""
-    shown = number(value)
-    if math.isfinite(value) and p.stderr is not None and 0 < p.stderr < math.inf:
-        shown, stderr, places = _rounded(value, p.stderr / factor)
-        if p.ci95 is not None:
-            interval = " to ".join(_fixed(bound / factor, places) for bound in p.ci95)
-    unit = {"": "–", "1": "–", "-": "–", "Pa s": "Pa·s", "Pa*s": "Pa·s"}.get(unit, unit)
-    return Readable(name, _symbol(name), shown, stderr, interval, unit, p.state, p.why,
-        p.ci95_method or "",
-    )  # fmt: skip
-
-
-def number(value: Any) -> str:
-    """Return anything as text; a number with four digits, an integer with all of its own."""
-    if value is None or (isinstance(value, float) and not math.isfinite(value)):
-        return "–"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, list | tuple):
-        return ", ".join(number(item) for item in value)
-    if not isinstance(value, float):
-        return str(value)
-    if value == 0 or 1e-3 <= abs(value) < 1e6:
-        decimals = 0 if value == 0 else max(0, 3 - math.floor(math.log10(abs(value))))
-        return _fixed(value, decimals)
-    return f"{value:.3e}".replace("-", "−")
-
-
-def _curves(result: FitResult) -> dict[str, str]:
+def _curves(result: Fit) -> dict[str, str]:
     """Return the keys of the misfits and what they are called, masses inside last."""
     inside = {f"{interior_channel(i)}_time": f"mass {i}" for i in result.curves.interior}
     return CURVES | {key: f"displacement-time of {name}" for key, name in inside.items()}
-
-
-def _symbol(name: str) -> tuple[str, str]:
-    """Return the symbol of a parameter and its index: k and "c,2" of s2_kc."""
-    spring, _, base = name.partition("_")
-    if name in SYMBOLS or base not in SYMBOLS:
-        return SYMBOLS.get(name, (name, ""))
-    stem, index = SYMBOLS[base]
-    return stem, ",".join(part for part in (index, spring.removeprefix("s")) if part)
-
-
-def _rounded(value: float, stderr: float) -> tuple[str, str, int]:
-    """Return value and standard error to two digits of the error, and the decimal places."""
-    places = 1 - math.floor(math.log10(float(f"{stderr:.1e}")))
-    most = 6 - math.floor(math.log10(abs(value))) if value else 6
-    if places > most:  # an error far below the value, as of synthetic data: seven digits are enough
-        return _fixed(value, most), f"{stderr:.1e}", most
-    return _fixed(value, places), _fixed(stderr, places), places
-
-
-def _fixed(value: float, places: int) -> str:
-    text = f"{round(value, places):.{max(places, 0)}f}"
-    if float(text) == 0:
-        text = text.lstrip("-")
-    return text.replace("-", "−")
 
 
 def _points(spring: Any) -> list[tuple[tuple[str, str], str, str, str]]:
@@ -333,7 +240,7 @@ def _energies(energy: dict[str, Any]) -> Iterator[tuple[str, str]]:
             yield label, engineering(value, unit) if unit else number(value)
 
 
-def _visited(result: FitResult) -> dict[str, tuple[str, ...] | None]:
+def _visited(result: Fit) -> dict[str, tuple[str, ...] | None]:
     """Return the branches that each spring went through, None for a spring that has none."""
     bistable = result.bistable_springs
     names = [f"s{i}" for i in range(1, len(result.chain.springs) + 1)]

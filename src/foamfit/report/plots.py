@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 import re
 import textwrap
 import warnings
@@ -18,14 +17,14 @@ from numpy.typing import NDArray
 
 from foamfit.errors import InputError
 from foamfit.files import write_file
+from foamfit.report.readable import readable_unit
 from foamfit.terminal import printable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from foamfit.report.comparison import Comparison, Row, Section
-    from foamfit.results import FitResult, ParameterEstimate
+    from foamfit.results import Fit, ParameterEstimate
     from foamfit.solve.simulation import Response
     from foamfit.trust.intervals import Profile
 
@@ -57,11 +56,6 @@ POINTS = {
     ("c", "e"): "C2", ("e", "c"): "C2",
     ("e", "a"): "A2",
 }  # fmt: skip
-UNITS = {
-    "Pa": ((1e9, "GPa"), (1e6, "MPa"), (1e3, "kPa"), (1.0, "Pa")),
-    "s": ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs")),
-    "m": ((1.0, "m"), (1e-3, "mm"), (1e-6, "µm")),
-}
 BESIDE = {"a": (-6, 4), "d": (-6, 4), "c": (7, -3), "e": (4, -7)}  # points from the branch
 MARKS = ((BLUE, "o"), (VERMILION, "s"), ("black", "^"), (GREY, "D"))  # of results in a comparison
 MATH = {
@@ -74,33 +68,12 @@ DPI = 250  # of a PNG
 MARKERS = 60  # of a measured curve: more of them blot
 
 
-def readable_unit(size: float, unit: str) -> tuple[float, str]:
-    """Return the unit in which a number of this size reads well.
-
-    Parameters
-    ----------
-    size : float
-        The largest number to show, in `unit`.
-    unit : str
-        "Pa", "s" or "m"; any other unit is kept.
-
-    Returns
-    -------
-    factor : float
-        What one of the readable units is in `unit`.
-    name : str
-        Its name, for example "MPa".
-    """
-    scales = UNITS.get(unit, ((1.0, unit),))
-    return next((scale for scale in scales if abs(size) >= scale[0]), scales[-1])
-
-
-def plot_fit(result: FitResult, path: str | Path | None = None) -> Figure:
+def plot_fit(result: Fit, path: str | Path | None = None) -> Figure:
     """Draw stress-time, displacement-time and stress-strain, measured and fitted.
 
     Parameters
     ----------
-    result : FitResult
+    result : Fit
         The fit; a panel of which it has no curve is left out.
     path : str or Path, optional
         Where to save the figure; the suffix gives the format.
@@ -127,12 +100,12 @@ def plot_fit(result: FitResult, path: str | Path | None = None) -> Figure:
     return save(figure, path)
 
 
-def plot_residuals(result: FitResult, path: str | Path | None = None) -> Figure:
+def plot_residuals(result: Fit, path: str | Path | None = None) -> Figure:
     """Draw fitted minus measured along each curve, in units of the measured range.
 
     Parameters
     ----------
-    result : FitResult
+    result : Fit
         The fit; a curve that has nothing to compare is left out.
     path : str or Path, optional
         Where to save the figure; the suffix gives the format.
@@ -159,16 +132,16 @@ def plot_residuals(result: FitResult, path: str | Path | None = None) -> Figure:
             ax.set_title(f"{name}: fitted − measured", loc="left", fontsize=7.5, pad=3)
             column[-1].set_xlabel(f"time ({unit})" if unit else "sample")
         if not strips:
-            _say_nothing_there(column[0])
+            say_nothing_there(column[0])
     return save(figure, path)
 
 
-def plot_profiles(result: FitResult, path: str | Path | None = None) -> Figure:
+def plot_profiles(result: Fit, path: str | Path | None = None) -> Figure:
     """Draw the profile of each parameter that was followed, with its 95 % cut and its interval.
 
     Parameters
     ----------
-    result : FitResult
+    result : Fit
         The fit; a profile that was stopped is drawn as far as it came.
     path : str or Path, optional
         Where to save the figure; the suffix gives the format.
@@ -194,7 +167,7 @@ def plot_profiles(result: FitResult, path: str | Path | None = None) -> Figure:
             for ax in axes[: len(profiles) : 4]:
                 ax.set_ylabel("rise of χ²")
         else:
-            _say_nothing_there(axes[0])
+            say_nothing_there(axes[0])
     return save(figure, path)
 
 
@@ -274,49 +247,6 @@ def plot_response(response: Response, path: str | Path | None = None) -> Figure:
     return save(figure, path)
 
 
-def plot_comparison(comparison: Comparison, path: str | Path | None = None) -> Figure:
-    """Draw how far each parameter is from its reference, in standard errors, and in percent.
-
-    Parameters
-    ----------
-    comparison : Comparison
-        From `report.comparison.compare`.
-    path : str or Path, optional
-        Where to save the figure; the suffix gives the format.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        One panel for each reference, 7 in wide; shaded are one and three standard errors. What is
-        not compared is left out, what is not determined is named.
-    """
-    import matplotlib
-    from matplotlib.figure import Figure
-
-    groups: dict[str, list[Section]] = {}
-    for section in comparison.sections:
-        groups.setdefault(section.reference, []).append(section)
-    columns = min(len(groups), 2)
-    rows = [list(groups.items())[i : i + columns] for i in range(0, len(groups), columns)]
-    lines = [max(_comparison_lines(sections) for _, sections in row) for row in rows]
-    with matplotlib.rc_context(STYLE):
-        size = (7.0, 0.5 + sum(0.6 + 0.12 * n for n in lines))
-        figure = Figure(figsize=size, layout="constrained")
-        grid = figure.add_gridspec(len(rows), columns, height_ratios=[n + 2 for n in lines])
-        for i, row in enumerate(rows):
-            for j, (reference, sections) in enumerate(row):
-                ax = figure.add_subplot(grid[i, j])
-                _draw_comparison(ax, sections)
-                title = textwrap.fill(f"beside {reference}", 58 if columns == 2 else 110)
-                ax.set_title(
-                    title, loc="left", fontsize=7.5, pad=4, weight="bold", parse_math=False
-                )
-                if i == len(rows) - 1 or len(rows[i + 1]) <= j:
-                    ax.set_xlabel("deviation (standard errors)")
-        _name_results(figure, list(groups.values()))
-    return save(figure, path)
-
-
 @contextmanager
 def laid_out(figure: Figure, dpi: int = DPI) -> Iterator[None]:
     """Keep one layout of a figure for all images that are made of it within.
@@ -378,7 +308,7 @@ def image(figure: Figure, form: Literal["png", "pdf", "svg"], dpi: int = DPI) ->
     return buffer.getvalue()
 
 
-def origin_word(result: FitResult) -> str | None:
+def origin_word(result: Fit) -> str | None:
     """Return "reconstruction" or "synthetic" where the test's name or notes say it is that."""
     text = " ".join((result.measurement.name, *result.measurement.notes)).lower()
     match = re.search(r"\b(reconstruct|synthetic)", text)
@@ -410,7 +340,7 @@ class _Panel:
         return x, f"{self.x_name} ({x_unit})", y, f"{self.y_name} ({y_unit})"
 
 
-def _panels(result: FitResult) -> Iterator[_Panel]:
+def _panels(result: Fit) -> Iterator[_Panel]:
     c, height = result.curves, result.measurement.specimen.height
     # What a drive prescribes, the fitted loop has too, whether or not it is kept twice.
     pushed = c.measured_stress if result.drive == "stress" and c.stress is None else c.stress
@@ -446,117 +376,15 @@ def _panels(result: FitResult) -> Iterator[_Panel]:
             yield _Panel(key, x_name, x_unit, y_name, y_unit, lines)
 
 
-def _is_shown(row: Row) -> bool:
-    return row.standard_errors is not None or row.lost
-
-
-def _shown(sections: list[Section]) -> list[str]:
-    """Return the parameters of which some result has something to show, in their order."""
-    rows = [row for section in sections for row in section.rows]
-    there = {row.label for row in rows if _is_shown(row)}
-    return list(dict.fromkeys(row.label for row in rows if row.label in there))
-
-
-def _lanes(sections: list[Section]) -> list[int]:
-    """Return the places of the results that have anything to show: each gets a lane."""
-    return [k for k, section in enumerate(sections) if any(map(_is_shown, section.rows))]
-
-
-def _comparison_lines(sections: list[Section]) -> int:
-    return max(len(_shown(sections)), 1) * (len(_lanes(sections)) + 1)
-
-
-def _draw_comparison(ax: Axes, sections: list[Section]) -> None:
-    """One line for each parameter of each result; results of a parameter stand together."""
-    labels = _shown(sections)
-    if not labels:
-        _say_nothing_there(ax)
-        return
-    found = [row.standard_errors for section in sections for row in section.rows]
-    reach = max(4.0, 1.1 * max((abs(z) for z in found if z is not None), default=0.0))
-    for half, shade in ((3.0, "0.95"), (1.0, "0.88")):
-        ax.axvspan(-half, half, color=shade, lw=0, zorder=0)
-    ax.axvline(0.0, color=GREY, lw=0.6, zorder=1)
-    lanes = _lanes(sections)
-    step = len(lanes) + 1
-    for lane, k in enumerate(lanes):
-        color, mark = MARKS[k % len(MARKS)]
-        for row in sections[k].rows:
-            if row.label not in labels:
-                continue
-            y = labels.index(row.label) * step + lane
-            if row.lost:
-                ax.annotate(
-                    "not determined", (0.0, y), ha="center", va="center", fontsize=6.5,
-                    color=color, style="italic",
-                )  # fmt: skip
-            elif row.standard_errors is not None:
-                ax.plot([0.0, row.standard_errors], [y, y], color=color, lw=0.9, zorder=2)
-                ax.plot(
-                    row.standard_errors, y, mark, ms=3.4, color=color, zorder=3,
-                    mfc="white" if row.state == "weak" else color,
-                )  # fmt: skip
-                ax.annotate(
-                    _percent(row), (1.0, y), (2, 0), xycoords=("axes fraction", "data"),
-                    textcoords="offset points", ha="left", va="center", fontsize=6.5, color=color,
-                )  # fmt: skip
-    ax.set_xlim(-reach, reach)
-    ax.set_ylim(step * len(labels) - 0.5, -1.0)
-    ax.set_yticks(
-        [i * step + 0.5 * (step - 2) for i in range(len(labels))],
-        [IN_MATH.sub(lambda found: MATH[found[0]], label) for label in labels],
-    )
-    ax.tick_params(axis="y", length=0)
-    ax.spines["left"].set_visible(False)
-
-
-def _name_results(figure: Figure, groups: list[list[Section]]) -> None:
-    """Say once what the colours mean: the drives, where these are the same in every panel."""
-    drives = [[f"{section.drive} drive" for section in sections] for sections in groups]
-    longest = max(drives, key=len)
-    alike = all(names == longest[: len(names)] for names in drives)
-    if alike and len(set(longest)) == len(longest):
-        names = longest
-    elif len(groups) == 1:
-        names = [f"{s.test}: {s.model}, {s.drive} drive" for s in groups[0]]
-    else:
-        names = [f"result {k + 1}" for k in range(len(longest))]
-    drawn = {k for sections in groups for k in _lanes(sections)}
-    for k, name in enumerate(names):
-        color, mark = MARKS[k % len(MARKS)]
-        label = name if k in drawn else f"{name}: nothing to compare"
-        figure.axes[0].plot([], [], mark, ms=3.4, color=color, label=label)
-    if any(row.state == "weak" for group in groups for section in group for row in section.rows):
-        figure.axes[0].plot(
-            [], [], "o", ms=3.4, color=GREY, mfc="white", label="hollow: weakly determined"
-        )
-    handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(
-        handles, [label.replace("$", r"\$") for label in labels], loc="outside lower center",
-        ncols=1 if max(map(len, labels)) > 30 else len(labels), handletextpad=0.2,
-    )  # fmt: skip
-
-
-def _percent(row: Row) -> str:
-    """Return the difference with its standard error, in percent of the reference."""
-    if row.percent is None or not row.reference:
-        return ""
-    spread = 100.0 * math.hypot(row.stderr or 0.0, row.reference_stderr or 0.0)
-    spread /= abs(row.reference)
-    places = 0 if spread >= 10.0 else 1 if spread >= 1.0 else 2
-    shown = f"{row.percent:+.{places}f}"
-    shown = shown[1:] if float(shown) == 0.0 else shown.replace("-", "−")
-    return f"{shown} ± {spread:.{places}f} %"
-
-
 def _row(figure: Figure, n: int) -> list[Axes]:
     axes: list[Axes] = list(figure.subplots(1, max(n, 1), squeeze=False)[0])
     if n == 0:
-        _say_nothing_there(axes[0])
+        say_nothing_there(axes[0])
     return axes[:n]
 
 
-def _say_nothing_there(ax: Axes) -> None:
+def say_nothing_there(ax: Axes) -> None:
+    """Write into an empty panel that there is no curve."""
     ax.set_axis_off()
     ax.text(0.5, 0.5, "no curve to compare", ha="center", va="center", transform=ax.transAxes)
 
@@ -599,7 +427,7 @@ def _evenly(x: Array, y: Array, n: int) -> NDArray[np.intp]:
     return there[np.unique(np.searchsorted(along, np.linspace(0.0, along[-1], n)))]
 
 
-def _mark_outliers(ax: Axes, panel: _Panel, result: FitResult) -> None:
+def _mark_outliers(ax: Axes, panel: _Panel, result: Fit) -> None:
     """Cross what the file has at samples that are not fitted, at the edge if it is beyond."""
     test = result.measurement
     fx, _, fy, _ = panel.scale()
@@ -623,7 +451,7 @@ def _mark_outliers(ax: Axes, panel: _Panel, result: FitResult) -> None:
         ax.set_ylim(low, high)
 
 
-def _mark_switches(ax: Axes, panel: _Panel, result: FitResult) -> None:
+def _mark_switches(ax: Axes, panel: _Panel, result: Fit) -> None:
     from matplotlib.patheffects import withStroke
 
     fx, _, fy, _ = panel.scale()
@@ -664,7 +492,7 @@ def _offset(point: str, key: str) -> tuple[float, float]:
     return {"A1": (5, -4), "C1": (-5, 3), "C2": (5, 3), "A2": (5, 4)}.get(point, (5, 5))
 
 
-def _name_branches(ax: Axes, panel: _Panel, result: FitResult) -> None:
+def _name_branches(ax: Axes, panel: _Panel, result: Fit) -> None:
     """Write a, d, c, e beside the branches of the only spring."""
     fitted = next((line for line in panel.lines if line.kind == "fitted"), None)
     if len(result.chain.springs) > 1 or not result.bistable_springs or fitted is None:
@@ -685,11 +513,11 @@ def _name_branches(ax: Axes, panel: _Panel, result: FitResult) -> None:
         named.add(branch)
 
 
-def _targets(result: FitResult) -> list[str]:
+def _targets(result: Fit) -> list[str]:
     return [switch.target for switch in result.switches] or ["a"]
 
 
-def _switch_samples(result: FitResult, loop: _Line) -> list[int]:
+def _switch_samples(result: Fit, loop: _Line) -> list[int]:
     """Return the sample of the fitted loop (strain, stress) at which each switch happens."""
     samples, time = [0], result.curves.time
     for switch in result.switches:
@@ -703,7 +531,7 @@ def _switch_samples(result: FitResult, loop: _Line) -> list[int]:
     return samples[1:]
 
 
-def _head(figure: Figure, result: FitResult) -> None:
+def _head(figure: Figure, result: Fit) -> None:
     name = printable(" ".join(result.measurement.name.split()))
     name = name if len(name) <= 60 else name[:59] + "…"
     title = f"{name} · {result.model} · {result.drive} drive"
@@ -725,7 +553,7 @@ def _head(figure: Figure, result: FitResult) -> None:
         )
 
 
-def _residuals(result: FitResult) -> Iterator[tuple[str, Array]]:
+def _residuals(result: Fit) -> Iterator[tuple[str, Array]]:
     c = result.curves
     for key, name, fitted, measured in (
         ("stress_time", "stress-time", c.stress, c.measured_stress),

@@ -15,6 +15,7 @@ from foamfit.data.measurement import INTEGRATED
 from foamfit.data.prepare import engineering
 from foamfit.errors import InputError
 from foamfit.fitting.objective import check_time_shift
+from foamfit.results import Check, ParameterEstimate
 from foamfit.springs.model import split_name
 from foamfit.trust.covariance import AT_LIMIT, WEAK
 from foamfit.trust.time_shift import shift_hint
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from foamfit.data.energy import EnergyAudit
     from foamfit.fitting.problem import Problem
     from foamfit.fitting.search import SearchRecord
-    from foamfit.results import ParameterEstimate
     from foamfit.trust.covariance import Covariance
     from foamfit.trust.intervals import Intervals
 
@@ -43,34 +43,6 @@ REASONS = 3
 BRANCHES = ("a", "d", "c", "e")
 # Parameters that may be zero: their interval tells whether there is anything at all.
 MAY_VANISH = ("dsigma", "kh_plus", "kh_minus", "eta")
-
-
-@dataclass(frozen=True)
-class Check:
-    """One question to a fit.
-
-    Attributes
-    ----------
-    key : str
-        Short name.
-    question : str
-        Put so that "yes" is good.
-    answer : bool or None
-        None where the test or the search does not allow to tell.
-    sentence : str
-        What the answer rests on.
-    warnings : tuple of str
-        What a reader must know if the answer is no, one sentence each; empty otherwise.
-    fatal : bool
-        Whether a "no" means that no acceptable fit was found.
-    """
-
-    key: str
-    question: str
-    answer: bool | None
-    sentence: str
-    warnings: tuple[str, ...] = ()
-    fatal: bool = False
 
 
 @dataclass(frozen=True, eq=False)

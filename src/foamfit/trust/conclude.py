@@ -24,7 +24,7 @@ from foamfit.fitting.objective import (
 )
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import SearchRecord
-from foamfit.results import Correlation, Curves, FitResult, ParameterEstimate, Switch
+from foamfit.results import Correlation, Curves, Fit, ParameterEstimate, Switch
 from foamfit.springs import kernels
 from foamfit.springs.model import split_name, unit_of
 from foamfit.trust import covariance
@@ -41,7 +41,7 @@ ASTRAY = 2.0
 
 def conclude(
     problem: Problem, values: Array, record: SearchRecord, intervals: Intervals | None = None
-) -> FitResult:
+) -> Fit:
     """Assemble the result at the best point, with other intervals than local ones if there are."""
     objective, measurement = problem.objective, problem.measurement
     simulated = objective.simulate(values, everything=True)
@@ -66,7 +66,7 @@ def conclude(
     )
     checklist = make_checklist(evidence)
     n_vary = 0 if insight is None else len(insight.names)  # determined or not, they follow the data
-    return FitResult(
+    return Fit(
         measurement=measurement,
         model=problem.model.name,
         drive=objective.drive,

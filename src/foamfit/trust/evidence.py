@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.fitting.problem import Problem
-from foamfit.results import FitResult
+from foamfit.results import Fit, rung_name
 from foamfit.springs import kernels
 from foamfit.trust.covariance import NOTHING, autocorrelation_time
 from foamfit.trust.residual_tests import branch_places, neighbours_test, runs_test
@@ -29,18 +29,13 @@ MARGIN = 6.0
 EXACT = 1e-5
 
 
-def rung_name(model: str, damping: str) -> str:
-    """Model and damping in words."""
-    return model if damping == "none" else f"{model} {damping} damping"
-
-
 @dataclass(frozen=True, eq=False)
 class Tried:
     """A fitted rung, and what is needed to weigh it against the others.
 
     Attributes
     ----------
-    result : FitResult
+    result : Fit
         Its result.
     damping : str
         As in `Rung`.
@@ -61,7 +56,7 @@ class Tried:
         Run time.
     """
 
-    result: FitResult
+    result: Fit
     damping: str
     residual: Array
     counted: tuple[str, ...]
@@ -117,7 +112,7 @@ class Tried:
         return tuple(n for n, item in self.result.parameters.items() if item.state == state)
 
 
-def weigh(problem: Problem, result: FitResult, damping: str, seconds: float) -> Tried:
+def weigh(problem: Problem, result: Fit, damping: str, seconds: float) -> Tried:
     """Take from a fit what is needed to compare it."""
     objective = problem.objective
     values, names = problem.vector(), problem.free()

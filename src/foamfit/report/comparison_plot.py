@@ -1,0 +1,161 @@
+"""The figure of a comparison: how far each parameter is from its reference."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from foamfit.report.comparison import Comparison, Row, Section
+from foamfit.report.plots import GREY, IN_MATH, MARKS, MATH, STYLE, save, say_nothing_there
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+def plot_comparison(comparison: Comparison, path: str | Path | None = None) -> Figure:
+    """Draw how far each parameter is from its reference, in standard errors, and in percent.
+
+    Parameters
+    ----------
+    comparison : Comparison
+        From `report.comparison.compare`.
+    path : str or Path, optional
+        Where to save the figure; the suffix gives the format.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        One panel for each reference, 7 in wide; shaded are one and three standard errors. What is
+        not compared is left out, what is not determined is named.
+    """
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    groups: dict[str, list[Section]] = {}
+    for section in comparison.sections:
+        groups.setdefault(section.reference, []).append(section)
+    columns = min(len(groups), 2)
+    rows = [list(groups.items())[i : i + columns] for i in range(0, len(groups), columns)]
+    lines = [max(_comparison_lines(sections) for _, sections in row) for row in rows]
+    with matplotlib.rc_context(STYLE):
+        size = (7.0, 0.5 + sum(0.6 + 0.12 * n for n in lines))
+        figure = Figure(figsize=size, layout="constrained")
+        grid = figure.add_gridspec(len(rows), columns, height_ratios=[n + 2 for n in lines])
+        for i, row in enumerate(rows):
+            for j, (reference, sections) in enumerate(row):
+                ax = figure.add_subplot(grid[i, j])
+                _draw_comparison(ax, sections)
+                title = textwrap.fill(f"beside {reference}", 58 if columns == 2 else 110)
+                ax.set_title(
+                    title, loc="left", fontsize=7.5, pad=4, weight="bold", parse_math=False
+                )
+                if i == len(rows) - 1 or len(rows[i + 1]) <= j:
+                    ax.set_xlabel("deviation (standard errors)")
+        _name_results(figure, list(groups.values()))
+    return save(figure, path)
+
+
+def _is_shown(row: Row) -> bool:
+    return row.standard_errors is not None or row.lost
+
+
+def _shown(sections: list[Section]) -> list[str]:
+    """Return the parameters of which some result has something to show, in their order."""
+    rows = [row for section in sections for row in section.rows]
+    there = {row.label for row in rows if _is_shown(row)}
+    return list(dict.fromkeys(row.label for row in rows if row.label in there))
+
+
+def _lanes(sections: list[Section]) -> list[int]:
+    """Return the places of the results that have anything to show: each gets a lane."""
+    return [k for k, section in enumerate(sections) if any(map(_is_shown, section.rows))]
+
+
+def _comparison_lines(sections: list[Section]) -> int:
+    return max(len(_shown(sections)), 1) * (len(_lanes(sections)) + 1)
+
+
+def _draw_comparison(ax: Axes, sections: list[Section]) -> None:
+    """One line for each parameter of each result; results of a parameter stand together."""
+    labels = _shown(sections)
+    if not labels:
+        say_nothing_there(ax)
+        return
+    found = [row.standard_errors for section in sections for row in section.rows]
+    reach = max(4.0, 1.1 * max((abs(z) for z in found if z is not None), default=0.0))
+    for half, shade in ((3.0, "0.95"), (1.0, "0.88")):
+        ax.axvspan(-half, half, color=shade, lw=0, zorder=0)
+    ax.axvline(0.0, color=GREY, lw=0.6, zorder=1)
+    lanes = _lanes(sections)
+    step = len(lanes) + 1
+    for lane, k in enumerate(lanes):
+        color, mark = MARKS[k % len(MARKS)]
+        for row in sections[k].rows:
+            if row.label not in labels:
+                continue
+            y = labels.index(row.label) * step + lane
+            if row.lost:
+                ax.annotate(
+                    "not determined", (0.0, y), ha="center", va="center", fontsize=6.5,
+                    color=color, style="italic",
+                )  # fmt: skip
+            elif row.standard_errors is not None:
+                ax.plot([0.0, row.standard_errors], [y, y], color=color, lw=0.9, zorder=2)
+                ax.plot(
+                    row.standard_errors, y, mark, ms=3.4, color=color, zorder=3,
+                    mfc="white" if row.state == "weak" else color,
+                )  # fmt: skip
+                ax.annotate(
+                    _percent(row), (1.0, y), (2, 0), xycoords=("axes fraction", "data"),
+                    textcoords="offset points", ha="left", va="center", fontsize=6.5, color=color,
+                )  # fmt: skip
+    ax.set_xlim(-reach, reach)
+    ax.set_ylim(step * len(labels) - 0.5, -1.0)
+    ax.set_yticks(
+        [i * step + 0.5 * (step - 2) for i in range(len(labels))],
+        [IN_MATH.sub(lambda found: MATH[found[0]], label) for label in labels],
+    )
+    ax.tick_params(axis="y", length=0)
+    ax.spines["left"].set_visible(False)
+
+
+def _name_results(figure: Figure, groups: list[list[Section]]) -> None:
+    """Say once what the colours mean: the drives, where these are the same in every panel."""
+    drives = [[f"{section.drive} drive" for section in sections] for sections in groups]
+    longest = max(drives, key=len)
+    alike = all(names == longest[: len(names)] for names in drives)
+    if alike and len(set(longest)) == len(longest):
+        names = longest
+    elif len(groups) == 1:
+        names = [f"{s.test}: {s.model}, {s.drive} drive" for s in groups[0]]
+    else:
+        names = [f"result {k + 1}" for k in range(len(longest))]
+    drawn = {k for sections in groups for k in _lanes(sections)}
+    for k, name in enumerate(names):
+        color, mark = MARKS[k % len(MARKS)]
+        label = name if k in drawn else f"{name}: nothing to compare"
+        figure.axes[0].plot([], [], mark, ms=3.4, color=color, label=label)
+    if any(row.state == "weak" for group in groups for section in group for row in section.rows):
+        figure.axes[0].plot(
+            [], [], "o", ms=3.4, color=GREY, mfc="white", label="hollow: weakly determined"
+        )
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(
+        handles, [label.replace("$", r"\$") for label in labels], loc="outside lower center",
+        ncols=1 if max(map(len, labels)) > 30 else len(labels), handletextpad=0.2,
+    )  # fmt: skip
+
+
+def _percent(row: Row) -> str:
+    """Return the difference with its standard error, in percent of the reference."""
+    if row.percent is None or not row.reference:
+        return ""
+    spread = 100.0 * math.hypot(row.stderr or 0.0, row.reference_stderr or 0.0)
+    spread /= abs(row.reference)
+    places = 0 if spread >= 10.0 else 1 if spread >= 1.0 else 2
+    shown = f"{row.percent:+.{places}f}"
+    shown = shown[1:] if float(shown) == 0.0 else shown.replace("-", "−")
+    return f"{shown} ± {spread:.{places}f} %"

@@ -1,0 +1,226 @@
+"""The folder of a result: written whole, replaced whole, and read again."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from foamfit.data.measurement import Outliers, interior_channel
+from foamfit.errors import InputError
+from foamfit.files import reason, replacing
+from foamfit.report.page import render_report
+from foamfit.report.plots import image, laid_out, plot_fit
+from foamfit.results import SCHEMA, Array, Curves, Fit, ParameterEstimate, plain
+from foamfit.trust.intervals import Intervals
+
+# All that `save_result` may write.
+RESULT_FILES = frozenset(
+    {
+        "fit.json", "parameters.csv", "curves.csv", "profiles.csv", "ladder.csv", "fit.png",
+        "fit.pdf", "report.html",
+    }
+)  # fmt: skip
+
+
+def save_result(result: Fit, folder: str | Path) -> Path:
+    """Write the result folder whole, replacing an older one at the end.
+
+    Parameters
+    ----------
+    result : Fit
+        What was found.
+    folder : str or Path
+        Where to; made with its parents. What stood there must be empty or a result folder that
+        holds nothing else.
+
+    Returns
+    -------
+    Path
+        The folder, with ``fit.json``, ``parameters.csv``, ``curves.csv``, ``fit.png``,
+        ``fit.pdf`` and ``report.html``; with profiles also ``profiles.csv``, of a ladder also
+        ``ladder.csv``.
+
+    Raises
+    ------
+    InputError
+        If something else stands there or it cannot be written; nothing is changed then.
+    """
+    folder = Path(folder)
+    check_target(folder)
+    try:
+        with replacing(folder.resolve()) as fresh:
+            _write(result, fresh)
+            check_target(folder)  # what has been put there in the meantime stays
+    except OSError as error:
+        raise InputError(
+            f"the result cannot be written to {folder}: {reason(error)}; choose another folder"
+        ) from error
+    return folder
+
+
+def check_target(folder: str | Path) -> None:
+    """Raise InputError unless `folder` is free, empty or an older result that may be replaced."""
+    folder = Path(folder)
+    try:
+        place = folder.resolve()
+        here = Path.cwd()
+        if place.exists() and any(place.samefile(at) for at in (here, *here.parents)):
+            raise InputError(
+                f"{folder} is the current directory or holds it, and a result folder is replaced "
+                "as a whole; choose a folder of its own"
+            )
+        if place.is_dir():
+            _check_replaceable(folder, place)
+        elif os.path.lexists(place):
+            raise InputError(f"{folder} is a file; choose a new or an empty folder")
+        there = next(path for path in place.parents if path.exists())
+        if not there.is_dir():
+            raise InputError(
+                f"{folder} cannot be written: {there} is a file; choose another folder"
+            )
+        if not os.access(there, os.W_OK | os.X_OK):
+            raise InputError(
+                f"{folder} cannot be written: Permission denied in {there}; choose another folder"
+            )
+    except (OSError, RuntimeError) as error:  # also a link to itself
+        raise InputError(
+            f"{folder} cannot be written: {reason(error)}; choose another folder"
+        ) from error
+
+
+def _check_replaceable(folder: Path, place: Path) -> None:
+    """Refuse a folder that is there, at `place`, and must not or cannot be replaced."""
+    if place.is_mount():
+        raise InputError(f"{folder} is a mount point and cannot be replaced; name a folder in it")
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise InputError(f"{folder} cannot be written: Permission denied; choose another folder")
+    there = sorted(place.iterdir())
+    if there and not _is_of_fit(place / "fit.json"):
+        raise InputError(
+            f"{folder} is not empty and holds no foamfit result (no fit.json of foamfit), so it is "
+            "not replaced; choose a new or an empty folder"
+        )
+    for path in there:
+        if not is_written(path):
+            raise InputError(
+                f"{folder} holds {path.name}, which foamfit did not write, so it is not replaced; "
+                "move that or choose another folder"
+            )
+
+
+def is_written(path: Path) -> bool:
+    """Whether something in a result folder is what a fit writes there."""
+    return path.name in RESULT_FILES and path.is_file() and not path.is_symlink()
+
+
+def _is_of_fit(path: Path) -> bool:
+    """Whether a fit.json is that of a fit, of this version or another one."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):  # neither UTF-8 nor JSON
+        return False
+    return isinstance(content, dict) and {"schema", "foamfit"} <= content.keys()
+
+
+def load_result(folder: str | Path) -> dict[str, Any]:
+    """Read the ``fit.json`` of a result folder.
+
+    Parameters
+    ----------
+    folder : str or Path
+        The result folder, or its ``fit.json``.
+
+    Returns
+    -------
+    dict
+        The content of ``fit.json``; values are SI.
+
+    Raises
+    ------
+    InputError
+        If there is no ``fit.json`` that this version of foamfit understands.
+    """
+    path = Path(folder)
+    if path.is_dir():
+        path = path / "fit.json"
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(
+            f"{folder} is not a result folder: {path.name} cannot be read "
+            f"({error.strerror or error})"
+        ) from error
+    except ValueError as error:  # neither UTF-8 nor JSON
+        raise InputError(f"{path} is not valid JSON: {error}") from error
+    if not isinstance(content, dict) or "schema" not in content:
+        raise InputError(f"{path} is not the result of a fit (it has no schema number)")
+    if content["schema"] != SCHEMA:
+        raise InputError(
+            f"{path} has schema {content['schema']}, this foamfit reads schema {SCHEMA}"
+        )
+    return content
+
+
+def _write(result: Fit, folder: Path) -> None:
+    text = json.dumps(result.to_json_dict(), indent=2, ensure_ascii=False, allow_nan=False)
+    # A name that is no UTF-8 keeps its bytes as an escape of JSON.
+    (folder / "fit.json").write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
+    _write_table(folder / "parameters.csv", _parameter_rows(result.parameters))
+    _write_table(folder / "curves.csv", _curve_rows(result.curves, result.measurement.outliers))
+    if result.intervals is not None and result.intervals.profiles:
+        _write_table(folder / "profiles.csv", _profile_rows(result.intervals))
+    if result.ladder is not None:
+        _write_table(folder / "ladder.csv", result.ladder.rows())
+    figure = plot_fit(result)
+    with laid_out(figure):
+        png, pdf = image(figure, "png"), image(figure, "pdf")
+    (folder / "fit.png").write_bytes(png)
+    (folder / "fit.pdf").write_bytes(pdf)
+    page = render_report(result, fit_png=png)
+    (folder / "report.html").write_text(page, encoding="utf-8", errors="replace")
+
+
+def _write_table(path: Path, rows: Iterable[Iterable[object]]) -> None:
+    with path.open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows(rows)
+
+
+def _parameter_rows(parameters: Mapping[str, ParameterEstimate]) -> Iterator[list[object]]:
+    yield [
+        "name", "value", "stderr", "ci95_low", "ci95_high", "unit", "state", "why", "ci95_method"
+    ]  # fmt: skip
+    for name, p in parameters.items():
+        low, high = p.ci95 or (None, None)
+        numbers = (plain(number) for number in (p.value, p.stderr, low, high))
+        yield [name, *numbers, p.unit, p.state, p.why, p.ci95_method]
+
+
+def _profile_rows(intervals: Intervals) -> Iterator[Iterable[object]]:
+    yield ["name", "value", "chi2", "chi2 of the 95 % cut", "complete"]
+    for profile in intervals.profiles:
+        for value, rise in zip(profile.values.tolist(), profile.rises.tolist(), strict=True):
+            yield [profile.name, value, rise, profile.cut, profile.complete]
+
+
+def _curve_rows(curves: Curves, outliers: Mapping[str, Outliers]) -> Iterator[Iterable[object]]:
+    columns: dict[str, Array | None] = {
+        "time (s)": curves.time,
+        "measured stress (Pa)": curves.measured_stress,
+        "fitted stress (Pa)": curves.stress,
+        "measured displacement (m)": curves.measured_displacement,
+        "fitted displacement (m)": curves.displacement,
+        "stress along measured displacement (Pa)": curves.stress_along,
+    }
+    for node, (measured, fitted) in curves.interior.items():
+        columns[f"measured {interior_channel(node)} (m)"] = measured
+        columns[f"fitted {interior_channel(node)} (m)"] = fitted
+    for channel, found in outliers.items():
+        columns[f"outliers of {channel} left out"] = found.left_out.astype(int)
+    there = {name: column for name, column in columns.items() if column is not None}
+    yield there.keys()
+    # Python floats are written with as many digits as they have, numpy's with their type's name.
+    yield from zip(*(column.tolist() for column in there.values()), strict=True)

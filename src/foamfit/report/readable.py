@@ -1,0 +1,128 @@
+"""Parameters and numbers as they are to be read: unit, digits, symbol."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from foamfit.results import ParameterEstimate
+
+SYMBOLS = {
+    "k0": ("k", "0"), "kc": ("k", "c"), "dsigma": ("Δσ", ""), "eps_a": ("ε", "a"),
+    "eps_c": ("ε", "c"), "kh_plus": ("k", "h+"), "kh_minus": ("k", "h−"), "eta": ("η", ""),
+    "height": ("h", ""), "site_eta": ("η", "site"), "time_shift": ("Δt", ""),
+}  # fmt: skip
+
+UNITS = {
+    "Pa": ((1e9, "GPa"), (1e6, "MPa"), (1e3, "kPa"), (1.0, "Pa")),
+    "s": ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs")),
+    "m": ((1.0, "m"), (1e-3, "mm"), (1e-6, "µm")),
+}
+
+
+def readable_unit(size: float, unit: str) -> tuple[float, str]:
+    """Return the unit in which a number of this size reads well.
+
+    Parameters
+    ----------
+    size : float
+        The largest number to show, in `unit`.
+    unit : str
+        "Pa", "s" or "m"; any other unit is kept.
+
+    Returns
+    -------
+    factor : float
+        What one of the readable units is in `unit`.
+    name : str
+        Its name, for example "MPa".
+    """
+    scales = UNITS.get(unit, ((1.0, unit),))
+    return next((scale for scale in scales if abs(size) >= scale[0]), scales[-1])
+
+
+@dataclass(frozen=True)
+class Readable:
+    """A parameter in the unit in which it reads well, its numbers rounded to its uncertainty."""
+
+    name: str
+    symbol: tuple[str, str]  # and its index
+    value: str
+    stderr: str
+    interval: str
+    unit: str
+    state: str
+    why: str
+    method: str = ""
+
+    @property
+    def with_error(self) -> str:
+        """The value with its standard error, where there is one."""
+        return f"{self.value} ± {self.stderr}" if self.stderr else self.value
+
+
+def readable(name: str, p: ParameterEstimate) -> Readable:
+    """Return a parameter as it is to be read.
+
+    Parameters
+    ----------
+    name : str
+        Its name, for example "s1_k0".
+    p : ParameterEstimate
+        Its value in SI; it is shown with the digits that its standard error leaves (two of the
+        error), or with four where there is none.
+    """
+    factor, unit = readable_unit(p.value or p.stderr or 0.0, p.unit)
+    value = p.value / factor
+    interval = stderr = ""
+    shown = number(value)
+    if math.isfinite(value) and p.stderr is not None and 0 < p.stderr < math.inf:
+        shown, stderr, places = _rounded(value, p.stderr / factor)
+        if p.ci95 is not None:
+            interval = " to ".join(_fixed(bound / factor, places) for bound in p.ci95)
+    unit = {"": "–", "1": "–", "-": "–", "Pa s": "Pa·s", "Pa*s": "Pa·s"}.get(unit, unit)
+    return Readable(name, _symbol(name), shown, stderr, interval, unit, p.state, p.why,
+        p.ci95_method or "",
+    )  # fmt: skip
+
+
+def number(value: Any) -> str:
+    """Return anything as text; a number with four digits, an integer with all of its own."""
+    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, list | tuple):
+        return ", ".join(number(item) for item in value)
+    if not isinstance(value, float):
+        return str(value)
+    if value == 0 or 1e-3 <= abs(value) < 1e6:
+        decimals = 0 if value == 0 else max(0, 3 - math.floor(math.log10(abs(value))))
+        return _fixed(value, decimals)
+    return f"{value:.3e}".replace("-", "−")
+
+
+def _symbol(name: str) -> tuple[str, str]:
+    """Return the symbol of a parameter and its index: k and "c,2" of s2_kc."""
+    spring, _, base = name.partition("_")
+    if name in SYMBOLS or base not in SYMBOLS:
+        return SYMBOLS.get(name, (name, ""))
+    stem, index = SYMBOLS[base]
+    return stem, ",".join(part for part in (index, spring.removeprefix("s")) if part)
+
+
+def _rounded(value: float, stderr: float) -> tuple[str, str, int]:
+    """Return value and standard error to two digits of the error, and the decimal places."""
+    places = 1 - math.floor(math.log10(float(f"{stderr:.1e}")))
+    most = 6 - math.floor(math.log10(abs(value))) if value else 6
+    if places > most:  # an error far below the value, as of synthetic data: seven digits are enough
+        return _fixed(value, most), f"{stderr:.1e}", most
+    return _fixed(value, places), _fixed(stderr, places), places
+
+
+def _fixed(value: float, places: int) -> str:
+    text = f"{round(value, places):.{max(places, 0)}f}"
+    if float(text) == 0:
+        text = text.lstrip("-")
+    return text.replace("-", "−")
