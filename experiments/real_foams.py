@@ -104,4 +104,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    from unchanged import keep_unchanged
+
+    with keep_unchanged(HERE):
+        main()

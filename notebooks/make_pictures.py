@@ -7,6 +7,7 @@ The tests are reconstructions, simulated from published parameters, not measurem
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import foamfit as ff
@@ -56,4 +57,8 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.path.insert(0, str(HERE.parent / "experiments"))
+    from unchanged import keep_unchanged
+
+    with keep_unchanged(HERE):
+        main()

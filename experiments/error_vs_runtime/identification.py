@@ -28,6 +28,7 @@ the shoe foam is left out.
 from __future__ import annotations
 
 import os
+import sys
 
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_name] = "1"  # one thread for all, so that processor time is the time on the clock
@@ -452,4 +453,8 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.path.insert(0, str(HERE.parent))
+    from unchanged import keep_unchanged
+
+    with keep_unchanged(HERE):
+        main()

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -755,4 +756,8 @@ def of_energy() -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    main()
+    sys.path.insert(0, str(HERE.parent))
+    from unchanged import keep_unchanged
+
+    with keep_unchanged(HERE):
+        main()

@@ -1,0 +1,101 @@
+"""Keep tracked results as they were where remaking them changed no figure.
+
+Another machine, or another day on this one, changes last digits, run times and the pixels of a
+letter. A study that is remade inside `keep_unchanged` leaves such files as they were:
+
+- numbers agree to 1e-3, or to 1e-9 in size (rounding); counts agree exactly;
+- run times and evaluations (in a column or behind a key named for them, or followed by the unit s,
+  ms or µs) agree within a factor of three: the machines are shared;
+- pictures have the same size, and one pixel in two hundred at most has plainly changed.
+"""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import io
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import zip_longest
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+
+DIGITS, ROUNDING, RUN_TIMES, PIXELS, PLAIN = 1e-3, 1e-9, 3.0, 5e-3, 0.2
+TEXT = {".csv", ".json", ".md", ".toml", ".txt", ".gz"}
+
+_NUMBER = re.compile(r"[-−+]?\d[\d,]*\.?\d*(?:[eE][-+−]?\d+)?")
+_TIMED_KEY = re.compile(r"(?:seconds|runtime\w*|run time|nfev|evaluations|steps)[^\d]{0,6}$", re.I)
+_TIMED_UNIT = re.compile(r"\s?(?:s|ms|µs)\b")
+_TIMED_COLUMN = re.compile(r"seconds|runtime|nfev|evaluations|steps|(^|\W)(s|ms|µs)$", re.I)
+
+
+@contextmanager
+def keep_unchanged(folder: Path) -> Iterator[None]:
+    """Put back, at the end, the files of a folder that the body wrote but did not really change."""
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    yield
+    for path, old in before.items():
+        if path.is_file() and (new := path.read_bytes()) != old and same(path, old, new):
+            path.write_bytes(old)
+
+
+def same(path: Path, old: bytes, new: bytes) -> bool:
+    """Whether two versions of a file say the same."""
+    if path.suffix == ".png":
+        return _same_picture(old, new)
+    if path.suffix not in TEXT:
+        return False
+    if path.suffix == ".gz":
+        old, new = gzip.decompress(old), gzip.decompress(new)
+    one, other = old.decode("utf-8"), new.decode("utf-8")
+    return _same_table(one, other) if ".csv" in path.suffixes else same_text(one, other)
+
+
+def same_text(one: str, other: str) -> bool:
+    """Whether two texts differ in numbers alone, and in these by no more than they mean."""
+    if _NUMBER.sub("0", one) != _NUMBER.sub("0", other):
+        return False
+    pairs = zip(_NUMBER.finditer(one), _NUMBER.finditer(other), strict=True)
+    return all(_same_number(a[0], b[0], _is_timed(one, a)) for a, b in pairs)
+
+
+def _is_timed(text: str, found: re.Match[str]) -> bool:
+    """Whether a number in a text is a run time."""
+    before = text[max(found.start() - 20, 0) : found.start()]
+    return bool(_TIMED_KEY.search(before) or _TIMED_UNIT.match(text, found.end()))
+
+
+def _same_table(one: str, other: str) -> bool:
+    """Compare two CSV tables cell by cell; a column named for seconds holds run times."""
+    rows, others = (list(csv.reader(io.StringIO(text))) for text in (one, other))
+    timed = [bool(_TIMED_COLUMN.search(name)) for name in (rows or [[]])[0]]
+    return len(rows) == len(others) and all(
+        a is not None and b is not None and (_same_number(a, b, bool(t)) or same_text(a, b))
+        for row, new in zip(rows, others, strict=True)
+        for a, b, t in zip_longest(row, new, timed[: len(row)])
+    )
+
+
+def _same_number(one: str, other: str, timed: bool) -> bool:
+    """Compare two numbers as they are written; what is no number must be the same text."""
+    try:
+        a, b = (float(text.replace(",", "").replace("−", "-")) for text in (one, other))
+    except ValueError:
+        return one == other
+    if timed and a > 0.0 and b > 0.0:
+        return max(a, b) <= RUN_TIMES * min(a, b)
+    if one.isdigit() or other.isdigit():
+        return a == b
+    return a == b or abs(a - b) <= max(DIGITS * abs(a), ROUNDING) or (a != a and b != b)
+
+
+def _same_picture(old: bytes, new: bytes) -> bool:
+    """Compare two PNG pictures pixel by pixel."""
+    one, other = (matplotlib.image.imread(io.BytesIO(image)) for image in (old, new))
+    if one.shape != other.shape:
+        return False
+    changed = np.abs(one - other).max(axis=-1) > PLAIN
+    return bool(changed.mean() <= PIXELS)
