@@ -207,13 +207,10 @@ def test_no_judgement_past_the_bound_on_steps() -> None:
 def test_it_has_no_say_where_the_law_leaves_open_which_spring_moves() -> None:
     """Two gaps under one stress, two flat branches: the sum is known, its shares are not."""
     time = np.linspace(0.0, 1.0, 11)
-    pull = ff.DisplacementDrive(-1e-4 * time)
-    gap, flat = (
-        ff.LinearSpring(6e7, unilateral=True),
-        ff.BistableSpring(2e6, 6e7, -1e5, 0.2, 0.5, 0.0, 1e6),
-    )
-    for spring, sure in ((gap, False), (flat, False), (ff.LinearSpring(6e7), True)):
-        twice = ff.Chain([spring, spring], [1e-3, 1e-3], 2e-5)
-        apart = ff.Chain([spring, spring], [1e-3, 1e-3], 2e-5, [1e-3, 0.0])
+    pull = SimpleNamespace(displacement=1e-5 * time)
+    gap, flat = Linear(6e7, unilateral=True), Bistable(2e6, 6e7, -1e5, 0.2, 0.5, 0.0, 1e6)
+    for spring, sure in ((gap, False), (flat, False), (Linear(6e7), True)):
+        twice = Chain((spring, spring), (1e-3, 1e-3), 2e-5, (0.0, 0.0))
+        apart = Chain((spring, spring), (1e-3, 1e-3), 2e-5, (1e-3, 0.0))
         assert (independent.follow(twice, pull, time).why == "") == sure
         assert independent.follow(apart, pull, time).why != independent.SHARED
