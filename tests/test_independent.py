@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -201,3 +202,15 @@ def test_no_judgement_past_the_bound_on_steps() -> None:
     made = chain(Linear(2e6, 1e6), SPRING, masses=(1e-9, 0.0))
     got = independent.judge(made, Impact(7e-3, 1.0), np.linspace(0.0, 1e-3, 11), most=10_000)
     assert got.why == "too many steps"
+
+
+def test_it_has_no_say_where_the_law_leaves_open_which_spring_moves() -> None:
+    """Two gaps under one stress, two flat branches: the sum is known, its shares are not."""
+    time = np.linspace(0.0, 1.0, 11)
+    pull = SimpleNamespace(displacement=1e-5 * time)
+    gap, flat = Linear(6e7, unilateral=True), Bistable(2e6, 6e7, -1e5, 0.2, 0.5, 0.0, 1e6)
+    for spring, sure in ((gap, False), (flat, False), (Linear(6e7), True)):
+        twice = Chain((spring, spring), (1e-3, 1e-3), 2e-5, (0.0, 0.0))
+        apart = Chain((spring, spring), (1e-3, 1e-3), 2e-5, (1e-3, 0.0))
+        assert (independent.follow(twice, pull, time).why == "") == sure
+        assert independent.follow(apart, pull, time).why != independent.SHARED

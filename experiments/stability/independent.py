@@ -49,6 +49,7 @@ MASS, DAMPER, STRESS, MOTION = range(4)
 # How a run ended.
 DONE, TOO_LONG, NO_STEP, FLAT = range(4)
 WHY = ("", "too many steps", "no step is short enough", "stress prescribed on a flat branch")
+SHARED = "several gaps or flat branches share an elongation, and the law does not say how"
 
 
 # ------------------------------------------------------------------------------------ the law
@@ -716,6 +717,30 @@ def _fastest(rows: Array, ends: Integers, mass: Array, top: int) -> float:
     )
 
 
+def _shares(chain: Any, drive: Any, ends: Integers) -> bool:
+    """Whether a prescribed motion may meet gaps or flat branches of several springs at one stress.
+
+    They carry one stress whichever of them moves: the law leaves open which does, and a spring that
+    has moved through its flat branch alone has snapped, while one that has shared it has not.
+    """
+    if not hasattr(drive, "displacement"):
+        return False
+    for first, last in zip([0, *ends[:-1]], ends, strict=True):
+        stresses = []
+        for spring in chain.springs[first:last]:
+            if spring.eta > 0.0:
+                continue
+            if not hasattr(spring, "kc"):
+                stresses += [("gap", 0.0)] if spring.unilateral else []
+                continue
+            snap = spring.k0 * spring.eps_a / (1.0 - spring.eps_a)
+            stresses += [("d", snap)] if spring.kh_plus == 0.0 else []
+            stresses += [("e", snap + spring.dsigma)] if spring.kh_minus == 0.0 else []
+        if len(set(stresses)) < len(stresses):
+            return True
+    return False
+
+
 def follow(chain: Any, drive: Any, time: Array, tol: float = TIGHT, most: int = MOST_WORK) -> Truth:
     """Follow a scene once, at one tolerance; its own uncertainty is not known then."""
     count = len(chain.springs)
@@ -748,6 +773,8 @@ def follow(chain: Any, drive: Any, time: Array, tol: float = TIGHT, most: int = 
     nodes, base = np.zeros((count, time.size)), np.zeros(time.size)
     if _fastest(rows, ends, mass, top) * (time[-1] - time[0]) > 6.0 * most / count:
         return Truth(nodes, base, None, math.nan, math.nan, math.inf, 0, 0, WHY[TOO_LONG])
+    if _shares(chain, drive, ends):
+        return Truth(nodes, base, None, math.nan, math.nan, math.inf, 0, 0, SHARED)
     log = np.zeros((4096, 3))
     start = _start(rows, kinds, ends, top, float(values[0]))
     outcome, steps, switches, end, dip, _ = _follow(
