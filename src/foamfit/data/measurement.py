@@ -146,6 +146,11 @@ class Dropped:
     last: int
     why: str
 
+    @classmethod
+    def of(cls, rows: NDArray[np.int64], why: str) -> Dropped:
+        """Leave out the rows with these numbers."""
+        return cls(rows.size, int(rows[0]), int(rows[-1]), why)
+
     def __str__(self) -> str:
         """Return for example "rows 2 to 200 (199): before contact starts"."""
         if self.rows == 1:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from foamfit.data.measurement import Noise, Specimen, Striker, interior_node
-from foamfit.data.prepare import Window
+from foamfit.data.record import Window
 from foamfit.data.units import is_unit, parse_quantity, split_quantity
 from foamfit.errors import InputError
 from foamfit.terminal import printable

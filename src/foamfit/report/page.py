@@ -11,7 +11,6 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 from foamfit.data.measurement import interior_channel
-from foamfit.data.prepare import engineering
 from foamfit.report.plots import (
     DPI,
     image,
@@ -21,6 +20,7 @@ from foamfit.report.plots import (
     plot_residuals,
     readable_unit,
 )
+from foamfit.text import engineering
 
 if TYPE_CHECKING:
     from foamfit.auto import Ladder
