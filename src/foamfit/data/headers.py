@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from foamfit.data.measurement import interior_node
+from foamfit.data.toml_file import LONGEST
 from foamfit.data.units import factor, is_unit
 
-LONGEST = 200  # characters of a column's name
 WEAK = 3  # rank of a header that may name the displacement
 
 

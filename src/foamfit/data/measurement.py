@@ -28,18 +28,9 @@ def interior_node(channel: str) -> int | None:
 
 @dataclass(frozen=True)
 class Specimen:
-    """The foam specimen.
+    """The foam specimen: height before the test (m), cross-section (m²), mass (kg).
 
-    Attributes
-    ----------
-    height : float
-        Height H before the test, m.
-    area : float
-        Cross-section A, m².
-    mass : float or None
-        Mass of the foam, kg.
-    heights : tuple of float or None
-        Heights h_i of the springs of a chain, base first, m.
+    `heights` are those of the springs of a chain, base first, m.
     """
 
     height: float
@@ -58,12 +49,10 @@ class Striker:
 
 @dataclass(frozen=True)
 class NoiseLevel:
-    """The noise of one channel.
+    """The noise of one channel: one standard deviation, Pa or m.
 
     Attributes
     ----------
-    sigma : float
-        One standard deviation, Pa or m.
     given : bool
         Whether the test states it; else it is estimated from the data.
     how : str
@@ -128,17 +117,10 @@ class Outliers:
 
 @dataclass(frozen=True)
 class Dropped:
-    """Rows of a file that are not used, for one reason.
+    """Rows of a file that are not used, for one reason, which follows "not used: ".
 
-    Attributes
-    ----------
-    rows : int
-        How many.
-    first, last : int
-        Row numbers of the first and the last of them: lines of the file as an editor counts them,
-        from 1 and with the header. Rows that are used may lie between.
-    why : str
-        The reason, to follow "not used: ".
+    `first` and `last` are lines of the file as an editor counts them, from 1 and with the header.
+    Rows that are used may lie between.
     """
 
     rows: int
@@ -173,8 +155,8 @@ class RowCount:
 
     def sentences(self) -> list[str]:
         """Say how many rows there are, and name those that are not used."""
-        told = f"{self.rows} in the file, {self.used} used"
-        return [f"{told}.", *(f"Not used: {item}." for item in self.dropped)]
+        told = f"{self.rows} in the file, {self.used} used."
+        return [told, *(f"Not used: {item}." for item in self.dropped)]
 
 
 @dataclass(frozen=True, eq=False)
