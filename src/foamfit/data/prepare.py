@@ -13,13 +13,7 @@ from typing import NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from foamfit.data.contact import (
-    Start,
-    cut_to_contact,
-    find_start,
-    remove_offset,
-    zero_interior,
-)
+from foamfit.data.contact import Start, cut_to_contact, find_start, remove_offset, zero_interior
 from foamfit.data.cycles import inner_reversals, select_cycle
 from foamfit.data.measurement import (
     INTEGRATED,
