@@ -81,9 +81,8 @@ def find_start(record: Record, levels: Levels, striker: Striker | None) -> Start
     impact, drift = striker is not None, 0.01 * float(stress.max())
     by_the_stress = "where the stress leaves its rest"
     if w is None:
-        by_stress = leave_rest(time, stress, levels["stress"], drift=drift)
-        at_first = Start("at the first sample")
-        return at_first if by_stress is None else Start(by_the_stress, by_stress, free=True)
+        at = leave_rest(time, stress, levels["stress"], drift=drift)
+        return Start("at the first sample") if at is None else Start(by_the_stress, at, free=True)
     noise, top = levels["displacement"], int(np.argmax(w))
     first, balance = _first_levels(time, w, stress, top, noise)
     surely = min(first, balance, key=lambda level: level.sureness) if impact else first
@@ -93,7 +92,7 @@ def find_start(record: Record, levels: Levels, striker: Striker | None) -> Start
     drift = np.inf if elsewhere else 0.0 if impact else drift
     by_stress = leave_rest(time, stress, levels["stress"], drift=drift)
     if impact and elsewhere and by_stress is None:
-        # No zero of the file speaks for its first sample: the likelier start is taken.
+        # The file's zero does not lie at its first sample: the likelier start is taken.
         by_stress = leave_rest(time, stress, levels["stress"], _STILL_STRIKER)
     onset = 0 if by_stress is None else int(np.searchsorted(time, by_stress))
     travel = float(w[top] - w[onset])
@@ -123,7 +122,7 @@ def find_start(record: Record, levels: Levels, striker: Striker | None) -> Start
     if surely.sureness > ERRORS and 0.7 < first.value / max(gone, 1e-300) < 1.1:
         return Start("before the first sample", at_zero=True)
     under_load = stress[:3].mean() > 0.05 * stress.max() and 0 < first.value < travel
-    if not elsewhere or under_load:
+    if under_load or not elsewhere:
         return Start("at the first sample")
     told = first.told(noise, "line through") + " from the first on; the file's zero lies elsewhere"
     return Start("at the first sample", zero=first.value, zero_from=told)

@@ -9,6 +9,7 @@ from foamfit.data.measurement import Array
 from foamfit.data.noise import noise_level
 from foamfit.data.record import Record
 from foamfit.errors import InputError
+from foamfit.text import percent
 
 # Shares of the largest displacement: what a reversal goes back at least, what is left of it at
 # rest, what counts as unloading, and a cycle that is named for being small.
@@ -48,7 +49,7 @@ def select_cycle(record: Record, cycle: int) -> tuple[Record, list[str]]:
     share = (displacement[top] - displacement.min()) / size
     if share < _SMALLER:
         notes.append(
-            f"Check: cycle {cycle} reaches {share:.0%} of the largest displacement; "
+            f"Check: cycle {cycle} reaches {percent(share)} of the largest displacement; "
             f"cycle {largest + 1} of {n} reaches all of it ([window] cycle = {largest + 1})."
         )
     if unloaded <= _UNLOADED * size:
@@ -118,9 +119,9 @@ def inner_reversals(displacement: Array) -> list[str]:
     ]
     if not backs:
         return []
-    times = "once" if len(backs) == 1 else f"{len(backs)} times"
+    times, share = "once" if len(backs) == 1 else f"{len(backs)} times", max(backs) / size
     return [
-        f"Check: the record reverses {times} below its peak, by up to {max(backs) / size:.0%} of "
-        "it; the law has no inner loops: partial unloading runs back along the branch it came "
-        "along, so a loop there stays in the residuals."
+        f"Check: the record reverses {times} below its peak, by up to {percent(share)} of it; the "
+        "law has no inner loops: partial unloading runs back along the branch it came along, so a "
+        "loop there stays in the residuals."
     ]

@@ -111,15 +111,7 @@ class EnergyAudit:
 def audit(measurement: Measurement) -> EnergyAudit:
     """Compare what the striker brings with what the specimen takes.
 
-    Parameters
-    ----------
-    measurement : Measurement
-        A conditioned test; whatever it lacks is left None and named in `missing`.
-
-    Returns
-    -------
-    EnergyAudit
-        Energies in J/m³, impulse in N·s.
+    Whatever a test lacks is left None and named in `missing`.
     """
     test, missing = measurement, list[str]()
     striker, specimen = test.striker or Striker(), test.specimen
@@ -175,12 +167,7 @@ def largest_motion(displacement: Array, time: Array | None = None) -> tuple[int,
     A quartic is fitted to the samples about the turn that the noise could confuse with it; where
     the motion is so clean that they are few, the largest sample is the turn.
 
-    Returns
-    -------
-    index : int
-        The sample at the turn.
-    value : float
-        The displacement there, free of the noise of that sample.
+    Returns the sample at the turn and the displacement there, free of the noise of that sample.
     """
     floor = displacement.max() - 8.0 * noise_level(displacement)
     near = np.flatnonzero(displacement >= floor)

@@ -51,14 +51,8 @@ class Striker:
 class NoiseLevel:
     """The noise of one channel: one standard deviation, Pa or m.
 
-    Attributes
-    ----------
-    given : bool
-        Whether the test states it; else it is estimated from the data.
-    how : str
-        "given", or how it was estimated: "estimated from 40 samples before contact".
-    time : float
-        Its autocorrelation time, in samples (1: white).
+    It is `given` by the test, or else estimated from the data; `how` says so ("estimated from 40
+    samples before contact"). `time` is its autocorrelation time, in samples (1: white).
     """
 
     sigma: float
@@ -69,15 +63,11 @@ class NoiseLevel:
 
 @dataclass(frozen=True)
 class Noise:
-    """The noise of the channels, each one standard deviation.
+    """The noise of the channels, each one standard deviation, Pa or m.
 
-    Attributes
-    ----------
-    stress, displacement : float or None
-        As the TOML states them, Pa and m; the second holds for masses inside too.
-    estimated : dict of str to NoiseLevel
-        Of the channels of which the TOML says nothing ("stress", "displacement",
-        "displacement_1", …), as they were estimated from the data.
+    `stress` and `displacement` are what the TOML states; the second holds for masses inside too.
+    `estimated` holds what was estimated from the data of the channels that it does not state
+    ("stress", "displacement", "displacement_1", …).
     """
 
     stress: float | None = None
@@ -96,17 +86,10 @@ class Noise:
 class Outliers:
     """Samples of a channel that are not fitted: spikes, short gaps, and a clipped top.
 
-    Attributes
-    ----------
-    left_out : (n,) array of bool
-        Samples of the test that are not fitted; at spikes and gaps the channel holds a straight
-        line.
-    at : (k,) array
-        Where the file has spikes and gaps: time in s, or the sample where the test has no time.
-    values : (k,) array
-        What the file has there, Pa or m.
-    clipped_at : float or None
-        The value at which the sensor or its amplifier clips the channel, Pa; None if it does not.
+    `left_out` marks these samples, shape (n,); at spikes and gaps the channel holds a straight
+    line. What the file has there is `values` (k,), Pa or m, `at` (k,) times in s, or samples where
+    the test has no time. `clipped_at` is the value at which the sensor or its amplifier clips the
+    channel, Pa.
     """
 
     left_out: NDArray[np.bool_]

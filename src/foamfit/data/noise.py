@@ -61,16 +61,10 @@ def residual_noise(values: Array) -> tuple[float, float]:
     with white noise, their variance is the answer. Else σ and φ are those that explain all widths
     best. Switches and spikes are cut from the residuals at three deviations.
 
-    Parameters
-    ----------
-    values : (n,) array
-        Evenly sampled.
-
     Returns
     -------
     sigma : float
-        Standard deviation, in the unit of the values; at least that of the digitiser's step q,
-        q/√12.
+        Standard deviation; at least that of the digitiser's step q, q/√12.
     phi : float
         Autocorrelation from one sample to the next; 0 for white noise, and where a vibration or a
         noise slower than the signal hides it.
@@ -135,22 +129,11 @@ def estimated_noise(values: Array) -> NoiseLevel:
 
 
 def noise_at_rest(rest: Array, during: NoiseLevel, block: int) -> NoiseLevel | None:
-    """Noise of a channel from its samples before contact, about their line.
+    """Noise of a channel from its samples before contact, about their line; None for no noise.
 
-    Parameters
-    ----------
-    rest : (n,) array
-        Those samples.
-    during : NoiseLevel
-        What the signal itself shows during contact. Where it contradicts it is the answer: a sensor
-        may be quieter at rest, and a motion may start before the stress.
-    block : int
-        So many samples are averaged during contact.
-
-    Returns
-    -------
-    NoiseLevel or None
-        None where neither shows any noise.
+    During contact `block` samples are averaged. What the signal itself shows there, `during`, is
+    the answer where it contradicts: a sensor may be quieter at rest, and a motion may start before
+    the stress.
     """
     n = len(rest)
     x = np.arange(n, dtype=np.float64)

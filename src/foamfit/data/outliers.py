@@ -43,19 +43,10 @@ def find_outliers(values: Array, time: Array | None = None) -> NDArray[np.bool_]
     that prediction, as seen over the whole record, while the neighbours agree among themselves and
     the lines from either side do not lead to it. Where the signal bends they do one or the other.
 
-    Parameters
-    ----------
-    values : (n,) array
-        The channel. In one that is held for some samples at a time only gaps are looked for: the
-        steps have no even spacing.
-    time : (n,) array, optional
-        Increasing; without it the samples are evenly spaced. Cubics and lines go by the true
-        spacing, and nothing is judged across a pause in the record.
-
-    Returns
-    -------
-    (n,) array of bool
-        True at an outlier. Never more than 2 % of the samples: then none, they are no exceptions.
+    `values` and `time` have the shape (n,); without a time the samples are evenly spaced. Cubics
+    and lines go by the true spacing, and nothing is judged across a pause. In a channel that is
+    held for some samples at a time only gaps are looked for: its steps have no even spacing. Never
+    are more than 2 % of the samples outliers: then none is, they are no exceptions.
     """
     n = values.size
     if n < 30:

@@ -32,7 +32,7 @@ from foamfit.data.record import MIN_ROWS, Record, Window
 from foamfit.data.rest import MIN_REST, line_at, smooth
 from foamfit.data.staircase import fill_staircase, noise_of_held
 from foamfit.errors import InputError
-from foamfit.text import engineering
+from foamfit.text import engineering, percent
 
 _MAX_ROWS, _BLOCKS = 1500, 1000  # above so many samples they are averaged in so many blocks
 
@@ -62,25 +62,12 @@ def condition(
     window: Window | None = None,
     advice: Mapping[str, str] | None = None,
 ) -> Conditioned:
-    """Turn the samples of a file into one loading and unloading.
+    """Turn all samples of a file into one loading and unloading.
 
-    Parameters
-    ----------
-    record : Record
-        All samples of the file.
-    specimen : Specimen
-        Its height and area turn force into stress and limit the strain.
-    striker : Striker, optional
-        With it and a time the record is an impact, else a slow test whose displacement is driven.
-    window : Window, optional
-        What the user chose to look at.
-    advice : mapping, optional
-        What to say of a channel that is plainly the other way round; see `check_signs`.
-
-    Returns
-    -------
-    Conditioned
-        At most 1500 samples; time is zero and displacement is zero where contact starts.
+    With a striker and a time the record is an impact, else a slow test whose displacement is
+    driven. `window` is what the user chose to look at, and `advice` what to say of a channel that
+    is plainly the other way round; see `check_signs`. At most 1500 samples are left; time and
+    displacement are zero where contact starts.
     """
     window, notes = window or Window(), list[str]()
     striker = None if record.time is None else striker
@@ -251,7 +238,9 @@ def _stress_notes(stress: Array) -> list[str]:
     peak, width, notes = float(stress.max()), max(1, len(stress) // 100), []
     share = stress[:3].mean() / peak
     if share > 0.05:
-        notes.append(f"Check: the record starts under load, at {share:.0%} of the peak stress.")
+        notes.append(
+            f"Check: the record starts under load, at {percent(share)} of the peak stress."
+        )
     lowest = float(smooth(stress, width)[int(np.argmax(stress)) :].min())
     if lowest < -max(0.002 * peak, 4 * noise_level(stress) / np.sqrt(width)):
         notes.append(
