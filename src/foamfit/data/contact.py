@@ -103,8 +103,8 @@ def find_start(record: Record, levels: Levels, striker: Striker | None) -> Start
     if below and unloaded and (by_stress is None or abs(w[onset]) < 0.3 * w[top]):
         at = _time_of_passage(time, w, crossing, near)
         return Start("where the displacement passes zero", at)
-    still = _STILL_STRIKER if impact else STILL
-    by_motion = leave_rest(time[: top + 1], w[: top + 1], noise, still)
+    up_to = slice(top + 1)
+    by_motion = leave_rest(time[up_to], w[up_to], noise, _STILL_STRIKER if impact else STILL)
     approach = w[onset] - first.value if by_stress is not None else 0.0
     # A striker's motion starts at contact, if tracked so; a machine's may start above the specimen.
     small = approach < (0.3 if impact else 0.1) * travel
@@ -118,7 +118,7 @@ def find_start(record: Record, levels: Levels, striker: Striker | None) -> Start
         zero = level_on_line(time[near], w[near], by_stress, noise)
         told = zero.told(noise, "line through") + " around it, the stress being at rest before"
         return Start(by_the_stress, by_stress, zero.value, True, told)
-    gone = (striker.velocity or 0.0) * time[0] if striker is not None else 0.0
+    gone = time[0] * (striker.velocity or 0.0) if striker is not None else 0.0
     if surely.sureness > ERRORS and 0.7 < first.value / max(gone, 1e-300) < 1.1:
         return Start("before the first sample", at_zero=True)
     under_load = stress[:3].mean() > 0.05 * stress.max() and 0 < first.value < travel

@@ -8,7 +8,7 @@ import hashlib
 import io
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -68,13 +68,9 @@ class Table:
         """Yield (row number in the file, cells) of the rows that are not blank."""
         raw, encoding = self.text.raw, self.text.encoding
         lines = io.TextIOWrapper(io.BytesIO(raw), encoding, errors="replace", newline="")
-        reader = csv.reader(lines, delimiter=self.separator)
-        try:
-            for cells in reader:
-                if reader.line_num > self.first_row and any(cell.strip() for cell in cells):
-                    yield reader.line_num, cells
-        except csv.Error as error:
-            raise InputError(f"{self.path}: row {reader.line_num}: {error}.") from None
+        for number, cells in _cells(self.path, lines, self.separator):
+            if number > self.first_row and any(cell.strip() for cell in cells):
+                yield number, cells
 
     def body(self) -> bytes:
         """Return the rows below the header."""
@@ -149,19 +145,24 @@ def find_table(text: Text, names: set[str]) -> Table:
     return Table(text, separator, decimal, i + 1, cells, first, headers)
 
 
+def _cells(path: Path, lines: Iterable[str], separator: str) -> Iterator[tuple[int, list[str]]]:
+    """Yield the number of the last line of each row, and its cells."""
+    reader = csv.reader(lines, delimiter=separator)
+    try:
+        for cells in reader:
+            yield reader.line_num, cells
+    except csv.Error:
+        raise InputError(
+            f"{path}: row {reader.line_num} has a cell of more than {csv.field_size_limit()} "
+            "characters; the file must be a text table (CSV)."
+        ) from None
+
+
 def _header_row(path: Path, lines: list[str], names: set[str]) -> tuple[str, list[list[str]], int]:
     """Separator, cells and place of the row that names most channels."""
     best: tuple[int, str, list[list[str]], int] = (0, ",", [], 0)
     for separator in ("\t", ";", ","):
-        reader = csv.reader(lines, delimiter=separator)
-        try:
-            grid = list(reader)
-        except csv.Error:
-            raise InputError(
-                f"{path}: row {reader.line_num} has a cell of more than {csv.field_size_limit()} "
-                "characters; the file must be a text table (CSV)."
-            ) from None
-        numbers = False
+        grid, numbers = [cells for _, cells in _cells(path, lines, separator)], False
         for i, cells in enumerate(grid):
             # On a tie the last row wins: titles and instrument settings stand above the header.
             # Below rows of numbers it is another header, which `_refuse_cells` will meet.

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# What is said of a motion that is no measurement of its own.
-INTEGRATED = "integrated from force"
+# Where a motion comes from; the second is no measurement of its own.
+MEASURED, INTEGRATED = "measured", "integrated from force"
 
 
 def interior_channel(node: int) -> str:

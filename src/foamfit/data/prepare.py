@@ -17,6 +17,7 @@ from foamfit.data.contact import Start, cut_to_contact, find_start, remove_offse
 from foamfit.data.cycles import inner_reversals, select_cycle
 from foamfit.data.measurement import (
     INTEGRATED,
+    MEASURED,
     Array,
     Dropped,
     NoiseLevel,
@@ -71,6 +72,7 @@ def condition(
     """
     window, notes = window or Window(), list[str]()
     striker = None if record.time is None else striker
+    impact = striker is not None
 
     def done(result: tuple[Record, list[str]]) -> Record:
         notes.extend(result[1])
@@ -82,24 +84,23 @@ def condition(
     check_signs(record, advice or {})
     held = noise_of_held(record)
     record = done(fill_staircase(record))
-    if striker is not None and window.cycle != 1:
+    if impact and window.cycle != 1:
         raise InputError("[window] cycle is for slow tests; for an impact give start and end.")
-    first = record if striker is not None else select_cycle(record, 1)[0]
+    first = record if impact else select_cycle(record, 1)[0]
     levels = held | {c: estimated_noise(v) for c, v in first.curves().items() if c not in held}
     start = find_start(first, levels, striker)
     # Before a slow test nothing shows that the specimen is free.
-    resting = start.rest(first) if striker is not None or start.free else 0
+    resting = start.rest(first) if impact or start.free else 0
     record = done(zero_interior(record, first, start, levels))
     record = done(remove_offset(record, resting, levels["stress"]))
-    if striker is None:
+    if not impact:
         record = done(select_cycle(record, window.cycle))
     if window.cycle > 1:  # a later cycle keeps the zero of the first, when the foam was fresh
         how, resting = f"with cycle {window.cycle}", 0
         start = Start(how, zero=start.zero, zero_from=start.zero_from)
-    record = done(cut_to_contact(record, start, striker is not None, levels["stress"]))
-    motion = "measured"
-    if record.displacement is None:
-        record, motion = integrate_motion(record, specimen, striker or Striker())
+    record = done(cut_to_contact(record, start, impact, levels["stress"]))
+    record, motion = integrate_motion(record, specimen, striker or Striker())
+    if motion != MEASURED:
         notes.append(f"The file has no displacement: the motion is {motion}.")
     notes += checks(record, specimen, striker, motion)
     whole, record = record, done(thin(record))
@@ -107,10 +108,10 @@ def condition(
     noise = noise_before_contact(first.rows(slice(resting)), record, block)
     noise |= {name: averaged(level, block) for name, level in held.items()}
     outliers = outliers_of_blocks(whole, block)
-    for name, count in spoilt.items():
-        notes.append(outlier_note(name, count, outliers.get(name), record.time is not None))
-    rows = count_rows(whole, outliers, block)
-    return Conditioned(record, motion, tuple(notes), outliers, noise, start.by, rows)
+    timed = record.time is not None
+    notes += [outlier_note(name, n, outliers.get(name), timed) for name, n in spoilt.items()]
+    count = count_rows(whole, outliers, block)
+    return Conditioned(record, motion, tuple(notes), outliers, noise, start.by, count)
 
 
 def cut_to_window(record: Record, window: Window) -> tuple[Record, list[str]]:
@@ -166,11 +167,13 @@ def check_signs(record: Record, advice: Mapping[str, str]) -> None:
 
 
 def integrate_motion(record: Record, specimen: Specimen, striker: Striker) -> tuple[Record, str]:
-    """Integrate the displacement from acceleration, else velocity, else from the force.
+    """Integrate a displacement that was not measured: from acceleration, velocity or force.
 
     From w(0) = 0 and w'(0) the striker's velocity; w'' = −a, or −σA/m. The integrals are exact
     where the channel is straight between samples.
     """
+    if record.displacement is not None:
+        return record, MEASURED
     time = record.time
     assert time is not None  # without a time the file has been refused
     if record.clipped is not None and record.acceleration is None and record.velocity is None:
@@ -207,7 +210,7 @@ def checks(record: Record, specimen: Specimen, striker: Striker | None, motion: 
         raise InputError(f"only {len(record)} samples are in contact; at least {MIN_ROWS} needed.")
     strain = float(displacement.max()) / height
     if strain >= 1:
-        cause = "the unit of displacement or strain" if motion == "measured" else "the striker"
+        cause = "the unit of displacement or strain" if motion == MEASURED else "the striker"
         raise InputError(f"strain reaches {strain:.3g}, beyond one; check height and {cause}.")
     for node, values in record.interior.items():
         name, most = interior_channel(node), float(values.max())
