@@ -12,11 +12,10 @@ from scipy.signal import lfilter
 from conftest import EXPERIMENTS
 from foamfit import read_test
 from foamfit.data.cycles import select_cycle
-from foamfit.data.measurement import Specimen, Striker
+from foamfit.data.measurement import Record, Specimen, Striker, Window
 from foamfit.data.noise import noise_level
+from foamfit.data.outliers import fill_staircase
 from foamfit.data.prepare import condition, thin
-from foamfit.data.record import Record, Window
-from foamfit.data.staircase import fill_staircase
 from foamfit.errors import InputError
 from foamfit.text import engineering
 

@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from foamfit.data.measurement import Array, NoiseLevel, Striker, interior_node
+from foamfit.data.measurement import MIN_ROWS, Array, NoiseLevel, Record, Striker, interior_node
 from foamfit.data.noise import noise_level
-from foamfit.data.record import MIN_ROWS, Record
 from foamfit.data.rest import (
     ERRORS,
     LEAST_REST,

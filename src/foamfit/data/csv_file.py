@@ -21,12 +21,14 @@ from foamfit.data.columns import (
     si_factor,
     sign_advice,
 )
-from foamfit.data.csv_table import MIN_ROWS, Table, find_table, read_numbers, read_text
+from foamfit.data.csv_table import Table, find_table, read_numbers, read_text
 from foamfit.data.headers import CHANNELS, example
 from foamfit.data.measurement import (
+    MIN_ROWS,
     Array,
     Dropped,
     Measurement,
+    Record,
     Specimen,
     Striker,
     interior_channel,
@@ -34,7 +36,6 @@ from foamfit.data.measurement import (
 )
 from foamfit.data.noise import with_noise
 from foamfit.data.prepare import condition
-from foamfit.data.record import Record
 from foamfit.data.toml_file import Column, Settings, read_settings
 from foamfit.errors import InputError
 from foamfit.text import engineering, percent

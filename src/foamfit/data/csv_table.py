@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.data.headers import CHANNELS, Header, parse_header
-from foamfit.data.measurement import Array
+from foamfit.data.measurement import MIN_ROWS, Array
 from foamfit.data.toml_file import LONGEST
 from foamfit.data.units import is_unit
 from foamfit.errors import InputError
@@ -25,7 +25,6 @@ from foamfit.errors import InputError
 if TYPE_CHECKING:
     import pandas as pd
 
-MIN_ROWS = 10
 _HEAD_ROWS = 400
 _NUMBER = re.compile(
     r"[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|nan|inf(?:inity)?)", re.IGNORECASE | re.ASCII

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from foamfit.data.measurement import Array
+from foamfit.data.measurement import Array, Record
 from foamfit.data.noise import noise_level
-from foamfit.data.record import Record
 from foamfit.errors import InputError
 from foamfit.text import percent
 

@@ -18,20 +18,28 @@ from foamfit.data.cycles import inner_reversals, select_cycle
 from foamfit.data.measurement import (
     INTEGRATED,
     MEASURED,
+    MIN_ROWS,
     Array,
     Dropped,
     NoiseLevel,
     Outliers,
+    Record,
     RowCount,
     Specimen,
     Striker,
+    Window,
     interior_channel,
 )
 from foamfit.data.noise import averaged, estimated_noise, noise_at_rest, noise_level
-from foamfit.data.outliers import bridge_outliers, mark_clipped, outlier_note, outliers_of_blocks
-from foamfit.data.record import MIN_ROWS, Record, Window
+from foamfit.data.outliers import (
+    bridge_outliers,
+    fill_staircase,
+    mark_clipped,
+    noise_of_held,
+    outlier_note,
+    outliers_of_blocks,
+)
 from foamfit.data.rest import MIN_REST, line_at, smooth
-from foamfit.data.staircase import fill_staircase, noise_of_held
 from foamfit.errors import InputError
 from foamfit.text import engineering, percent
 

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from foamfit.data.measurement import Array, NoiseLevel
+from foamfit.data.measurement import MIN_ROWS, Array, NoiseLevel
 from foamfit.data.noise import correlation_time, lag_one, noise_level
-from foamfit.data.record import MIN_ROWS
 
 # A rest has as many independent samples, and the slope of a signal on it is less than this share of
 # the slope that follows: the branches of a foam on loading differ less in stiffness (6 times in the

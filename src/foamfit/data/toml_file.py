@@ -17,8 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from foamfit.data.measurement import Noise, Specimen, Striker, interior_node
-from foamfit.data.record import Window
+from foamfit.data.measurement import Noise, Specimen, Striker, Window, interior_node
 from foamfit.data.units import is_unit, parse_quantity, split_quantity
 from foamfit.errors import InputError
 from foamfit.terminal import printable
