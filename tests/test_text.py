@@ -47,6 +47,7 @@ def test_numbers() -> None:
         "0.000012",
     ]
     assert [percent(v) for v in (1.384, 0.0023, 0.05)] == ["140 %", "0.23 %", "5 %"]
+    assert percent(1e-9) == "less than 0.001 %"
 
 
 def test_words() -> None:

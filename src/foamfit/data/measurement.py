@@ -243,18 +243,13 @@ class Measurement:
 
     Attributes
     ----------
-    name : str
-        Name of the test.
-    path : Path or None
-        The file that it was read from.
-    data_sha256 : str
-        Digest of that file's bytes, hexadecimal ("" if it was not read from a file).
+    name, path, data_sha256
+        Name of the test, and the file that it was read from (None if from none) with the
+        hexadecimal digest of its bytes.
     time : (n,) array or None
         s, increasing; None where the file has no time.
-    stress : (n,) array or None
-        Nominal base stress, Pa.
-    displacement : (n,) array or None
-        Displacement of the top, m.
+    stress, displacement : (n,) array or None
+        Nominal base stress, Pa, and displacement of the top, m.
     interior : dict of int to (n,) array
         Displacement of the masses inside that a camera followed, m: 1 is the one above spring 1.
     specimen, striker
@@ -264,7 +259,7 @@ class Measurement:
     motion : str or None
         Where the displacement came from: "measured", "integrated from force", …
     notes : tuple of str
-        Each thing that the loader did to the data or could not do, one sentence each.
+        Each thing that was done to the data or could not be done, one sentence each.
     outliers : dict of str to Outliers
         Of the channels that have some.
     contact : str
