@@ -11,18 +11,13 @@ from scipy.signal import lfilter
 
 from conftest import EXPERIMENTS
 from foamfit import read_test
-from foamfit.data.measurement import Specimen, Striker
-from foamfit.data.prepare import (
-    Record,
-    Window,
-    condition,
-    engineering,
-    fill_staircase,
-    noise_level,
-    select_cycle,
-    thin,
-)
+from foamfit.data.cycles import select_cycle
+from foamfit.data.measurement import Record, Specimen, Striker, Window
+from foamfit.data.noise import noise_level
+from foamfit.data.outliers import fill_staircase
+from foamfit.data.prepare import condition, thin
 from foamfit.errors import InputError
+from foamfit.text import engineering
 
 SPECIMEN = Specimen(height=1.19e-3, area=1.9635e-5, mass=5.56e-6)
 STRIKER = Striker(mass=7e-3, velocity=1.75)

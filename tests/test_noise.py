@@ -12,9 +12,10 @@ from scipy.signal import lfilter
 import foamfit as ff
 from conftest import DATA, HEIGHT, needs_data, synthetic_impact
 from fabricated import half_sine
-from foamfit.data.measurement import Noise, Specimen, Striker
-from foamfit.data.noise import find_outliers, quantum, residual_noise, with_noise
-from foamfit.data.prepare import Record, condition
+from foamfit.data.measurement import Noise, Record, Specimen, Striker
+from foamfit.data.noise import quantum, residual_noise, with_noise
+from foamfit.data.outliers import find_outliers
+from foamfit.data.prepare import condition
 
 SPECIMEN = Specimen(HEIGHT, 1.9635e-5)
 

@@ -169,7 +169,8 @@ def check(
         foamfit check PLAN.toml --model bistable --published foam-1/model-1
     """
     from foamfit.data.csv_file import read_test
-    from foamfit.data.energy import audit, describe
+    from foamfit.data.describe import describe
+    from foamfit.data.energy import audit
 
     if model is None:
         for option, value in (

@@ -1,4 +1,4 @@
-"""The ways in which foamfit says no, each in one sentence that says what would be right."""
+"""Errors raised by foamfit."""
 
 
 class InputError(ValueError):

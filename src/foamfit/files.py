@@ -1,4 +1,4 @@
-"""What is written: a whole file or a whole folder, or nothing.
+"""Write a whole file or a whole folder, or nothing.
 
 Each is made beside its place under a name that tells which process makes it, and is put in its
 place at the end. What a process that was killed has left behind is removed by the next one that
@@ -114,7 +114,7 @@ def _beside(path: Path, ending: str) -> Path:
 
 
 def _short(name: str) -> str:
-    """Name that leaves room for an ending; its own if that is short enough."""
+    """Name to which an ending can be added; its own if that is short enough."""
     raw = os.fsencode(name)
     return name if len(raw) <= 100 else f"{name[:20]}~{hashlib.sha256(raw).hexdigest()[:12]}"
 

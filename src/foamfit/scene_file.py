@@ -5,13 +5,14 @@ from __future__ import annotations
 import csv
 import io
 import math
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from foamfit.data.csv_file import read_history
+from foamfit.data.measurement import Array
 from foamfit.data.toml_file import check_keys, load_toml
 from foamfit.data.units import parse_quantity
 from foamfit.errors import InputError
@@ -28,7 +29,7 @@ from foamfit.springs.spring import (
     Spring,
 )
 
-Array = NDArray[np.float64]
+Made = TypeVar("Made")
 
 _EXAMPLES = {  # key: SI unit and an example
     "eps_a": ("", "0.14"),
@@ -47,17 +48,7 @@ _MOST_SAMPLES = 1_000_000
 
 
 def read_scene(path: Path) -> tuple[Chain, Drive, Array]:
-    """Read a scene file; see `foamfit simulate --help` for its keys.
-
-    Parameters
-    ----------
-    path : Path
-        TOML with [chain], [drive] and, in an impact, [time].
-
-    Returns
-    -------
-    tuple
-        Chain, drive and samples (s).
+    """Read chain, drive and samples (s) of a scene; see `foamfit simulate --help` for the keys.
 
     Raises
     ------
@@ -67,8 +58,7 @@ def read_scene(path: Path) -> tuple[Chain, Drive, Array]:
     document = load_toml(path, "give the TOML file of a scene")
     check_keys(f"{path}:", document, ["chain", "drive", "time"])
     chain = _chain(f"{path}: [chain]", _table(path, document, "chain"))
-    drive, time = _drive(path, document)
-    return chain, drive, time
+    return chain, *_drive(path, document)
 
 
 def files_of_scene(path: Path) -> tuple[Path, ...]:
@@ -104,9 +94,9 @@ def _chain(where: str, table: dict[str, Any]) -> Chain:
             raise InputError(f"{where} published = {name!r}; it may be {', '.join(published)}.")
         return published[name].chain
     check_keys(where, table, ["area", "diameter", "springs", "site_damping"])
+    if "diameter" in table and "area" in table:
+        raise InputError(f"{where} has both a diameter and an area; give one of them.")
     if "diameter" in table:
-        if "area" in table:
-            raise InputError(f"{where} has both a diameter and an area; give one of them.")
         area = math.pi / 4.0 * _number(where, table, "diameter") ** 2
     else:
         area = _number(where, table, "area")
@@ -120,8 +110,13 @@ def _chain(where: str, table: dict[str, Any]) -> Chain:
         heights.append(_number(here, item, "height"))
         masses.append(_number(here, item, "mass") if "mass" in item else 0.0)
     site = _number(where, table, "site_damping") if "site_damping" in table else 0.0
+    return _made(where, lambda: Chain(springs, heights, area, masses, site_damping=site))
+
+
+def _made(where: str, make: Callable[[], Made]) -> Made:
+    """Make a part of the scene; a refusal names where its numbers stand."""
     try:
-        return Chain(springs, heights, area, masses, site_damping=site)
+        return make()
     except InputError as error:
         raise InputError(f"{where} {error}.") from None
 
@@ -134,12 +129,9 @@ def _spring(where: str, given: dict[str, Any]) -> Spring:
     check_keys(where, given, ["kind", "height", "mass", *names])
     needed = [name for name in names if name != "eta" or name in given]
     values = {name: _number(where, given, name) for name in needed}
-    try:
-        if kind == "bistable":
-            return BistableSpring(**values)
-        return LinearSpring(**values, unilateral=kind == "unilateral")
-    except InputError as error:
-        raise InputError(f"{where} {error}.") from None
+    if kind == "bistable":
+        return _made(where, lambda: BistableSpring(**values))
+    return _made(where, lambda: LinearSpring(**values, unilateral=kind == "unilateral"))
 
 
 def _drive(path: Path, document: dict[str, Any]) -> tuple[Drive, Array]:
@@ -149,11 +141,7 @@ def _drive(path: Path, document: dict[str, Any]) -> tuple[Drive, Array]:
     if kind == "impact":
         check_keys(where, table, ["kind", "mass", "velocity"])
         mass, velocity = (_number(where, table, key) for key in ("mass", "velocity"))
-        try:
-            drive = Impact(mass, velocity)
-        except InputError as error:
-            raise InputError(f"{where} {error}.") from None
-        return drive, _samples(path, document)
+        return _made(where, lambda: Impact(mass, velocity)), _samples(path, document)
     if kind not in ("stress", "displacement"):
         raise InputError(f"{where} kind = {kind!r}; it must be impact, stress or displacement.")
     check_keys(where, table, ["kind", "file"])

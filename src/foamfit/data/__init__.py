@@ -1,5 +1,8 @@
 """From the files of a test to a measurement in SI, ready to be fitted.
 
-`csv_file` and `toml_file` read, `prepare` finds contact and cycles, `noise` estimates, `energy`
-audits what striker, force and motion say of each other. A newcomer may skip `units`.
+`csv_file.read_test` tells the whole way. `csv_table` finds the numbers of a file, `headers` and
+`columns` their channels and units, `toml_file` the specimen and the striker. `prepare.condition`
+turns the samples into one loading and unloading: `outliers` mends single samples, `cycles` and
+`contact` find the part that counts. `noise` estimates, `energy` audits what striker, force and
+motion say of each other, `describe` prints a test. A newcomer may skip `units` and `rest`.
 """

@@ -1,4 +1,4 @@
-"""Do mass, velocity, force and motion of a test agree? And what `foamfit check` prints of a test.
+"""Do mass, velocity, force and motion of a test agree?
 
 The striker brings m v²/(2 A H) per unit volume; what the stress does on the way to the largest
 strain must take it up. The impulse of the force must be the striker's change of momentum.
@@ -10,8 +10,10 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from foamfit.data.measurement import INTEGRATED, Array, Measurement, Striker, interior_channel
-from foamfit.data.prepare import engineering, line_at, noise_level
+from foamfit.data.measurement import INTEGRATED, Array, Measurement, Striker
+from foamfit.data.noise import noise_level
+from foamfit.data.rest import line_at
+from foamfit.text import engineering, percent
 
 
 @dataclass(frozen=True)
@@ -28,10 +30,8 @@ class EnergyAudit:
         Dissipated over absorbed energy, and absorbed over the striker's energy.
     rebound_velocity : float or None
         Velocity with which the top leaves, m/s, positive away from the specimen.
-    impulse, momentum_change : float or None
-        ∫F dt over contact, and m (v_in + v_out), N·s.
-    impulse_ratio : float or None
-        The first over the second; one if force, mass and motion agree.
+    impulse, momentum_change, impulse_ratio : float or None
+        ∫F dt over contact and m (v_in + v_out), N·s, and the first over the second.
     motion : str or None
         Where the displacement came from.
     missing : tuple of str
@@ -88,18 +88,16 @@ class EnergyAudit:
 
     def sentences(self) -> list[str]:
         """Return what was found, what does not close, and what is missing."""
-        found = []
+        found, ratio = [], self.absorbed_over_striker
         if self.striker_energy is not None:
             found.append(f"The striker brings {engineering(self.striker_energy, 'J/m³')}.")
         if self.absorbed_energy is not None:
-            share = ""
-            if self.absorbed_over_striker is not None:
-                share = f", {self.absorbed_over_striker:.2f} of what the striker brings"
-            peak = engineering(self.absorbed_energy, "J/m³")
-            found.append(f"The foam absorbs {peak} up to the largest strain{share}.")
+            taken = engineering(self.absorbed_energy, "J/m³")
+            share = "" if ratio is None else f", {ratio:.2f} of what the striker brings"
+            found.append(f"The foam absorbs {taken} up to the largest strain{share}.")
         if self.dissipated_energy is not None and self.dissipated_fraction is not None:
             lost = engineering(self.dissipated_energy, "J/m³")
-            found.append(f"It dissipates {lost}, {self.dissipated_fraction:.0%} of that.")
+            found.append(f"It dissipates {lost}, {percent(self.dissipated_fraction)} of that.")
         if self.rebound_velocity is not None:
             found.append(f"The striker leaves at {self.rebound_velocity:.3g} m/s.")
         if self.impulse is not None and self.momentum_change is not None:
@@ -113,39 +111,20 @@ class EnergyAudit:
 def audit(measurement: Measurement) -> EnergyAudit:
     """Compare what the striker brings with what the specimen takes.
 
-    Parameters
-    ----------
-    measurement : Measurement
-        A conditioned test; whatever it lacks is left None and named in `missing`.
-
-    Returns
-    -------
-    EnergyAudit
-        Energies in J/m³, impulse in N·s.
+    Whatever a test lacks is left None and named in `missing`.
     """
     test, missing = measurement, list[str]()
     striker, specimen = test.striker or Striker(), test.specimen
-    striker_energy = absorbed = dissipated = ratio = None
+    brought = None
     if striker.mass and striker.velocity:
-        volume = specimen.area * specimen.height
-        striker_energy = striker.mass * striker.velocity**2 / (2 * volume)
+        brought = striker.mass * striker.velocity**2 / (2 * specimen.area * specimen.height)
     else:
         missing.append("The striker's energy needs its mass and velocity.")
-    if test.stress is not None and test.displacement is not None:
-        strain = test.displacement / specimen.height
-        top, largest = largest_motion(test.displacement, test.time)
-        # What precedes the first sample is the triangle from zero at time zero.
-        before = 0.5 * float(max(test.stress[0], 0.0) * max(strain[0], 0.0))
-        absorbed = before + float(np.trapezoid(test.stress[: top + 1], strain[: top + 1]))
-        # The sum ends at a noisy strain, where the stress is highest; the true end is the turn.
-        absorbed += float(test.stress[top]) * (largest / specimen.height - float(strain[top]))
-        if _unloaded(test.stress):
-            dissipated = before + float(np.trapezoid(test.stress, strain))
-        else:
-            missing.append("The dissipated energy needs the unloading.")
-        ratio = absorbed / striker_energy if striker_energy else None
-    else:
+    absorbed, dissipated = _absorbed(test)
+    if absorbed is None:
         missing.append("The absorbed energy needs stress and displacement.")
+    elif dissipated is None:
+        missing.append("The dissipated energy needs the unloading.")
     rebound = _rebound(test)
     impulse, change = _momentum(test, striker, rebound)
     if test.motion == INTEGRATED:
@@ -153,11 +132,11 @@ def audit(measurement: Measurement) -> EnergyAudit:
     elif change is None:
         missing.append("The balance of momentum needs an impact of known mass with its rebound.")
     return EnergyAudit(
-        striker_energy=striker_energy,
+        striker_energy=brought,
         absorbed_energy=absorbed,
         dissipated_energy=dissipated,
         dissipated_fraction=dissipated / absorbed if dissipated is not None and absorbed else None,
-        absorbed_over_striker=ratio,
+        absorbed_over_striker=absorbed / brought if absorbed is not None and brought else None,
         rebound_velocity=rebound,
         impulse=impulse,
         momentum_change=change,
@@ -167,25 +146,28 @@ def audit(measurement: Measurement) -> EnergyAudit:
     )
 
 
+def _absorbed(test: Measurement) -> tuple[float | None, float | None]:
+    """∫σ dε up to the largest strain, and over the whole history if the test unloads."""
+    stress, w, height = test.stress, test.displacement, test.specimen.height
+    if stress is None or w is None:
+        return None, None
+    strain = w / height
+    top, largest = largest_motion(w, test.time)
+    # What precedes the first sample is the triangle from zero at time zero.
+    before = 0.5 * float(max(stress[0], 0.0) * max(strain[0], 0.0))
+    absorbed = before + float(np.trapezoid(stress[: top + 1], strain[: top + 1]))
+    # The sum ends at a noisy strain, where the stress is highest; the true end is the turn.
+    absorbed += float(stress[top]) * (largest / height - float(strain[top]))
+    return absorbed, before + float(np.trapezoid(stress, strain)) if _unloaded(stress) else None
+
+
 def largest_motion(displacement: Array, time: Array | None = None) -> tuple[int, float]:
     """Find the turn of a motion: the largest of its samples would be the largest of its noise.
 
     A quartic is fitted to the samples about the turn that the noise could confuse with it; where
     the motion is so clean that they are few, the largest sample is the turn.
 
-    Parameters
-    ----------
-    displacement : (n,) array
-        m.
-    time : (n,) array, optional
-        s; without it the samples count as evenly spaced.
-
-    Returns
-    -------
-    index : int
-        The sample at the turn.
-    value : float
-        The displacement there, free of the noise of that sample, m.
+    Returns the sample at the turn and the displacement there, free of the noise of that sample.
     """
     floor = displacement.max() - 8.0 * noise_level(displacement)
     near = np.flatnonzero(displacement >= floor)
@@ -223,115 +205,6 @@ def _momentum(
     if test.striker is None or time is None or stress is None:
         return None, None
     impulse = test.specimen.area * float(np.trapezoid(stress, time) + 0.5 * stress[0] * time[0])
-    if not (striker.mass and striker.velocity) or rebound is None:
-        return impulse, None
-    if test.motion == INTEGRATED:
+    if not (striker.mass and striker.velocity) or rebound is None or test.motion == INTEGRATED:
         return impulse, None
     return impulse, striker.mass * (striker.velocity + rebound)
-
-
-# What `foamfit check` prints.
-
-
-def describe(measurement: Measurement, audit: EnergyAudit) -> str:
-    """Write what the loader understood of a test, for people: a few aligned lines.
-
-    Parameters
-    ----------
-    measurement : Measurement
-        The conditioned test.
-    audit : EnergyAudit
-        Its balance of energy and momentum.
-
-    Returns
-    -------
-    str
-        Text of about thirty lines, without a newline at its end.
-    """
-    test = measurement
-    lines = [("test", test.name), ("file", str(test.path or "none"))]
-    lines += [("specimen", _specimen(test)), ("striker", _striker(test))]
-    lines += _labelled("rows", test.rows.sentences())
-    lines += [("samples", _sampling(test))]
-    lines += _peaks(test)
-    lines += _labelled("noise", noise_sentences(test))
-    lines += _labelled("done", test.notes) + _labelled("energy", audit.sentences())
-    return "\n".join(f"{label:<10}{_wrap(text)}" for label, text in lines)
-
-
-def noise_sentences(measurement: Measurement) -> list[str]:
-    """Say of each channel what its noise is, one standard deviation, and how it is known."""
-    told = []
-    for channel, values in measurement.channels().items():
-        level = measurement.noise.of(channel)
-        if level is not None:
-            sigma = engineering(level.sigma, "Pa" if channel == "stress" else "m")
-            share = level.sigma / (float(np.ptp(values)) or 1.0)
-            slow = f", each follows the others for {level.time:.1f} samples"
-            slow = slow if level.time > 1.0 else ""
-            told.append(
-                f"{channel} {sigma} ({100.0 * share:.2g} % of its range), {level.how}{slow}."
-            )
-    return told
-
-
-def _wrap(text: str) -> str:
-    import textwrap
-
-    return textwrap.fill(text, width=98, initial_indent=" " * 10, subsequent_indent=" " * 12)[10:]
-
-
-def _labelled(label: str, sentences: tuple[str, ...] | list[str]) -> list[tuple[str, str]]:
-    return [(label if i == 0 else "", text) for i, text in enumerate(sentences)]
-
-
-def _specimen(test: Measurement) -> str:
-    s = test.specimen
-    text = f"height {engineering(s.height, 'm')}, area {s.area * 1e6:.4g} mm²"
-    if s.mass:
-        density = s.mass / (s.area * s.height)
-        text += f", mass {engineering(s.mass * 1e3, 'g')} ({density:.4g} kg/m³)"
-    if s.heights:
-        text += f", springs from the base {' + '.join(engineering(h, 'm') for h in s.heights)}"
-    return text
-
-
-def _striker(test: Measurement) -> str:
-    s = test.striker or Striker()
-    mass = engineering(s.mass * 1e3, "g") if s.mass else "mass unknown"
-    speed = f"{s.velocity:.4g} m/s" if s.velocity else "velocity unknown"
-    return f"{mass}, {speed}" if test.striker else "none given"
-
-
-def _sampling(test: Measurement) -> str:
-    time = test.time
-    channels = {"time": time, "stress": test.stress, "displacement": test.displacement}
-    channels |= {interior_channel(node): values for node, values in test.interior.items()}
-    present = [name for name, values in channels.items() if values is not None]
-    n = max(len(values) for values in channels.values() if values is not None)
-    text = f"{n} of {', '.join(present)}"
-    if time is None:
-        return f"{text}; no time, so only slow drives make sense"
-    step = float(np.median(np.diff(time)))
-    end = engineering(float(time[-1]), "s")
-    return f"{text}, every {engineering(step, 's')} from time zero to {end}"
-
-
-def _peaks(test: Measurement) -> list[tuple[str, str]]:
-    lines = []
-    if test.stress is not None:
-        at = _moment(test.time, int(np.argmax(test.stress)))
-        lines.append(("stress", f"peak {engineering(float(test.stress.max()), 'Pa')}{at}"))
-    if test.displacement is not None:
-        top, w = largest_motion(test.displacement, test.time)
-        at = _moment(test.time, top)
-        text = f"peak {w / test.specimen.height:.4g} ({engineering(w, 'm')}){at}, {test.motion}"
-        lines.append(("strain", text))
-    for node, values in test.interior.items():
-        top, w = largest_motion(values, test.time)
-        lines.append((f"mass {node}", f"peak {engineering(w, 'm')}{_moment(test.time, top)}"))
-    return lines
-
-
-def _moment(time: Array | None, sample: int) -> str:
-    return "" if time is None else f" at {engineering(float(time[sample]), 's')}"

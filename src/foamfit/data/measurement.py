@@ -1,18 +1,20 @@
-"""What was measured: the channels of one test in SI, its specimen and its striker."""
+"""What was measured: the samples of a file, and the test made of them, all in SI."""
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+MIN_ROWS = 10  # samples of a test
 
-# What is said of a motion that is no measurement of its own.
-INTEGRATED = "integrated from force"
+# Where a motion comes from; the second is no measurement of its own.
+MEASURED, INTEGRATED = "measured", "integrated from force"
 
 
 def interior_channel(node: int) -> str:
@@ -28,18 +30,9 @@ def interior_node(channel: str) -> int | None:
 
 @dataclass(frozen=True)
 class Specimen:
-    """The foam specimen.
+    """The foam specimen: height before the test (m), cross-section (m²), mass (kg).
 
-    Attributes
-    ----------
-    height : float
-        Height H before the test, m.
-    area : float
-        Cross-section A, m².
-    mass : float or None
-        Mass of the foam, kg.
-    heights : tuple of float or None
-        Heights h_i of the springs of a chain, base first, m.
+    `heights` are those of the springs of a chain, base first, m.
     """
 
     height: float
@@ -58,18 +51,10 @@ class Striker:
 
 @dataclass(frozen=True)
 class NoiseLevel:
-    """The noise of one channel.
+    """The noise of one channel: one standard deviation, Pa or m.
 
-    Attributes
-    ----------
-    sigma : float
-        One standard deviation, Pa or m.
-    given : bool
-        Whether the test states it; else it is estimated from the data.
-    how : str
-        "given", or how it was estimated: "estimated from 40 samples before contact".
-    time : float
-        Its autocorrelation time, in samples (1: white).
+    It is `given` by the test, or else estimated from the data; `how` says so ("estimated from 40
+    samples before contact"). `time` is its autocorrelation time, in samples (1: white).
     """
 
     sigma: float
@@ -80,15 +65,11 @@ class NoiseLevel:
 
 @dataclass(frozen=True)
 class Noise:
-    """The noise of the channels, each one standard deviation.
+    """The noise of the channels, each one standard deviation, Pa or m.
 
-    Attributes
-    ----------
-    stress, displacement : float or None
-        As the TOML states them, Pa and m; the second holds for masses inside too.
-    estimated : dict of str to NoiseLevel
-        Of the channels of which the TOML says nothing ("stress", "displacement",
-        "displacement_1", …), as they were estimated from the data.
+    `stress` and `displacement` are what the TOML states; the second holds for masses inside too.
+    `estimated` holds what was estimated from the data of the channels that it does not state
+    ("stress", "displacement", "displacement_1", …).
     """
 
     stress: float | None = None
@@ -107,17 +88,10 @@ class Noise:
 class Outliers:
     """Samples of a channel that are not fitted: spikes, short gaps, and a clipped top.
 
-    Attributes
-    ----------
-    left_out : (n,) array of bool
-        Samples of the test that are not fitted; at spikes and gaps the channel holds a straight
-        line.
-    at : (k,) array
-        Where the file has spikes and gaps: time in s, or the sample where the test has no time.
-    values : (k,) array
-        What the file has there, Pa or m.
-    clipped_at : float or None
-        The value at which the sensor or its amplifier clips the channel, Pa; None if it does not.
+    `left_out` marks these samples, shape (n,); at spikes and gaps the channel holds a straight
+    line. What the file has there is `values` (k,), Pa or m, `at` (k,) times in s, or samples where
+    the test has no time. `clipped_at` is the value at which the sensor or its amplifier clips the
+    channel, Pa.
     """
 
     left_out: NDArray[np.bool_]
@@ -128,23 +102,21 @@ class Outliers:
 
 @dataclass(frozen=True)
 class Dropped:
-    """Rows of a file that are not used, for one reason.
+    """Rows of a file that are not used, for one reason, which follows "not used: ".
 
-    Attributes
-    ----------
-    rows : int
-        How many.
-    first, last : int
-        Row numbers of the first and the last of them: lines of the file as an editor counts them,
-        from 1 and with the header. Rows that are used may lie between.
-    why : str
-        The reason, to follow "not used: ".
+    `first` and `last` are lines of the file as an editor counts them, from 1 and with the header.
+    Rows that are used may lie between.
     """
 
     rows: int
     first: int
     last: int
     why: str
+
+    @classmethod
+    def of(cls, rows: NDArray[np.int64], why: str) -> Dropped:
+        """Leave out the rows with these numbers."""
+        return cls(rows.size, int(rows[0]), int(rows[-1]), why)
 
     def __str__(self) -> str:
         """Return for example "rows 2 to 200 (199): before contact starts"."""
@@ -168,8 +140,101 @@ class RowCount:
 
     def sentences(self) -> list[str]:
         """Say how many rows there are, and name those that are not used."""
-        told = f"{self.rows} in the file, {self.used} used"
-        return [f"{told}.", *(f"Not used: {item}." for item in self.dropped)]
+        told = f"{self.rows} in the file, {self.used} used."
+        return [told, *(f"Not used: {item}." for item in self.dropped)]
+
+
+@dataclass(frozen=True)
+class Window:
+    """The part of a file to look at: times in s as the file counts them, and which cycle."""
+
+    start: float | None = None
+    end: float | None = None
+    cycle: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """The channels of a test in SI, each of shape (n,) or None where the file lacks it.
+
+    Time in s, stress in Pa, displacement of the top in m, velocity of the top in m/s and its
+    deceleration in m/s² (like the stress that causes it, it is positive in compression). `interior`
+    holds the displacement of masses inside in m, 1 for the one above spring 1. `excess` is what the
+    file has beyond the straight line that bridges an outlier, 0 elsewhere, for each channel that
+    has outliers. `clipped` marks the samples at which the force is clipped. `numbers` holds the row
+    number in the file of each sample (None: they count from 1), and `dropped` the rows of the file
+    that were left out so far.
+    """
+
+    time: Array | None
+    stress: Array
+    displacement: Array | None
+    velocity: Array | None = None
+    acceleration: Array | None = None
+    interior: dict[int, Array] = field(default_factory=dict)
+    excess: dict[str, Array] = field(default_factory=dict)
+    clipped: NDArray[np.bool_] | None = None
+    numbers: NDArray[np.int64] | None = None
+    dropped: tuple[Dropped, ...] = ()
+
+    def __len__(self) -> int:
+        """Count the samples."""
+        return len(self.stress)
+
+    @property
+    def row_numbers(self) -> NDArray[np.int64]:
+        """Row number in the file of each sample, shape (n,)."""
+        return np.arange(1, len(self) + 1) if self.numbers is None else self.numbers
+
+    @property
+    def instants(self) -> Array:
+        """Time, or the sample's number where there is none, shape (n,)."""
+        return np.arange(len(self), dtype=np.float64) if self.time is None else self.time
+
+    def curves(self, *more: str) -> dict[str, Array]:
+        """Stress, displacement, `more` and displacements inside, as far as they are there."""
+        names = ("stress", "displacement", *more, *map(interior_channel, self.interior))
+        found = {name: self.channel(name) for name in names}
+        return {name: values for name, values in found.items() if values is not None}
+
+    def channel(self, name: str) -> Array | None:
+        """Return a channel by its name; "displacement_1" is the mass inside above spring 1."""
+        node = interior_node(name)
+        values: Array | None = getattr(self, name) if node is None else self.interior.get(node)
+        return values
+
+    def changed(self, name: str, values: Array) -> Record:
+        """Put other values into a channel."""
+        node = interior_node(name)
+        if node is None:
+            return replace(self, **{name: values})  # type: ignore[arg-type]
+        return replace(self, interior=self.interior | {node: values})
+
+    def rows(self, which: slice | NDArray[np.bool_]) -> Record:
+        """Keep some rows of every channel; those that `without` leaves out are counted, too."""
+        kept: dict[str, Any] = {}
+        for item in fields(self):
+            values = getattr(self, item.name)
+            if isinstance(values, dict):
+                kept[item.name] = {key: v[which] for key, v in values.items()}
+            elif isinstance(values, np.ndarray):
+                kept[item.name] = values[which]
+        return replace(self, **kept)
+
+    def without(self, gone: slice | NDArray[np.bool_], why: str) -> Record:
+        """Leave out some rows of every channel, and count them with the reason."""
+        numbers = self.row_numbers
+        lost = numbers[gone]
+        if not lost.size:
+            return self
+        kept = np.ones(len(self), dtype=bool)
+        kept[gone] = False
+        dropped = (*self.dropped, Dropped.of(lost, why))
+        return replace(self, numbers=numbers, dropped=dropped).rows(kept)
+
+    def between(self, first: int, end: int, before: str, after: str) -> Record:
+        """Keep the samples from `first` up to `end`; the reasons count what lies outside."""
+        return self.without(slice(end, None), after).without(slice(0, first), before)
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,18 +243,13 @@ class Measurement:
 
     Attributes
     ----------
-    name : str
-        Name of the test.
-    path : Path or None
-        The file that it was read from.
-    data_sha256 : str
-        Digest of that file's bytes, hexadecimal ("" if it was not read from a file).
+    name, path, data_sha256
+        Name of the test, and the file that it was read from (None if from none) with the
+        hexadecimal digest of its bytes.
     time : (n,) array or None
         s, increasing; None where the file has no time.
-    stress : (n,) array or None
-        Nominal base stress, Pa.
-    displacement : (n,) array or None
-        Displacement of the top, m.
+    stress, displacement : (n,) array or None
+        Nominal base stress, Pa, and displacement of the top, m.
     interior : dict of int to (n,) array
         Displacement of the masses inside that a camera followed, m: 1 is the one above spring 1.
     specimen, striker
@@ -199,7 +259,7 @@ class Measurement:
     motion : str or None
         Where the displacement came from: "measured", "integrated from force", …
     notes : tuple of str
-        Each thing that the loader did to the data or could not do, one sentence each.
+        Each thing that was done to the data or could not be done, one sentence each.
     outliers : dict of str to Outliers
         Of the channels that have some.
     contact : str

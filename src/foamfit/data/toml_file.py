@@ -17,14 +17,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from foamfit.data.measurement import Noise, Specimen, Striker, interior_node
-from foamfit.data.prepare import Window
+from foamfit.data.measurement import Noise, Specimen, Striker, Window, interior_node
 from foamfit.data.units import is_unit, parse_quantity, split_quantity
 from foamfit.errors import InputError
 from foamfit.terminal import printable
 
 _LARGEST = 1_000_000  # characters of a TOML
-_LONGEST = 200  # characters of a name
+LONGEST = 200  # characters of a name
 # Many keys that are joined by dots.
 _DOTTED = re.compile(r"""(?<![\w"'-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){32}""")
 # Section, key: SI unit and an example.
@@ -41,15 +40,13 @@ _SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
     "window": {"start": ("s", "0.5 ms"), "end": ("s", "2 ms"), "cycle": ("", "1")},
     "data": {"duplicates": ("", "average")},
 }
-DUPLICATES = ("average", "refuse")
 
 
 @dataclass(frozen=True)
 class Column:
     """What [columns] says of one channel: its column, and the unit and scale of its numbers.
 
-    `counts_down` says that the column is a gap or a position that gets smaller in compression; the
-    displacement is what it has lost since contact.
+    A column that `counts_down` is a gap or a position that gets smaller in compression.
     """
 
     column: str
@@ -61,11 +58,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Settings:
-    """What the TOML says, in SI.
-
-    `duplicates` says what becomes of neighbouring rows with the same time stamp: "average" makes
-    one sample of them, "refuse" ends the reading.
-    """
+    """What the TOML says, in SI; `duplicates` says what becomes of rows with one time stamp."""
 
     name: str
     specimen: Specimen
@@ -77,20 +70,7 @@ class Settings:
 
 
 def load_toml(path: Path, otherwise: str) -> dict[str, Any]:
-    """Load a TOML file.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    otherwise : str
-        What to say where there is none: what it is needed for.
-
-    Raises
-    ------
-    InputError
-        If there is none or it is no TOML.
-    """
+    """Load a TOML file; `otherwise` says what it is needed for where there is none."""
     try:
         with path.open("rb") as file:
             raw = file.read(_LARGEST + 1)
@@ -120,22 +100,15 @@ def check_keys(where: str, given: Iterable[str], valid: Iterable[str]) -> None:
     valid = list(valid)
     for key in given:
         if key not in valid:
-            near = difflib.get_close_matches(key[:_LONGEST], valid, n=2, cutoff=0.4) or valid
-            key = key if len(key) <= _LONGEST else f"{key[:_LONGEST]} …"
+            near = difflib.get_close_matches(key[:LONGEST], valid, n=2, cutoff=0.4) or valid
+            key = key if len(key) <= LONGEST else f"{key[:LONGEST]} …"
             raise InputError(f"{where} has no key {key!r}; meant may be {', '.join(near)}.")
 
 
 def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Settings:
-    """Read and check the TOML at `path`.
+    """Read and check the TOML at `path` that describes the file `test`.
 
-    Parameters
-    ----------
-    path : Path
-        The TOML.
-    test : Path
-        The test file that it describes.
-    channels : iterable of str
-        What [columns] may name besides displacement_1, displacement_2, …
+    [columns] may name `channels`, displacement_1, displacement_2, …
 
     Raises
     ------
@@ -144,18 +117,7 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
     """
     document = load_toml(path, f"{test.name} needs a TOML with [specimen] height and diameter")
     check_keys(f"{path}:", document, ["name", "columns", *_SECTIONS])
-    name = document.get("name", test.stem)
-    if not isinstance(name, str) or not name.strip():
-        raise InputError(f"{path}: name = {name!r} is no text; give it in quotation marks.")
-    if len(name) > _LONGEST:
-        raise InputError(
-            f"{path}: name has {len(name)} characters; it must have {_LONGEST} at most."
-        )
-    control = next((c for c in name if not c.isprintable()), None)
-    if control is not None and "name" in document:
-        raise InputError(
-            f"{path}: name has a control character, U+{ord(control):04X}; write it in plain text."
-        )
+    name = _name(path, document["name"]) if "name" in document else printable(test.stem)
     values: dict[str, dict[str, Any]] = {}
     for section, keys in _SECTIONS.items():
         table = document.get(section, {})
@@ -164,7 +126,7 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
         check_keys(f"{path}: [{section}]", table, keys)
         values[section] = {k: _value(path, section, k, v) for k, v in table.items()}
     return Settings(
-        name=printable(name),
+        name=name,
         specimen=_specimen(path, values["specimen"]),
         striker=Striker(**values["striker"]) if values["striker"] else None,
         noise=Noise(**values["noise"]),
@@ -172,6 +134,22 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
         columns=_columns(path, document.get("columns", {}), channels),
         **values["data"],
     )
+
+
+def _name(path: Path, name: Any) -> str:
+    """Check the name of a test."""
+    if not isinstance(name, str) or not name.strip():
+        raise InputError(f"{path}: name = {name!r} is no text; give it in quotation marks.")
+    if len(name) > LONGEST:
+        raise InputError(
+            f"{path}: name has {len(name)} characters; it must have {LONGEST} at most."
+        )
+    control = next((c for c in name if not c.isprintable()), None)
+    if control is not None:
+        raise InputError(
+            f"{path}: name has a control character, U+{ord(control):04X}; write it in plain text."
+        )
+    return name
 
 
 def _value(path: Path, section: str, key: str, value: Any) -> Any:
@@ -182,8 +160,8 @@ def _value(path: Path, section: str, key: str, value: Any) -> Any:
             raise InputError(f"{where} = {value!r} must be a whole number from 1 up.")
         return value
     if key == "duplicates":
-        if value not in DUPLICATES:
-            raise InputError(f"{where} = {value!r} must be one of {', '.join(DUPLICATES)}.")
+        if value not in ("average", "refuse"):
+            raise InputError(f"{where} = {value!r} must be one of average, refuse.")
         return value
     if key == "heights":
         if not isinstance(value, list) or not value:

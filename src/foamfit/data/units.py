@@ -18,9 +18,10 @@ _QUANTITY = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*)")
 def _registry() -> Any:
     import pint
 
-    registry: Any
     try:  # parsing pint's definitions takes longer than most fits: it keeps them in a cache
-        registry = pint.UnitRegistry(autoconvert_offset_to_baseunit=True, cache_folder=":auto:")
+        registry: Any = pint.UnitRegistry(
+            autoconvert_offset_to_baseunit=True, cache_folder=":auto:"
+        )
     except OSError:
         registry = pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
     registry.define("microstrain = 1e-6 = ustrain")
@@ -51,21 +52,10 @@ def is_unit(text: str, *, any_case: bool = False) -> bool:
 
 
 def factor(unit: str, si: str, *, times: str = "") -> float | None:
-    """Return what a number in `unit` · `times` is multiplied by to be in `si`.
+    """Return what a number in `unit` · `times` is multiplied by to be in `si`, "" for none.
 
-    Parameters
-    ----------
-    unit : str
-        The unit of a column, in whatever case; the first spelling of the right kind counts.
-    si : str
-        The wanted unit, "" for none.
-    times : str
-        The unit of a scale, for example "N/V".
-
-    Returns
-    -------
-    float or None
-        None if `unit` is unknown or of another kind.
+    The unit may be in whatever case; the first spelling of the right kind counts. None if it is
+    unknown or of another kind.
     """
     for spelling in _spellings(unit):
         one = _unit(spelling)
@@ -81,28 +71,9 @@ def split_quantity(text: str) -> tuple[float, str] | None:
 
 
 def parse_quantity(value: object, si: str, where: str, example: str) -> float:
-    """Read a quantity such as "1.19 mm".
+    """Read a quantity such as "1.19 mm" in the unit `si`, "" for none.
 
-    Parameters
-    ----------
-    value : object
-        What a file holds; anything but a text with a number and a unit is refused.
-    si : str
-        The unit of the answer, "" for none.
-    where : str
-        File and key, for the refusal.
-    example : str
-        What would be right, for the refusal.
-
-    Returns
-    -------
-    float
-        In `si`.
-
-    Raises
-    ------
-    InputError
-        If it is no quantity, or its unit is unknown or of another kind.
+    A refusal names `where` it stands, file and key, and gives an `example`.
     """
     parts = split_quantity(value) if isinstance(value, str) else None
     if parts is None:

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.data.measurement import Measurement, Noise, NoiseLevel, Striker
-from foamfit.data.prepare import engineering
 from foamfit.data.toml_file import read_settings
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.problem import Problem, make_problem
@@ -30,6 +29,7 @@ from foamfit.springs.chain import Chain, Impact
 from foamfit.springs.model import Model, split_name, unit_of
 from foamfit.springs.published import published
 from foamfit.springs.spring import BistableSpring
+from foamfit.text import engineering
 from foamfit.trust import covariance
 from foamfit.trust.checklist import ESTIMATED
 from foamfit.trust.conclude import state_of

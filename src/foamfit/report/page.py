@@ -10,7 +10,6 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 from foamfit.data.measurement import interior_channel
-from foamfit.data.prepare import engineering
 from foamfit.report.plots import (
     DPI,
     image,
@@ -20,6 +19,7 @@ from foamfit.report.plots import (
     plot_residuals,
 )
 from foamfit.report.readable import Readable, number, readable, readable_unit
+from foamfit.text import engineering
 
 if TYPE_CHECKING:
     from foamfit.data.measurement import Measurement

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from foamfit.data.measurement import INTEGRATED
-from foamfit.data.prepare import engineering
 from foamfit.errors import InputError
 from foamfit.fitting.objective import check_time_shift
 from foamfit.results import Check, ParameterEstimate
 from foamfit.springs.model import split_name
+from foamfit.text import engineering
 from foamfit.trust.covariance import AT_LIMIT, WEAK
 from foamfit.trust.time_shift import shift_hint
 

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foamfit.data.energy import audit, noise_sentences
+from foamfit.data.describe import noise_sentences
+from foamfit.data.energy import audit
 from foamfit.data.measurement import INTEGRATED, interior_channel
-from foamfit.data.prepare import engineering
 from foamfit.errors import SimulationError
 from foamfit.fitting.objective import (
     LOSSES,
@@ -27,6 +27,7 @@ from foamfit.fitting.search import SearchRecord
 from foamfit.results import Correlation, Curves, Fit, ParameterEstimate, Switch
 from foamfit.springs import kernels
 from foamfit.springs.model import split_name, unit_of
+from foamfit.text import engineering
 from foamfit.trust import covariance
 from foamfit.trust.checklist import MAY_VANISH, Evidence, make_checklist, status_of, warnings_of
 from foamfit.trust.identifiability import Insight, look, unreached, visited

@@ -1,0 +1,196 @@
+"""Which column of a table is which channel, and what its numbers are multiplied by to be in SI."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from foamfit.data.csv_table import Table, read_numbers
+from foamfit.data.headers import CHANNELS, WEAK, WEIGHTS, Header, channel_of, example, in_si
+from foamfit.data.measurement import Striker, interior_channel, interior_node
+from foamfit.data.toml_file import Column, Settings
+from foamfit.data.units import is_unit
+from foamfit.errors import InputError
+
+_NONE = Column("")
+
+
+def assign_columns(table: Table, given: dict[str, Column], toml: Path | None) -> dict[str, int]:
+    """Which column each channel is in: as [columns] of the TOML says, else as the headers do."""
+    found: dict[str, int] = {}
+    strained = "strain" in given or any(h.rank("strain") is not None for h in table.headers)
+    for channel in _channels(table, given):
+        if channel in given:
+            found[channel] = _given_column(table, channel, given[channel].column, toml)
+            continue
+        ranks = {k: r for k, h in enumerate(table.headers) if (r := h.rank(channel)) is not None}
+        if interior_node(channel):  # a column that the TOML calls the top is not inside
+            taken = {found[c] for c in given if c in found}
+            ranks = {k: r for k, r in ranks.items() if k not in taken}
+        best = [k for k, r in ranks.items() if r == min(ranks.values())]
+        if len(best) > 1 and channel == "time":
+            best = _clear_time(table, best)
+        if len(best) > 1:
+            both = " and ".join(repr(table.headers[k].text) for k in best)
+            entry = f'{channel} = {{ column = "{table.headers[best[0]].text}" }}'
+            raise InputError(
+                f"{table.path}: columns {both} could both be the {channel}; keep one"
+                + (f", or write {entry} in [columns] of {toml.name}." if toml else ".")
+            )
+        if best and not (ranks[best[0]] == WEAK and strained):
+            found[channel] = best[0]
+    # A channel that the TOML names replaces its twin that only a header names.
+    for one, other in (("stress", "force"), ("displacement", "strain")):
+        for named, twin in ((one, other), (other, one)):
+            if named in given and twin not in given:
+                found.pop(twin, None)
+    return found
+
+
+def _channels(table: Table, given: dict[str, Column]) -> list[str]:
+    """List the channels to look for: the usual ones, then the masses inside that are named."""
+    numbers = {int(w) for h in table.headers for w in h.words if w.isdecimal()}
+    inside = {c for c in (*map(interior_channel, numbers), *given) if interior_node(c)}
+    return [*CHANNELS, *sorted(inside, key=lambda c: (c not in given, interior_node(c) or 0))]
+
+
+def _given_column(table: Table, channel: str, name: str, toml: Path | None) -> int:
+    """Place of the one column that the TOML names."""
+    matches = [k for k, h in enumerate(table.headers) if h.is_named(name)]
+    if len(matches) != 1:
+        raise InputError(
+            f"{toml}: [columns] {channel}: column {name!r} is {'twice' if matches else 'nowhere'} "
+            f"in {table.path.name}, which has {table.listed}."
+        )
+    return matches[0]
+
+
+def _clear_time(table: Table, columns: list[int]) -> list[int]:
+    """Of several columns that could be the time keep the one that never goes back, if it is one.
+
+    The others start anew with each cycle, or stand still.
+    """
+    numbers, _ = read_numbers(table, {str(k): k for k in columns})
+    steps = {k: np.diff(numbers[str(k)]) for k in columns}
+    onward = [k for k, step in steps.items() if step.size and step.min() >= 0.0 < step.max()]
+    return onward if len(onward) == 1 else columns
+
+
+def si_factor(table: Table, channel: str, header: Header, given: Column | None) -> float:
+    """Return what the numbers of a column are multiplied by to be SI."""
+    right, where = example(channel), f"{table.path}: column {header.text!r}"
+    given = given or _NONE
+    unit = given.unit if given.unit is not None else header.unit
+    over = header.text.partition("/")[2].strip()  # Weg/mm, which only the TOML calls displacement
+    if unit is None and over and in_si(channel, over, given.scale_unit) is not None:
+        unit = over
+    if unit is None and not given.scale_unit and channel != "strain":
+        usual = channel_of(channel).unit
+        raise InputError(
+            f"{where} has no unit; write it in the header like '{right}' or in [columns] like "
+            f'{channel} = {{ column = "{header.text}", unit = "{usual}" }}.'
+        )
+    unit = unit or ""
+    if not is_unit(unit, any_case=True):
+        raise InputError(f"{where} has an unknown unit {unit!r}; write it like '{right}'.")
+    if given.unit is not None:
+        _check_unit(channel, header, given.unit, where)
+    one = in_si(channel, unit, given.scale_unit)
+    if one is None:
+        raise InputError(
+            f"{where} cannot be read as {channel}: its unit {unit!r} is of another kind; "
+            f"write it like '{right}' or give a scale in [columns]."
+        )
+    return given.scale * one * (-1.0 if given.counts_down else 1.0)
+
+
+def _check_unit(channel: str, header: Header, given: str, where: str) -> None:
+    """Refuse a unit in [columns] that contradicts the one in the header."""
+    own = header.unit
+    if own is None or not is_unit(own, any_case=True):
+        return
+    stated, there = in_si(channel, given), in_si(channel, own)
+    if there is None and not header.text.endswith((")", "]", "}")):
+        return  # the last word of a name only looks like a unit
+    if stated != there or (stated is None and given.casefold() != own.casefold()):
+        raise InputError(
+            f"{where} has the unit {own!r} in its header, but [columns] {channel} says {given!r}; "
+            "leave unit out, or, if the header is wrong, correct it by scale."
+        )
+
+
+def needed_columns(table: Table, columns: dict[str, int], settings: Settings) -> dict[str, int]:
+    """Choose the channels worth reading; refuse a file that lacks one that nothing can replace."""
+    has, striker = set(columns), settings.striker or Striker()
+    forced = bool(has & {"stress", "force"})
+    if not forced and not ({"acceleration", "time"} <= has and striker.mass):
+        raise InputError(
+            f"{table.path}: no column is a stress or a force (there are {table.listed}); name one "
+            'like \'stress (MPa)\', or write force = { column = "…", unit = "N" } in [columns]; '
+            "with a time and the [striker] mass an acceleration will do."
+        )
+    helping = {"velocity", "acceleration"} if forced else {"velocity"}
+    if has & {"displacement", "strain"}:
+        return {c: k for c, k in columns.items() if c not in helping}
+    for channel in has & helping - set(settings.columns):
+        try:  # these only help, so one whose unit does not say what it is can be left
+            si_factor(table, channel, table.headers[columns[channel]], None)
+        except InputError:
+            has.remove(channel)
+    sources = "velocity" in has or (striker.velocity and (striker.mass or "acceleration" in has))
+    if "time" not in has or not sources:
+        timed = "" if "time" in has else 'time = { column = "…", unit = "s" } there, and '
+        raise InputError(
+            f"{table.path}: no column is a displacement or a strain (there are {table.listed}); "
+            "name one like 'displacement (mm)', or write displacement = { column = \"…\", unit = "
+            f'"mm" }} in [columns], or give {timed}the [striker] mass and velocity to integrate '
+            "the motion."
+        )
+    return {c: k for c, k in columns.items() if c in has}
+
+
+def columns_note(table: Table, needed: dict[str, int], settings: Settings) -> str:
+    """Say what is read from which column, and which columns are not used."""
+    parts = []
+    for channel, k in needed.items():
+        given, header = settings.columns.get(channel, _NONE), table.headers[k]
+        by = f"{given.scale:.6g} {given.scale_unit}".strip()
+        own = (given.unit or header.unit or "").casefold()
+        part = f"{channel} from {header.text!r}" + (f" in {given.unit}" if given.unit else "")
+        part += f" times {by}" if by != "1" else ""
+        part += ", counting down" if given.counts_down else ""
+        if channel == "force" and own in WEIGHTS:
+            part += f" ({WEIGHTS[own]}: the weight of that mass)"
+        parts.append(part)
+    rest = [
+        repr(h.text) for k, h in enumerate(table.headers) if h.text and k not in needed.values()
+    ]
+    return f"Read {', '.join(parts)}" + (f"; not used: {', '.join(rest)}." if rest else ".")
+
+
+def sign_advice(table: Table, columns: dict[str, int], settings: Settings) -> dict[str, str]:
+    """Say for each channel of a record what would turn it round; see `check_signs`."""
+    found = {}
+    for channel, k in columns.items():
+        given, entry = settings.columns.get(channel, _NONE), f'column = "{table.headers[k].text}"'
+        motion = channel.startswith("displacement")
+        by = f"{-given.scale:g} {given.scale_unit}".strip()
+        by = f'"{by}"' if given.scale_unit else by
+        if given.counts_down:
+            told = "leave counts_down = true out"
+        elif given.scale < 0.0:
+            told = f"leave the minus sign of scale = {given.scale:g} out"
+        elif motion:
+            told = f"write {channel} = {{ {entry}, counts_down = true }}"
+            told += f" (of a gap or a position; else scale = {by})"
+        else:
+            told = f"write {channel} = {{ {entry}, scale = {by} }}"
+        wrong = "is negative in compression; it must be positive"
+        if motion:
+            wrong = "is negative or gets smaller in compression; it must get larger"
+        found[channel] = f"{channel} {wrong}: {told} in [columns]"
+    for channel, *others in (("stress", "force", "acceleration"), ("displacement", "strain")):
+        source = next((found[c] for c in (channel, *others) if c in found), None)
+        found |= {channel: source} if source else {}
+    return found

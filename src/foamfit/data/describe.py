@@ -1,0 +1,90 @@
+"""What `foamfit check` prints of a test."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from foamfit.data.energy import EnergyAudit, largest_motion
+from foamfit.data.measurement import Array, Measurement, Specimen, Striker, interior_node
+from foamfit.text import engineering, labelled, percent
+
+
+def describe(measurement: Measurement, audit: EnergyAudit) -> str:
+    """Write what was read of a test, what was done to it, and its balance of energy and momentum.
+
+    The text has about thirty aligned lines, without a newline at its end.
+    """
+    test = measurement
+    striker = "none given" if test.striker is None else _striker(test.striker)
+    lines = [
+        ("test", [test.name]),
+        ("file", [str(test.path or "none")]),
+        ("specimen", [_specimen(test.specimen)]),
+        ("striker", [striker]),
+        ("rows", test.rows.sentences()),
+        ("samples", [_samples(test)]),
+        *_peaks(test),
+        ("noise", noise_sentences(test)),
+        ("done", test.notes),
+        ("energy", audit.sentences()),
+    ]
+    return labelled(lines)
+
+
+def noise_sentences(measurement: Measurement) -> list[str]:
+    """Say of each channel what its noise is, one standard deviation, and how it is known."""
+    told = []
+    for channel, values in measurement.channels().items():
+        level = measurement.noise.of(channel)
+        if level is not None:
+            sigma = engineering(level.sigma, "Pa" if channel == "stress" else "m")
+            share = percent(level.sigma / (float(np.ptp(values)) or 1.0))
+            slow = f", correlated over {level.time:.1f} samples" if level.time > 1.0 else ""
+            told.append(f"{channel} {sigma} ({share} of its range), {level.how}{slow}.")
+    return told
+
+
+def _specimen(s: Specimen) -> str:
+    text = f"height {engineering(s.height, 'm')}, area {s.area * 1e6:.4g} mm²"
+    if s.mass:
+        density = s.mass / (s.area * s.height)
+        text += f", mass {engineering(s.mass * 1e3, 'g')} ({density:.4g} kg/m³)"
+    if s.heights:
+        text += f", springs from the base {' + '.join(engineering(h, 'm') for h in s.heights)}"
+    return text
+
+
+def _striker(s: Striker) -> str:
+    mass = engineering(s.mass * 1e3, "g") if s.mass else "mass unknown"
+    return f"{mass}, {s.velocity:.4g} m/s" if s.velocity else f"{mass}, velocity unknown"
+
+
+def _samples(test: Measurement) -> str:
+    channels, time = test.channels(), test.time
+    present = ", ".join(([] if time is None else ["time"]) + list(channels))
+    text = f"{max(map(len, channels.values()))} of {present}"
+    if time is None:
+        return f"{text}; no time, so only slow drives make sense"
+    step, end = float(np.median(np.diff(time))), float(time[-1])
+    return f"{text}, every {engineering(step, 's')} from time zero to {engineering(end, 's')}"
+
+
+def _peaks(test: Measurement) -> list[tuple[str, list[str]]]:
+    """The largest value of each channel, and when it is reached."""
+    lines = []
+    for name, values in test.channels().items():
+        node = interior_node(name)
+        if name == "stress":
+            top, label, text = int(np.argmax(values)), name, engineering(float(values.max()), "Pa")
+        else:
+            top, w = largest_motion(values, test.time)
+            label, text = f"mass {node}", engineering(w, "m")
+            if node is None:
+                label, text = "strain", f"{w / test.specimen.height:.4g} ({text})"
+        source = f", {test.motion}" if label == "strain" else ""
+        lines.append((label, [f"peak {text}{_moment(test.time, top)}{source}"]))
+    return lines
+
+
+def _moment(time: Array | None, sample: int) -> str:
+    return "" if time is None else f" at {engineering(float(time[sample]), 's')}"

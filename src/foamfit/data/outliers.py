@@ -1,0 +1,319 @@
+"""Samples that are no measurements: spikes, short gaps, a clipped force, and values that are held.
+
+A sample is judged by its neighbours alone; nothing here knows the model.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foamfit.data.measurement import MIN_ROWS, Array, NoiseLevel, Outliers, Record
+from foamfit.data.noise import residual_noise, robust_variance
+from foamfit.text import counted, engineering
+
+# An outlier is off by this many standard deviations of its leave-one-out residual, and by this
+# many of what its neighbours are off when it is gone (at a kink they are off too).
+_OFF, _ALONE = 4.0, 2.5
+_LEAST = 5e-3  # of the range: what is less far off is no outlier
+_MOST = 0.02  # of the samples: if more stand out, they are no exceptions
+# A gap is entered and left by a jump so many times the median one of the samples nearby.
+_JUMP, _NEARBY, _MAX_RUN = 10.0, 31, 5
+_WIDTH, _HALF = 9, 4  # samples of a cubic, and on either side of its middle
+_SIDES = [1, 2, 3], [5, 6, 7]  # samples of the lines that lead to its middle
+# Samples count as even if their steps differ by this share at most; a pause is so many times the
+# usual step; a middle sample is judged if its neighbours hold so much of the cubic.
+_EVEN, _PAUSE, _OPEN = 0.02, 6.0, 0.1
+_CHUNK = 50_000
+# A force may be clipped where so many samples are equal at its top; a parabola falls by so many
+# steps of its digits within half that length on either side.
+_FLAT, _PARABOLA = 5, 3
+
+
+def find_outliers(values: Array, time: Array | None = None) -> NDArray[np.bool_]:
+    """Isolated samples that no smooth signal with this noise can hold: spikes and gaps.
+
+    First the jumps into and out of gaps of up to five samples are looked for (dropped to zero,
+    saturated): ten times the median jump nearby, to and fro. Then each sample is predicted by the
+    cubic through its eight neighbours: it is an outlier if it is off by four standard deviations of
+    that prediction, as seen over the whole record, while the neighbours agree among themselves and
+    the lines from either side do not lead to it. Where the signal bends they do one or the other.
+
+    `values` and `time` have the shape (n,); without a time the samples are evenly spaced. Cubics
+    and lines go by the true spacing, and nothing is judged across a pause. In a channel that is
+    held for some samples at a time only gaps are looked for: its steps have no even spacing. Never
+    are more than 2 % of the samples outliers: then none is, they are no exceptions.
+    """
+    n = values.size
+    if n < 30:
+        return np.zeros(n, dtype=bool)
+    least = _LEAST * float(np.ptp(np.quantile(values, (0.005, 0.995))))
+    time = None if time is None or _is_even(time, values, least) else time
+    cubics = _Cubics.of(np.arange(n, dtype=np.float64) if time is None else time, time is None)
+    wrong = _gaps(values, time)
+    for _ in range(4):  # what a big spike hides
+        smooth = _bridged(values, wrong, cubics.time)
+        if is_staircase(smooth):
+            break
+        found = _spikes(smooth, least, cubics) & ~wrong
+        if not found.any():
+            break
+        wrong |= found
+    return wrong if wrong.sum() <= max(_MOST * n, 2) else np.zeros(n, dtype=bool)
+
+
+def _is_even(time: Array, values: Array, least: float) -> bool:
+    """Whether the steps of time are the same, or as near as makes no difference to the values.
+
+    Time stamps are rounded; what the signal does in the time that a step is off is far less than
+    what counts as an outlier then.
+    """
+    step = np.diff(time)
+    usual = float(np.median(step))
+    off = float(np.abs(step - usual).max()) / usual
+    return off <= _EVEN or off * float(np.quantile(np.abs(np.diff(values)), 0.99)) < 0.1 * least
+
+
+def _bridged(values: Array, wrong: NDArray[np.bool_], time: Array) -> Array:
+    """Put the straight line between the samples around them in the place of some."""
+    return np.where(wrong, np.interp(time, time[~wrong], values[~wrong]), values)
+
+
+def _gaps(values: Array, time: Array | None) -> NDArray[np.bool_]:
+    """Short runs into which the signal jumps and out of which it jumps back.
+
+    In a step of time that is longer than usual the signal itself may go farther.
+    """
+    from scipy.ndimage import median_filter
+
+    out = np.zeros(values.size, dtype=bool)
+    jump = np.diff(values)
+    usual = np.abs(jump)
+    if time is not None:
+        step = np.diff(time)
+        usual = usual / np.maximum(step / median_filter(step, _NEARBY), 1.0)
+    floor = float(np.median(usual[usual > 0.0])) if usual.any() else 0.0
+    high = np.flatnonzero(usual > _JUMP * np.maximum(median_filter(usual, _NEARBY), floor))
+    for start, end in ((i, j) for i in high for j in high[(high > i) & (high <= i + _MAX_RUN)]):
+        there, back = jump[start], jump[end]
+        left = abs(values[end + 1] - values[start])  # what the signal itself has changed
+        if there * back < 0.0 and left < 0.5 * min(abs(there), abs(back)):
+            out[start + 1 : end + 1] = True
+    return out
+
+
+def _spikes(values: Array, least: float, cubics: _Cubics) -> NDArray[np.bool_]:
+    """Samples that the cubic through their eight neighbours does not expect."""
+    out, own = np.zeros(values.size, dtype=bool), cubics.own
+    residual = cubics.residual(values)
+    off = np.abs(residual) / own
+    usual = np.sqrt(robust_variance(residual / np.sqrt(own)) / own)
+    far = np.flatnonzero(off > np.maximum(_OFF * usual, least))
+    near, times = _windows(values)[far], _windows(cubics.time)[far]
+    basis = _orthonormal(times.T)
+    left = near - np.einsum("kw,ksw->ws", np.einsum("ksw,ws->kw", basis, near), basis)
+    rest = np.sum(left**2, axis=1) - residual[far] ** 2 / own[far]
+    alone = np.sqrt(np.maximum(rest, 0.0) / (_WIDTH - 5) / own[far])
+    # Beside a spike the cubic is off too: only the farthest of five is one.
+    nearby = np.lib.stride_tricks.sliding_window_view(np.pad(off, 2), 5).max(axis=1)
+    # The tip of a kink is where the line from one of its sides leads.
+    leads = [np.sum(near[:, at] * _line_to_middle(times, at), axis=1) for at in _SIDES]
+    beside = np.min((near[:, _HALF] - np.array(leads)) * np.sign(residual[far]), axis=0)
+    out[far + _HALF] = (
+        (off[far] > _ALONE * alone) & (off[far] >= nearby[far]) & (beside > 0.5 * off[far])
+    )
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class _Cubics:
+    """Cubics over nine samples, for every sample with four on either side.
+
+    `weights` (samples of a window, windows) are those of "sample minus cubic", and `own` that of
+    the middle sample itself. They are zero and one where nothing is judged: across a pause, and
+    where the middle sample alone holds the cubic.
+    """
+
+    time: Array
+    weights: Array
+    own: Array
+
+    @classmethod
+    def of(cls, time: Array, even: bool) -> _Cubics:
+        """Prepare the cubics; in parts, for all at once would take much memory."""
+        windows = _windows(time)
+        n = len(windows)
+        if even:  # all are the same
+            windows = windows[:1]
+        weights = np.empty((_WIDTH, len(windows)))
+        for first in range(0, len(windows), _CHUNK):
+            basis = _orthonormal(windows[first : first + _CHUNK].T)
+            weights[:, first : first + _CHUNK] = -np.einsum("kw,ksw->sw", basis[:, _HALF], basis)
+        weights[_HALF] += 1.0
+        if even:
+            weights = np.broadcast_to(weights, (_WIDTH, n))
+            return cls(time, weights, weights[_HALF])
+        step = np.diff(time)
+        steps = np.lib.stride_tricks.sliding_window_view(step, _WIDTH - 1)
+        pause = steps.max(axis=1) > _PAUSE * float(np.median(step))
+        unjudged = pause | (weights[_HALF] < _OPEN)
+        weights[:, unjudged] = 0.0
+        return cls(time, weights, np.where(unjudged, 1.0, weights[_HALF]))
+
+    def residual(self, values: Array) -> Array:
+        """What the cubics leave of the middle samples."""
+        n = self.own.size
+        left = np.zeros(n)
+        for i, weights in enumerate(self.weights):
+            left += weights * values[i : i + n]
+        return left
+
+
+def _windows(values: Array) -> Array:
+    return np.lib.stride_tricks.sliding_window_view(values, _WIDTH)
+
+
+def _orthonormal(times: Array) -> Array:
+    """Orthonormal cubics over times (samples, windows), shape (4, samples, windows)."""
+    x = times - times[_HALF]
+    x = x / np.abs(x).max(axis=0)
+    basis = np.empty((4, *x.shape))
+    for k in range(4):
+        new = x**k
+        for lower in basis[:k]:
+            new = new - np.einsum("sw,sw->w", new, lower) * lower
+        basis[k] = new / np.sqrt(np.einsum("sw,sw->w", new, new))
+    return basis
+
+
+def _line_to_middle(times: Array, at: list[int]) -> Array:
+    """Weights of three samples of each window in the value of their line in its middle."""
+    x = times[:, at] - times[:, [_HALF]]
+    centre = x.mean(axis=1, keepdims=True)
+    x = x - centre
+    return np.asarray(1.0 / 3.0 - centre * x / np.sum(x**2, axis=1, keepdims=True))
+
+
+def bridge_outliers(record: Record) -> Record:
+    """Put a straight line in the place of spikes and short gaps; `excess` keeps what was there."""
+    for name, values in record.curves("velocity", "acceleration").items():
+        wrong = find_outliers(values, record.time)
+        if wrong.any():
+            line = _bridged(values, wrong, record.instants)
+            excess = record.excess | {name: np.where(wrong, values - line, 0.0)}
+            record = replace(record.changed(name, line), excess=excess)
+    return record
+
+
+def mark_clipped(record: Record) -> tuple[Record, list[str]]:
+    """Find the samples at which the force is clipped: a flat top at one value, with steep flanks.
+
+    A rounded top shows equal samples, too, where its values are rounded: it is about a parabola,
+    which falls by some three more steps of the digits within half the length of the flat on either
+    side. A clipped force falls by more.
+    """
+    stress = record.stress
+    top = float(stress.max())
+    at_top = stress >= top - 1e-9 * float(np.ptp(stress))
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], at_top.astype(np.int8), [0]])))
+    starts, ends = edges[::2], edges[1::2]
+    longest = int(np.argmax(ends - starts))
+    first, end = int(starts[longest]), int(ends[longest])
+    if end - first < max(_FLAT, 3 * float(np.median(fresh_samples(stress)[1]))):
+        return record, []
+    reach = -(-(end - first) // 2)
+    around = stress[max(first - reach, 0)], stress[min(end - 1 + reach, len(stress) - 1)]
+    levels = np.diff(np.unique(stress))
+    step = float(levels[levels > 1e-9 * np.ptp(stress)].min())
+    if top - max(around) < 4 * _PARABOLA * step:
+        return record, []
+    lines = record.row_numbers[at_top]
+    note = (
+        f"Check: the force is clipped: {lines.size} samples have one and the same value at its "
+        f"top, a stress of {engineering(top, 'Pa')} (rows {lines[0]} to {lines[-1]}); they are not "
+        "fitted, the true peak is not known, and energy and impulse come out too small."
+    )
+    return replace(record, clipped=at_top), [note]
+
+
+def outliers_of_blocks(record: Record, block: int) -> dict[str, Outliers]:
+    """Outliers of blocks of samples: a block of them is left out, one in a block is not."""
+    found = {}
+    edges = np.arange(0, len(record), block)
+    for name, excess in record.excess.items():
+        values, wrong = record.channel(name), excess != 0.0
+        if values is None or not wrong.any():
+            continue
+        share = np.add.reduceat(wrong.astype(float), edges) / block
+        at = np.flatnonzero(wrong)
+        found[name] = Outliers(share > 0.5, record.instants[at], values[at] + excess[at])
+    if record.clipped is not None and record.clipped.any():
+        left_out = np.add.reduceat(record.clipped.astype(float), edges) > 0.0
+        none = np.zeros(0)
+        spikes = found.get("stress") or Outliers(np.zeros(left_out.size, dtype=bool), none, none)
+        top = float(record.stress[record.clipped].max())
+        found["stress"] = replace(spikes, left_out=spikes.left_out | left_out, clipped_at=top)
+    return found
+
+
+def outlier_note(name: str, count: int, found: Outliers | None, timed: bool) -> str:
+    """Name a channel's outliers: how many, and where those of the part that is used are."""
+    note = f"Check: {counted(count, 'sample')} of the {name} stood out as spikes or gaps and"
+    if found is None or not found.at.size:
+        return f"{note} were bridged, none of them in the part that is used."
+    unit = {"stress": "Pa", "velocity": "m/s", "acceleration": "m/s²"}.get(name, "m")
+    told = []
+    for at, value in list(zip(found.at.tolist(), found.values.tolist(), strict=True))[:4]:
+        place = engineering(at, "s") if timed else f"sample {at:.0f}"
+        told.append(f"{engineering(value, unit)} at {place}")
+    used = found.at.size
+    more = f" and {used - len(told)} more" if used > len(told) else ""
+    part = "" if used == count else f", {used} of them in the part that is used"
+    return f"{note} are not fitted{part}: {', '.join(told)}{more}."
+
+
+def fresh_samples(values: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Samples at which a value is new, and for how many samples each is held."""
+    fresh = np.append(0, np.flatnonzero(np.diff(values) != 0.0) + 1)
+    return fresh, np.diff(np.append(fresh, len(values)))
+
+
+def is_staircase(values: Array) -> bool:
+    """Whether most samples repeat the one before."""
+    return bool(np.median(fresh_samples(values)[1]) >= 2)
+
+
+def noise_of_held(record: Record) -> dict[str, NoiseLevel]:
+    """Noise of the displacements that are held, from the samples where they are fresh."""
+    levels = {}
+    for name, values in record.curves().items():
+        fresh = values[fresh_samples(values)[0]]
+        if name != "stress" and is_staircase(values) and len(fresh) >= MIN_ROWS:
+            how = f"estimated from what local cubics leave of {len(fresh)} fresh samples"
+            step = len(values) / len(fresh)
+            levels[name] = NoiseLevel(residual_noise(fresh)[0], False, how, step)
+    return levels
+
+
+def fill_staircase(record: Record) -> tuple[Record, list[str]]:
+    """Interpolate displacements that are held while the stress goes on.
+
+    The instants where a value is fresh are kept. A much longer hold is a real one: it lasts
+    until one usual step before the next fresh value.
+    """
+    notes, time = [], record.instants
+    for name, values in record.curves().items():
+        fresh, lengths = fresh_samples(values)
+        step = int(np.median(lengths))
+        if name == "stress" or len(lengths) < MIN_ROWS or step < 2:
+            continue
+        knots = np.union1d(fresh, (fresh + lengths - step)[lengths > 3 * step])
+        record = record.changed(name, np.interp(time, time[knots], values[knots]))
+        shown = "The displacement" if name == "displacement" else name
+        notes.append(
+            f"{shown} is held for about {step} samples at a time; it is interpolated between the "
+            f"{len(fresh)} instants where it is fresh."
+        )
+    return record, notes
