@@ -8,15 +8,14 @@ from functools import cached_property
 
 import lmfit
 import numpy as np
-from numpy.typing import NDArray
 
+from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError
 from foamfit.fitting.box import LARGEST_SHIFT, Scales, Space
-from foamfit.fitting.objective import Objective, check_interior, choose_drive, default_weights
+from foamfit.fitting.curves import check_interior, choose_drive, default_weights
+from foamfit.fitting.objective import Objective
 from foamfit.springs.model import Model, split_name
-
-Array = NDArray[np.float64]
 
 
 def make_params(

@@ -13,16 +13,16 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 from scipy.linalg import toeplitz
 
-Array = NDArray[np.float64]
+from foamfit.arrays import Array
+from foamfit.text import percent
 
-# Half widths of the 95 % interval, over the natural size of a parameter, past which it is weak,
-# and past which the test says nothing about it.
+# Half widths of the 95 % interval, over the scale of a parameter (`fitting.box.Scales`), past which
+# it is weak, and past which the test does not determine it.
 WEAK, NOTHING = 0.5, 3.0
-# A parameter this close to a limit, over its natural size, lies at it.
+# A parameter this close to a limit, over its scale, lies at it.
 AT_LIMIT = 1e-6
 # Two directions closer than this cannot be told apart.
 SINGULAR = 1e-12
@@ -292,7 +292,7 @@ def covariance(
     sizes : tuple of int
         Samples of each curve, in their order.
     sizes_of : (k,) array
-        Natural size of each parameter, so that directions can be compared.
+        Scale of each parameter, so that directions can be compared.
     """
     scaled = jacobian * sizes_of
     noise = noise_processes(residual, scaled, sizes)
@@ -334,7 +334,9 @@ def half_width(stderr: float, freedom: float) -> float:
     return float(stats.t.ppf(0.975, max(freedom, 1.0))) * stderr
 
 
-def state(value: float, half: float, size: float, low: float, high: float) -> tuple[str, str]:
+def state(
+    value: float, half: float, size: float, low: float, high: float, of: str = "its value"
+) -> tuple[str, str]:
     """State of a parameter that was varied and whose branch was reached, and why.
 
     Parameters
@@ -344,25 +346,20 @@ def state(value: float, half: float, size: float, low: float, high: float) -> tu
     half : float
         Half of its 95 % interval, not cut at the limits; NaN where the data fix only a combination.
     size : float
-        Its natural size.
+        Its scale.
     low, high : float
         Its limits.
+    of : str
+        What the scale is, in words.
     """
     if not math.isfinite(half):
         return "not determined", "the data fix only a combination of it with other parameters"
-    edge = AT_LIMIT * size
+    ratio, edge = half / size, AT_LIMIT * size
+    width = f"its 95 % interval is ±{percent(ratio)} of {of}"
     if half > NOTHING * size:
-        return "not determined", f"its 95 % interval is {_wide(half / size)} its natural size"
+        wide = f"its 95 % interval is more than ±100 times {of}"
+        return "not determined", wide if ratio > 100.0 else width
     if value - low <= edge or high - value <= edge:
         limit = low if value - low <= edge else high
         return "weak", f"it lies at its limit {limit:g}; its interval is open on that side"
-    if half > WEAK * size:
-        return "weak", f"its 95 % interval is ±{half / size:.0%} of its natural size"
-    return "determined", f"its 95 % interval is ±{half / size:.1%} of its natural size"
-
-
-def _wide(ratio: float) -> str:
-    """Write the half width of a hopeless interval over the natural size so that it can be read."""
-    if ratio > 100.0:
-        return "more than 100 times"
-    return f"±{ratio:.2g} times" if ratio > 2.0 else f"±{ratio:.0%} of"
+    return "weak" if half > WEAK * size else "determined", width

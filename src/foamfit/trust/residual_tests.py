@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-Array = NDArray[np.float64]
+from foamfit.arrays import Array
 
 # A structure of which a parabola takes more than this share is called bent.
 BENT = 0.6
@@ -101,7 +101,7 @@ def find_structure(residual: Array, places: NDArray[np.str_]) -> Structure:
     residual : (n,) array
         Of one curve.
     places : (n,) array of str
-        See `branch_places`.
+        See `fitting.branches.branch_of_samples`.
     """
     product = residual[1:] * residual[:-1]
     rough = residual[1:-1] - 0.5 * (residual[2:] + residual[:-2])
@@ -114,40 +114,6 @@ def find_structure(residual: Array, places: NDArray[np.str_]) -> Structure:
         place=place,
         share=sums[place] / held if held > 0.0 else 0.0,
         bent=_bent(residual[places == place]),
-    )
-
-
-def branch_places(
-    kinds: tuple[str, ...],
-    switches: Array,
-    clock: Array,
-    stress: Array,
-    names: tuple[str, ...],
-) -> NDArray[np.str_]:
-    """Which branches the springs are on at each sample, in words, (n,).
-
-    Parameters
-    ----------
-    kinds : (n_springs,) tuple of str
-        Of the model.
-    switches : (m, 5) array
-        As `Response.switches`.
-    clock, stress : (n,) arrays
-        Time that the switches refer to, and the measured stress (Pa), whose peak ends loading.
-    names : tuple of str
-        Names of the branches by their number.
-    """
-    bistable = [i for i, kind in enumerate(kinds) if kind == "bistable"]
-    branch = {i: np.full(clock.size, "a", dtype="<U4") for i in bistable}
-    for when, spring, _, entered, _ in switches:
-        if int(spring) in branch:
-            branch[int(spring)][np.searchsorted(clock, when) :] = names[int(entered)]
-    way = np.where(np.arange(clock.size) <= np.argmax(stress), "loading", "unloading")
-    return np.array(
-        [
-            f"{way[at]}, " + " and ".join(f"spring {i + 1} on {branch[i][at]}" for i in bistable)
-            for at in range(clock.size)
-        ]
     )
 
 
