@@ -22,22 +22,13 @@ LAST_STRAIN = 0.999
 
 @dataclass(frozen=True)
 class Scales:
-    """The scales of a test that make its parameters dimensionless.
+    """The scales of a test that make its parameters dimensionless."""
 
-    Attributes
-    ----------
-    stress, strain : float
-        Largest stress (Pa) and overall strain.
-    rate : float
-        Typical strain rate, 1/s; 0 where time is unknown.
-    height : float
-        m.
-    """
-
+    # Largest stress (Pa) and overall strain.
     stress: float
     strain: float
-    rate: float
-    height: float
+    rate: float  # Typical strain rate, 1/s; 0 where time is unknown
+    height: float  # m
 
     @classmethod
     def of(cls, measurement: Measurement) -> Scales:
@@ -116,30 +107,16 @@ LARGEST_SHIFT = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """The box in which the search moves, and the way between it and the vector of parameters.
+    """The box in which the search moves, and the way between it and the vector of parameters."""
 
-    Parameters
-    ----------
-    model : Model
-        The springs.
-    scales : Scales
-        Of the test.
-    values : (n,) array
-        Values of the parameters that do not vary (SI); the others are ignored.
-    free : tuple of str
-        Names of the parameters that vary.
-    low, high : (n,) arrays
-        Limits of every parameter, SI.
-    tied : callable or None
-        Completes a vector in which some parameters hang on others.
-    """
-
-    model: Model
-    scales: Scales
-    values: Array
-    free: tuple[str, ...]
+    model: Model  # The springs
+    scales: Scales  # Of the test
+    values: Array  # (n,): Values of the parameters that do not vary (SI); the others are ignored
+    free: tuple[str, ...]  # Names of the parameters that vary
+    # (n,): Limits of every parameter, SI.
     low: Array
     high: Array
+    # Completes a vector in which some parameters hang on others.
     tied: Callable[[Array], Array] | None
 
     @cached_property

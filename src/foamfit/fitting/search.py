@@ -47,26 +47,16 @@ def what_stopped(error: BaseException) -> str:
 
 @dataclass(frozen=True)
 class SearchRecord:
-    """How a search went.
+    """How a search went."""
 
-    Attributes
-    ----------
-    seed, starts : int
-        What it was asked for.
-    began : float
-        `time.perf_counter` at its start, s.
-    costs : tuple of (float, int)
-        Final costs of the descents on the drive's curves, best first, and how many descents on the
-        loop led to each.
-    stopped : str or None
-        What ended it before its time: "the time limit", "Ctrl-C".
-    """
-
+    # What it was asked for.
     seed: int
     starts: int
-    began: float
+    began: float  # `time.perf_counter` at its start, s
+    # Final costs of the descents on the drive's curves, best first, and how many descents on the
+    # loop led to each.
     costs: tuple[tuple[float, int], ...] = ()
-    stopped: str | None = None
+    stopped: str | None = None  # What ended it before its time: "the time limit", "Ctrl-C"
 
     @property
     def agreeing(self) -> int:

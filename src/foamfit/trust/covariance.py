@@ -32,21 +32,12 @@ MOST_ORDERS, LARGEST, CORRECTIONS = 10, 0.995, 4
 
 @dataclass(frozen=True, eq=False)
 class NoiseProcess:
-    """Autoregressive noise of one curve: x_t = Σ φ_j x_(t-j) + white.
+    """Autoregressive noise of one curve: x_t = Σ φ_j x_(t-j) + white."""
 
-    Attributes
-    ----------
-    coefficients : (p,) array
-        φ_1 … φ_p; none for white noise.
-    variance : float
-        Of the process itself, not of the white noise that drives it.
-    samples : float
-        How many it was read off, less those that the parameters of the fit took; infinite if it is
-        known.
-    """
-
-    coefficients: Array
-    variance: float
+    coefficients: Array  # (p,): φ_1 … φ_p; none for white noise
+    variance: float  # Of the process itself, not of the white noise that drives it
+    # How many it was read off, less those that the parameters of the fit took; infinite if it is
+    # known.
     samples: float = math.inf
 
     def autocovariance(self, n: int) -> Array:
@@ -235,31 +226,19 @@ def autocorrelation_time(residual: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """Covariance of the varied parameters at the best point.
+    """Covariance of the varied parameters at the best point."""
 
-    Attributes
-    ----------
-    matrix : (k, k) array
-        Covariance, SI; NaN rows and columns where the test says nothing.
-    inflation : (k,) array
-        Variance of each parameter over that of a residual of white noise of unit variance: what a
-        rise of the sum of squares along a parameter's profile must be divided by to be a χ².
-    freedom : (k,) array
-        Degrees of freedom of each variance: those of the χ² distribution that is as uncertain as
-        the estimated noise makes it (Satterthwaite 1946, Biometrics Bull. 2, 110), but no more than
-        the effective samples that the parameters have left: what a model cannot follow is no noise
-        whose spectrum is known.
-    effective : float
-        Effective number of samples.
-    noise : tuple of NoiseProcess
-        Noise of each curve, in units of the residual.
-    """
-
-    matrix: Array
+    matrix: Array  # (k, k): Covariance, SI; NaN rows and columns where the test says nothing
+    # (k,): Variance of each parameter over that of a residual of white noise of unit variance: what
+    # a rise of the sum of squares along a parameter's profile must be divided by to be a χ².
     inflation: Array
+    # (k,): Degrees of freedom of each variance: those of the χ² distribution that is as uncertain
+    # as the estimated noise makes it (Satterthwaite 1946, Biometrics Bull. 2, 110), but no more
+    # than the effective samples that the parameters have left: what a model cannot follow is no
+    # noise whose spectrum is known.
     freedom: Array
-    effective: float
-    noise: tuple[NoiseProcess, ...]
+    effective: float  # Effective number of samples
+    noise: tuple[NoiseProcess, ...]  # Noise of each curve, in units of the residual
 
     @property
     def tau(self) -> tuple[float, ...]:

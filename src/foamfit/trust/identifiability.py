@@ -28,38 +28,20 @@ MOST = 3
 
 @dataclass(frozen=True, eq=False)
 class Insight:
-    """The sensitivities of all counted curves to the parameters that they can tell of.
+    """The sensitivities of all counted curves to the parameters that they can tell of."""
 
-    Attributes
-    ----------
-    names : (k,) tuple of str
-        Parameters that vary and whose branch was reached.
-    values, sizes : (k,) arrays
-        Where they stand and their scales, SI.
-    curves : tuple of str
-        Counted curves, in the order of the rows of `scaled`.
-    clock : (n_samples,) array
-        Time of the samples, s; their number where the test has no time.
-    timed : bool
-        Whether the clock is a time.
-    scaled : (len(curves) * n_samples, k) array
-        By how many standard deviations of its noise a curve moves, sample by sample, if a parameter
-        changes by its scale; to first order. Zero at samples that are not counted.
-    sections : tuple of Section
-        The stretches of the run between switches.
-    silent : tuple of str
-        Parameters that vary but whose branch was never reached.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # (k,): Parameters that vary and whose branch was reached
+    # (k,): Where they stand and their scales, SI.
     values: Array
     sizes: Array
-    curves: tuple[str, ...]
-    clock: Array
-    timed: bool
+    curves: tuple[str, ...]  # Counted curves, in the order of the rows of `scaled`
+    clock: Array  # (n_samples,): Time of the samples, s; their number where the test has no time
+    timed: bool  # Whether the clock is a time
+    # (len(curves): By how many standard deviations of its noise a curve moves, sample by sample, if
+    # a parameter changes by its scale; to first order. Zero at samples that are not counted.
     scaled: Array
-    sections: tuple[Section, ...]
-    silent: tuple[str, ...] = ()
+    sections: tuple[Section, ...]  # The stretches of the run between switches
+    silent: tuple[str, ...] = ()  # Parameters that vary but whose branch was never reached
 
     @cached_property
     def _directions(self) -> tuple[Array, Array]:

@@ -32,22 +32,13 @@ Announce = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Choice:
-    """Which intervals are wanted.
+    """Which intervals are wanted."""
 
-    Attributes
-    ----------
-    method : str
-        "auto" (profiles of those parameters along which the cost is no parabola, local covariance
-        for the others), "local", "profile", "bootstrap" or "mcmc".
-    draws : int
-        Refits of the bootstrap, or steps of the Markov chain.
-    seed : int
-        Source of all chance.
-    """
-
+    # "auto" (profiles of those parameters along which the cost is no parabola, local covariance for
+    # the others), "local", "profile", "bootstrap" or "mcmc".
     method: str = "auto"
-    draws: int = 0
-    seed: int = 0
+    draws: int = 0  # Refits of the bootstrap, or steps of the Markov chain
+    seed: int = 0  # Source of all chance
 
     def __post_init__(self) -> None:
         """Refuse what is unknown or cannot be done."""
@@ -67,32 +58,18 @@ class Choice:
 
 @dataclass(frozen=True, eq=False)
 class Intervals:
-    """The 95 % intervals of a fit, and how they were made.
+    """The 95 % intervals of a fit, and how they were made."""
 
-    Attributes
-    ----------
-    ends : dict of str to (float, float)
-        Ends of the intervals that are not those of the local covariance.
-    methods : dict of str to str
-        How each of these was made.
-    profiles : tuple of Profile
-        All profiles that were followed, whole or not.
-    doubtful : tuple of str
-        Parameters along which the cost is no parabola and whose interval is local all the same.
-    notes : tuple of str
-        One sentence each.
-    warnings : tuple of str
-        Why they are not, or hardly, what was asked for; one sentence each.
-    better : (n,) array or None
-        A point with a lower cost that was met: the fit should go on from there.
-    """
-
+    # Ends of the intervals that are not those of the local covariance.
     ends: dict[str, tuple[float, float]] = field(default_factory=dict)
-    methods: dict[str, str] = field(default_factory=dict)
-    profiles: tuple[Profile, ...] = ()
+    methods: dict[str, str] = field(default_factory=dict)  # How each of these was made
+    profiles: tuple[Profile, ...] = ()  # All profiles that were followed, whole or not
+    # Parameters along which the cost is no parabola and whose interval is local all the same.
     doubtful: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # One sentence each
+    # Why they are not, or hardly, what was asked for; one sentence each.
     warnings: tuple[str, ...] = ()
+    # (n,): A point with a lower cost that was met: the fit should go on from there.
     better: Array | None = None
 
 

@@ -33,36 +33,19 @@ BETTER = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """Least cost along one parameter.
+    """Least cost along one parameter."""
 
-    Attributes
-    ----------
-    name : str
-        The parameter.
-    values : (m,) array
-        Where it was held, ascending, SI; the best point is among them.
-    rises : (m,) array
-        Rise of the cost there as a χ² of one degree of freedom.
-    points : (m, n) array
-        All parameters of the model at each.
-    cut : float
-        χ² of the 95 % interval.
-    ci95 : (float, float)
-        Outermost crossings of the cut; a limit of the parameter where there is none.
-    open_low, open_high : bool
-        Whether the cost does not reach the cut on that side.
-    stopped : str or None
-        What ended it before its end on both sides: "the time limit", "Ctrl-C".
-    """
-
-    name: str
-    values: Array
-    rises: Array
-    points: Array
-    cut: float
+    name: str  # The parameter
+    values: Array  # (m,): Where it was held, ascending, SI; the best point is among them
+    rises: Array  # (m,): Rise of the cost there as a χ² of one degree of freedom
+    points: Array  # (m, n): All parameters of the model at each
+    cut: float  # χ² of the 95 % interval
+    # Outermost crossings of the cut; a limit of the parameter where there is none.
     ci95: tuple[float, float]
+    # Whether the cost does not reach the cut on that side.
     open_low: bool
     open_high: bool
+    # What ended it before its end on both sides: "the time limit", "Ctrl-C".
     stopped: str | None = None
 
     @property

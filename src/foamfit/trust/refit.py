@@ -21,20 +21,12 @@ LAST_DROP = 0.999
 
 @dataclass(eq=False)
 class Refit:
-    """Least squares close to the best point, with some parameters held.
+    """Least squares close to the best point, with some parameters held."""
 
-    Parameters
-    ----------
-    best : BestPoint
-        Where to start.
-    tracker : Tracker
-        Simulates, counts and ends all at its deadline.
-    shift : (n_data,) array or float
-        Taken off the residual, before the loss: data that differ from those that were fitted.
-    """
-
-    best: BestPoint
-    tracker: Tracker
+    best: BestPoint  # Where to start
+    tracker: Tracker  # Simulates, counts and ends all at its deadline
+    # (n_data,): Taken off the residual, before the loss: data that differ from those that were
+    # fitted.
     shift: Array | float = 0.0
 
     def __post_init__(self) -> None:

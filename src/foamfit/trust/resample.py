@@ -118,28 +118,15 @@ def bootstrap(best: BestPoint, draws: int, seed: int, tracker: Tracker | None = 
 
 @dataclass(frozen=True, eq=False)
 class MarkovChain:
-    """A Markov chain of the parameters.
+    """A Markov chain of the parameters."""
 
-    Attributes
-    ----------
-    samples : (m, k) array
-        Draws after the burn-in, all walkers, SI.
-    steps, burn_in : int
-        Steps of each walker, and how many of the first were left out.
-    walkers : int
-        Number of walkers.
-    autocorrelation : float
-        Integrated autocorrelation time of the slowest parameter, steps.
-    stopped : str or None
-        What ended it before its steps were done.
-    """
-
-    samples: Array
+    samples: Array  # (m, k): Draws after the burn-in, all walkers, SI
+    # Steps of each walker, and how many of the first were left out.
     steps: int
     burn_in: int
-    walkers: int
-    autocorrelation: float
-    stopped: str | None = None
+    walkers: int  # Number of walkers
+    autocorrelation: float  # Integrated autocorrelation time of the slowest parameter, steps
+    stopped: str | None = None  # What ended it before its steps were done
 
     @property
     def converged(self) -> bool:

@@ -63,28 +63,17 @@ def neighbours_test(residual: Array) -> float:
 
 @dataclass(frozen=True)
 class Structure:
-    """Where the largest structure of a curve's residual sits.
+    """Where the largest structure of a curve's residual sits."""
 
-    Attributes
-    ----------
-    size : float
-        Root of the mean product of neighbouring residuals, in their unit: white noise adds nothing.
-    noise : float
-        One standard deviation of what is left of a residual over the mean of its neighbours, as
-        white noise would have it (its variance there is 3/2 of its own); by the median, which jumps
-        do not move.
-    place : str
-        Branches that the springs are on, and whether on loading or unloading.
-    share : float
-        Share of the structure that this place holds.
-    bent : float
-        Share of the squares of the residual there that a parabola over the samples takes off.
-    """
-
+    # Root of the mean product of neighbouring residuals, in their unit: white noise adds nothing.
     size: float
+    # One standard deviation of what is left of a residual over the mean of its neighbours, as white
+    # noise would have it (its variance there is 3/2 of its own); by the median, which jumps do not
+    # move.
     noise: float
-    place: str
-    share: float
+    place: str  # Branches that the springs are on, and whether on loading or unloading
+    share: float  # Share of the structure that this place holds
+    # Share of the squares of the residual there that a parabola over the samples takes off.
     bent: float
 
     @property
