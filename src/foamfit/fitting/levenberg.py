@@ -57,7 +57,7 @@ def damped_step(
     step = np.zeros(gradient.size)
     if moving.size:
         own = at.jacobian[:, moving]
-        normal = own.T @ own
+        normal = at.jacobian[:, moving].T @ own
         scale = np.maximum(np.diag(normal), 1e-12 * max(float(np.trace(normal)), 1e-300))
         step[moving] = np.linalg.solve(normal + damping * np.diag(scale), -gradient[moving])
     return step

@@ -336,8 +336,8 @@ def state(
     ratio, edge = half / size, AT_LIMIT * size
     width = f"its 95 % interval is ±{percent(ratio)} of {of}"
     if half > NOTHING * size:
-        wide = f"its 95 % interval is more than ±100 times {of}"
-        return "not determined", wide if ratio > 100.0 else width
+        wide = "more than 100 times" if ratio > 100.0 else f"±{ratio:.2g} times"
+        return "not determined", f"its 95 % interval is {wide} {of}"
     if value - low <= edge or high - value <= edge:
         limit = low if value - low <= edge else high
         return "weak", f"it lies at its limit {limit:g}; its interval is open on that side"

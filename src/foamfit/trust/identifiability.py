@@ -205,7 +205,7 @@ class Insight:
         parts = [i for i in order if abs(change[i]) > NAMED * abs(change[order[0]])]
         told = ", ".join(f"{self.names[i]} ({change[i]:+.2g})" for i in parts[:MOST])
         more = f" and {len(parts) - MOST} more" if len(parts) > MOST else ""
-        return f"a relative change of 1 is compensated by {told.replace('-', '−')}{more}"
+        return f"compensated by {told.replace('-', '−')}{more} (relative changes)"
 
     def _group(self, free: Array, member: int) -> list[int]:
         """Parameters that can move together with one, itself included, along free directions."""
