@@ -556,7 +556,7 @@ def test_what_was_never_reached_is_said_first() -> None:
     start = (
         "s1_kc, s1_dsigma, s1_eps_c and s1_kh_minus cannot be determined: no branch they act on "
     )
-    assert slow.insight.sentence().startswith(start + "on was reached. The least determined ")
+    assert slow.insight.sentence().startswith(start + "was reached. The least determined ")
     warning = next(w for w in slow.warnings if w.startswith("Not determined"))
     assert "s1_kc (branch c of spring 1 was never reached)" in warning
     assert "s1_dsigma, s1_eps_c, s1_kh_minus (branch e of spring 1 was never reached)" in warning

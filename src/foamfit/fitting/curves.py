@@ -21,10 +21,7 @@ DRIVES = ("impact", "stress", "displacement")
 def choose_drive(measurement: Measurement) -> str:
     """Choose the drive: impact if striker and time are known, else displacement.
 
-    Raises
-    ------
-    InputError
-        If the test has neither.
+    Raises InputError if the test has neither.
     """
     striker = measurement.striker
     if (
@@ -43,13 +40,7 @@ def choose_drive(measurement: Measurement) -> str:
 
 
 def check_drive(measurement: Measurement, drive: str) -> None:
-    """Refuse a drive that the test cannot feed.
-
-    Raises
-    ------
-    InputError
-        Naming what is missing.
-    """
+    """Refuse a drive that the test cannot feed (InputError, naming what is missing)."""
     if drive not in DRIVES:
         raise InputError(f"drive '{drive}' is unknown; it must be one of {', '.join(DRIVES)}")
     striker = measurement.striker
@@ -82,12 +73,9 @@ def interior_curves(measurement: Measurement, springs: int) -> dict[str, int]:
 
 
 def check_interior(measurement: Measurement, springs: int) -> None:
-    """Refuse the displacement of a mass that is not inside a chain of so many springs.
+    """Refuse the displacement of a mass that is not inside a chain of so many springs (InputError).
 
-    Raises
-    ------
-    InputError
-        Naming the node. A single spring has nothing inside; the result's notes say so.
+    A single spring has nothing inside; the result's notes say so.
     """
     wrong = [node for node in sorted(measurement.interior) if node >= springs]
     if not wrong or springs == 1:
@@ -124,17 +112,10 @@ def default_weights(measurement: Measurement, drive: str, springs: int = 1) -> d
 
 
 def smoothed(values: Array, window: int) -> Array:
-    """Smooth samples by the parabola through each window of them (Savitzky & Golay 1964).
+    """Smooth samples by the parabola through each (odd) window of them (Savitzky & Golay 1964).
 
     Analytical Chemistry 36, 1627; as `scipy.signal.savgol_filter`, whose package takes longer to
-    import than a search.
-
-    Parameters
-    ----------
-    values : (n,) array
-        Evenly sampled.
-    window : int
-        Odd, at most n. The first and the last half of a window lie on its parabola.
+    import than a search. The first and the last half of a window lie on its parabola.
     """
     half, clock = window // 2, np.arange(float(window))
     weights, *_ = lstsq(np.vander(half - clock, 3, increasing=True).T, np.array([1.0, 0.0, 0.0]))
@@ -157,13 +138,7 @@ def driving_stress(stress: Array, model: Model) -> Array:
 
 
 def check_time_shift(measurement: Measurement, drive: str) -> None:
-    """Refuse a time shift where the test has no two channels in time.
-
-    Raises
-    ------
-    InputError
-        Saying what is missing.
-    """
+    """Refuse a time shift where the test has no two channels in time (InputError)."""
     missing = None
     if measurement.time is None:
         missing = "it has no time"

@@ -40,16 +40,8 @@ def damped_step(
 ) -> Array:  # fmt: skip
     """Damped Gauss-Newton step; what lies at a limit and is pressed outwards is held.
 
-    Parameters
-    ----------
-    at : Iterate
-        Where the step begins.
-    coordinates, low, high : (k,) arrays
-        Where the coordinates stand, and their limits.
-    damping : float
-        Over the diagonal of the normal matrix.
-    free : (k,) array of bool
-        Coordinates that may move.
+    `coordinates` (k,) stand between `low` and `high`, `damping` is over the diagonal of the normal
+    matrix; those that are not `free` do not move.
     """
     gradient = at.jacobian.T @ at.residual
     pressed = ((coordinates <= low) & (gradient > 0)) | ((coordinates >= high) & (gradient < 0))
@@ -57,7 +49,8 @@ def damped_step(
     step = np.zeros(gradient.size)
     if moving.size:
         own = at.jacobian[:, moving]
-        normal = at.jacobian[:, moving].T @ own
+        # Two copies are multiplied with another rounding than one with itself, and flat fits show it.
+        normal = (at.jacobian[:, moving] if free is True else own).T @ own
         scale = np.maximum(np.diag(normal), 1e-12 * max(float(np.trace(normal)), 1e-300))
         step[moving] = np.linalg.solve(normal + damping * np.diag(scale), -gradient[moving])
     return step
@@ -114,25 +107,11 @@ def descend_updated(
     iterations: int,
     enough: float,
 ) -> tuple[Iterate, bool, bool]:
-    """Descend by the Jacobian of the start and its updates.
+    """Descend by the Jacobian of the start and its updates, until `enough` gain is not expected.
 
-    Parameters
-    ----------
-    residual : callable
-        Of a point; None where it cannot be simulated.
-    step_from, move : callable
-        The step at an iterate with a damping; the point that it leads to and the step taken.
-    at : Iterate
-        The start.
-    iterations : int
-        At most so many.
-    enough : float
-        Expected gain below which it ends.
-
-    Returns
-    -------
-    Iterate, bool, bool
-        The end, whether no more gain is expected, and whether the Jacobian predicted a gain badly.
+    `residual` of a point is None where it cannot be simulated; `move` gives the point that a step
+    leads to and the step taken. Returned are the end, whether no more gain is expected, and whether
+    the Jacobian predicted a gain badly.
     """
     damping, growth, poor = 1e-6, 4.0, False
     for _ in range(iterations):

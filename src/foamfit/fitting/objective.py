@@ -73,46 +73,22 @@ class Simulated:
 class Objective:
     """Residuals of a model under a drive against a measurement.
 
-    Parameters
-    ----------
-    measurement : Measurement
-        The conditioned test.
-    model : Model
-        The springs.
-    drive : str
-        "impact", "stress" or "displacement".
-    weights : dict
-        Weight of each curve; see `default_weights`. A weight w multiplies the curve's squares.
-    rtol : float
-        Tolerance of the simulation.
-    interior_mass : bool
-        Whether the specimen's mass sits between the springs, in equal parts, as in the paper.
-    time_shift : bool
-        Whether the flat vector of parameters ends, after those of the model, with how late the
-        motion channel is, s.
-    loss : str
-        One of `LOSSES`.
-
-    Attributes
-    ----------
-    curves : tuple of str
-        Names of the curves that can be counted.
-    interior : dict of str to int
-        Those of masses inside, and their node.
-    evaluations, failures : int
-        How many sets of parameters were simulated, and how many of them could not be.
+    `curves` are the names of the curves that can be counted, `interior` those of masses inside and
+    their node.
     """
 
-    measurement: Measurement
+    measurement: Measurement  # Conditioned
     model: Model
-    drive: str
-    weights: dict[str, float]
-    rtol: float = 1e-6
+    drive: str  # "impact", "stress" or "displacement"
+    weights: dict[str, float]  # Of each curve: it multiplies the curve's squares
+    rtol: float = 1e-6  # Of the simulation
+    # Whether the specimen's mass sits between the springs, in equal parts, as in the paper.
     interior_mass: bool = False
+    # Whether the vector of parameters ends with how late the motion channel is, s.
     time_shift: bool = False
-    loss: str = "linear"
-    evaluations: int = field(default=0, init=False)
-    failures: int = field(default=0, init=False)
+    loss: str = "linear"  # One of `LOSSES`
+    evaluations: int = field(default=0, init=False)  # Sets of parameters that were simulated
+    failures: int = field(default=0, init=False)  # Those of them that could not be
 
     def __post_init__(self) -> None:
         """Make the scenes ready and fix the scale of each curve."""

@@ -326,29 +326,9 @@ def search(
 ) -> list[tuple[float, int]]:
     """Search for the best parameters; the tracker keeps them.
 
-    Parameters
-    ----------
-    tracker : Tracker
-        Of the objective of the drive.
-    space : Space
-        The box.
-    starts : int
-        Descents on the loop; the best quarter of them go on to the curves of the drive.
-    rng : Generator
-        Source of all chance.
-    progress : callable
-        Told the fraction done and what is going on.
-
-    Returns
-    -------
-    list of (float, int)
-        Final costs of the descents on the drive's curves, best first, and how many descents on the
-        loop led to each.
-
-    Raises
-    ------
-    SearchStoppedError
-        When the time is up.
+    Of the descents on the loop (so many `starts`) the best quarter go on to the curves of the
+    drive. Returned are the final costs there, best first, and how many descents on the loop led to
+    each. Raises SearchStoppedError when the time is up.
     """
     points = [space.encode(space.values), *box_starts(space, rng, CURVE_STARTS // 3)]
     counts: dict[int, int] = {}

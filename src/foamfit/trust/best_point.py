@@ -22,19 +22,10 @@ from foamfit.trust.covariance import Covariance
 def m_estimate(residual: Array, sizes: tuple[int, ...], loss: str) -> tuple[Array, Array]:
     """Weights of slopes and pseudo-residuals whose least squares have the covariance of a loss.
 
-    With the mean m of ψ'(r) over each curve: √m and ψ(r)/√m. The normal matrix of the slopes so
-    weighted is half the curvature of the cost, and the covariance of their least squares that of
-    an M-estimate (Huber 1981, Robust Statistics, section 7.6). Under the linear loss they are one
-    and the residuals.
-
-    Parameters
-    ----------
-    residual : (n,) array
-        Before the loss.
-    sizes : tuple of int
-        Samples of each curve.
-    loss : str
-        See `fitting.losses.soften`.
+    With the mean m of ψ'(r) over each curve (so many samples in `sizes`): √m and ψ(r)/√m. The
+    normal matrix of the slopes so weighted is half the curvature of the cost, and the covariance of
+    their least squares that of an M-estimate (Huber 1981, Robust Statistics, section 7.6). Under
+    the linear loss they are one and the residuals.
     """
     psi, slope = influence(residual, loss)
     weights = np.empty(residual.size)

@@ -279,19 +279,8 @@ def state_of(
 ) -> tuple[str, str]:
     """State of a parameter that varies and whose branch is reached, and the reason in one sentence.
 
-    Parameters
-    ----------
-    name : str
-        For example "s1_kc".
-    value : float
-        Its value.
-    ends : (float, float)
-        Of its 95 % interval, not cut at the limits; NaN or infinite where the data fix only a
-        combination.
-    insight : Insight
-        Sensitivities and correlations there.
-    limits : (float, float)
-        Its limits.
+    `ends` are those of its 95 % interval, not cut at its `limits`; NaN or infinite where the data
+    fix only a combination.
     """
     size, short, unit = (
         float(insight.sizes[insight.names.index(name)]),

@@ -212,13 +212,7 @@ def _basis(jacobian: Array) -> Array:
 
 
 def autocorrelation_time(residual: Array) -> float:
-    """Autocorrelation time τ = 1 + 2 Σ ρ_k >= 1 of a residual, in samples; white noise has τ = 1.
-
-    Parameters
-    ----------
-    residual : (n,) array
-        In the order of time.
-    """
+    """Autocorrelation time τ = 1 + 2 Σ ρ_k >= 1 of a residual, in samples; 1 of white noise."""
     if residual.size < 8 or not residual.any():
         return 1.0
     return noise_process(residual).tau
@@ -318,18 +312,8 @@ def state(
 ) -> tuple[str, str]:
     """State of a parameter that was varied and whose branch was reached, and why.
 
-    Parameters
-    ----------
-    value : float
-        Identified value.
-    half : float
-        Half of its 95 % interval, not cut at the limits; NaN where the data fix only a combination.
-    size : float
-        Its scale.
-    low, high : float
-        Its limits.
-    of : str
-        What the scale is, in words.
+    `half` is half of its 95 % interval, not cut at the limits, NaN where the data fix only a
+    combination; `size` is its scale, in words `of`; `low` and `high` are its limits.
     """
     if not math.isfinite(half):
         return "not determined", "the data fix only a combination of it with other parameters"

@@ -159,17 +159,10 @@ def effective_samples(reference: Tried) -> float:
 def effective_parameters(grams: Array, reference: Tried) -> int:
     """How many combinations of its parameters the curves fix against the noise.
 
-    The rank of the Jacobian, counted against the noise: a direction counts if its 95 % interval is
-    narrower than a relative change of ±`NOTHING`, the limit at which a parameter is called not
-    determined. Where a linear spring in series only bends the branches of a bistable one, the
-    curves do not depend on such combinations.
-
-    Parameters
-    ----------
-    grams : (n_curves, k, k) array
-        See `Tried`.
-    reference : Tried
-        Its residuals are the noise.
+    The rank of the Jacobian (`grams` as in `Tried`), counted against the residuals of `reference`
+    as noise: a direction counts if its 95 % interval is narrower than a relative change of
+    ±`NOTHING`, the limit at which a parameter is called not determined. Where a linear spring in
+    series only bends the branches of a bistable one, the curves do not depend on such combinations.
     """
     information = np.zeros(grams.shape[1:])
     for gram, part, tau in zip(grams, reference.curves, reference.taus, strict=True):

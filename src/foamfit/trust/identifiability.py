@@ -165,18 +165,9 @@ class Insight:
     def combination(self, name: str, loose: float) -> str:
         """Say what the data fix instead of a parameter; "" if it is loose by itself.
 
-        Parameters
-        ----------
-        name : str
-            One of `names`.
-        loose : float
-            Directions whose relative standard error is larger are taken for free.
-
-        Returns
-        -------
-        str
-            If one combination of the parameters that can move together is fixed, that one as a
-            product of powers, good to first order; else those that compensate a change of it.
+        Directions whose relative standard error is larger than `loose` are taken for free. If one
+        combination of the parameters that can move together is fixed, it is given as a product of
+        powers, good to first order; else those parameters that compensate a change of it.
         """
         errors, vt = self._directions
         free = vt[errors > loose]
@@ -229,15 +220,10 @@ class Insight:
 
 
 def look(best: BestPoint, noise: Mapping[str, float]) -> Insight:
-    """Gather what a test can tell at a point of the parameters.
+    """Gather what a test can tell at a point of the parameters, usually the best one.
 
-    Parameters
-    ----------
-    best : BestPoint
-        The point; usually the best one.
-    noise : mapping
-        One standard deviation of each counted curve, SI; of noise that is not white, the root of
-        its autocorrelation time larger.
+    `noise` is one standard deviation of each counted curve, SI; of noise that is not white, the
+    root of its autocorrelation time larger.
     """
     problem, objective = best.problem, best.problem.objective
     n, at = objective.time.size, 0

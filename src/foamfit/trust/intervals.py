@@ -84,20 +84,9 @@ def assess(
 ) -> Intervals:
     """Make the intervals that were chosen.
 
-    Parameters
-    ----------
-    best : BestPoint
-        The best point.
-    choice : Choice
-        The method.
-    minima : sequence of (n,) arrays
-        Points at which the descents of the search ended.
-    deadline : float, optional
-        `time.monotonic` at which it ends with what was done.
-    budget : float
-        Evaluations after which "auto" begins no further profile.
-    announce : callable
-        Called with the expected run time before it is spent.
+    `minima` are points at which the descents of the search ended. It ends at the `deadline` (of
+    `time.monotonic`) with what was done; after `budget` evaluations "auto" begins no further
+    profile. `announce` is called with the expected run time before it is spent.
     """
     if choice.method == "local":
         return Intervals()

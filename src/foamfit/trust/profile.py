@@ -61,24 +61,9 @@ def profile(
 
     The adjusted likelihood ratio: the rise of the cost over `Covariance.inflation`, which is χ²
     with one degree of freedom also where the noise is correlated (Chandler & Bate 2007,
-    Biometrika 94, 167).
-
-    Parameters
-    ----------
-    best : BestPoint
-        The best point.
-    name : str
-        One of its names.
-    tracker : Tracker, optional
-        Counts, keeps the best point seen and ends the profile at its deadline.
-    minima : sequence of (n,) arrays
-        Other points at which descents ended: the profile goes on beyond them where they are
-        within the cut, whatever barrier lies between.
-
-    Returns
-    -------
-    Profile
-        Incomplete if the deadline or Ctrl-C ended it: `ci95` is then that of what was done.
+    Biometrika 94, 167). `minima` are other points at which descents ended: the profile goes on
+    beyond them where they are within the cut, whatever barrier lies between. It is incomplete if
+    the deadline or Ctrl-C ended it: `ci95` is then that of what was done.
     """
     tracker = Tracker(best.problem.objective) if tracker is None else tracker
     tracing = Tracing(best, name, tracker)

@@ -75,23 +75,8 @@ class Refits:
 def bootstrap(best: BestPoint, draws: int, seed: int, tracker: Tracker | None = None) -> Refits:
     """Refits to data remade from the fitted curves and blocks of the residuals.
 
-    Each refit descends from the best point; other minima of the cost are not searched.
-
-    Parameters
-    ----------
-    best : BestPoint
-        The best point.
-    draws : int
-        How many.
-    seed : int
-        Same seed, same numbers.
-    tracker : Tracker, optional
-        Ends it at its deadline.
-
-    Returns
-    -------
-    Refits
-        Fewer than asked for if the deadline or Ctrl-C ended them.
+    Each refit descends from the best point; other minima of the cost are not searched. They are
+    fewer than asked for if the deadline or Ctrl-C ended them.
     """
     objective = best.problem.objective
     tracker = Tracker(objective) if tracker is None else tracker
@@ -163,23 +148,8 @@ def mcmc(best: BestPoint, steps: int, seed: int, tracker: Tracker | None = None)
 
     Flat priors within the limits; the likelihood counts n/τ samples of each curve: its sum of
     squares over the variance of its noise is divided by τ. What the test does not determine is
-    sampled too and runs over its limits, so that the others are those whatever its value is.
-
-    Parameters
-    ----------
-    best : BestPoint
-        The best point, about which the walkers begin.
-    steps : int
-        Of each walker; the first fifth is left out.
-    seed : int
-        Same seed, same numbers.
-    tracker : Tracker, optional
-        Ends it at its deadline.
-
-    Raises
-    ------
-    InputError
-        If emcee is not installed.
+    sampled too and runs over its limits, so that the others are those whatever its value is. The
+    first fifth of the steps of each walker is left out. Raises InputError without emcee.
     """
     check_emcee()
     import emcee

@@ -20,12 +20,8 @@ def runs_test(residual: Array) -> float:
 
     Given n₊ positive and n₋ negative residuals in random order, the number of runs has mean
     μ = 2 n₊n₋/n + 1 and variance (μ-1)(μ-2)/(n-1), and is nearly normal (here with the correction
-    for continuity). One-sided: slow waves make few runs; noise that alternates is no structure.
-
-    Parameters
-    ----------
-    residual : (n,) array
-        In the order of time; samples that are exactly zero are left out.
+    for continuity). One-sided: slow waves make few runs; noise that alternates is no structure. The
+    residuals are in the order of time; those that are exactly zero are left out.
     """
     signs = residual[residual != 0.0] > 0.0
     n, positive = signs.size, int(np.count_nonzero(signs))
@@ -48,11 +44,6 @@ def neighbours_test(residual: Array) -> float:
     Σ r_i r_{i+1} / Σ r_i² of white noise is normal with variance 1/n, nearly. One-sided. It weighs
     by size what the runs test only counts by sign, and so sees a short strong wave that the runs
     test does not; the runs test in turn is not led astray by a few large samples.
-
-    Parameters
-    ----------
-    residual : (n,) array
-        In the order of time.
     """
     power = float(residual @ residual)
     if residual.size < 2 or power == 0.0:
@@ -83,14 +74,9 @@ class Structure:
 
 
 def find_structure(residual: Array, places: NDArray[np.str_]) -> Structure:
-    """Find the place that holds the largest part of the structure of a residual.
+    """Find the place that holds the largest part of the structure of the residual of one curve.
 
-    Parameters
-    ----------
-    residual : (n,) array
-        Of one curve.
-    places : (n,) array of str
-        See `fitting.branches.branch_of_samples`.
+    `places` are as from `fitting.branches.branch_of_samples`.
     """
     product = residual[1:] * residual[:-1]
     rough = residual[1:-1] - 0.5 * (residual[2:] + residual[:-2])
