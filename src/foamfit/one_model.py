@@ -47,10 +47,7 @@ PROFILE_SHARE, IMPROVEMENTS = 0.5, 3
 class Options:
     """How a test is fitted, whatever the model; see `foamfit.fit` for each.
 
-    Raises
-    ------
-    InputError
-        If one is not admissible; the message names it.
+    Raises InputError if one is not admissible; the message names it.
     """
 
     drive: str | None = None

@@ -10,8 +10,8 @@ from typing import Any
 
 import lmfit
 import numpy as np
-from numpy.typing import NDArray
 
+from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.springs.chain import Chain
 from foamfit.springs.spring import BistableSpring
@@ -20,8 +20,6 @@ from foamfit.trust.intervals import Intervals
 
 SCHEMA = 1
 DERIVED_POINTS = ("sigma_a", "sigma_c", "eps_star", "eps_hat_a", "eps_hat_c")
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ def damped_step(
     step = np.zeros(gradient.size)
     if moving.size:
         own = at.jacobian[:, moving]
-        # Two copies are multiplied with another rounding than one with itself, and flat fits show it.
+        # Two copies are multiplied with other rounding than one with itself; flat fits show it.
         normal = (at.jacobian[:, moving] if free is True else own).T @ own
         scale = np.maximum(np.diag(normal), 1e-12 * max(float(np.trace(normal)), 1e-300))
         step[moving] = np.linalg.solve(normal + damping * np.diag(scale), -gradient[moving])

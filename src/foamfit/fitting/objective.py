@@ -250,10 +250,7 @@ class Objective:
 
         `places` are those of the parameters by which derivatives are wanted.
 
-        Raises
-        ------
-        SimulationError
-            If the parameters are not admissible or the scene has no finite answer.
+        Raises SimulationError if they are not admissible or the scene has no finite answer.
         """
         count = len(self.model.names)
         self.evaluations += 1

@@ -196,7 +196,7 @@ class Problem:
         )
 
     def sizes(self, names: tuple[str, ...], values: Array) -> Array:
-        """Natural sizes of some parameters at a point."""
+        """Scales of some parameters at a point."""
         at = dict(zip(self.names, map(float, values), strict=True))
         return np.array([self.scales.of_parameter(name, at) for name in names])
 
@@ -246,10 +246,7 @@ def make_problem(
 ) -> Problem:
     """Make a problem ready; see `foamfit.fit` for the arguments.
 
-    Raises
-    ------
-    InputError
-        If the test cannot feed the drive or a parameter is unknown; the message names it.
+    Raises InputError if the test cannot feed the drive or a parameter is unknown, by its name.
     """
     model = Model.parse(model_name)
     drive = choose_drive(measurement) if drive is None else drive

@@ -150,21 +150,9 @@ class Loop:
 def read_spring(loop: Loop, marks: Array, scales: Scales) -> Array:
     """Read a bistable spring off a loop, given where on it A1, C1 and C2 are taken to lie.
 
-    Parameters
-    ----------
-    loop : Loop
-        Of the spring.
-    marks : (5,) array
-        In [0, 1]: places of A1, C1 and C2 between their neighbours, shares of the stress at C2 and
-        of the damping.
-    scales : Scales
-        Of the test.
-
-    Returns
-    -------
-    (8,) array
-        k0 … kh_minus, eta (SI): initial slope from A1, k_h+ from A1 to C1, k_c through C1 and C2,
-        k_h- from C2 towards rest.
+    `marks` (5,) in [0, 1] are the places of A1, C1 and C2 between their neighbours, and shares of
+    the stress at C2 and of the damping. Returned are k0 … kh_minus, eta (SI): initial slope from
+    A1, k_h+ from A1 to C1, k_c through C1 and C2, k_h- from C2 towards rest.
     """
     last = float(loop.strain[loop.peak])
     eps_a = min((0.02 + 0.85 * marks[0]) * last, 0.9)

@@ -24,7 +24,7 @@ from foamfit.text import percent
 WEAK, NOTHING = 0.5, 3.0
 # A parameter this close to a limit, over its scale, lies at it.
 AT_LIMIT = 1e-6
-# Two directions closer than this cannot be told apart.
+# Two directions closer than this count as one.
 SINGULAR = 1e-12
 # Of the autoregressive noise: most orders, largest reflection coefficient, rounds of correction.
 MOST_ORDERS, LARGEST, CORRECTIONS = 10, 0.995, 4
@@ -136,14 +136,8 @@ def noise_processes(residual: Array, jacobian: Array, sizes: tuple[int, ...]) ->
     smaller than the noise was. With the hat matrix H = QQᵀ of the fit, residuals (I-H)e have the
     expected lag sums tr S_k (I-H)Σ(I-H); the autocovariances are corrected by what Σ itself loses.
 
-    Parameters
-    ----------
-    residual : (n,) array
-        All curves after each other, each in the order of time.
-    jacobian : (n, k) array
-        Derivative of the residual, in any scaling of its columns.
-    sizes : tuple of int
-        Samples of each curve.
+    `residual` (n,) holds all curves after each other, each in the order of time, so many samples of
+    each as in `sizes`; `jacobian` (n, k) may have any scaling of its columns.
     """
     basis = _basis(jacobian)
     curves = parts(sizes)
@@ -256,16 +250,8 @@ def covariance(
 ) -> Covariance:
     """Covariance (JᵀJ)⁻¹ JᵀΣJ (JᵀJ)⁻¹ with Σ the noise of each curve (`noise_processes`).
 
-    Parameters
-    ----------
-    jacobian : (n, k) array
-        Derivative of the residual.
-    residual : (n,) array
-        At the best point.
-    sizes : tuple of int
-        Samples of each curve, in their order.
-    sizes_of : (k,) array
-        Scale of each parameter, so that directions can be compared.
+    `residual` (n,) and `jacobian` (n, k) are those of the best point, so many samples of each curve
+    as in `sizes`; `sizes_of` (k,) are the scales of the parameters, so that directions compare.
     """
     scaled = jacobian * sizes_of
     noise = noise_processes(residual, scaled, sizes)
