@@ -12,10 +12,16 @@ import json
 import os
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+from conftest import synthetic_impact
+from foamfit.one_model import Options, identify, judge
+from foamfit.solve.plan import CLOSED_FORM, SECOND_ORDER, Plan
+from foamfit.trust.intervals import Choice
 
 HERE = Path(__file__).parent
 DRIVES = ("impact", "stress", "displacement")
@@ -133,3 +139,29 @@ def test_a_residual_alone_costs_no_sensitivity(
     counted: dict[str, dict[str, dict[str, Any]]],
 ) -> None:
     assert counted["sensitivities"]["none, 0 held"]["tangents expanded"] == 0
+
+
+# ---------------------------------------------------------------- after the search
+
+
+def test_the_best_point_is_simulated_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One run with all curves (and the stress along the motion), one with sensitivities."""
+    _, measurement = synthetic_impact(samples=101)
+    found = identify(measurement, "bistable", None, Options(starts=2), lambda *_: None)
+    runs: Counter[tuple[str, bool]] = Counter()
+    original = Plan.run
+
+    def counted_run(plan: Plan, *args: Any, **options: Any) -> Any:
+        runs[plan.solver, len(options["directions"]) > 0] += 1
+        return original(plan, *args, **options)
+
+    monkeypatch.setattr(Plan, "run", counted_run)
+    before = found.problem.objective.evaluations
+    result, _ = judge(found, Choice("local"), lambda _: None)
+    assert result.parameters["s1_k0"].state == "determined"
+    assert runs == {
+        (SECOND_ORDER, False): 1,
+        (CLOSED_FORM, False): 1,
+        (SECOND_ORDER, True): 1,
+    }
+    assert found.problem.objective.evaluations == before + 2

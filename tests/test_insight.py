@@ -17,6 +17,7 @@ import foamfit as ff
 from conftest import AREA, EXPERIMENTS, HEIGHT, synthetic_impact, synthetic_loop
 from foamfit.cli import main
 from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
+from foamfit.fitting.branches import FLIGHT, Section
 from foamfit.fitting.problem import Problem, make_params, make_problem
 from foamfit.fitting.search import SearchRecord
 from foamfit.report import outlook as planning
@@ -24,9 +25,10 @@ from foamfit.report.identifiability_plots import plot_information, plot_sensitiv
 from foamfit.report.outlook_plot import plot_plan
 from foamfit.report.page import render_report, summary_text
 from foamfit.springs.chain import Chain, Impact
+from foamfit.trust.best_point import BestPoint
 from foamfit.trust.checklist import Check, _by_reason, status_of
 from foamfit.trust.conclude import conclude
-from foamfit.trust.identifiability import FLIGHT, Insight, Section
+from foamfit.trust.identifiability import Insight
 from foamfit.trust.intervals import Intervals
 from reference import reference_impact
 
@@ -58,6 +60,11 @@ def values_of(problem: Problem, *springs: ff.BistableSpring, **given: float) -> 
     for name, value in given.items():
         values[problem.model.index[name]] = value
     return problem.space().complete(values)
+
+
+def best_of(problem: Problem, spring: ff.BistableSpring) -> BestPoint:
+    """The point of one spring."""
+    return BestPoint(problem, values_of(problem, spring))
 
 
 def insight_of(scaled: np.ndarray, values: np.ndarray | None = None) -> Insight:
@@ -173,7 +180,7 @@ def test_two_springs_in_series_show_only_their_compliance() -> None:
     )  # fmt: skip
     problem = problem_of(test, "linear+linear")
     values = values_of(problem, s1_k0=k[0], s2_k0=k[1], s1_height=h)
-    result = conclude(problem, values, SearchRecord(0, 1, 0.0, AGREED))
+    result = conclude(BestPoint(problem, values), SearchRecord(0, 1, 0.0, AGREED))
     slopes = {
         "s1_k0": -(h / k[0]) / compliance,
         "s2_k0": -((HEIGHT - h) / k[1]) / compliance,
@@ -200,7 +207,7 @@ X = np.linspace(0.0, 1.0, 60)
         ((X, -X, 1 - X), (1.0, 1.0, 1.0), "the data fix only p/q"),
         ((2 * X, -X, 1 - X), (1.0, 1.0, 1.0), "the data fix only p/q^0.5"),
         ((2 * X, -X, 1 - X), (1.0, -3.0, 1.0), "the data fix only p·q^0.5"),
-        ((X, X**2, X + 2 * X**2), (1.0, 1.0, 1.0), "made up for by q (+2), r (−1)"),
+        ((X, X**2, X + 2 * X**2), (1.0, 1.0, 1.0), "compensated by q (+2), r (−1)"),
         ((0 * X, 0 * X, 1 - X), (1.0, 1.0, 1.0), ""),
     ],
 )
@@ -208,7 +215,7 @@ def test_a_combination_is_named_with_its_powers(
     columns: tuple[np.ndarray, ...], values: tuple[float, ...], said: str
 ) -> None:
     told = insight_of(100 * np.column_stack(columns), np.array(values)).combination("p", 1.0)
-    assert told == said or ("made up" in said and said in told)
+    assert told == said or ("compensated" in said and said in told)
 
 
 def test_the_weakest_direction_is_told_in_words() -> None:
@@ -218,18 +225,18 @@ def test_the_weakest_direction_is_told_in_words() -> None:
         {"p": 1.0, "q": -1.0}, rel=2e-3
     )
     assert error == pytest.approx(alike.stderr[0] * math.sqrt(2), rel=2e-3)
-    assert "together" in alike.sentence()
+    assert "The least determined combination is a joint" in alike.sentence()
     alone = insight_of(np.column_stack([30 * X, 1 - X]))
-    assert alone.sentence().startswith("The test says least about q, which has a standard error")
+    assert alone.sentence().startswith("The least determined parameter is q: its standard error is")
     nothing = insight_of(np.column_stack([X, 0 * X]))
-    assert "q, which cannot be told at all" in nothing.sentence()
+    assert "is q: the curves do not depend on it" in nothing.sentence()
     assert np.isinf(nothing.stderr[1])
 
 
 def test_the_shares_of_the_information_add_up_and_lie_where_the_branch_is() -> None:
     spring, test = synthetic_impact()
     problem = problem_of(test, drive="displacement")
-    result = conclude(problem, values_of(problem, spring), SearchRecord(0, 1, 0.0, AGREED))
+    result = conclude(best_of(problem, spring), SearchRecord(0, 1, 0.0, AGREED))
     parts, shares = result.insight.shares()
     assert np.sum(shares, axis=1) == pytest.approx(np.ones(len(result.insight.names)))
     where = {
@@ -246,7 +253,7 @@ def test_the_shares_of_the_information_add_up_and_lie_where_the_branch_is() -> N
 def test_the_sections_are_those_of_the_branches_in_time() -> None:
     spring, test = synthetic_impact()
     problem = problem_of(test)
-    result = conclude(problem, values_of(problem, spring), SearchRecord(0, 1, 0.0, AGREED))
+    result = conclude(best_of(problem, spring), SearchRecord(0, 1, 0.0, AGREED))
     cuts = result.insight.sections
     assert [cut.branches for cut in cuts] == ["a", "d", "c", "e", FLIGHT]
     assert cuts[0].start == 0
@@ -272,7 +279,7 @@ def concluded(
     problem = problem_of(test if measurement is None else measurement, **given)
     values = values_of(problem, spring)
     found = SearchRecord(0, 8, 0.0, **({"costs": AGREED} | (record or {})))
-    return conclude(problem, values, found, intervals)
+    return conclude(BestPoint(problem, values), found, intervals)
 
 
 def answers(result: Any) -> dict[str, bool | None]:
@@ -323,15 +330,15 @@ def test_trials_that_fail_and_masses_that_ring_are_asked_after() -> None:
     spring, test = synthetic_impact(samples=201)
     problem = problem_of(test)
     problem.objective.evaluations, problem.objective.failures = 10, 90
-    result = conclude(problem, values_of(problem, spring), SearchRecord(0, 8, 0.0, AGREED))
+    result = conclude(best_of(problem, spring), SearchRecord(0, 8, 0.0, AGREED))
     assert answers(result)["simulated"] is False
     item = ff.published["foam-1/model-3"]
     heavy = replace(test, specimen=Specimen(HEIGHT, AREA, 5.56e-6, item.chain.heights))
     params = make_params(heavy, "linear+bistable")
     problem = make_problem(heavy, "linear+bistable", None, params, None, interior_mass=True)
     values, _ = planning.published_values(problem, "foam-1/model-3")
-    result = conclude(problem, values, SearchRecord(0, 8, 0.0, AGREED))
-    assert answers(result)["ringing"] is False
+    result = conclude(BestPoint(problem, values), SearchRecord(0, 8, 0.0, AGREED))
+    assert answers(result)["vibration"] is False
     assert "determined" not in {p.state for p in result.parameters.values()}
 
 
@@ -396,7 +403,7 @@ def test_parameters_that_are_not_determined_count_as_varied() -> None:
 def test_what_the_test_does_not_say_is_neither_yes_nor_no() -> None:
     spring, test = synthetic_loop()
     problem = problem_of(test, drive="displacement")
-    result = conclude(problem, values_of(problem, spring), SearchRecord(0, 8, 0.0, AGREED))
+    result = conclude(best_of(problem, spring), SearchRecord(0, 8, 0.0, AGREED))
     assert answers(result)["energy"] is None
     assert answers(result)["impulse"] is None
     assert answers(result)["floor"] is True  # the noise is estimated here
@@ -415,18 +422,18 @@ def test_the_status_follows_from_the_answers() -> None:
 def test_a_damper_that_may_be_none_is_not_called_determined() -> None:
     spring, test = synthetic_impact(eta=8.0)
     problem = problem_of(test, damped=True)
-    result = conclude(problem, values_of(problem, spring), SearchRecord(0, 8, 0.0, AGREED))
+    result = conclude(best_of(problem, spring), SearchRecord(0, 8, 0.0, AGREED))
     item = result.parameters["s1_eta"]
     assert item.ci95[0] == 0.0
     assert item.state == "weak"
-    assert item.why.startswith("it is not told from zero: its 95 % interval goes from 0 to ")
+    assert item.why.startswith("it is consistent with zero; upper bound ")
     # Its limit is known well, which is nothing to be warned of, but it is said.
     assert result.status == "ok"
     told = next(check for check in result.checklist if check.key == "determined")
-    assert told.sentence == "7 of 8 are; small for sure, though not told from zero: s1_eta."
+    assert told.sentence == "7 of 8 are; consistent with zero, with a small upper bound: s1_eta."
     spring, test = synthetic_impact(eta=60.0)
     problem = problem_of(test, damped=True)
-    result = conclude(problem, values_of(problem, spring), SearchRecord(0, 8, 0.0, AGREED))
+    result = conclude(best_of(problem, spring), SearchRecord(0, 8, 0.0, AGREED))
     assert result.parameters["s1_eta"].state == "determined"
 
 
@@ -546,8 +553,10 @@ def test_report_and_plan_show_them_too() -> None:
 
 def test_what_was_never_reached_is_said_first() -> None:
     slow = concluded(synthetic_impact(velocity=1.75, samples=201)[1])
-    start = "The test says nothing of s1_kc, s1_dsigma, s1_eps_c and s1_kh_minus, and least of the "
-    assert slow.insight.sentence().startswith(start + "rest of s1_")
+    start = (
+        "s1_kc, s1_dsigma, s1_eps_c and s1_kh_minus cannot be determined: no branch they act on "
+    )
+    assert slow.insight.sentence().startswith(start + "was reached. The least determined ")
     warning = next(w for w in slow.warnings if w.startswith("Not determined"))
     assert "s1_kc (branch c of spring 1 was never reached)" in warning
     assert "s1_dsigma, s1_eps_c, s1_kh_minus (branch e of spring 1 was never reached)" in warning

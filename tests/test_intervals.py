@@ -23,24 +23,19 @@ from conftest import EXPERIMENTS, synthetic_impact
 from foamfit import one_model
 from foamfit.cli import main
 from foamfit.errors import InputError
-from foamfit.fitting.objective import soften
+from foamfit.fitting.losses import soften
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.search import SearchRecord, Tracker
 from foamfit.one_model import Found, judge
 from foamfit.report.plots import plot_profiles
-from foamfit.trust import intervals
+from foamfit.trust import intervals, resample
+from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
 from foamfit.trust.covariance import NoiseProcess, noise_process
-from foamfit.trust.intervals import (
-    Choice,
-    assess,
-    block_length,
-    bootstrap,
-    departures,
-    mcmc,
-    profile,
-)
-from foamfit.trust.refit import Vicinity
+from foamfit.trust.intervals import Choice, assess
+from foamfit.trust.profile import departures, profile
+from foamfit.trust.refit import Refit
+from foamfit.trust.resample import block_length, bootstrap, mcmc
 
 
 def autoregressive(rng: np.random.Generator, n: int, rho: float) -> np.ndarray:
@@ -68,9 +63,15 @@ class Curve:
         a, b = values
         return a + b * self.time + self.bend * b**2 * self.time**2
 
-    def differences(self, values: np.ndarray) -> np.ndarray:
+    def simulate(self, values: np.ndarray, *, everything: bool = False) -> np.ndarray:
         self.evaluations += 1
-        return self.model(values) - self.data
+        return self.model(values)
+
+    def compare(self, curves: np.ndarray) -> np.ndarray:
+        return curves - self.data
+
+    def differences(self, values: np.ndarray) -> np.ndarray:
+        return self.compare(self.simulate(values))
 
     def residual(self, values: np.ndarray, shift: np.ndarray | float = 0.0) -> np.ndarray:
         return soften(self.differences(values) - shift, self.loss)
@@ -78,7 +79,7 @@ class Curve:
 
 @dataclass(eq=False)
 class Bench:
-    """What `Vicinity` needs of a problem, for a `Curve`."""
+    """What `BestPoint` needs of a problem, for a `Curve`."""
 
     objective: Curve
     low: float = -100.0
@@ -105,7 +106,7 @@ class Bench:
 
 def curve(
     bend: float = 0.0, rho: float = 0.0, low: float = -100.0, slope: float = 0.3, n: int = 400
-) -> Vicinity:
+) -> BestPoint:
     """A vicinity of the best fit of a curve with noise of 0.1."""
     rng = np.random.default_rng(5)
     time = np.linspace(-1, 1, n)
@@ -113,17 +114,17 @@ def curve(
     noise = autoregressive(rng, n, rho)
     bench.objective.data = bench.objective.model(np.array([1.0, slope])) + 0.1 * noise
     best = least_squares(bench.objective.residual, [1.0, slope], xtol=1e-14, ftol=1e-14).x
-    return Vicinity.of(bench, best, ("a", "b"))  # type: ignore[arg-type]
+    return BestPoint(bench, best, ("a", "b"))  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
-def impact() -> Vicinity:
+def impact() -> BestPoint:
     """The best fit of a synthetic impact, closed loop, starting at the truth."""
     spring, measurement = synthetic_impact(samples=301)
     problem = make_problem(measurement, "bistable", "impact", None, None, False)
     problem.params["s1_eta"].set(value=0.0, vary=False)
     values = np.array([*spring.seven, 0.0, 0.0])
-    return Vicinity.of(problem, _refitted(problem, values, problem.free()), problem.free())
+    return BestPoint(problem, _refitted(problem, values, problem.free()), problem.free())
 
 
 def _refitted(problem: Problem, values: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
@@ -216,7 +217,7 @@ def test_the_intervals_of_a_soft_loss_agree_with_each_other(loss):
     data += 8.0 * (rng.random(600) < 0.1) * rng.standard_normal(600)
     bench = Bench(Curve(time, data, loss=loss))
     best = least_squares(bench.objective.residual, [1.0, 0.3], xtol=1e-14, ftol=1e-14).x
-    around = Vicinity.of(bench, best, ("a", "b"))  # type: ignore[arg-type]
+    around = BestPoint(bench, best, ("a", "b"))  # type: ignore[arg-type]
     drawn = np.percentile(bootstrap(around, 400, seed=0).values, [2.5, 97.5], axis=0)
     for column, name in enumerate("ab"):
         width = 2.0 * around.quantiles[column] * around.spread.stderr[column]
@@ -256,7 +257,7 @@ def test_the_ends_of_a_profile_satisfy_the_cut_by_an_independent_refit(impact):
 
 
 def test_a_profile_goes_on_beyond_a_valley_that_is_as_good():
-    """A cost of two valleys: x² (x-3)² seen by its residual x (x-3), flat noise elsewhere."""
+    """A cost of two minima: x² (x-3)² seen by its residual x (x-3), flat noise elsewhere."""
     rng = np.random.default_rng(0)
     noise = rng.standard_normal(400)
 
@@ -276,9 +277,9 @@ def test_a_profile_goes_on_beyond_a_valley_that_is_as_good():
 
     noise[:2] = 0.0
     bench = TwoBench(Two(np.arange(400.0), noise))
-    around = Vicinity.of(bench, np.zeros(2), ("a", "b"))  # type: ignore[arg-type]
+    around = BestPoint(bench, np.zeros(2), ("a", "b"))  # type: ignore[arg-type]
     alone = profile(around, "b")
-    both = profile(around, "b", valleys=[np.array([0.0, 3.0])])
+    both = profile(around, "b", minima=[np.array([0.0, 3.0])])
     assert alone.ci95[1] < 0.5
     assert both.ci95[0] == pytest.approx(alone.ci95[0])
     assert both.ci95[1] == pytest.approx(3.0 - alone.ci95[0], rel=1e-2)
@@ -289,13 +290,13 @@ def test_a_profile_goes_on_beyond_a_valley_that_is_as_good():
             return super().residual(values, shift)
 
     bench = TwoBench(Gap(np.arange(400.0), noise))
-    around = Vicinity.of(bench, np.zeros(2), ("a", "b"))  # type: ignore[arg-type]
-    apart = profile(around, "b", valleys=[np.array([0.0, 3.0])])
+    around = BestPoint(bench, np.zeros(2), ("a", "b"))  # type: ignore[arg-type]
+    apart = profile(around, "b", minima=[np.array([0.0, 3.0])])
     assert apart.ci95 == pytest.approx(both.ci95, rel=1e-2)
 
 
 def test_what_one_profile_meets_counts_for_the_others():
-    """Two valleys a low barrier apart: a = 0, b = 0 and a = 1, b = 3.
+    """Two minima a low barrier apart: a = 0, b = 0 and a = 1, b = 3.
 
     With a held b does not move, since a - (3 - 2u) u², u = b/3, has no slope there: the profile of
     a alone stays in the first valley. That of b crosses the barrier and meets the second.
@@ -318,7 +319,7 @@ def test_what_one_profile_meets_counts_for_the_others():
             return out
 
     bench = StairsBench(Stairs(np.arange(400.0), noise))
-    around = Vicinity.of(bench, np.zeros(2), ("a", "b"))  # type: ignore[arg-type]
+    around = BestPoint(bench, np.zeros(2), ("a", "b"))  # type: ignore[arg-type]
     alone = profile(around, "a")
     found = assess(around, Choice("profile"))
     half = around.quantiles[0] * around.spread.stderr[0]
@@ -361,7 +362,7 @@ def test_a_better_point_is_told(impact):
     """Around a point that is not the best, a profile says where to go on."""
     values = impact.values.copy()
     values[impact.problem.model.index["s1_kc"]] *= 1.01
-    off = Vicinity.of(impact.problem, values, impact.names)
+    off = BestPoint(impact.problem, values, impact.names)
     found = assess(off, Choice("profile"))
     assert found.better is not None
     residual = impact.problem.objective.residual(found.better)
@@ -411,7 +412,7 @@ def test_a_markov_chain_agrees_with_the_local_errors():
 
 def test_a_short_chain_says_that_it_is_short():
     pytest.importorskip("emcee")
-    assert "too short to trust" in mcmc(curve(), 100, seed=0).sentence()
+    assert "too short" in mcmc(curve(), 100, seed=0).sentence()
 
 
 class Levels(Curve):
@@ -433,14 +434,14 @@ class LevelsBench(Bench):
         return {name: SimpleNamespace(min=-1.0, max=1.0) for name in "abc"}
 
 
-def levels(kind: type[Curve] = Levels, names: tuple[str, ...] = ("a", "b", "c")) -> Vicinity:
+def levels(kind: type[Curve] = Levels, names: tuple[str, ...] = ("a", "b", "c")) -> BestPoint:
     """The best point of a curve that does not determine a and c."""
     time = np.linspace(-1, 1, 400)
     data = 0.4 + 0.3 * time + 0.1 * np.random.default_rng(5).standard_normal(400)
     bench = LevelsBench(kind(time, data), index={"a": 0, "b": 1, "c": 2})
     slope, level = np.polyfit(time, data, 1)
     best = np.array([0.5 * level, slope, 0.5 * level])
-    return Vicinity.of(bench, best, names)  # type: ignore[arg-type]
+    return BestPoint(bench, best, names)  # type: ignore[arg-type]
 
 
 def test_a_chain_runs_over_what_is_not_determined_within_its_limits():
@@ -463,6 +464,7 @@ def test_a_chain_runs_over_what_is_not_determined_within_its_limits():
 @pytest.mark.parametrize("method", ["profile", "bootstrap", "mcmc"])
 def test_nothing_is_drawn_where_nothing_is_determined(method):
     around = levels(names=("a", "c"))
+    assert around.known == []
     before = around.problem.objective.evaluations
     found = assess(around, Choice(method, 200))
     assert "determines no parameter" in found.warnings[0]
@@ -481,11 +483,12 @@ def test_where_nothing_can_be_simulated_a_chain_gives_up():
             return super().residual(values, shift)
 
     around = levels(Alone)
+    assert around.known
     before = around.problem.objective.evaluations
     chain = mcmc(around, 100, seed=0)
     assert len(chain.samples) == 0
     assert "nothing can be simulated" in chain.sentence()
-    assert around.problem.objective.evaluations - before == intervals.HALVINGS
+    assert around.problem.objective.evaluations - before == resample.HALVINGS
 
 
 @pytest.mark.parametrize("method", ["bootstrap", "mcmc"])
@@ -515,7 +518,7 @@ def test_fewer_refits_than_asked_for_are_a_no_of_the_checklist(impact, monkeypat
     monkeypatch.setattr(intervals, "Tracker", _Interrupting)
     found = assess(impact, Choice("bootstrap", 5000))
     assert found.ends
-    result = conclude(impact.problem, impact.values, SearchRecord(0, 8, 0.0, ((1.0, 8),)), found)
+    result = conclude(impact, SearchRecord(0, 8, 0.0, ((1.0, 8),)), found)
     (check,) = [check for check in result.checklist if check.key == "intervals"]
     assert check.answer is False
     assert result.status == "warnings"
@@ -603,7 +606,7 @@ def test_an_interval_is_in_order_and_holds_its_value(impact, method, seed):
         made = intervals.Intervals()
     problem, values = impact.problem, impact.values.copy()
     values[impact.index["s1_dsigma"]] = -1e-15
-    for item in conclude(problem, values, AGREED, made).parameters.values():
+    for item in conclude(BestPoint(problem, values), AGREED, made).parameters.values():
         if item.ci95 is not None:
             assert item.ci95[0] <= item.value <= item.ci95[1]
             assert item.ci95[0] < item.ci95[1]
@@ -615,7 +618,7 @@ def test_what_is_within_rounding_of_its_limit_is_at_it(impact, monkeypatch):
     values = impact.values.copy()
     values[at] = -3e-15
     found = Found(problem, Tracker(problem.objective, best_values=values), AGREED)
-    result = judge(found, Choice("local"), lambda _: None)
+    result, _ = judge(found, Choice("local"), lambda _: None)
     item = result.parameters["s1_dsigma"]
     assert (item.value, str(item.value)) == (0.0, "0.0")
     assert result.params["s1_dsigma"].value == 0.0
@@ -623,20 +626,20 @@ def test_what_is_within_rounding_of_its_limit_is_at_it(impact, monkeypatch):
     assert "lies at its limit 0" in item.why
     assert item.ci95[1] == 0.0
     values[at] = -0.0
-    assert str(one_model._on_limits(problem, values)[at]) == "0.0"
+    assert str(one_model._on_limits(BestPoint(problem, values), np.inf).values[at]) == "0.0"
     # What would cost something stays where it is.
     monkeypatch.setattr(one_model, "AT_LIMIT", 1.0)
-    assert np.array_equal(one_model._on_limits(problem, impact.values), impact.values)
+    assert one_model._on_limits(impact, impact.cost) is impact
 
 
 def test_a_profile_that_its_limit_cuts_is_not_called_narrow(impact):
     values = impact.values.copy()
     values[impact.index["s1_dsigma"]] = 0.0
-    around = Vicinity.of(impact.problem, values, impact.names)
+    around = BestPoint(impact.problem, values, impact.names)
     column = impact.names.index("s1_dsigma")
     half = around.quantiles[column] * around.spread.stderr[column]
     made = intervals.Intervals({"s1_dsigma": (-0.9 * half, 0.0)}, {"s1_dsigma": PROFILE})
-    item = conclude(impact.problem, values, AGREED, made).parameters["s1_dsigma"]
+    item = conclude(BestPoint(impact.problem, values), AGREED, made).parameters["s1_dsigma"]
     assert item.ci95_method == PROFILE
     assert item.ci95 == pytest.approx((-0.9 * half, 0.0))
     assert item.stderr == pytest.approx(around.spread.stderr[column])
@@ -664,13 +667,13 @@ def test_nine_of_ten_intervals_hold():
         truth = np.array([*spring.seven, spring.eta, 0.0])
         tracker = Tracker(problem.objective)
         names = problem.free()
-        around = Vicinity.of(problem, truth, names)
-        refit = intervals.Refit(around, tracker)
+        around = BestPoint(problem, truth, names)
+        refit = Refit(around, tracker)
         best = refit.run(refit.start(), np.ones(len(names), dtype=bool), steps=40)
-        around = Vicinity.of(problem, best.point, names)
+        around = BestPoint(problem, best.point, names)
         found = assess(around, Choice())
         for i, name in enumerate(names):
-            if around.knows(name):
+            if name in around.known:
                 half = around.quantiles[i] * around.spread.stderr[i]
                 value = around.values[problem.model.index[name]]
                 low, high = found.ends.get(name, (value - half, value + half))

@@ -18,10 +18,12 @@ from conftest import synthetic_impact, synthetic_loop
 from foamfit import auto, one_model
 from foamfit.cli import main
 from foamfit.data.measurement import Measurement, Outliers, Specimen, Striker
+from foamfit.fitting.branches import branch_of_samples
 from foamfit.fitting.problem import make_problem
 from foamfit.report.page import render_report, summary_text
 from foamfit.trust import evidence
-from foamfit.trust.residual_tests import branch_places, find_structure, neighbours_test, runs_test
+from foamfit.trust.best_point import BestPoint
+from foamfit.trust.residual_tests import find_structure, neighbours_test, runs_test
 
 HEIGHT, AREA = 1.2e-3, 1.9635e-5
 
@@ -93,7 +95,7 @@ def test_combinations_are_not_counted_as_parameters():
     noise = tried(rng.standard_normal(600), np.ones((600, 1)))
     apart = np.column_stack([np.ones_like(x), x, x**2])
     same = np.column_stack([apart, apart[:, 0] - apart[:, 1]])
-    faint = np.column_stack([apart, 0.01 * x**3])  # its interval is ±13 natural sizes
+    faint = np.column_stack([apart, 0.01 * x**3])  # its interval is ±13
     counted = [
         evidence.effective_parameters(np.array([columns.T @ columns]), noise)
         for columns in (apart, same, faint)
@@ -106,7 +108,7 @@ def test_the_criteria_are_those_of_closed_form():
     residual = np.random.default_rng(2).standard_normal(500)
     columns = np.column_stack([np.ones(500), np.linspace(-1, 1, 500)])
     one = tried(residual, columns)
-    found = evidence.evidence(one, one)
+    found = evidence.criteria(one, one)
     fit = 500 * np.log(residual @ residual / 500)
     assert found.rank == 2
     assert found.aicc == pytest.approx(fit + 4 + 12 / 497, rel=1e-12)
@@ -120,7 +122,7 @@ def test_correlated_residuals_are_less_evidence():
         scale * lfilter([1.0], [1.0, -2.0 / 3.0], rng.standard_normal(1000)) for scale in (1.0, 1.1)
     )
     columns = np.ones((1000, 1))
-    bic = [evidence.evidence(tried(r, columns), tried(small, columns)).bic for r in (large, small)]
+    bic = [evidence.criteria(tried(r, columns), tried(small, columns)).bic for r in (large, small)]
     expected = 200.0 * np.log((large @ large) / (small @ small))
     assert bic[0] - bic[1] == pytest.approx(expected, rel=0.15)
 
@@ -128,8 +130,13 @@ def test_correlated_residuals_are_less_evidence():
 def test_a_bent_structure_is_found_where_it_is():
     strain = np.concatenate([np.linspace(0, 1, 200), np.linspace(1, 0, 200)])
     switches = np.array([[50, 1, 0, 1, 0], [150, 1, 1, 2, 0], [250, 1, 2, 3, 0]], dtype=float)
-    names = ("a", "d", "c", "e")
-    places = branch_places(("linear", "bistable"), switches, np.arange(400.0), strain, names)
+    problem = SimpleNamespace(
+        model=SimpleNamespace(kinds=("linear", "bistable")),
+        objective=SimpleNamespace(time=np.arange(400.0)),
+        measurement=SimpleNamespace(stress=strain),
+    )
+    run = SimpleNamespace(motion=SimpleNamespace(switches=switches))
+    places = branch_of_samples(problem, run)
     residual = 1e-3 * np.random.default_rng(0).standard_normal(400)
     residual[50:150] += 0.1 * (np.linspace(-1, 1, 100) ** 2 - 1 / 3)
     found = find_structure(residual, places)
@@ -217,7 +224,7 @@ def test_a_linear_spring_in_series_adds_combinations_and_no_evidence():
     both = []
     for result in (one, chain):
         problem = make_problem(loop, result.model, result.drive, result.params, None, False)
-        both.append(evidence.weigh(problem, result, "none", 0.0))
+        both.append(evidence.Tried(result, "none", BestPoint(problem, problem.vector()), 0.0))
     best, found = evidence.choose(both)
     assert best == 0
     varied = [sum(item.vary for item in result.parameters.values()) for result in (one, chain)]
@@ -283,7 +290,7 @@ def test_outliers_leave_the_ladder_standing():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(auto, "LADDER", auto.LADDER[:1])
         result = ff.fit(replace(test, stress=stress, outliers=spikes), model="auto", starts=4)
-    assert any("hold a structure" in text for text in result.warnings)
+    assert any("have a structure" in text for text in result.warnings)
 
 
 # ---------------------------------------------------------------- interruption
@@ -374,9 +381,9 @@ def climbed(wavy):
 
 
 def test_what_remains_is_said(climbed):
-    warning = next(text for text in climbed.warnings if text.startswith("No rung reaches"))
-    assert "residuals of stress_strain hold a structure of" in warning
-    size = float(warning.split("structure of ")[1].split("%")[0])
+    warning = next(text for text in climbed.warnings if text.startswith("No model reaches"))
+    assert "residuals of stress_strain have a structure of" in warning
+    size = float(warning.split("structure of ")[1].split(" %")[0])
     assert size == pytest.approx(5 / np.sqrt(2), rel=0.25)  # what the springs follow of it is less
     assert climbed.ladder.ended == "the top of the ladder was reached"
 
@@ -389,7 +396,7 @@ def test_undetermined_parameters_of_the_chosen_model_are_named(climbed):
         result = ff.fit(test, model="auto", starts=4)
     (sentence,) = [text for text in result.ladder.cautions if "does not determine" in text]
     assert "s1_kc" in sentence
-    assert "no rung of the ladder has all parameters determined" in sentence
+    assert "no model of the ladder has all parameters determined" in sentence
     assert sentence in result.warnings
     assert result.ladder.chosen.rank <= 3 < result.ladder.chosen.n_vary
     assert any("combinations" in text for text in result.ladder.sentences)
@@ -453,8 +460,11 @@ def loop_file(tmp_path, monkeypatch):
 def test_the_command_writes_to_auto(loop_file, tmp_path):
     done = run("fit", loop_file, "--model", "auto", "--starts", 4)
     assert done.exit_code == 0, done.output
-    assert "The first rung bistable is the simplest that holds" in done.stdout
-    assert "no richer rung was tried" in done.stdout
+    assert (
+        "bistable was chosen of 1 model: it is the simplest whose residuals are structureless"
+        in done.stdout
+    )
+    assert "no richer model was tried" in done.stdout
     folder = tmp_path / "fits" / "loop" / "auto"
     content = json.loads((folder / "fit.json").read_text())
     assert content["model"] == "bistable"

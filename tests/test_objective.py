@@ -11,16 +11,14 @@ from scipy.signal import savgol_filter
 import foamfit as ff
 from conftest import synthetic_impact, synthetic_loop
 from foamfit.data.measurement import Noise, Outliers, Striker
-from foamfit.fitting.objective import (
-    MODEL_ERROR,
-    PENALTY,
-    Objective,
+from foamfit.fitting.curves import (
     check_drive,
     check_interior,
     choose_drive,
     default_weights,
     smoothed,
 )
+from foamfit.fitting.objective import MODEL_ERROR, PENALTY, Objective
 from foamfit.springs.model import Model
 
 BISTABLE = Model.parse("bistable")

@@ -17,7 +17,7 @@ from foamfit.data.describe import describe
 from foamfit.data.energy import audit
 from foamfit.data.measurement import Outliers
 from foamfit.errors import InputError
-from foamfit.fitting.objective import check_drive
+from foamfit.fitting.curves import check_drive
 from foamfit.report.page import render_report, summary_text
 
 SPECIMEN = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\n'
@@ -312,7 +312,7 @@ def test_a_clipped_force_is_no_shift_of_the_clocks():
     told = [[w for w in result.warnings if "--time-shift" in w] for result in results]
     assert told[0] == []
     assert told[1]  # what a clipped force looks like
-    (check,) = [c for c in results[0].checklist if c.key == "clocks"]
+    (check,) = [c for c in results[0].checklist if c.key == "time_shift"]
     assert check.answer is None
     assert "clipped" in check.sentence
 

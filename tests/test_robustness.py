@@ -18,14 +18,16 @@ from conftest import AREA, HEIGHT, synthetic_impact, synthetic_loop
 from foamfit.api import FitResult
 from foamfit.cli import main
 from foamfit.data.measurement import Measurement, Outliers
-from foamfit.fitting.objective import LOSSES, Objective, default_weights, influence, soften
+from foamfit.fitting.curves import default_weights
+from foamfit.fitting.losses import LOSSES, influence, soften
+from foamfit.fitting.objective import Objective
 from foamfit.report.comparison import compare, comparison_text
 from foamfit.report.folder import load_result
 from foamfit.report.page import render_report, summary_text
 from foamfit.report.plots import plot_fit
 from foamfit.springs.model import Model
 from foamfit.trust import covariance
-from foamfit.trust.refit import m_estimate
+from foamfit.trust.best_point import m_estimate
 
 BISTABLE = Model.parse("bistable")
 NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")

@@ -116,7 +116,7 @@ def test_states(half, value, expected):
 
 
 @pytest.mark.parametrize(
-    ("half", "told"), [(1.5, "±150% of its"), (39.2, "±39 times its"), (14522.57, "more than 100")]
+    ("half", "told"), [(1.5, "±150 % of its"), (39.2, "±39 times its"), (14522.57, "more than 100")]
 )
 def test_hopeless_intervals_are_told_in_numbers_that_can_be_read(half, told):
     assert told in state(1.0, half, 1.0, 0.0, 10.0)[1]

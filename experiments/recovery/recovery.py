@@ -40,9 +40,8 @@ from scipy.stats import binomtest, norm
 import foamfit as ff
 from foamfit.data.measurement import Measurement
 from foamfit.fitting.problem import make_problem
+from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import NoiseProcess, parts
-from foamfit.trust.identifiability import unreached
-from foamfit.trust.refit import Vicinity
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent / "noise_floor"))
@@ -164,9 +163,8 @@ def linear_test(group: Class, seed: int) -> list[dict[str, object]]:
     spring, measurement = random_case(group.rng(seed), group.samples, draw)
     problem = make_problem(measurement, "bistable", "impact", None, None, False)
     truth = np.array([*spring.seven, spring.eta, 0.0])
-    lost = unreached(problem, truth)
-    names = tuple(name for name in problem.free() if name not in lost)
-    around = Vicinity.of(problem, truth, names)
+    around = BestPoint(problem, truth)
+    names = around.names
     scaled = around.jacobian * around.sizes
     pull = np.linalg.pinv(scaled.T @ scaled, rcond=1e-14, hermitian=True) @ scaled.T
     variance = np.zeros(len(names))

@@ -1,4 +1,4 @@
-"""The public fit: of one model, or of the simplest that holds."""
+"""The public fit: of one model, or of the simplest that follows the curves."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import lmfit
 
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError
-from foamfit.one_model import Options, Progress, Tell, identify, judge
+from foamfit.one_model import Options, Progress, identify, judge
 from foamfit.report.folder import save_result
 from foamfit.results import Fit
+from foamfit.trust.intervals import Announce
 
 
 class FitResult(Fit):
@@ -38,7 +39,7 @@ def fit(
     intervals: str = "auto",
     draws: int | None = None,
     progress: Progress | None = None,
-    tell: Tell | None = None,
+    tell: Announce | None = None,
 ) -> FitResult:
     """Identify the parameters of a chain of springs from a test.
 
@@ -79,7 +80,7 @@ def fit(
     progress : callable, optional
         Told the fraction done and what is going on.
     tell : callable, optional
-        Told what the intervals will cost before it is paid.
+        Called with the expected run time of the intervals before it is spent.
 
     Returns
     -------
@@ -119,5 +120,6 @@ def fit(
 
         found = climb(measurement, options, progress, tell)
     else:
-        found = judge(identify(measurement, model, params, options, progress), options.choice, tell)
+        searched = identify(measurement, model, params, options, progress)
+        found, _ = judge(searched, options.choice, tell)
     return FitResult(**vars(found))

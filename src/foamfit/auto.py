@@ -1,10 +1,10 @@
-"""The simplest model that holds: a climb from one spring to several, and the evidence for each.
+"""The simplest model that follows the curves, and the evidence for each that was tried.
 
 A ladder of models is fitted from the simplest up, each without damping and then with it. What is
 compared are AICc and BIC with the effective number of samples and the effective number of
 parameters, so that neither correlated residuals nor combinations that the curves do not fix count
-as evidence. The climb ends where the residuals are structureless, or where two steps in a row bring
-no evidence.
+as evidence. It ends where the residuals are structureless, or where two models in a row bring no
+evidence.
 """
 
 from __future__ import annotations
@@ -15,33 +15,33 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import lmfit
+import numpy as np
 
 from foamfit import one_model
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError
-from foamfit.fitting.objective import choose_drive
+from foamfit.fitting.curves import choose_drive
 from foamfit.fitting.problem import make_params
-from foamfit.one_model import Found, Options, Progress, Tell
+from foamfit.one_model import Found, Options, Progress
 from foamfit.results import Fit, Ladder, Rung, rung_name
 from foamfit.springs.model import Model, split_name
+from foamfit.text import counted, percent
 from foamfit.trust.evidence import (
     MARGIN,
-    Evidence,
+    Criteria,
     Tried,
     choose,
     effective_samples,
-    least,
     reference_of,
-    weigh,
 )
-from foamfit.trust.intervals import Choice
+from foamfit.trust.intervals import Announce, Choice
 from foamfit.trust.residual_tests import BENT, find_structure, neighbours_test, runs_test
 
 # From the simplest up. More springs have more parameters (23 and more) than a loop has features,
 # and take minutes.
 LADDER = ("bistable", "linear+bistable", "bistable+bistable", "linear+bistable+bistable")
-# Steps up the ladder in a row without evidence after which it ends.
-PATIENCE = 2
+# So many models in a row without evidence end the comparison.
+WITHOUT_EVIDENCE = 2
 
 
 def _dampers(params: lmfit.Parameters) -> list[str]:
@@ -79,7 +79,9 @@ def _carry(params: lmfit.Parameters, model: Model, below: Fit | None) -> None:
 # ---------------------------------------------------------------- the climb
 
 
-def climb(measurement: Measurement, options: Options, progress: Progress, tell: Tell) -> Fit:
+def climb(
+    measurement: Measurement, options: Options, progress: Progress, announce: Announce
+) -> Fit:
     """Fit ever richer models until one holds; this is `foamfit.fit` with model="auto".
 
     The time limit is that of all rungs together. The time limit and Ctrl-C keep what is done. Rungs
@@ -112,9 +114,9 @@ def climb(measurement: Measurement, options: Options, progress: Progress, tell: 
             if any(one.structureless for one in family):
                 ended = "the residuals are structureless"
                 break
-            idle = 0 if _speaks(tried, below) else idle + 1
-            if idle == PATIENCE:
-                ended = f"{PATIENCE} steps in a row brought no evidence"
+            idle = 0 if _has_evidence(tried, below) else idle + 1
+            if idle == WITHOUT_EVIDENCE:
+                ended = f"{WITHOUT_EVIDENCE} models in a row brought no evidence"
                 break
         stopped = state.stopped
     except KeyboardInterrupt:
@@ -125,14 +127,14 @@ def climb(measurement: Measurement, options: Options, progress: Progress, tell: 
         raise SimulationError(f"{measurement.name}: no rung could be tried: {'; '.join(skipped)}")
     if stopped is None and options.choice.method != "local":
         best = choose(tried)[0]
-        tried[best] = state.reassessed(best, tried[best], tell)
+        tried[best] = state.reassessed(best, tried[best], announce)
     state.progress(1.0, "done")
     ended = f"it was stopped by {stopped}" if stopped else ended
     return _conclude(tried, ended, stopped, tuple(skipped), time.perf_counter() - state.began)
 
 
-def _speaks(tried: Sequence[Tried], below: int) -> bool:
-    """Whether AICc or BIC speaks strongly for one of the last rungs against all below them."""
+def _has_evidence(tried: Sequence[Tried], below: int) -> bool:
+    """Whether AICc or BIC strongly prefers one of the last rungs to all below them."""
     if not 0 < below < len(tried):
         return len(tried) > below
     found = choose(tried)[1]
@@ -211,13 +213,13 @@ class _Climb:
             replace(self.options, max_time=left),
             lambda done, what: self.progress(share + 0.1 * done, f"{label}: {what}"),
         )
-        result = one_model.judge(found, Choice("local"), lambda _: None)
-        return found, weigh(found.problem, result, damping, time.perf_counter() - began)
+        result, best = one_model.judge(found, Choice("local"), lambda _: None)
+        return found, Tried(result, damping, best, time.perf_counter() - began)
 
-    def reassessed(self, at: int, one: Tried, tell: Tell) -> Tried:
-        """Make the intervals that were asked for; of a better point that they meet, the weight."""
-        result = one_model.judge(self.fits[at], self.options.choice, tell)
-        return weigh(self.fits[at].problem, result, one.damping, one.seconds)
+    def reassessed(self, at: int, one: Tried, announce: Announce) -> Tried:
+        """Make the intervals that were asked for; they may meet a better point."""
+        result, best = one_model.judge(self.fits[at], self.options.choice, announce)
+        return Tried(result, one.damping, best, one.seconds)
 
 
 def _models(measurement: Measurement) -> tuple[list[str], list[str]]:
@@ -251,72 +253,70 @@ def _conclude(
 ) -> Fit:
     """Result of the chosen rung with the whole ladder."""
     best, found = choose(tried)
-    reference = reference_of(tried)
-    rungs = tuple(
-        _rung(one, ev, i == best, _why(i, best, tried, found))
-        for i, (one, ev) in enumerate(zip(tried, found, strict=True))
-    )
-    sentences, cautions = _sentences(tried, found, best, ended, stopped)
+    reference, result = reference_of(tried), tried[best].result
+    said, warned = _choice_sentences(tried, found, best, ended), []
+    if stopped is not None:
+        warned.append(
+            f"The comparison was stopped by {stopped} on {tried[-1].name}; richer models were not "
+            "tried."
+        )
+    if tried[best].states("not determined"):
+        warned.append(_undetermined(tried, found, best))
+    if not any(rung.structureless for rung in tried):
+        warned.append(_structure_left(tried, best))
     ladder = Ladder(
-        rungs=rungs,
+        rungs=tuple(_rung(i, best, tried, found) for i in range(len(tried))),
         n_eff=effective_samples(reference),
         noise_from=reference.name,
         ended=ended,
         stopped=stopped,
         skipped=skipped,
-        sentences=(*sentences, *cautions),
-        cautions=cautions,
+        sentences=(*said, *warned),
+        cautions=tuple(warned),
     )
-    result = tried[best].result
-    status = "warnings" if cautions and result.status == "ok" else result.status
     return replace(
         result,
-        status=status,
-        warnings=(*cautions, *result.warnings),
+        status="warnings" if warned and result.status == "ok" else result.status,
+        warnings=(*warned, *result.warnings),
         ladder=ladder,
         stopped=stopped or result.stopped,
         runtime_s=took,
     )
 
 
-def _rung(one: Tried, found: Evidence, chosen: bool, why: str) -> Rung:
+def _rung(i: int, best: int, tried: Sequence[Tried], found: Sequence[Criteria]) -> Rung:
+    one = tried[i]
     return Rung(
         model=one.result.model,
         damping=one.damping,
         misfit=dict(one.result.misfit),
         chisqr=one.chisqr,
         n_vary=sum(item.vary for item in one.result.parameters.values()),
-        rank=found.rank,
+        rank=found[i].rank,
         n_eff=effective_samples(one),
-        aicc=found.aicc,
-        bic=found.bic,
+        aicc=found[i].aicc,
+        bic=found[i].bic,
         runs_p=one.runs_p,
         neighbours_p=one.neighbours_p,
         not_determined=one.states("not determined"),
         weak=one.states("weak"),
         seconds=one.seconds,
         stopped=one.result.stopped,
-        chosen=chosen,
-        why=why,
+        chosen=i == best,
+        why=_why(i, best, tried, found),
     )
 
 
-def _why(i: int, best: int, tried: Sequence[Tried], found: Sequence[Evidence]) -> str:
-    """Why a rung was chosen or not, in a phrase."""
-    mine, taken = found[i], found[best]
+def _why(i: int, best: int, tried: Sequence[Tried], found: Sequence[Criteria]) -> str:
+    """Why a rung was chosen or not."""
     if i == best:
-        noise = "its residuals are structureless" if tried[i].structureless else "best supported"
+        reason = "its residuals are structureless" if tried[i].structureless else "best supported"
         if best == len(tried) - 1:
-            return f"{noise}, and no richer rung was tried"
-        return f"{noise}, and no richer rung lowers AICc and BIC by {MARGIN:g}"
-    if i < best:
-        return f"BIC {signed(mine.bic - taken.bic)}, AICc {signed(mine.aicc - taken.aicc)}"
-    gains = [
-        f"{name} {signed(off)}"
-        for name, off in (("BIC", mine.bic - taken.bic), ("AICc", mine.aicc - taken.aicc))
-        if not off < -MARGIN
-    ]
-    return f"richer without evidence: {', '.join(gains)}"
+            return f"{reason}, and no richer model was tried"
+        return f"{reason}, and no richer model lowers AICc and BIC by {MARGIN:g}"
+    bic, aicc = found[i].bic - found[best].bic, found[i].aicc - found[best].aicc
+    told = f"BIC {signed(bic)}, AICc {signed(aicc)}"
+    return told if i < best else f"richer without evidence: {told}"
 
 
 def signed(value: float) -> str:
@@ -328,88 +328,67 @@ def signed(value: float) -> str:
 
 def p_value(p: float) -> str:
     """Write a p-value, with a sign: "= 0.43", "< 1e-6"."""
-    if p < 1e-6:
-        return "< 1e-6"
-    return f"= {p:.2g}"
+    return "< 1e-6" if p < 1e-6 else f"= {p:.2g}"
 
 
-def _of(name: str, count: int) -> str:
-    return f"Of {count} rungs {name}" if count > 1 else f"The first rung {name}"
-
-
-def _sentences(
-    tried: Sequence[Tried],
-    found: Sequence[Evidence],
-    best: int,
-    ended: str,
-    stopped: str | None,
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """What the comparison says, and what it warns of."""
+def _choice_sentences(
+    tried: Sequence[Tried], found: Sequence[Criteria], best: int, ended: str
+) -> list[str]:
+    """What was chosen, and what each criterion alone would choose."""
     one, mine = tried[best], found[best]
-    taken = "is the simplest that holds" if one.structureless else "is what the evidence supports"
-    said = [
-        f"{_of(one.name, len(tried))} {taken} (runs test p {p_value(one.runs_p)}, neighbours "
-        f"test p {p_value(one.neighbours_p)}); the climb ended because {ended}."
-    ]
-    warned = []
     varied = sum(item.vary for item in one.result.parameters.values())
+    tests = f"runs test p {p_value(one.runs_p)}, neighbours test p {p_value(one.neighbours_p)}"
+    reason = "the evidence supports it best"
+    if one.structureless:
+        reason = "it is the simplest whose residuals are structureless"
+    said = [
+        f"{one.name} was chosen of {counted(len(tried), 'model')}: {reason} ({tests}). No more "
+        f"models were tried because {ended}."
+    ]
     if mine.rank < varied:
         said.append(
-            f"Of its {varied} parameters the curves fix {mine.rank} combinations; AICc and BIC "
+            f"The curves fix {mine.rank} combinations of its {varied} parameters; AICc and BIC "
             "count those."
         )
-    for name, value in (("AICc", "aicc"), ("BIC", "bic")):
-        other = least([getattr(one, value) for one in found])
-        off = getattr(found[other], value) - getattr(mine, value)
+    for name, values in (("AICc", [one.aicc for one in found]), ("BIC", [c.bic for c in found])):
+        least = int(np.argmin(values))
+        off = values[least] - values[best]
         if off < -MARGIN:
-            said.append(f"By {name} alone it would be {tried[other].name} ({signed(off)}).")
-    if stopped is not None:
-        warned.append(
-            f"The ladder was stopped by {stopped} on {tried[-1].name}; richer models were not "
-            "tried."
-        )
-    lost = one.states("not determined")
-    if lost:
-        warned.append(_undetermined(tried, found, best, lost))
-    if not any(rung.structureless for rung in tried):
-        warned.append(_remains(tried, best))
-    return tuple(said), tuple(warned)
+            said.append(f"{name} alone would choose {tried[least].name} ({signed(off)}).")
+    return said
 
 
-def _undetermined(
-    tried: Sequence[Tried], found: Sequence[Evidence], best: int, lost: tuple[str, ...]
-) -> str:
+def _undetermined(tried: Sequence[Tried], found: Sequence[Criteria], best: int) -> str:
     """Sentence on the parameters of the chosen rung that the test does not determine."""
+    lost = ", ".join(tried[best].states("not determined"))
+    start = f"The test does not determine {lost} of the chosen model {tried[best].name}"
     sound = [i for i, one in enumerate(tried) if not one.states("not determined")]
-    nearest = min(sound, key=lambda i: found[i].bic, default=None)
-    other = "no rung of the ladder has all parameters determined"
-    if nearest is not None:
-        other = (
-            f"{tried[nearest].name} has none such, at a BIC higher by "
-            f"{found[nearest].bic - found[best].bic:.1f}"
-        )
+    if not sound:
+        return f"{start}; no model of the ladder has all parameters determined."
+    nearest = min(sound, key=lambda i: found[i].bic)
+    off = found[nearest].bic - found[best].bic
     return (
-        f"The chosen model {tried[best].name} has parameters that the test does not determine "
-        f"({', '.join(lost)}): the curves ask for its shape, not for these values; {other}."
+        f"{start}; all parameters of {tried[nearest].name} are determined, at a BIC higher by "
+        f"{off:.1f}."
     )
 
 
-def _remains(tried: Sequence[Tried], best: int) -> str:
-    """Sentence on the structure that no rung takes off, as the chosen one leaves it."""
+def _structure_left(tried: Sequence[Tried], best: int) -> str:
+    """Sentence on the structure in the residuals of the chosen rung."""
     one = tried[best]
-    which = least([min(runs_test(part), neighbours_test(part)) for part in one.curves])
-    curve = one.counted[which]
-    found = find_structure(one.curves[which], one.places[which])
-    size, noise = found.size / one.spans[which], found.noise / one.spans[which]
+    worst = int(np.argmin([min(runs_test(part), neighbours_test(part)) for part in one.curves]))
+    found = find_structure(one.curves[worst], one.places[worst])
+    size, noise = found.size / one.spans[worst], found.noise / one.spans[worst]
     runs, near = (max(p) for p in zip(*((r.runs_p, r.neighbours_p) for r in tried), strict=True))
     told = (
-        f"No rung reaches the noise (at best runs test p {p_value(runs)}, neighbours test p "
-        f"{p_value(near)}): the residuals of {curve} hold a structure of {size:.2%} of the range "
-        f"(neighbours scatter by {noise:.2%}), {found.share:.0%} of it on {found.place}"
+        f"No model reaches the noise (at best runs test p {p_value(runs)}, neighbours test p "
+        f"{p_value(near)}): the residuals of {one.counted[worst]} have a structure of "
+        f"{percent(size)} of the range (noise {percent(noise)}), {percent(found.share)} of it on "
+        f"{found.place}."
     )
     if found.bent > BENT and found.straight:
         told += (
-            f", where a parabola takes off {found.bent:.0%}: the curve is bent there where the law "
-            "is a straight line, and a law with a curved branch would be needed to follow it"
+            f" A parabola describes {percent(found.bent)} of it: the measured branch is curved "
+            "where the law is a straight line."
         )
-    return f"{told}."
+    return told

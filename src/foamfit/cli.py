@@ -344,7 +344,7 @@ def fit(
         measurement = read_test(test, specimen)
         folder = _result_folder(out, test, specimen, model)
         from foamfit import api
-        from foamfit.fitting.objective import check_time_shift, choose_drive
+        from foamfit.fitting.curves import check_time_shift, choose_drive
         from foamfit.fitting.problem import make_params
 
         if time_shift:

@@ -11,8 +11,8 @@ from numbers import Integral, Real
 
 import lmfit
 import numpy as np
-from numpy.typing import NDArray
 
+from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.problem import Problem, make_problem
@@ -21,21 +21,18 @@ from foamfit.fitting.search import (
     SearchRecord,
     SearchStoppedError,
     Tracker,
-    salvage,
+    ensure_feasible,
     search,
     what_stopped,
 )
 from foamfit.results import Fit
 from foamfit.springs.model import Model, split_name
+from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
 from foamfit.trust.covariance import AT_LIMIT
-from foamfit.trust.identifiability import unreached
-from foamfit.trust.intervals import Choice, Intervals, assess
-from foamfit.trust.refit import Vicinity
+from foamfit.trust.intervals import Announce, Choice, Intervals, assess
 
-Array = NDArray[np.float64]
 Progress = Callable[[float, str], None]
-Tell = Callable[[str], None]
 
 # Descents of the search for each spring.
 STARTS = 16
@@ -50,10 +47,7 @@ PROFILE_SHARE, IMPROVEMENTS = 0.5, 3
 class Options:
     """How a test is fitted, whatever the model; see `foamfit.fit` for each.
 
-    Raises
-    ------
-    InputError
-        If one is not admissible; the message names it.
+    Raises InputError if one is not admissible; the message names it.
     """
 
     drive: str | None = None
@@ -109,11 +103,11 @@ class Found:
     tracker: Tracker
     record: SearchRecord
 
-    @property
-    def values(self) -> Array:
-        """The best point, SI."""
-        assert self.tracker.best_values is not None  # checked by identify
-        return self.tracker.best_values
+    def best(self) -> BestPoint:
+        """The best point, its springs in order."""
+        values = self.tracker.best_values
+        assert values is not None  # checked by identify
+        return BestPoint(self.problem, _ordered(self.problem, values))
 
 
 def identify(
@@ -147,54 +141,52 @@ def identify(
     return Found(problem, tracker, record)
 
 
-def judge(found: Found, choice: Choice, tell: Tell) -> Fit:
-    """Make the intervals that were chosen, and say what is to be said of the best point."""
-    intervals, record = Intervals(), found.record
+def judge(found: Found, choice: Choice, announce: Announce) -> tuple[Fit, BestPoint]:
+    """Make the intervals that were chosen, and the result of the best point."""
     try:
+        best, record, intervals = found.best(), found.record, Intervals()
         if record.stopped is None:
-            intervals, record = _assess(found, choice, tell)
-        return _finish(found, record, intervals)
+            best, record, intervals = _assess(found, best, choice, announce)
+        return _finish(found, best, record, intervals)
     except KeyboardInterrupt:  # what was found is not given up for a late Ctrl-C
-        return _finish(found, replace(found.record, stopped="Ctrl-C"), Intervals())
+        record = replace(found.record, stopped="Ctrl-C")
+        return _finish(found, found.best(), record, Intervals())
 
 
-def _finish(found: Found, record: SearchRecord, intervals: Intervals) -> Fit:
-    """Order the springs, write the point into the parameters, and conclude."""
-    values = _on_limits(found.problem, _ordered(found.problem, found.values))
-    found.problem.put(values)
-    return conclude(found.problem, values, record, intervals)
+def _finish(
+    found: Found, best: BestPoint, record: SearchRecord, intervals: Intervals
+) -> tuple[Fit, BestPoint]:
+    """Write the point into the parameters, and conclude."""
+    best = _on_limits(best, found.tracker.best_cost)
+    found.problem.put(best.values)
+    return conclude(best, record, intervals), best
 
 
-def _assess(found: Found, choice: Choice, tell: Tell) -> tuple[Intervals, SearchRecord]:
+def _assess(
+    found: Found, best: BestPoint, choice: Choice, announce: Announce
+) -> tuple[BestPoint, SearchRecord, Intervals]:
     """Make the intervals; where these meet a better point, go on from there."""
     problem, tracker, record = found.problem, found.tracker, found.record
     budget = PROFILE_SHARE * problem.objective.evaluations
-    made = Intervals()
     for _ in range(IMPROVEMENTS + 1):
-        values = _ordered(problem, found.values)
-        lost = unreached(problem, values)
-        names = tuple(name for name in problem.free() if name not in lost)
-        if not names or choice.method == "local":
+        if choice.method == "local" or not best.names:
             break
         made = assess(
-            Vicinity.of(problem, values, names),
-            choice,
-            valleys=tracker.ends,
-            deadline=tracker.deadline,
-            budget=budget,
-            tell=tell,
-        )
+            best, choice, minima=tracker.ends, deadline=tracker.deadline, budget=budget,
+            announce=announce,
+        )  # fmt: skip
         if made.better is None:
-            break
+            return best, record, made
         before = tracker.best_cost
         tracker.consider(made.better)
         try:
             _refine(problem, tracker)
         except SearchStoppedError:
-            break
-        if tracker.best_cost < before / 1.02:  # a valley that no descent of the search has found
+            return found.best(), record, Intervals()
+        best = found.best()
+        if tracker.best_cost < before / 1.02:  # a minimum that no descent of the search has found
             record = replace(record, costs=((tracker.best_cost, 1), *record.costs))
-    return (made if made.better is None else Intervals()), record
+    return best, record, Intervals()
 
 
 def _search(
@@ -216,7 +208,7 @@ def _search(
         progress(0.95, "refinement")
         _refine(problem, tracker)
     except STOPPING as error:
-        salvage(tracker, problem.space(), np.random.default_rng(record.seed))
+        ensure_feasible(tracker, problem.space(), np.random.default_rng(record.seed))
         return replace(record, stopped=what_stopped(error))
     progress(1.0, "done")
     return record
@@ -225,21 +217,19 @@ def _search(
 def _refine(problem: Problem, tracker: Tracker) -> None:
     """Refine the best point by lmfit's least_squares in the physical parameters.
 
-    Parameters on branches that the best point never reaches leave no trace in the curves; they are
-    held for the refinement.
+    Parameters on branches that the best point never reaches do not change the curves; they are held
+    for the refinement.
     """
     if tracker.best_values is None:
         return
-    problem.put(tracker.best_values)
-    lost = unreached(problem, tracker.best_values)
-    params = problem.params.copy()
-    for name in lost:
+    best = BestPoint(problem, tracker.best_values)
+    problem.put(best.values)
+    params, names = problem.params.copy(), best.names
+    for name in best.unreached:
         params[name].vary = False
-    names = tuple(name for name in problem.names if params[name].vary)
     if not names:
         return
     _move_inside(params, names)
-    sizes = problem.sizes(names, tracker.best_values)
 
     def residual(p: lmfit.Parameters) -> Array:
         return tracker.residual(problem.vector(p))
@@ -247,10 +237,10 @@ def _refine(problem: Problem, tracker: Tracker) -> None:
     def jacobian(p: lmfit.Parameters) -> Array:
         return problem.slopes(problem.vector(p), names)
 
-    with warnings.catch_warnings():  # of its covariance, which `uncertainty` does better
+    with warnings.catch_warnings():  # of its covariance, which `trust.covariance` does better
         warnings.simplefilter("ignore", RuntimeWarning)
         lmfit.minimize(
-            residual, params, method="least_squares", jac=jacobian, x_scale=sizes,
+            residual, params, method="least_squares", jac=jacobian, x_scale=best.sizes,
             ftol=1e-10, xtol=1e-10, gtol=1e-12, max_nfev=60,
         )  # fmt: skip
 
@@ -267,26 +257,30 @@ def _move_inside(params: lmfit.Parameters, names: tuple[str, ...]) -> None:
             )
 
 
-def _on_limits(problem: Problem, values: Array) -> Array:
-    """Put parameters that are within rounding of a limit on it, if that costs nothing.
+def _on_limits(best: BestPoint, cost: float) -> BestPoint:
+    """Put parameters that are within rounding of a limit on it, if `cost` hardly rises.
 
     The refinement stays off the limits by a hair (`_move_inside`).
     """
+    problem, space = best.problem, best.problem.space()
+    values = best.values + 0.0  # no -0
+    if np.any(np.signbit(best.values) & (values == 0.0)):
+        best = BestPoint(problem, values)
     names = problem.free()
     places = [problem.index[name] for name in names]
     near = AT_LIMIT * problem.sizes(names, values)
-    moved = values = values + 0.0  # no -0
-    for limits in (problem.space().low, problem.space().high):
+    moved = values.copy()
+    for limits in (space.low, space.high):
         close = np.abs(values[places] - limits[places]) <= near
-        moved = moved.copy()
         moved[places] = np.where(close, limits[places], moved[places])
-    moved = problem.space().complete(moved)
+    moved = space.complete(moved)
     if np.array_equal(moved, values):
-        return values
-    failures = problem.objective.failures
-    before, after = (float(r @ r) for r in map(problem.objective.residual, (values, moved)))
-    fine = problem.objective.failures == failures and after <= before + 1e-6 * (1.0 + before)
-    return moved if fine else values
+        return best
+    there = BestPoint(problem, moved)
+    try:
+        return there if there.cost <= cost + 1e-6 * (1.0 + cost) else best
+    except SimulationError:
+        return best
 
 
 def _moved(model: Model, values: Array, sources: Mapping[int, int]) -> Array:
@@ -300,7 +294,7 @@ def _moved(model: Model, values: Array, sources: Mapping[int, int]) -> Array:
 
 
 def _ordered(problem: Problem, values: Array) -> Array:
-    """Order springs that the data cannot tell apart by their σ_a, the softest at the base.
+    """Order springs that can be exchanged by their σ_a, the softest at the base.
 
     Two springs can be exchanged if they are of one kind and the curves stay the same, so never
     across a mass inside whose displacement is counted; the foam of the paper buckles first at its
@@ -326,7 +320,10 @@ def _ordered(problem: Problem, values: Array) -> Array:
     def order(spring: int) -> tuple[int, float]:
         return sum(node <= spring for node in nodes), onset(spring)
 
-    moved = _moved(model, values, dict(zip(bistable, sorted(bistable, key=order), strict=True)))
+    ranked = sorted(bistable, key=order)
+    if ranked == bistable:
+        return values
+    moved = _moved(model, values, dict(zip(bistable, ranked, strict=True)))
     before, after = (problem.objective.residual(v) for v in (values, moved))
     same = np.allclose(before, after, rtol=0.0, atol=1e-9 * max(float(np.max(np.abs(before))), 1.0))
     return moved if same else values

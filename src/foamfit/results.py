@@ -10,8 +10,8 @@ from typing import Any
 
 import lmfit
 import numpy as np
-from numpy.typing import NDArray
 
+from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.springs.chain import Chain
 from foamfit.springs.spring import BistableSpring
@@ -20,8 +20,6 @@ from foamfit.trust.intervals import Intervals
 
 SCHEMA = 1
 DERIVED_POINTS = ("sigma_a", "sigma_c", "eps_star", "eps_hat_a", "eps_hat_c")
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -85,30 +83,15 @@ class Switch:
 
 @dataclass(frozen=True)
 class Check:
-    """One question to a fit.
+    """One question to a fit."""
 
-    Attributes
-    ----------
-    key : str
-        Short name.
-    question : str
-        Put so that "yes" is good.
-    answer : bool or None
-        None where the test or the search does not allow to tell.
-    sentence : str
-        What the answer rests on.
-    warnings : tuple of str
-        What a reader must know if the answer is no, one sentence each; empty otherwise.
-    fatal : bool
-        Whether a "no" means that no acceptable fit was found.
-    """
-
-    key: str
-    question: str
-    answer: bool | None
-    sentence: str
+    key: str  # Short name
+    question: str  # Put so that "yes" is good
+    answer: bool | None  # None where the test or the search does not allow to tell
+    sentence: str  # What the answer rests on
+    # What a reader must know if the answer is no, one sentence each; empty otherwise.
     warnings: tuple[str, ...] = ()
-    fatal: bool = False
+    fatal: bool = False  # Whether a "no" means that no acceptable fit was found
 
 
 def rung_name(model: str, damping: str) -> str:
@@ -118,59 +101,31 @@ def rung_name(model: str, damping: str) -> str:
 
 @dataclass(frozen=True)
 class Rung:
-    """One model of the ladder and the evidence for it.
+    """One model of the ladder and the evidence for it."""
 
-    Attributes
-    ----------
-    model : str
-        Springs from the base up.
-    damping : str
-        "with", "without" (every dashpot held at zero) or "none" where the drive has none to vary.
-    misfit : dict
-        As `Fit.misfit`.
-    chisqr : float
-        Sum of the squared residuals.
-    n_vary : int
-        Parameters that were varied.
-    rank : int
-        How many combinations of them the curves fix: what AICc and BIC count.
-    n_eff : float
-        Effective samples by its own residuals. AICc and BIC use `Ladder.n_eff`, one for all.
-    aicc, bic : float
-        Infinite where there are too few effective samples for so many parameters.
-    runs_p : float
-        p-value of the runs test: the chance that noise without structure has as few runs.
-    neighbours_p : float
-        p-value of the neighbours test: the same by size, where the runs test goes by sign.
-    not_determined, weak : tuple of str
-        Names of the parameters in these states.
-    seconds : float
-        Run time.
-    stopped : str or None
-        What ended the search before its time.
-    chosen : bool
-        Whether the result is that of this rung.
-    why : str
-        Why it was chosen or not.
-    """
-
-    model: str
+    model: str  # Springs from the base up
+    # "with", "without" (every dashpot held at zero) or "none" where the drive has none to vary.
     damping: str
-    misfit: dict[str, float | None]
-    chisqr: float
-    n_vary: int
-    rank: int
+    misfit: dict[str, float | None]  # As `Fit.misfit`
+    chisqr: float  # Sum of the squared residuals
+    n_vary: int  # Parameters that were varied
+    rank: int  # How many combinations of them the curves fix: what AICc and BIC count
+    # Effective samples by its own residuals. AICc and BIC use `Ladder.n_eff`, one for all.
     n_eff: float
+    # Infinite where there are too few effective samples for so many parameters.
     aicc: float
     bic: float
+    # p-value of the runs test: the chance that noise without structure has as few runs.
     runs_p: float
+    # p-value of the neighbours test: the same by size, where the runs test goes by sign.
     neighbours_p: float
+    # Names of the parameters in these states.
     not_determined: tuple[str, ...]
     weak: tuple[str, ...]
-    seconds: float
-    stopped: str | None
-    chosen: bool
-    why: str
+    seconds: float  # Run time
+    stopped: str | None  # What ended the search before its time
+    chosen: bool  # Whether the result is that of this rung
+    why: str  # Why it was chosen or not
 
     @property
     def name(self) -> str:
@@ -180,36 +135,16 @@ class Rung:
 
 @dataclass(frozen=True)
 class Ladder:
-    """The rungs that were tried, and what the comparison says.
+    """The rungs that were tried, and what the comparison says."""
 
-    Attributes
-    ----------
-    rungs : tuple of Rung
-        From the simplest up.
-    n_eff : float
-        Effective samples that AICc and BIC use.
-    noise_from : str
-        The rung of the least chi-square: its residuals are taken for the noise.
-    ended : str
-        Why the climb ended.
-    stopped : str or None
-        "the time limit" or "Ctrl-C" if that ended it.
-    skipped : tuple of str
-        Rungs that could not be tried, and why.
-    sentences : tuple of str
-        What the comparison says.
-    cautions : tuple of str
-        Those of them that are warnings.
-    """
-
-    rungs: tuple[Rung, ...]
-    n_eff: float
-    noise_from: str
-    ended: str
-    stopped: str | None
-    skipped: tuple[str, ...]
-    sentences: tuple[str, ...]
-    cautions: tuple[str, ...]
+    rungs: tuple[Rung, ...]  # From the simplest up
+    n_eff: float  # Effective samples that AICc and BIC use
+    noise_from: str  # The rung of the least chi-square: its residuals are taken for the noise
+    ended: str  # Why the climb ended
+    stopped: str | None  # "the time limit" or "Ctrl-C" if that ended it
+    skipped: tuple[str, ...]  # Rungs that could not be tried, and why
+    sentences: tuple[str, ...]  # What the comparison says
+    cautions: tuple[str, ...]  # Those of them that are warnings
 
     @property
     def chosen(self) -> Rung:

@@ -6,39 +6,29 @@ slopes and damping over the scales of the test, a time shift over the largest on
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.springs.model import Model, split_name
-
-Array = NDArray[np.float64]
 
 LAST_STRAIN = 0.999
 
 
 @dataclass(frozen=True)
 class Scales:
-    """The scales of a test that make its parameters dimensionless.
+    """The scales of a test that make its parameters dimensionless."""
 
-    Attributes
-    ----------
-    stress, strain : float
-        Largest stress (Pa) and overall strain.
-    rate : float
-        Typical strain rate, 1/s; 0 where time is unknown.
-    height : float
-        m.
-    """
-
+    # Largest stress (Pa) and overall strain.
     stress: float
     strain: float
-    rate: float
-    height: float
+    rate: float  # Typical strain rate, 1/s; 0 where time is unknown
+    height: float  # m
 
     @classmethod
     def of(cls, measurement: Measurement) -> Scales:
@@ -70,7 +60,7 @@ class Scales:
         return 2.0 * self.strain / self.rate if self.rate > 0.0 else 1.0
 
     def of_parameter(self, name: str, values: dict[str, float]) -> float:
-        """Natural size of a parameter, in its unit: what a change by 100 % means."""
+        """Scale of a parameter, in its unit: a change by so much is a relative change of 1."""
         spring, short = split_name(name)
         if short == "eta":
             return max(abs(values[name]), 0.1 * self.eta)
@@ -82,6 +72,19 @@ class Scales:
             eps_a = values[f"s{spring + 1}_eps_a"]
             return values[f"s{spring + 1}_k0"] * eps_a / (1.0 - eps_a)
         return abs(values[name]) or 1.0
+
+
+def scale_in_words(name: str, value: float, scale: float) -> str:
+    """Say what the scale of a parameter is."""
+    if math.isclose(scale, abs(value), rel_tol=1e-9):
+        return "its value"
+    return {
+        "eta": "a tenth of the damping that would carry the whole stress",
+        "time_shift": "a hundredth of the time under load",
+        "kh_plus": "a tenth of the largest stress over strain",
+        "kh_minus": "a tenth of the largest stress over strain",
+        "dsigma": "σ_a",
+    }.get(split_name(name)[1], "its value")
 
 
 # Coordinates of the box: lowest and highest. Stiffnesses are over the largest stress, slopes over
@@ -104,30 +107,16 @@ LARGEST_SHIFT = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """The box in which the search moves, and the way between it and the vector of parameters.
+    """The box in which the search moves, and the way between it and the vector of parameters."""
 
-    Parameters
-    ----------
-    model : Model
-        The springs.
-    scales : Scales
-        Of the test.
-    values : (n,) array
-        Values of the parameters that do not vary (SI); the others are ignored.
-    free : tuple of str
-        Names of the parameters that vary.
-    low, high : (n,) arrays
-        Limits of every parameter, SI.
-    tied : callable or None
-        Completes a vector in which some parameters hang on others.
-    """
-
-    model: Model
-    scales: Scales
-    values: Array
-    free: tuple[str, ...]
+    model: Model  # The springs
+    scales: Scales  # Of the test
+    values: Array  # (n,): Values of the parameters that do not vary (SI); the others are ignored
+    free: tuple[str, ...]  # Names of the parameters that vary
+    # (n,): Limits of every parameter, SI.
     low: Array
     high: Array
+    # Completes a vector in which some parameters hang on others.
     tied: Callable[[Array], Array] | None
 
     @cached_property

@@ -13,12 +13,20 @@ from numbers import Real
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lstsq
-from scipy.ndimage import convolve1d
 
-from foamfit.data.measurement import INTEGRATED, Measurement, NoiseLevel, interior_channel
+from foamfit.arrays import Array
+from foamfit.data.measurement import INTEGRATED, Measurement, NoiseLevel
 from foamfit.data.noise import with_noise
 from foamfit.errors import InputError, SimulationError
+from foamfit.fitting.curves import (
+    CURVES,
+    MOTION_CURVES,
+    check_drive,
+    check_time_shift,
+    driving_stress,
+    interior_curves,
+)
+from foamfit.fitting.losses import LOSSES, soften, softness
 from foamfit.solve.plan import Motion, Plan
 from foamfit.solve.plan import plan as make_plan
 from foamfit.springs import kernels
@@ -26,13 +34,6 @@ from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, Stres
 from foamfit.springs.model import Model
 from foamfit.springs.spring import LinearSpring
 
-Array = NDArray[np.float64]
-
-# Of every objective; to them come displacement_1_time … where masses inside were followed.
-CURVES = ("stress_time", "displacement_time", "stress_strain")
-# Those that need a motion.
-MOTION_CURVES = ("displacement_time", "stress_strain")
-DRIVES = ("impact", "stress", "displacement")
 # What a residual is, in units of the curve's scale, where a simulation failed.
 PENALTY = 10.0
 NOWHERE = np.empty(0, np.int64)
@@ -40,210 +41,8 @@ NOWHERE = np.empty(0, np.int64)
 # measured foam closer than 1 % of its range: noise far below that must not let one channel outweigh
 # the other by what is an error of the model in both.
 MODEL_ERROR = 0.005
-# Losses, and the residual (in units of the scale) past which each gives way: those of 95 %
-# efficiency under normal noise for Huber's and Cauchy's (Holland & Welsch 1977, Commun. Stat. A6,
-# 813).
-LOSSES = {"linear": np.inf, "soft_l1": 1.345, "huber": 1.345, "cauchy": 2.385}
 # A trial that needs more steps than this is too stiff to be worth waiting for.
 MAX_STEPS = 20_000
-
-
-def choose_drive(measurement: Measurement) -> str:
-    """Choose the drive: impact if striker and time are known, else displacement.
-
-    Raises
-    ------
-    InputError
-        If the test has neither.
-    """
-    striker = measurement.striker
-    if (
-        striker is not None
-        and striker.mass is not None
-        and striker.velocity
-        and measurement.time is not None
-    ):
-        return "impact"
-    if measurement.displacement is not None:
-        return "displacement"
-    raise InputError(
-        f"{measurement.name}: no drive is possible; give a displacement or strain column, "
-        "or time and a [striker] with mass and velocity"
-    )
-
-
-def check_drive(measurement: Measurement, drive: str) -> None:
-    """Refuse a drive that the test cannot feed.
-
-    Raises
-    ------
-    InputError
-        Naming what is missing.
-    """
-    if drive not in DRIVES:
-        raise InputError(f"drive '{drive}' is unknown; it must be one of {', '.join(DRIVES)}")
-    striker = measurement.striker
-    missing = []
-    if measurement.stress is None:
-        missing.append("a force or stress column")
-    if drive == "impact":
-        if measurement.time is None:
-            missing.append("a time column")
-        if striker is None or striker.mass is None:
-            missing.append("[striker] mass")
-        if striker is None or not striker.velocity:
-            missing.append("[striker] velocity greater than zero")
-    elif measurement.displacement is None:
-        missing.append("a displacement or strain column")
-    if missing:
-        raise InputError(f"{measurement.name}: the {drive} drive needs {' and '.join(missing)}")
-    force = measurement.outliers.get("stress")
-    if drive == "stress" and force is not None and force.clipped_at is not None:
-        raise InputError(
-            f"{measurement.name}: the force is clipped, so it cannot drive the specimen; choose "
-            "the displacement or the impact drive"
-        )
-
-
-def interior_curves(measurement: Measurement, springs: int) -> dict[str, int]:
-    """Curves of the masses inside a chain of so many springs that were followed, and their node."""
-    nodes = sorted(node for node in measurement.interior if node < springs)
-    return {f"{interior_channel(node)}_time": node for node in nodes}
-
-
-def check_interior(measurement: Measurement, springs: int) -> None:
-    """Refuse the displacement of a mass that is not inside a chain of so many springs.
-
-    Raises
-    ------
-    InputError
-        Naming the node. A single spring has nothing inside; the result's notes say so.
-    """
-    wrong = [node for node in sorted(measurement.interior) if node >= springs]
-    if not wrong or springs == 1:
-        return
-    name = interior_channel(wrong[0])
-    top = (
-        f"node {springs} of a {springs}-spring chain is the top, which is the 'displacement' column"
-    )
-    raise InputError(
-        f"{measurement.name}: {name} is no mass inside a chain of {springs} springs: {top}; take "
-        "a model of more springs, or rename or leave out that column"
-    )
-
-
-def default_weights(measurement: Measurement, drive: str, springs: int = 1) -> dict[str, float]:
-    """Weights that count each measured channel once, for a chain of so many springs.
-
-    In the impact drive stress and displacement are compared in time; a displacement that was
-    integrated from the force is no second measurement. In the displacement drive the stress along
-    the measured displacement is the one curve, in the stress drive the displacement. Displacements
-    of masses inside count in all drives: they tell the springs apart.
-    """
-    weights = dict.fromkeys(CURVES, 0.0)
-    weights |= dict.fromkeys(interior_curves(measurement, springs), 1.0)
-    if drive == "impact":
-        weights["stress_time"] = 1.0
-        if measurement.displacement is not None and measurement.motion != INTEGRATED:
-            weights["displacement_time"] = 1.0
-    elif drive == "stress":
-        weights["displacement_time"] = 1.0
-    else:
-        weights["stress_strain"] = 1.0
-    return weights
-
-
-def smoothed(values: Array, window: int) -> Array:
-    """Smooth samples by the parabola through each window of them (Savitzky & Golay 1964).
-
-    Analytical Chemistry 36, 1627; as `scipy.signal.savgol_filter`, whose package takes longer to
-    import than a search.
-
-    Parameters
-    ----------
-    values : (n,) array
-        Evenly sampled.
-    window : int
-        Odd, at most n. The first and the last half of a window lie on its parabola.
-    """
-    half, clock = window // 2, np.arange(float(window))
-    weights, *_ = lstsq(np.vander(half - clock, 3, increasing=True).T, np.array([1.0, 0.0, 0.0]))
-    out = convolve1d(values, weights, mode="constant")
-    for edge, part in ((slice(half), slice(window)), (slice(-half, None), slice(-window, None))):
-        out[edge] = np.polyval(np.polyfit(clock, values[part], 2), clock[edge])
-    return np.asarray(out)
-
-
-def driving_stress(stress: Array, model: Model) -> Array:
-    """Smooth a measured stress (Pa) that is to drive a model.
-
-    The noise of a driving stress is taken for stress that acted, and biases the soft branches
-    (errors in variables): a parabola over a twenty-fifth of the samples takes it off. A chain with
-    a unilateral spring carries no tension.
-    """
-    window = 2 * (stress.size // 50) + 1
-    smooth = smoothed(stress, window) if window > 3 else stress
-    return np.maximum(smooth, 0.0) if "unilateral" in model.kinds else smooth
-
-
-def check_time_shift(measurement: Measurement, drive: str) -> None:
-    """Refuse a time shift where the test has no two channels in time.
-
-    Raises
-    ------
-    InputError
-        Saying what is missing.
-    """
-    missing = None
-    if measurement.time is None:
-        missing = "it has no time"
-    elif measurement.displacement is None or measurement.motion == INTEGRATED:
-        missing = "its motion is not measured apart from the force"
-    if missing:
-        raise InputError(
-            f"{measurement.name}: a time shift between force and motion cannot be fitted in the "
-            f"{drive} drive, {missing}; both channels must be measured in time"
-        )
-
-
-def soften(residual: Array, loss: str) -> Array:
-    """Residuals whose squares sum to the loss: sign(r) c √ρ((r/c)²), shape (n,).
-
-    A search that lowers a sum of squares so lowers Σ c² ρ((r/c)²); ρ(z) is z (linear),
-    2 (√(1+z) - 1) (soft_l1), z up to 1 and 2√z - 1 beyond (huber), ln(1+z) (cauchy), as in
-    `scipy.optimize.least_squares`, and c is in `LOSSES`.
-    """
-    if loss == "linear":
-        return residual
-    width = LOSSES[loss]
-    z = (residual / width) ** 2
-    if loss == "soft_l1":
-        rho = 2.0 * z / (np.sqrt(1.0 + z) + 1.0)
-    elif loss == "huber":
-        rho = np.where(z <= 1.0, z, 2.0 * np.sqrt(z) - 1.0)
-    else:
-        rho = np.log1p(z)
-    return np.asarray(np.sign(residual) * width * np.sqrt(rho))
-
-
-def influence(residual: Array, loss: str) -> tuple[Array, Array]:
-    """Influence ψ(r) = r ρ'(z) of residuals under a loss, and its slope ψ'(r), shapes (n,)."""
-    if loss == "linear":
-        return residual, np.ones_like(residual)
-    z = (residual / LOSSES[loss]) ** 2
-    if loss == "soft_l1":
-        return residual / np.sqrt(1.0 + z), (1.0 + z) ** -1.5
-    if loss == "huber":
-        inside = z <= 1.0
-        return residual / np.sqrt(np.maximum(z, 1.0)), inside.astype(float)
-    return residual / (1.0 + z), (1.0 - z) / (1.0 + z) ** 2
-
-
-def softness(residual: Array, loss: str) -> Array:
-    """Derivative of `soften` by the residual, (n,): ψ over the softened residual, 1 at zero."""
-    soft = soften(residual, loss)
-    near = np.abs(soft) < 1e-8
-    return np.where(near, 1.0, influence(residual, loss)[0] / np.where(near, 1.0, soft))
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,46 +73,22 @@ class Simulated:
 class Objective:
     """Residuals of a model under a drive against a measurement.
 
-    Parameters
-    ----------
-    measurement : Measurement
-        The conditioned test.
-    model : Model
-        The springs.
-    drive : str
-        "impact", "stress" or "displacement".
-    weights : dict
-        Weight of each curve; see `default_weights`. A weight w multiplies the curve's squares.
-    rtol : float
-        Tolerance of the simulation.
-    interior_mass : bool
-        Whether the specimen's mass sits between the springs, in equal parts, as in the paper.
-    time_shift : bool
-        Whether the flat vector of parameters ends, after those of the model, with how late the
-        motion channel is, s.
-    loss : str
-        One of `LOSSES`.
-
-    Attributes
-    ----------
-    curves : tuple of str
-        Names of the curves that can be counted.
-    interior : dict of str to int
-        Those of masses inside, and their node.
-    evaluations, failures : int
-        How many sets of parameters were simulated, and how many of them could not be.
+    `curves` are the names of the curves that can be counted, `interior` those of masses inside and
+    their node.
     """
 
-    measurement: Measurement
+    measurement: Measurement  # Conditioned
     model: Model
-    drive: str
-    weights: dict[str, float]
-    rtol: float = 1e-6
+    drive: str  # "impact", "stress" or "displacement"
+    weights: dict[str, float]  # Of each curve: it multiplies the curve's squares
+    rtol: float = 1e-6  # Of the simulation
+    # Whether the specimen's mass sits between the springs, in equal parts, as in the paper.
     interior_mass: bool = False
+    # Whether the vector of parameters ends with how late the motion channel is, s.
     time_shift: bool = False
-    loss: str = "linear"
-    evaluations: int = field(default=0, init=False)
-    failures: int = field(default=0, init=False)
+    loss: str = "linear"  # One of `LOSSES`
+    evaluations: int = field(default=0, init=False)  # Sets of parameters that were simulated
+    failures: int = field(default=0, init=False)  # Those of them that could not be
 
     def __post_init__(self) -> None:
         """Make the scenes ready and fix the scale of each curve."""
@@ -475,16 +250,23 @@ class Objective:
 
         `places` are those of the parameters by which derivatives are wanted.
 
-        Raises
-        ------
-        SimulationError
-            If the parameters are not admissible or the scene has no finite answer.
+        Raises SimulationError if they are not admissible or the scene has no finite answer.
         """
         count = len(self.model.names)
-        springs = self._springs(values[:count], everything, places[places < count])
+        self.evaluations += 1
+        try:
+            springs = self._springs(values[:count], everything, places[places < count])
+        except SimulationError:
+            self.failures += 1
+            raise
         if not self.time_shift:
             return springs
-        return self._shifted(springs, float(values[count]), places == count)
+        return self.shifted(springs, float(values[count]), places == count)
+
+    def add_counts(self, other: Objective) -> None:
+        """Count the evaluations and failures of another objective as one's own."""
+        self.evaluations += other.evaluations
+        self.failures += other.failures
 
     def _springs(self, values: Array, everything: bool, places: NDArray[np.int64]) -> Simulated:
         """Simulate the parameters of the model, on one clock; see `simulate`."""
@@ -524,7 +306,9 @@ class Objective:
             slopes=slopes,
         )
 
-    def _shifted(self, curves: Simulated, late: float, by_shift: NDArray[np.bool_]) -> Simulated:
+    def shifted(
+        self, curves: Simulated, late: float, by_shift: NDArray[np.bool_] = NOWHERE == 0
+    ) -> Simulated:
         """Curves as channels show them of which the motion is late by so many seconds.
 
         Slopes are shifted with their curves. Where `by_shift` (n_places,) marks one by the shift
@@ -593,16 +377,14 @@ class Objective:
 
     def differences(self, values: Array) -> Array:
         """Residuals before the loss gives way to large ones, shape (n_data,)."""
-        self.evaluations += 1
         try:
             curves = self.simulate(values)
         except SimulationError:
-            self.failures += 1
             return np.full(self.n_data, self.penalty)
-        return self._compare(curves)
+        return self.compare(curves)
 
-    def _compare(self, curves: Simulated) -> Array:
-        """Residuals of simulated curves."""
+    def compare(self, curves: Simulated) -> Array:
+        """Residuals of simulated curves before the loss gives way to large ones, (n_data,)."""
         parts = []
         for name in self.counted:
             simulated = curves.curve(name)
@@ -621,11 +403,9 @@ class Objective:
 
         Carried along with the simulation; zeros where the parameters cannot be simulated.
         """
-        self.evaluations += 1
         try:
             curves = self.simulate(values, places=places)
         except SimulationError:
-            self.failures += 1
             return np.zeros((self.n_data, places.size))
         if curves.slopes is None:  # none were asked for
             return np.zeros((self.n_data, 0))
@@ -633,7 +413,7 @@ class Objective:
             curves.slopes[name][:, self._kept[name]] * self._factor(name) for name in self.counted
         ]
         slopes = np.concatenate(parts, axis=1).T
-        residual = self._compare(curves)
+        residual = self.compare(curves)
         slopes[np.abs(residual) >= self.penalty] = 0.0
         return slopes if self.loss == "linear" else slopes * softness(residual, self.loss)[:, None]
 
@@ -645,6 +425,14 @@ class Objective:
     def kept(self, name: str) -> NDArray[np.intp]:
         """Samples of a curve that stand in the residual, in their order: all but outliers."""
         return np.arange(self.measured_size(name))[self._kept[name]]
+
+    def rms(self, residual: Array) -> dict[str, float]:
+        """RMS of each counted curve in its unit, from residuals before the loss."""
+        parts = np.split(residual, np.cumsum(self.sizes)[:-1])
+        return {
+            name: float(np.sqrt(np.mean(part**2))) / self._factor(name)
+            for name, part in zip(self.counted, parts, strict=True)
+        }
 
     def misfit(self, curves: Simulated) -> dict[str, float | None]:
         """RMS of simulated minus measured over the measured range, per curve; None if not there.

@@ -8,15 +8,14 @@ from functools import cached_property
 
 import lmfit
 import numpy as np
-from numpy.typing import NDArray
 
+from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError
 from foamfit.fitting.box import LARGEST_SHIFT, Scales, Space
-from foamfit.fitting.objective import Objective, check_interior, choose_drive, default_weights
+from foamfit.fitting.curves import check_interior, choose_drive, default_weights
+from foamfit.fitting.objective import Objective
 from foamfit.springs.model import Model, split_name
-
-Array = NDArray[np.float64]
 
 
 def make_params(
@@ -197,7 +196,7 @@ class Problem:
         )
 
     def sizes(self, names: tuple[str, ...], values: Array) -> Array:
-        """Natural sizes of some parameters at a point."""
+        """Scales of some parameters at a point."""
         at = dict(zip(self.names, map(float, values), strict=True))
         return np.array([self.scales.of_parameter(name, at) for name in names])
 
@@ -247,10 +246,7 @@ def make_problem(
 ) -> Problem:
     """Make a problem ready; see `foamfit.fit` for the arguments.
 
-    Raises
-    ------
-    InputError
-        If the test cannot feed the drive or a parameter is unknown; the message names it.
+    Raises InputError if the test cannot feed the drive or a parameter is unknown, by its name.
     """
     model = Model.parse(model_name)
     drive = choose_drive(measurement) if drive is None else drive

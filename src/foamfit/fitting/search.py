@@ -1,6 +1,6 @@
-"""The lean search: start values read from the curve, and a descent from the best of many.
+"""The search: start values read from the curve, and descents from the best of many.
 
-The search moves in the box of `fitting.box`, so that no start needs luck and no step can leave
+It moves in the box of `fitting.box`, so that no start needs luck and no step can leave
 what the law admits. It first fits the loop (stress along the measured motion, closed form, cheap)
 and only then the curves of the drive itself.
 """
@@ -13,26 +13,27 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import qmc
 
+from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
+from foamfit.fitting import levenberg
 from foamfit.fitting.box import Scales, Space
-from foamfit.fitting.objective import Objective, smoothed
+from foamfit.fitting.curves import smoothed
+from foamfit.fitting.objective import Objective
 
-Array = NDArray[np.float64]
 Progress = Callable[[float, str], None]
 
 LOOP_SAMPLES = 240
 CURVE_STARTS = 300
-# Valleys of the loop whose cost on the drive's curves is within this factor of the best go on.
+# Minima of the loop whose cost on the drive's curves is within this factor of the best go on.
 PROMISING = 100.0
-# Pitches at which the ringing of an interior mass is tried, up to twice the stiffness and its half.
-PITCHES = np.geomspace(1.0, 2.0, 71)[1:]
+# Factors by which the stiffness that an interior mass vibrates on is changed, and their inverses.
+STIFFER = np.geomspace(1.0, 2.0, 71)[1:]
 
 
 class SearchStoppedError(Exception):
-    """The time is up; the best point so far is the answer."""
+    """The time is up; the best point so far is the result."""
 
 
 # What ends a search, refits or a chain before they are done: what was found is kept.
@@ -46,26 +47,16 @@ def what_stopped(error: BaseException) -> str:
 
 @dataclass(frozen=True)
 class SearchRecord:
-    """How a search went.
+    """How a search went."""
 
-    Attributes
-    ----------
-    seed, starts : int
-        What it was asked for.
-    began : float
-        `time.perf_counter` at its start, s.
-    costs : tuple of (float, int)
-        Final costs of the descents on the drive's curves, best first, and how many descents on the
-        loop led to each.
-    stopped : str or None
-        What ended it before its time: "the time limit", "Ctrl-C".
-    """
-
+    # What it was asked for.
     seed: int
     starts: int
-    began: float
+    began: float  # `time.perf_counter` at its start, s
+    # Final costs of the descents on the drive's curves, best first, and how many descents on the
+    # loop led to each.
     costs: tuple[tuple[float, int], ...] = ()
-    stopped: str | None = None
+    stopped: str | None = None  # What ended it before its time: "the time limit", "Ctrl-C"
 
     @property
     def agreeing(self) -> int:
@@ -159,21 +150,9 @@ class Loop:
 def read_spring(loop: Loop, marks: Array, scales: Scales) -> Array:
     """Read a bistable spring off a loop, given where on it A1, C1 and C2 are taken to lie.
 
-    Parameters
-    ----------
-    loop : Loop
-        Of the spring.
-    marks : (5,) array
-        In [0, 1]: places of A1, C1 and C2 between their neighbours, shares of the stress at C2 and
-        of the damping.
-    scales : Scales
-        Of the test.
-
-    Returns
-    -------
-    (8,) array
-        k0 … kh_minus, eta (SI): initial slope from A1, k_h+ from A1 to C1, k_c through C1 and C2,
-        k_h- from C2 towards rest.
+    `marks` (5,) in [0, 1] are the places of A1, C1 and C2 between their neighbours, and shares of
+    the stress at C2 and of the damping. Returned are k0 … kh_minus, eta (SI): initial slope from
+    A1, k_h+ from A1 to C1, k_c through C1 and C2, k_h- from C2 towards rest.
     """
     last = float(loop.strain[loop.peak])
     eps_a = min((0.02 + 0.85 * marks[0]) * last, 0.9)
@@ -278,66 +257,25 @@ def _cost(item: tuple[float, Array]) -> float:
 def descend(
     tracker: Tracker, space: Space, start: Array, iterations: int, enough: float = 1e-5
 ) -> tuple[float, Array]:
-    """Levenberg-Marquardt descent inside the box; returns (cost, coordinates) of its end.
-
-    Coordinates at an edge of the box that the gradient presses outwards are held. The damping
-    follows the gain ratio (Nielsen 1999, IMM-REP-1999-05). It ends when two steps in a row lower
-    the cost by less than the share `enough`.
-    """
-    low, high = space.box
-
-    def cost_at(point: Array) -> tuple[float, Array]:
-        residual = tracker.residual(space.decode(point))
-        return float(residual @ residual), residual
-
-    point = start
-    cost, residual = cost_at(point)
-    damping, growth, idle = 1e-3, 2.0, 0
-    jacobian = tracker.slopes(space, point)
-    for _ in range(iterations):
-        gradient = jacobian.T @ residual
-        held = ((point <= low) & (gradient > 0.0)) | ((point >= high) & (gradient < 0.0))
-        free = np.flatnonzero(~held)
-        if free.size == 0:
-            break
-        normal = jacobian[:, free].T @ jacobian[:, free]
-        scale = np.maximum(np.diag(normal), 1e-12 * max(float(np.trace(normal)), 1e-300))
-        step = np.zeros(point.size)
-        step[free] = -np.linalg.solve(normal + damping * np.diag(scale), gradient[free])
-        trial = np.clip(point + step, low, high)
-        moved = trial - point
-        expected = -float(moved @ (2.0 * gradient + jacobian.T @ (jacobian @ moved)))
-        new_cost, new_residual = cost_at(trial)
-        if new_cost < cost:
-            gain = (cost - new_cost) / max(expected, 1e-300)
-            idle = idle + 1 if cost - new_cost < enough * cost else 0
-            point, cost, residual = trial, new_cost, new_residual
-            damping *= max(1.0 / 3.0, 1.0 - (2.0 * min(gain, 1.0) - 1.0) ** 3)
-            growth = 2.0
-            if idle == 2:
-                break
-            jacobian = tracker.slopes(space, point)
-        else:
-            damping *= growth
-            growth *= 2.0
-            if damping > 1e8 or float(np.max(np.abs(moved))) < 1e-9:
-                break
-    return cost, point
+    """Levenberg-Marquardt descent inside the box; returns (cost, coordinates) of its end."""
+    return levenberg.descend(
+        lambda point: tracker.residual(space.decode(point)),
+        lambda point: tracker.slopes(space, point),
+        start, space.box, iterations, enough,
+    )  # fmt: skip
 
 
 def rank(tracker: Tracker, space: Space, points: list[Array]) -> list[tuple[float, Array]]:
     """Points of the box with their costs, cheapest first."""
-    ranked = []
-    for point in points:
-        residual = tracker.residual(space.decode(point))
-        ranked.append((float(residual @ residual), point))
-    return sorted(ranked, key=_cost)
+    residuals = [tracker.residual(space.decode(point)) for point in points]
+    costs = [float(residual @ residual) for residual in residuals]
+    return sorted(zip(costs, points, strict=True), key=_cost)
 
 
 def spread_out(space: Space, points: list[Array], count: int) -> list[Array]:
     """Choose `count` of the ranked points: the best, then the best of each range of ε_a.
 
-    Where branch d is about as stiff as branch a, the valleys of the cost differ by where A1 lies.
+    Where branch d is about as stiff as branch a, the minima of the cost differ by where A1 lies.
     """
     marks = [j for j, (_, short, _) in enumerate(space.coordinates) if short == "eps_a"]
     if not marks:
@@ -350,8 +288,11 @@ def spread_out(space: Space, points: list[Array], count: int) -> list[Array]:
     return [points[i] for i in sorted(chosen)]
 
 
-def valleys(ends: list[tuple[float, Array]], apart: float = 1e-3) -> list[tuple[int, Array]]:
-    """Ends of descents, best first, one of each cost with their number: one cost, one valley."""
+def distinct(ends: list[tuple[float, Array]], apart: float = 1e-3) -> list[tuple[int, Array]]:
+    """Distinct minima among the ends of descents, best first: how many ended there, and one end.
+
+    Ends whose costs differ by less than the share `apart` are of one minimum.
+    """
     chosen: list[tuple[int, Array]] = []
     last = 0.0
     for cost, point in sorted(ends, key=_cost):
@@ -373,43 +314,22 @@ def search(
 ) -> list[tuple[float, int]]:
     """Search for the best parameters; the tracker keeps them.
 
-    Parameters
-    ----------
-    tracker : Tracker
-        Of the objective of the drive.
-    space : Space
-        The box.
-    starts : int
-        Descents on the loop; the best quarter of them go on to the curves of the drive.
-    rng : Generator
-        Source of all chance.
-    progress : callable
-        Told the fraction done and what is going on.
-
-    Returns
-    -------
-    list of (float, int)
-        Final costs of the descents on the drive's curves, best first, and how many descents on the
-        loop led to each.
-
-    Raises
-    ------
-    SearchStoppedError
-        When the time is up.
+    Of the descents on the loop (so many `starts`) the best quarter go on to the curves of the
+    drive. Returned are the final costs there, best first, and how many descents on the loop led to
+    each. Raises SearchStoppedError when the time is up.
     """
     points = [space.encode(space.values), *box_starts(space, rng, CURVE_STARTS // 3)]
+    counts: dict[int, int] = {}
     if tracker.objective.measurement.displacement is not None:
-        ends = _search_loop(tracker, space, points, starts, rng, progress)
-        counts = {id(point): count for count, point in valleys(ends)}
-        points = [point for _, point in valleys(ends)]
-    else:
-        counts = {}
+        found = distinct(_search_loop(tracker, space, points, starts, rng, progress))
+        counts = {id(point): count for count, point in found}
+        points = [point for _, point in found]
     ranked = rank(tracker, space, points)
     if tracker.objective.interior_mass:
-        progress(0.7, "ringing")
-        ranked = sorted(ranked + _scan_ringing(tracker, space, points[0]), key=_cost)
+        progress(0.7, "vibration")
+        ranked = sorted(ranked + _scan_vibration(tracker, space, points[0]), key=_cost)
     promising = [item for item in ranked if item[0] <= PROMISING * ranked[0][0]]
-    points = [point for _, point in valleys(promising)][: max(3, starts // 4)]
+    points = [point for _, point in distinct(promising)][: max(3, starts // 4)]
     out = []
     for i, point in enumerate(points):
         progress(0.7 + 0.25 * i / len(points), "curves")
@@ -419,8 +339,8 @@ def search(
     return sorted(out)
 
 
-def salvage(tracker: Tracker, space: Space, rng: np.random.Generator) -> None:
-    """Give a search that was stopped before its first success a point that can be simulated."""
+def ensure_feasible(tracker: Tracker, space: Space, rng: np.random.Generator) -> None:
+    """Find some point that can be simulated, if the search was stopped before it had one."""
     for point in [space.encode(space.values), *box_starts(space, rng, CURVE_STARTS // 3)]:
         if tracker.best_values is not None:
             return
@@ -454,23 +374,20 @@ def _search_loop(
             progress(0.7 * i / starts, "loop")
             ends.append(descend(inner, space, point, 40))
     finally:
-        objective.evaluations += inner.objective.evaluations
-        objective.failures += inner.objective.failures
+        objective.add_counts(inner.objective)
         if inner.best_values is not None:
             tracker.consider(inner.best_values)
     return ends
 
 
-def _scan_ringing(tracker: Tracker, space: Space, start: Array) -> list[tuple[float, Array]]:
-    """Points along the valley of the massless chain, ranked by the curves with interior masses.
+def _scan_vibration(tracker: Tracker, space: Space, start: Array) -> list[tuple[float, Array]]:
+    """Fits of the massless chain for each stiffness of a linear spring, ranked with its masses.
 
-    An interior mass rings on a stiff linear spring, and the cost has a valley for every cycle that
-    the simulated ringing gains on the measured one: no descent crosses from one to the next. The
-    massless chain fixes all that does not ring, for each stiffness of a linear spring in turn.
+    An interior mass vibrates on a stiff linear spring, and the cost has a minimum for every cycle
+    that the simulated vibration gains on the measured one: no descent crosses from one to the next.
     """
-    ringing = tracker.objective
-    quiet = replace(ringing, interior_mass=False)
-    massless = Tracker(quiet, tracker.deadline)
+    objective = replace(tracker.objective, interior_mass=False)
+    massless = Tracker(objective, tracker.deadline)
     _, start = descend(massless, space, start, 40)
     out: list[tuple[float, Array]] = []
     for spring, kind in enumerate(space.model.kinds, start=1):
@@ -478,15 +395,14 @@ def _scan_ringing(tracker: Tracker, space: Space, start: Array) -> list[tuple[fl
         if kind == "bistable" or name not in space.free:
             continue
         at = space.model.index[name]
-        for pitches in (PITCHES, 1.0 / PITCHES):
+        for factors in (STIFFER, 1.0 / STIFFER):
             values = space.decode(start)
-            for stiffness in values[at] * pitches:
+            for stiffness in values[at] * factors:
                 values[at] = np.clip(stiffness, space.low[at], space.high[at])
                 free = tuple(other for other in space.free if other != name)
                 held = replace(space, values=values.copy(), free=free)
                 _, point = descend(massless, held, held.encode(values), 3, enough=1e-3)
                 values = held.decode(point)
                 out += rank(tracker, space, [space.encode(values)])
-    ringing.evaluations += quiet.evaluations
-    ringing.failures += quiet.failures
+    tracker.objective.add_counts(objective)
     return out

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, FigureBase
 
-    from foamfit.trust.identifiability import Insight, Section
+    from foamfit.fitting.branches import Section
+    from foamfit.trust.identifiability import Insight
 
 Array = NDArray[np.float64]
 
@@ -44,7 +45,7 @@ def plot_sensitivities(insight: Insight, path: str | Path | None = None) -> Figu
     -------
     matplotlib.figure.Figure
         One row for each parameter, one panel for each counted curve. A row has one scale, its
-        largest value, in standard deviations of the noise per 1 % of the natural size.
+        largest value, in standard deviations of the noise per 1 % of the scale.
     """
     import matplotlib
     from matplotlib.figure import Figure

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from foamfit.data.measurement import Measurement, Noise, NoiseLevel, Striker
 from foamfit.data.toml_file import read_settings
 from foamfit.errors import InputError, SimulationError
+from foamfit.fitting.branches import visited
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.search import Tracker, search
 from foamfit.report.folder import load_result
@@ -31,9 +32,10 @@ from foamfit.springs.published import published
 from foamfit.springs.spring import BistableSpring
 from foamfit.text import engineering
 from foamfit.trust import covariance
+from foamfit.trust.best_point import BestPoint
 from foamfit.trust.checklist import ESTIMATED
 from foamfit.trust.conclude import state_of
-from foamfit.trust.identifiability import Insight, look, unreached, visited
+from foamfit.trust.identifiability import Insight, look
 
 Array = NDArray[np.float64]
 
@@ -370,11 +372,9 @@ def expect(problem: Problem, values: Array, noise: Mapping[str, float]) -> Outlo
     noise : mapping
         One standard deviation of each counted curve, SI.
     """
-    lost, params = unreached(problem, values), problem.params
-    names = tuple(n for n in problem.names if params[n].vary and n not in lost)
-    insight = None
-    if names:
-        insight = look(problem, values, names, problem.slopes(values, names), noise)
+    best, params = BestPoint(problem, values), problem.params
+    lost, names = best.unreached, best.names
+    insight = look(best, noise) if names else None
     expected = {}
     for name in problem.free():
         value, unit = float(values[problem.index[name]]), unit_of(name)
@@ -390,7 +390,7 @@ def expect(problem: Problem, values: Array, noise: Mapping[str, float]) -> Outlo
         expected[name] = ParameterEstimate(
             value, stderr if told else None, None, unit, True, state, why
         )
-    seen = visited(problem, problem.objective.simulate(values, everything=True))
+    seen = visited(problem, best.simulated)
     impact = problem.objective.drive == "impact"
     velocity = _striker(problem.measurement).velocity if impact else None
     return Outlook(velocity, expected, seen, insight)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from foamfit.results import Fit, ParameterEstimate
     from foamfit.solve.simulation import Response
-    from foamfit.trust.intervals import Profile
+    from foamfit.trust.profile import Profile
 
 Array = NDArray[np.float64]
 

@@ -1,5 +1,6 @@
-"""How sure the parameters are, and which of them the test tells at all.
+"""How certain the parameters are, and which of them the test determines.
 
-`covariance` and `intervals` give numbers, `checklist` asks what a good fit must pass, `conclude`
-gives each parameter its state. A newcomer may skip `refit`, `evidence` and `residual_tests`.
+`best_point` holds what was computed at the best point, `covariance` and `intervals` give numbers,
+`checklist` asks what a good fit must pass, `conclude` gives each parameter its state. A newcomer
+may skip `refit`, `profile`, `resample`, `evidence` and `residual_tests`.
 """

@@ -7,27 +7,23 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import groupby
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from foamfit.data.energy import EnergyAudit
 from foamfit.data.measurement import INTEGRATED
 from foamfit.errors import InputError
-from foamfit.fitting.objective import check_time_shift
+from foamfit.fitting.branches import visited
+from foamfit.fitting.curves import check_time_shift
+from foamfit.fitting.objective import Objective
+from foamfit.fitting.search import SearchRecord
 from foamfit.results import Check, ParameterEstimate
 from foamfit.springs.model import split_name
 from foamfit.text import engineering
+from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import AT_LIMIT, WEAK
+from foamfit.trust.intervals import Intervals
 from foamfit.trust.time_shift import shift_hint
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from foamfit.data.energy import EnergyAudit
-    from foamfit.fitting.problem import Problem
-    from foamfit.fitting.search import SearchRecord
-    from foamfit.trust.covariance import Covariance
-    from foamfit.trust.intervals import Intervals
 
 # A curve was not fitted if it is off by more than this share of its own standard deviation; it is
 # fitted poorly if it is off by more than this share of its range.
@@ -46,23 +42,25 @@ MAY_VANISH = ("dsigma", "kh_plus", "kh_minus", "eta")
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class Findings:
     """What the questions are put to: the best point, how it was found, and what was measured."""
 
-    problem: Problem
+    best: BestPoint
     estimates: Mapping[str, ParameterEstimate]
-    visited: dict[str, tuple[str, ...]]
-    residual: NDArray[np.float64]
     misfit: dict[str, float | None]
-    spread: Covariance | None
     record: SearchRecord
     balance: EnergyAudit
     intervals: Intervals
 
     @property
-    def values(self) -> NDArray[np.float64]:
-        """The best point, SI, in the order of the problem's names."""
-        return np.array([item.value for item in self.estimates.values()])
+    def objective(self) -> Objective:
+        """What was minimised."""
+        return self.best.problem.objective
+
+    @property
+    def tau(self) -> tuple[float, ...]:
+        """Autocorrelation time of the residual of each curve, samples; none without parameters."""
+        return self.best.spread.tau if self.best.names else ()
 
 
 def status_of(checklist: Iterable[Check]) -> str:
@@ -78,27 +76,27 @@ def warnings_of(checklist: Iterable[Check]) -> tuple[str, ...]:
     return tuple(warning for check in checklist for warning in check.warnings)
 
 
-def make_checklist(evidence: Evidence) -> tuple[Check, ...]:
+def make_checklist(findings: Findings) -> tuple[Check, ...]:
     """Put all questions, what matters most first."""
-    questions: tuple[Callable[[Evidence], Check], ...] = (
+    questions: tuple[Callable[[Findings], Check], ...] = (
         _ended, _followed, _floor, _determined, _trusted, _visited, _bounds, _agree, _structure,
-        _ringing, _simulated, _energy, _impulse, _clocks,
+        _vibration, _simulated, _energy, _impulse, _time_shift,
     )  # fmt: skip
-    return tuple(question(evidence) for question in questions)
+    return tuple(question(findings) for question in questions)
 
 
 # ---------------------------------------------------------------- the search
 
 
-def _ended(e: Evidence) -> Check:
+def _ended(e: Findings) -> Check:
     question, stopped = "Did the search end by itself?", e.record.stopped
     if stopped is None:
-        return Check("ended", question, True, f"{e.problem.objective.evaluations} simulations.")
+        return Check("ended", question, True, f"{e.objective.evaluations} simulations.")
     warning = f"The search was stopped by {stopped}; this is the best point until then."
     return Check("ended", question, False, f"It was stopped by {stopped}.", (warning,))
 
 
-def _agree(e: Evidence) -> Check:
+def _agree(e: Findings) -> Check:
     question, record = "Do several starts agree?", e.record
     if record.stopped is not None or not record.costs:
         return Check("agree", question, None, "The search was stopped before it could tell.")
@@ -110,8 +108,8 @@ def _agree(e: Evidence) -> Check:
     return Check("agree", question, False, f"One of {total} descents did.", (warning,))
 
 
-def _simulated(e: Evidence) -> Check:
-    objective = e.problem.objective
+def _simulated(e: Findings) -> Check:
+    objective = e.objective
     failed, tried = objective.failures, max(objective.evaluations, 1)
     question = "Could most trials be simulated?"
     if failed <= 0.5 * tried:
@@ -120,55 +118,50 @@ def _simulated(e: Evidence) -> Check:
     return Check("simulated", question, False, f"{failed} of {tried} could not.", (warning,))
 
 
-def _ringing(e: Evidence) -> Check:
-    question = "Is the cost free of valleys that a ringing mass makes?"
-    if not e.problem.objective.interior_mass or len(e.problem.model.kinds) == 1:
-        return Check("ringing", question, True, "No interior mass rings.")
+def _vibration(e: Findings) -> Check:
+    question = "Is the cost free of the minima that a vibrating mass makes?"
+    if not e.objective.interior_mass or len(e.best.problem.model.kinds) == 1:
+        return Check("vibration", question, True, "No interior mass vibrates.")
     warning = (
-        "With interior masses the cost has a valley for every cycle of their ringing: trust no "
+        "With interior masses the cost has a minimum for every cycle of their vibration: trust no "
         "parameter that other seeds, or the fit without them, do not confirm."
     )
-    return Check("ringing", question, False, "The interior masses ring.", (warning,))
+    return Check("vibration", question, False, "The interior masses vibrate.", (warning,))
 
 
 # ---------------------------------------------------------------- the curves
 
 
-def missed(problem: Problem, misfit: Mapping[str, float | None], name: str) -> bool:
+def missed(objective: Objective, misfit: Mapping[str, float | None], name: str) -> bool:
     """Whether a counted curve was not fitted at all."""
-    measured = problem.objective.measured[name]
+    measured = objective.measured[name]
     assert measured is not None
     return (misfit[name] or 0.0) * float(np.ptp(measured)) > UNACCEPTABLE * float(np.std(measured))
 
 
-def _followed(e: Evidence) -> Check:
+def _followed(e: Findings) -> Check:
     warnings, fatal = [], False
-    for name in e.problem.objective.counted:
-        off, lost = e.misfit[name] or 0.0, missed(e.problem, e.misfit, name)
+    for name in e.objective.counted:
+        off, lost = e.misfit[name] or 0.0, missed(e.objective, e.misfit, name)
         fatal = fatal or lost
         if off > POOR or lost:
             word = "is not acceptable" if lost else "is large"
             warnings.append(f"The misfit of {name} is {off:.1%} of its range, which {word}.")
-    told = ", ".join(
-        f"{_spoken(name)} {e.misfit[name] or 0.0:.1%}" for name in e.problem.objective.counted
-    )
+    told = ", ".join(f"{_spoken(name)} {e.misfit[name] or 0.0:.1%}" for name in e.objective.counted)
     question, found = "Does the model follow the curves?", f"Misfit over range: {told}."
     return Check("followed", question, not warnings, found, tuple(warnings), fatal)
 
 
-def _floor(e: Evidence) -> Check:
+def _floor(e: Findings) -> Check:
     """Residuals against the noise of each curve, with the scatter that a chi-square has itself."""
-    objective, question = e.problem.objective, "Is the noise floor reached?"
-    told, warnings, at = [], [], 0
-    for i, (name, size) in enumerate(zip(objective.counted, objective.sizes, strict=True)):
+    objective, question = e.objective, "Is the noise floor reached?"
+    told, warnings, sizes = [], [], objective.sizes
+    for i, (name, rms) in enumerate(objective.rms(e.best.residual).items()):
         noise, stated = objective.noise(name).sigma, objective.noise(name).given
-        rms = float(np.sqrt(np.mean(e.residual[at : at + size] ** 2)))
-        rms *= objective.scale[name] / objective.weights[name] ** 0.5
-        at += size
         if noise <= 1e-9 * objective.scale[name]:  # there is none to be seen
             continue
-        tau = 1.0 if e.spread is None else e.spread.tau[i]
-        most = (STATED if stated else ESTIMATED) + 3.0 * math.sqrt(tau / (2.0 * size))
+        tau = e.tau[i] if e.tau else 1.0
+        most = (STATED if stated else ESTIMATED) + 3.0 * math.sqrt(tau / (2.0 * sizes[i]))
         source = "stated" if stated else "estimated"
         told.append(f"{_spoken(name)} {rms / noise:.2f} ({source})")
         if rms > most * noise:
@@ -177,24 +170,24 @@ def _floor(e: Evidence) -> Check:
                 "model does not follow all that was measured."
             )
     if not told:
-        return Check("floor", question, None, "The noise is neither stated nor to be seen.")
+        return Check("floor", question, None, "The noise is neither stated nor estimated.")
     found = f"Residuals over noise: {', '.join(told)}."
     return Check("floor", question, not warnings, found, tuple(warnings))
 
 
-def _structure(e: Evidence) -> Check:
+def _structure(e: Findings) -> Check:
     question = "Are the residuals free of structure?"
-    if e.spread is None:
-        return Check("structure", question, None, "There is nothing to judge them by.")
-    longest = max(e.spread.tau)
-    found = f"Their autocorrelation time is {longest:.2g} samples."
+    if not e.tau:
+        return Check("structure", question, None, "No parameter varies whose branch was reached.")
+    longest = max(e.tau)
+    found = f"Noise correlated over {longest:.2g} samples."
     if longest < 1.05:
-        found = "They follow each other no more than white noise does."
+        found = "Their autocorrelation is that of white noise."
     if longest <= STRUCTURED:
         return Check("structure", question, True, found)
     warning = (
-        f"The residuals are structured: they follow each other over {longest:.0f} samples, and "
-        "the intervals count that."
+        f"The residuals have structure: noise correlated over {longest:.0f} samples; the intervals "
+        "account for it."
     )
     return Check("structure", question, False, found, (warning,))
 
@@ -202,8 +195,8 @@ def _structure(e: Evidence) -> Check:
 # ---------------------------------------------------------------- the parameters
 
 
-def _determined(e: Evidence) -> Check:
-    """Ask for the states; what is known to be nearly nothing, or nothing, is known well enough."""
+def _determined(e: Findings) -> Check:
+    """Ask for the states; a parameter with a small upper bound is known well enough."""
     warnings, vanishing = [], [name for name in e.estimates if _vanishes(e, name)]
     for state in ("not determined", "weak"):
         of = [
@@ -216,13 +209,13 @@ def _determined(e: Evidence) -> Check:
     varied = [item.state for item in e.estimates.values() if item.state != "fixed"]
     found = f"{varied.count('determined')} of {len(varied)} are"
     if vanishing:
-        found += f"; small for sure, though not told from zero: {', '.join(vanishing)}"
+        found += f"; consistent with zero, with a small upper bound: {', '.join(vanishing)}"
     question = "Are all parameters determined?"
     return Check("determined", question, not warnings, f"{found}.", tuple(warnings))
 
 
-def _trusted(e: Evidence) -> Check:
-    question, warnings = "Were the intervals made as they should be?", e.intervals.warnings
+def _trusted(e: Findings) -> Check:
+    question, warnings = "Are the intervals those that were asked for?", e.intervals.warnings
     made = Counter(item.ci95_method for item in e.estimates.values() if item.ci95_method)
     found = ", ".join(f"{n} by {method}" for method, n in made.items()) or "There are none"
     if warnings:
@@ -230,12 +223,12 @@ def _trusted(e: Evidence) -> Check:
     return Check("intervals", question, True if made else None, f"{found}.")
 
 
-def _vanishes(e: Evidence, name: str) -> bool:
-    """Whether a parameter is small for sure, but not told from zero."""
+def _vanishes(e: Findings, name: str) -> bool:
+    """Whether a parameter is consistent with zero and its upper bound is small."""
     item = e.estimates[name]
     if item.state != "weak" or item.ci95 is None or split_name(name)[1] not in MAY_VANISH:
         return False
-    size = float(e.problem.sizes((name,), e.values)[0])
+    size = float(e.best.problem.sizes((name,), e.best.values)[0])
     return item.ci95[0] <= 0.0 <= item.ci95[1] and max(np.abs(item.ci95)) <= WEAK * size
 
 
@@ -250,32 +243,32 @@ def _by_reason(of: list[tuple[str, str]]) -> str:
     return "; ".join(f"{names} ({why})" for why, names in groups)
 
 
-def _visited(e: Evidence) -> Check:
+def _visited(e: Findings) -> Check:
     question = "Was every branch of every spring visited?"
     absent = {
         spring: [branch for branch in BRANCHES if branch not in seen]
-        for spring, seen in e.visited.items()
+        for spring, seen in visited(e.best.problem, e.best.simulated).items()
         if "a" in seen
     }
     lost = [f"{branch} of {spring}" for spring, gone in absent.items() for branch in gone]
     if not absent:
-        return Check("visited", question, True, "Linear springs have one only.")
+        return Check("visited", question, True, "Linear springs have one branch.")
     if not lost:
         return Check("visited", question, True, "a, d, c and e were.")
-    # Whether that matters: some parameter that varies hangs on it; its own warning says so.
-    hang = [
+    # It matters if some parameter that varies depends on it; its own warning says so.
+    depend = [
         name
         for name, item in e.estimates.items()
         if item.state == "not determined" and absent.get(f"s{split_name(name)[0] + 1}")
     ]
     found = f"Not visited: {', '.join(lost)}."
-    return Check("visited", question, False if hang else None, found)
+    return Check("visited", question, False if depend else None, found)
 
 
-def _bounds(e: Evidence) -> Check:
-    question, params = "Are all parameters off their bounds?", e.problem.params
+def _bounds(e: Findings) -> Check:
+    question, params = "Are all parameters off their bounds?", e.best.problem.params
     varied = [name for name, item in e.estimates.items() if item.vary]
-    sizes = e.problem.sizes(tuple(varied), e.values)
+    sizes = e.best.problem.sizes(tuple(varied), e.best.values)
     stuck, natural = [], []
     for name, size in zip(varied, sizes, strict=True):
         value, edge = e.estimates[name].value, AT_LIMIT * size
@@ -293,53 +286,52 @@ def _bounds(e: Evidence) -> Check:
 # ---------------------------------------------------------------- the test itself
 
 
-def _energy(e: Evidence) -> Check:
-    question, taken = (
-        "Do striker, force and motion agree in energy?",
-        e.balance.absorbed_over_striker,
-    )
+def _energy(e: Findings) -> Check:
+    question, taken = "Does the energy balance hold?", e.balance.absorbed_over_striker
     warnings = tuple(e.balance.energy_warnings())
     if taken is None and not warnings:
-        return Check("energy", question, None, "The test does not say enough to tell.")
+        return Check("energy", question, None, "The test does not state enough for this.")
     if e.balance.motion == INTEGRATED and not warnings:
         return Check("energy", question, None, "The motion comes from the force.")
-    found = "The loop gives out more than it takes up."
+    found = "The loop returns more energy than it takes up."
     if taken is not None:
-        found = f"The foam absorbs {taken:.2f} of what the striker brings."
+        found = f"The foam absorbs {taken:.2f} of the striker's energy."
     return Check("energy", question, not warnings, found, warnings)
 
 
-def _impulse(e: Evidence) -> Check:
-    question, ratio = "Do they agree in momentum?", e.balance.impulse_ratio
+def _impulse(e: Findings) -> Check:
+    question, ratio = "Does the momentum balance hold?", e.balance.impulse_ratio
     warnings = tuple(e.balance.impulse_warnings())
     if ratio is None:
-        return Check("impulse", question, None, "The test does not say enough to tell.")
+        return Check("impulse", question, None, "The test does not state enough for this.")
     found = f"The impulse of the force is {ratio:.2f} of the striker's change of momentum."
     return Check("impulse", question, not warnings, found, warnings)
 
 
-def _clocks(e: Evidence) -> Check:
-    question, objective = "Do the clocks of force and motion agree?", e.problem.objective
-    if objective.time_shift:
+def _time_shift(e: Findings) -> Check:
+    key, question = "time_shift", "Are force and motion free of a time shift?"
+    measurement = e.best.problem.measurement
+    if e.objective.time_shift:
         late = engineering(e.estimates["time_shift"].value, "s").replace("-", "−")
-        return Check("clocks", question, True, f"Their shift is fitted: {late}.")
-    force = e.problem.measurement.outliers.get("stress")
+        return Check(key, question, True, f"The time shift is fitted: {late}.")
+    force = measurement.outliers.get("stress")
     if force is not None and force.clipped_at is not None:
-        told = "The force is clipped, which looks like a shift of its peak."
-        return Check("clocks", question, None, told)
+        told = "The force is clipped, which looks like a time shift of its peak."
+        return Check(key, question, None, told)
     try:
-        check_time_shift(e.problem.measurement, objective.drive)
+        check_time_shift(measurement, e.objective.drive)
     except InputError:
-        return Check("clocks", question, None, "Not both channels were measured in time.")
-    found = shift_hint(e.problem, e.values, e.residual, e.estimates)
+        return Check(key, question, None, "Not both channels were measured in time.")
+    determined = [name for name, item in e.estimates.items() if item.stderr is not None]
+    found = shift_hint(e.best, determined)
     if found is None:
-        return Check("clocks", question, True, "A shift would explain nothing that is left.")
+        return Check(key, question, True, "A time shift would not lower the residuals.")
     told = f"{'late' if found > 0.0 else 'early'} by {engineering(abs(found), 's')}"
     warning = (
-        f"The motion channel seems to be {told} against the force; fit the shift by --time-shift "
-        "(time_shift=True)."
+        f"The motion channel seems to be {told} against the force; fit the time shift by "
+        "--time-shift (time_shift=True)."
     )
-    return Check("clocks", question, False, f"The motion seems {told}.", (warning,))
+    return Check(key, question, False, f"The motion seems {told}.", (warning,))
 
 
 def _spoken(name: str) -> str:

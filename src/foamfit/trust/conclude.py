@@ -8,65 +8,43 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from foamfit.arrays import Array
 from foamfit.data.describe import noise_sentences
 from foamfit.data.energy import audit
 from foamfit.data.measurement import INTEGRATED, interior_channel
 from foamfit.errors import SimulationError
-from foamfit.fitting.objective import (
-    LOSSES,
-    MODEL_ERROR,
-    MOTION_CURVES,
-    Objective,
-    Simulated,
-    soften,
-)
+from foamfit.fitting.box import scale_in_words
+from foamfit.fitting.branches import visited
+from foamfit.fitting.curves import MOTION_CURVES
+from foamfit.fitting.losses import LOSSES
+from foamfit.fitting.objective import MODEL_ERROR, Objective, Simulated
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import SearchRecord
 from foamfit.results import Correlation, Curves, Fit, ParameterEstimate, Switch
 from foamfit.springs import kernels
 from foamfit.springs.model import split_name, unit_of
-from foamfit.text import engineering
+from foamfit.text import engineering, percent
 from foamfit.trust import covariance
-from foamfit.trust.checklist import MAY_VANISH, Evidence, make_checklist, status_of, warnings_of
-from foamfit.trust.identifiability import Insight, look, unreached, visited
+from foamfit.trust.best_point import BestPoint
+from foamfit.trust.checklist import MAY_VANISH, Findings, make_checklist, status_of, warnings_of
+from foamfit.trust.identifiability import Insight, look
 from foamfit.trust.intervals import Intervals
-from foamfit.trust.refit import Vicinity
-
-Array = NDArray[np.float64]
 
 # Factor between an interval and the local one from which on the local standard error is given up.
 ASTRAY = 2.0
 
 
-def conclude(
-    problem: Problem, values: Array, record: SearchRecord, intervals: Intervals | None = None
-) -> Fit:
+def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None = None) -> Fit:
     """Assemble the result at the best point, with other intervals than local ones if there are."""
-    objective, measurement = problem.objective, problem.measurement
-    simulated = objective.simulate(values, everything=True)
-    springs = values[: len(problem.model.names)]
-    residual = objective.differences(values)
+    problem, objective, simulated = best.problem, best.problem.objective, best.simulated
+    measurement, specimen = problem.measurement, problem.measurement.specimen
     intervals = Intervals() if intervals is None else intervals
-    estimates, spread, insight = _estimate(problem, values, intervals)
-    correlation = None
-    if insight is not None and spread is not None:
-        correlation = Correlation(insight.names, spread.correlation)
-    balance = audit(measurement)
-    evidence = Evidence(
-        problem=problem,
-        estimates=estimates,
-        visited=visited(problem, simulated),
-        residual=residual,
-        misfit=objective.misfit(simulated),
-        spread=spread,
-        record=record,
-        balance=balance,
-        intervals=intervals,
-    )
-    checklist = make_checklist(evidence)
-    n_vary = 0 if insight is None else len(insight.names)  # determined or not, they follow the data
+    insight = look(best, _left_over(best)) if best.names else None
+    estimates = _estimates(best, insight, intervals)
+    balance, misfit = audit(measurement), objective.misfit(simulated)
+    checklist = make_checklist(Findings(best, estimates, misfit, record, balance, intervals))
+    springs = best.values[: len(problem.model.names)]
     return Fit(
         measurement=measurement,
         model=problem.model.name,
@@ -74,13 +52,13 @@ def conclude(
         seed=record.seed,
         status=status_of(checklist),
         warnings=warnings_of(checklist),
-        chain=problem.model.chain(springs, measurement.specimen.height, measurement.specimen.area),
+        chain=problem.model.chain(springs, specimen.height, specimen.area),
         params=problem.params,
         parameters=estimates,
-        visited=evidence.visited,
-        misfit=evidence.misfit,
+        visited=visited(problem, simulated),
+        misfit=misfit,
         weights=objective.weights,
-        statistics=_statistics(residual, n_vary, spread, objective, record),
+        statistics=_statistics(best, record),
         energy=balance.as_dict() | {"sentences": balance.sentences()},
         runtime_s=time.perf_counter() - record.began,
         curves=Curves(
@@ -96,31 +74,28 @@ def conclude(
             },
         ),
         switches=_switches(problem, simulated),
-        correlation=correlation,
-        notes=(*_notes(problem, values, simulated), *_noise_notes(objective), *intervals.notes),
+        correlation=Correlation(best.names, best.spread.correlation) if best.names else None,
+        notes=(*_notes(best), *_noise_notes(objective), *intervals.notes),
         checklist=checklist,
         insight=insight,
         stopped=record.stopped,
         loss=objective.loss,
-        noise=_noise(objective, residual),
+        noise=_noise(best),
         intervals=intervals,
     )
 
 
-def _noise(objective: Objective, residual: Array) -> dict[str, dict[str, Any]]:
+def _noise(best: BestPoint) -> dict[str, dict[str, Any]]:
     """Noise of each counted curve, how it is known, its scale, and the residuals over it."""
-    found = {}
-    ends = np.cumsum(objective.sizes)
-    for name, end, size in zip(objective.counted, ends, objective.sizes, strict=True):
-        level, scale = objective.noise(name), objective.scale[name]
-        part = residual[end - size : end] * scale / objective.weights[name] ** 0.5
-        rms = float(np.sqrt(np.mean(part**2)))
+    objective, found = best.problem.objective, {}
+    for name, rms in objective.rms(best.residual).items():
+        level = objective.noise(name)
         found[name] = {
             "sigma": level.sigma,
             "given": level.given,
             "how": level.how,
             "time": level.time,
-            "scale": scale,
+            "scale": objective.scale[name],
             "residual_over_noise": rms / level.sigma if level.sigma > 0.0 else None,
         }
     return found
@@ -146,7 +121,7 @@ def _noise_notes(objective: Objective) -> list[str]:
             told.append(f"{outliers.at.size} outliers of the {channel} are not fitted.")
     if objective.time_shift and objective.drive != "impact":
         told.append(
-            "time_shift: a foam whose stress relaxes leads its strain, and looks just as if the "
+            "time_shift: a foam whose stress relaxes leads its strain, and looks as if the "
             "motion were late."
         )
     if objective.loss != "linear":
@@ -157,8 +132,9 @@ def _noise_notes(objective: Objective) -> list[str]:
     return told
 
 
-def _notes(problem: Problem, values: Array, simulated: Simulated) -> tuple[str, ...]:
+def _notes(best: BestPoint) -> tuple[str, ...]:
     """What was left out of the model, and what it would change."""
+    problem, simulated = best.problem, best.simulated
     objective, specimen = problem.objective, problem.measurement.specimen
     unused = problem.notes + _along_integrated(problem, simulated)
     if len(problem.model.kinds) == 1 and problem.measurement.interior:
@@ -179,11 +155,11 @@ def _notes(problem: Problem, values: Array, simulated: Simulated) -> tuple[str, 
         )
     heavy = replace(objective, interior_mass=True)
     try:
-        other = heavy.simulate(values)
+        other = heavy.simulate(best.values)
     except SimulationError as error:
         return (*unused, f"{left_out}; with them the simulation ends: {error}.")
     changes = [
-        f"{name} by {_share(float(np.sqrt(np.mean((one - two) ** 2)) / np.ptp(one)))}"
+        f"{name} by {_share(one, two)}"
         for name, one, two in (
             ("the base stress", simulated.stress_time, other.stress_time),
             ("the displacement", simulated.displacement_time, other.displacement_time),
@@ -198,8 +174,9 @@ def _notes(problem: Problem, values: Array, simulated: Simulated) -> tuple[str, 
     )
 
 
-def _share(off: float) -> str:
-    return "less than 0.01%" if off < 1e-4 else f"{off:.2%}"
+def _share(one: Array, two: Array) -> str:
+    off = float(np.sqrt(np.mean((one - two) ** 2)) / np.ptp(one))
+    return "less than 0.01 %" if off < 1e-4 else percent(off)
 
 
 def _along_integrated(problem: Problem, simulated: Simulated) -> tuple[str, ...]:
@@ -221,90 +198,72 @@ def _along_integrated(problem: Problem, simulated: Simulated) -> tuple[str, ...]
     )
 
 
-def _estimate(
-    problem: Problem, values: Array, intervals: Intervals
-) -> tuple[dict[str, ParameterEstimate], covariance.Covariance | None, Insight | None]:
+def _estimates(
+    best: BestPoint, insight: Insight | None, intervals: Intervals
+) -> dict[str, ParameterEstimate]:
     """Value, uncertainty and state of every parameter; also put into lmfit's parameters."""
-    params = problem.params
-    lost = unreached(problem, values)
-    names = tuple(n for n in problem.names if params[n].vary and n not in lost)
-    spread = insight = None
-    if names:
-        around = Vicinity.of(problem, values, names)
-        spread = around.spread
-        insight = look(problem, values, names, around.jacobian, _left_over(around))
     out = {}
-    for i, name in enumerate(problem.names):
-        value, parameter = float(values[i]), params[name]
-        parameter.stderr = None
-        if name in lost and parameter.vary:
-            estimate = ParameterEstimate(
-                value, None, None, unit_of(name), True, "not determined",
-                f"branch {lost[name]} of spring {split_name(name)[0] + 1} was never reached",
-            )  # fmt: skip
-        elif name not in names:
-            why = "held fixed" if parameter.expr is None else f"tied by {parameter.expr}"
-            estimate = ParameterEstimate(value, None, None, unit_of(name), False, "fixed", why)
-        else:
-            assert spread is not None
+    for i, name in enumerate(best.problem.names):
+        value, parameter, unit = float(best.values[i]), best.problem.params[name], unit_of(name)
+        if name in best.names:
             assert insight is not None
-            estimate = _varied(problem, name, value, spread, insight, intervals)
-            parameter.stderr = estimate.stderr
-        out[name] = estimate
-    return out, spread, insight
+            out[name] = _varied(best, name, insight, intervals)
+        elif parameter.vary:
+            branch, spring = best.unreached[name], split_name(name)[0] + 1
+            why = f"branch {branch} of spring {spring} was never reached"
+            out[name] = ParameterEstimate(value, None, None, unit, True, "not determined", why)
+        else:
+            why = "held fixed" if parameter.expr is None else f"tied by {parameter.expr}"
+            out[name] = ParameterEstimate(value, None, None, unit, False, "fixed", why)
+        parameter.stderr = out[name].stderr
+    return out
 
 
-def _left_over(around: Vicinity) -> dict[str, float]:
+def _left_over(best: BestPoint) -> dict[str, float]:
     """One standard deviation of what is left of each curve, SI, its correlation counted."""
-    objective, out = around.problem.objective, {}
-    for name, process in zip(objective.counted, around.spread.noise, strict=True):
+    objective, out = best.problem.objective, {}
+    for name, process in zip(objective.counted, best.spread.noise, strict=True):
         spread = math.sqrt(max(process.variance * process.tau, 1e-300))
         out[name] = spread * objective.scale[name] / objective.weights[name] ** 0.5
     return out
 
 
 def _varied(
-    problem: Problem,
-    name: str,
-    value: float,
-    spread: covariance.Covariance,
-    insight: Insight,
-    intervals: Intervals,
+    best: BestPoint, name: str, insight: Insight, intervals: Intervals
 ) -> ParameterEstimate:
     """Estimate of a parameter that was varied and whose branch was reached."""
-    low, high = problem.params[name].min, problem.params[name].max
-    column = insight.names.index(name)
-    stderr = float(spread.stderr[column])
-    half = covariance.half_width(stderr, float(spread.freedom[column]))
+    (low, high), column = best.limits(name), best.names.index(name)
+    value, unit = float(best.values[best.index[name]]), unit_of(name)
+    stderr, half = float(best.spread.stderr[column]), float(best.halves[column])
     local = (value - half, value + half)
-    ends = _holding(value, intervals.ends.get(name, local))
+    ends = _ordered_with(value, intervals.ends.get(name, local))
     made, by_local = (
         min(pair[1], high) - max(pair[0], low)  # within the limits, which cut both
         for pair in (ends, local)
     )
     ratio = made / by_local if by_local > 0.0 else math.nan
-    # refits that stall in a long valley make a profile narrow: the wider interval is the honest one
-    stalled = ratio < 1.0 / ASTRAY and intervals.methods.get(name) == "profile likelihood"
+    method = intervals.methods.get(name, "local covariance")
+    # refits that stall in a long minimum make a profile narrow: the wider interval is taken
+    stalled = ratio < 1.0 / ASTRAY and method == "profile likelihood"
     ends = local if stalled else ends
-    verdict, why = state_of(name, value, ends, insight, (low, high))
-    if verdict == "determined" and problem.objective.interior_mass:
-        verdict, why = "weak", "the ringing of the interior mass leaves other valleys; " + why
-    if verdict == "not determined":
-        return ParameterEstimate(value, None, None, unit_of(name), True, verdict, why)
+    state, why = state_of(name, value, ends, insight, (low, high))
+    if state == "determined" and best.problem.objective.interior_mass:
+        state, why = "weak", "the vibration of the interior mass leaves other minima; " + why
+    if state == "not determined":
+        return ParameterEstimate(value, None, None, unit, True, state, why)
     if name in intervals.doubtful:
         why += "; its interval is local, though the cost is no parabola there"
-    ci95 = (max(ends[0], low), min(ends[1], high))
-    method = intervals.methods.get(name, "local covariance")
     if stalled:
         method = "local covariance"
         why += "; its profile is much narrower and was not taken"
     elif name in intervals.ends and (ratio < 1.0 / ASTRAY or ASTRAY < ratio < math.inf):
         stderr *= ratio
         why += "; its standard error is that of the interval, as the local one does not hold"
-    return ParameterEstimate(value, stderr, ci95, unit_of(name), True, verdict, why, method)
+    ci95 = (max(ends[0], low), min(ends[1], high))
+    return ParameterEstimate(value, stderr, ci95, unit, True, state, why, method)
 
 
-def _holding(value: float, ends: tuple[float, float]) -> tuple[float, float]:
+def _ordered_with(value: float, ends: tuple[float, float]) -> tuple[float, float]:
     """Ends of an interval in their order, moved out where they do not hold the value.
 
     Percentiles of refits, or of a chain, may all lie to one side of the best point.
@@ -321,67 +280,52 @@ def state_of(
 ) -> tuple[str, str]:
     """State of a parameter that varies and whose branch is reached, and the reason in one sentence.
 
-    Parameters
-    ----------
-    name : str
-        For example "s1_kc".
-    value : float
-        Its value.
-    ends : (float, float)
-        Of its 95 % interval, not cut at the limits; NaN or infinite where the data fix only a
-        combination.
-    insight : Insight
-        What the test can tell there.
-    limits : (float, float)
-        Its limits.
+    `ends` are those of its 95 % interval, not cut at its `limits`; NaN or infinite where the data
+    fix only a combination.
     """
-    size, short = float(insight.sizes[insight.names.index(name)]), split_name(name)[1]
+    size, short, unit = (
+        float(insight.sizes[insight.names.index(name)]),
+        split_name(name)[1],
+        unit_of(name),
+    )
     half = 0.5 * (ends[1] - ends[0])
     half = half if math.isfinite(half) else math.nan
-    verdict, why = covariance.state(value, half, size, *limits)
-    if verdict == "not determined":
-        trace = why if math.isfinite(half) else "it leaves no trace in the curves"
-        return verdict, insight.combination(name, covariance.NOTHING / 1.96) or trace
+    state, why = covariance.state(value, half, size, *limits, scale_in_words(name, value, size))
+    if state == "not determined":
+        reason = why if math.isfinite(half) else "the curves do not depend on it"
+        return state, insight.combination(name, covariance.NOTHING / 1.96) or reason
     at_bound = value in limits and value != 0.0
     if short in MAY_VANISH and ends[0] <= 0.0 <= ends[1] and not at_bound:
-        reach = engineering(ends[0] if short == "dsigma" else ends[1], unit_of(name))
-        reach = reach.replace("Pa s", "Pa·s").replace("-", "−")
-        where = "lies at its limit 0" if value == 0.0 else "is not told from zero"
-        return "weak", f"it {where}: its 95 % interval goes from 0 to {reach}"
-    if verdict == "determined":
-        return verdict, why
+        side, end = ("lower", ends[0]) if short == "dsigma" else ("upper", ends[1])
+        bound = engineering(end, unit).replace("Pa s", "Pa·s").replace("-", "−")
+        where = "lies at its limit 0" if value == 0.0 else "is consistent with zero"
+        return "weak", f"it {where}; {side} bound {bound} (95 %)"
+    if state == "determined":
+        return state, why
     past = [ends[0] <= limits[0], ends[1] >= limits[1]]
     if any(past) and "open" not in why:
-        limit, unit = limits[past.index(True)], unit_of(name)
+        limit = limits[past.index(True)]
         told = engineering(limit, unit) if unit else f"{limit:g}"
         why += f", open on one side: it reaches its limit {told}"
     together = insight.combination(name, covariance.WEAK / 1.96) or insight.companion(name)
-    return verdict, f"{why}; {together}" if together else why
+    return state, f"{why}; {together}" if together else why
 
 
-def _statistics(
-    residual: Array,
-    n_vary: int,
-    spread: covariance.Covariance | None,
-    objective: Objective,
-    record: SearchRecord,
-) -> dict[str, float | int | None]:
+def _statistics(best: BestPoint, record: SearchRecord) -> dict[str, float | int | None]:
     """Statistics as lmfit defines them (chi-square, AIC, BIC), and what the search cost."""
-    n = residual.size
-    cost = soften(residual, objective.loss)
-    chisqr = float(cost @ cost)
+    objective, chisqr = best.problem.objective, best.cost
+    n, n_vary = best.residual.size, len(best.names)  # determined or not, they follow the data
     log_likelihood = n * math.log(max(chisqr, 1e-300) / n)
-    aic = log_likelihood + 2 * n_vary
-    room = n - n_vary - 1
+    aic, freedom = log_likelihood + 2 * n_vary, n - n_vary - 1
     return {
         "n_data": n,
-        "n_effective": None if spread is None else spread.effective,
+        "n_effective": best.spread.effective if best.names else None,
         "n_left_out": sum(objective.measured_size(name) for name in objective.counted) - n,
         "n_vary": n_vary,
         "chisqr": chisqr,
         "redchi": chisqr / max(n - n_vary, 1),
         "aic": aic,
-        "aicc": aic + 2 * n_vary * (n_vary + 1) / room if room > 0 else None,
+        "aicc": aic + 2 * n_vary * (n_vary + 1) / freedom if freedom > 0 else None,
         "bic": log_likelihood + n_vary * math.log(n),
         "nfev": objective.evaluations,
         "n_failed": objective.failures,

@@ -13,18 +13,18 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 from scipy.linalg import toeplitz
 
-Array = NDArray[np.float64]
+from foamfit.arrays import Array
+from foamfit.text import percent
 
-# Half widths of the 95 % interval, over the natural size of a parameter, past which it is weak,
-# and past which the test says nothing about it.
+# Half widths of the 95 % interval, over the scale of a parameter (`fitting.box.Scales`), past which
+# it is weak, and past which the test does not determine it.
 WEAK, NOTHING = 0.5, 3.0
-# A parameter this close to a limit, over its natural size, lies at it.
+# A parameter this close to a limit, over its scale, lies at it.
 AT_LIMIT = 1e-6
-# Two directions closer than this cannot be told apart.
+# Two directions closer than this count as one.
 SINGULAR = 1e-12
 # Of the autoregressive noise: most orders, largest reflection coefficient, rounds of correction.
 MOST_ORDERS, LARGEST, CORRECTIONS = 10, 0.995, 4
@@ -32,21 +32,12 @@ MOST_ORDERS, LARGEST, CORRECTIONS = 10, 0.995, 4
 
 @dataclass(frozen=True, eq=False)
 class NoiseProcess:
-    """Autoregressive noise of one curve: x_t = Σ φ_j x_(t-j) + white.
+    """Autoregressive noise of one curve: x_t = Σ φ_j x_(t-j) + white."""
 
-    Attributes
-    ----------
-    coefficients : (p,) array
-        φ_1 … φ_p; none for white noise.
-    variance : float
-        Of the process itself, not of the white noise that drives it.
-    samples : float
-        How many it was read off, less those that the parameters of the fit took; infinite if it is
-        known.
-    """
-
-    coefficients: Array
-    variance: float
+    coefficients: Array  # (p,): φ_1 … φ_p; none for white noise
+    variance: float  # Of the process itself, not of the white noise that drives it
+    # How many it was read off, less those that the parameters of the fit took; infinite if it is
+    # known.
     samples: float = math.inf
 
     def autocovariance(self, n: int) -> Array:
@@ -145,14 +136,8 @@ def noise_processes(residual: Array, jacobian: Array, sizes: tuple[int, ...]) ->
     smaller than the noise was. With the hat matrix H = QQᵀ of the fit, residuals (I-H)e have the
     expected lag sums tr S_k (I-H)Σ(I-H); the autocovariances are corrected by what Σ itself loses.
 
-    Parameters
-    ----------
-    residual : (n,) array
-        All curves after each other, each in the order of time.
-    jacobian : (n, k) array
-        Derivative of the residual, in any scaling of its columns.
-    sizes : tuple of int
-        Samples of each curve.
+    `residual` (n,) holds all curves after each other, each in the order of time, so many samples of
+    each as in `sizes`; `jacobian` (n, k) may have any scaling of its columns.
     """
     basis = _basis(jacobian)
     curves = parts(sizes)
@@ -221,13 +206,7 @@ def _basis(jacobian: Array) -> Array:
 
 
 def autocorrelation_time(residual: Array) -> float:
-    """Autocorrelation time τ = 1 + 2 Σ ρ_k >= 1 of a residual, in samples; white noise has τ = 1.
-
-    Parameters
-    ----------
-    residual : (n,) array
-        In the order of time.
-    """
+    """Autocorrelation time τ = 1 + 2 Σ ρ_k >= 1 of a residual, in samples; 1 of white noise."""
     if residual.size < 8 or not residual.any():
         return 1.0
     return noise_process(residual).tau
@@ -235,31 +214,19 @@ def autocorrelation_time(residual: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """Covariance of the varied parameters at the best point.
+    """Covariance of the varied parameters at the best point."""
 
-    Attributes
-    ----------
-    matrix : (k, k) array
-        Covariance, SI; NaN rows and columns where the test says nothing.
-    inflation : (k,) array
-        Variance of each parameter over that of a residual of white noise of unit variance: what a
-        rise of the sum of squares along a parameter's profile must be divided by to be a χ².
-    freedom : (k,) array
-        Degrees of freedom of each variance: those of the χ² distribution that is as uncertain as
-        the estimated noise makes it (Satterthwaite 1946, Biometrics Bull. 2, 110), but no more than
-        the effective samples that the parameters have left: what a model cannot follow is no noise
-        whose spectrum is known.
-    effective : float
-        Effective number of samples.
-    noise : tuple of NoiseProcess
-        Noise of each curve, in units of the residual.
-    """
-
-    matrix: Array
+    matrix: Array  # (k, k): Covariance, SI; NaN rows and columns where the test says nothing
+    # (k,): Variance of each parameter over that of a residual of white noise of unit variance: what
+    # a rise of the sum of squares along a parameter's profile must be divided by to be a χ².
     inflation: Array
+    # (k,): Degrees of freedom of each variance: those of the χ² distribution that is as uncertain
+    # as the estimated noise makes it (Satterthwaite 1946, Biometrics Bull. 2, 110), but no more
+    # than the effective samples that the parameters have left: what a model cannot follow is no
+    # noise whose spectrum is known.
     freedom: Array
-    effective: float
-    noise: tuple[NoiseProcess, ...]
+    effective: float  # Effective number of samples
+    noise: tuple[NoiseProcess, ...]  # Noise of each curve, in units of the residual
 
     @property
     def tau(self) -> tuple[float, ...]:
@@ -283,16 +250,8 @@ def covariance(
 ) -> Covariance:
     """Covariance (JᵀJ)⁻¹ JᵀΣJ (JᵀJ)⁻¹ with Σ the noise of each curve (`noise_processes`).
 
-    Parameters
-    ----------
-    jacobian : (n, k) array
-        Derivative of the residual.
-    residual : (n,) array
-        At the best point.
-    sizes : tuple of int
-        Samples of each curve, in their order.
-    sizes_of : (k,) array
-        Natural size of each parameter, so that directions can be compared.
+    `residual` (n,) and `jacobian` (n, k) are those of the best point, so many samples of each curve
+    as in `sizes`; `sizes_of` (k,) are the scales of the parameters, so that directions compare.
     """
     scaled = jacobian * sizes_of
     noise = noise_processes(residual, scaled, sizes)
@@ -334,35 +293,22 @@ def half_width(stderr: float, freedom: float) -> float:
     return float(stats.t.ppf(0.975, max(freedom, 1.0))) * stderr
 
 
-def state(value: float, half: float, size: float, low: float, high: float) -> tuple[str, str]:
+def state(
+    value: float, half: float, size: float, low: float, high: float, of: str = "its value"
+) -> tuple[str, str]:
     """State of a parameter that was varied and whose branch was reached, and why.
 
-    Parameters
-    ----------
-    value : float
-        Identified value.
-    half : float
-        Half of its 95 % interval, not cut at the limits; NaN where the data fix only a combination.
-    size : float
-        Its natural size.
-    low, high : float
-        Its limits.
+    `half` is half of its 95 % interval, not cut at the limits, NaN where the data fix only a
+    combination; `size` is its scale, in words `of`; `low` and `high` are its limits.
     """
     if not math.isfinite(half):
         return "not determined", "the data fix only a combination of it with other parameters"
-    edge = AT_LIMIT * size
+    ratio, edge = half / size, AT_LIMIT * size
+    width = f"its 95 % interval is ±{percent(ratio)} of {of}"
     if half > NOTHING * size:
-        return "not determined", f"its 95 % interval is {_wide(half / size)} its natural size"
+        wide = "more than 100 times" if ratio > 100.0 else f"±{ratio:.2g} times"
+        return "not determined", f"its 95 % interval is {wide} {of}"
     if value - low <= edge or high - value <= edge:
         limit = low if value - low <= edge else high
         return "weak", f"it lies at its limit {limit:g}; its interval is open on that side"
-    if half > WEAK * size:
-        return "weak", f"its 95 % interval is ±{half / size:.0%} of its natural size"
-    return "determined", f"its 95 % interval is ±{half / size:.1%} of its natural size"
-
-
-def _wide(ratio: float) -> str:
-    """Write the half width of a hopeless interval over the natural size so that it can be read."""
-    if ratio > 100.0:
-        return "more than 100 times"
-    return f"±{ratio:.2g} times" if ratio > 2.0 else f"±{ratio:.0%} of"
+    return "weak" if half > WEAK * size else "determined", width

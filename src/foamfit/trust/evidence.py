@@ -8,17 +8,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from foamfit.fitting.problem import Problem
+from foamfit.arrays import Array
+from foamfit.fitting.branches import branch_of_samples
+from foamfit.fitting.losses import soften, softness
 from foamfit.results import Fit, rung_name
-from foamfit.springs import kernels
+from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import NOTHING, autocorrelation_time
-from foamfit.trust.residual_tests import branch_places, neighbours_test, runs_test
-
-Array = NDArray[np.float64]
+from foamfit.trust.residual_tests import neighbours_test, runs_test
 
 # Residuals are structureless where neither test of their order rejects it at this level.
 LEVEL = 0.05
@@ -31,40 +32,54 @@ EXACT = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class Tried:
-    """A fitted rung, and what is needed to weigh it against the others.
-
-    Attributes
-    ----------
-    result : Fit
-        Its result.
-    damping : str
-        As in `Rung`.
-    residual : (n_data,) array
-        At the best point, curve after curve.
-    counted : tuple of str
-        Names of the curves.
-    sizes : tuple of int
-        Samples of each curve.
-    spans : tuple of float
-        Measured range of each curve, in the unit of its residual.
-    places : tuple of (n,) arrays of str
-        Branches that the springs are on at each counted sample of each curve.
-    grams : (n_curves, k, k) array
-        JᵀJ of each curve, J the derivative of the residual by the varied parameters over their
-        natural sizes.
-    seconds : float
-        Run time.
-    """
+    """A fitted rung: its result, "with" or "without" damping, its best point, and its run time."""
 
     result: Fit
     damping: str
-    residual: Array
-    counted: tuple[str, ...]
-    sizes: tuple[int, ...]
-    spans: tuple[float, ...]
-    places: tuple[NDArray[np.str_], ...]
-    grams: Array
+    best: BestPoint
     seconds: float
+
+    @property
+    def counted(self) -> tuple[str, ...]:
+        """Names of the curves."""
+        return self.best.problem.objective.counted
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Samples of each curve."""
+        return self.best.problem.objective.sizes
+
+    @cached_property
+    def residual(self) -> Array:
+        """At the best point, curve after curve, (n_data,)."""
+        return soften(self.best.residual, self.best.problem.objective.loss)
+
+    @cached_property
+    def spans(self) -> tuple[float, ...]:
+        """Measured range of each curve, in the unit of its residual."""
+        objective, out = self.best.problem.objective, []
+        for name in self.counted:
+            measured = objective.measured[name]
+            assert measured is not None
+            weight, scale = objective.weights[name] ** 0.5, objective.scale[name]
+            out.append(weight * float(np.ptp(measured)) / scale)
+        return tuple(out)
+
+    @property
+    def places(self) -> list[NDArray[np.str_]]:
+        """Branches that the springs are on at each counted sample of each curve."""
+        objective = self.best.problem.objective
+        words = branch_of_samples(self.best.problem, self.best.simulated)
+        return [words[objective.kept(name)] for name in self.counted]
+
+    @cached_property
+    def grams(self) -> Array:
+        """JᵀJ of each curve, J the derivative by relative changes, (n_curves, k, k)."""
+        loss = self.best.problem.objective.loss
+        jacobian = self.best.jacobian * self.best.sizes
+        jacobian = jacobian * softness(self.best.residual, loss)[:, None]
+        parts = np.split(jacobian, np.cumsum(self.sizes)[:-1])
+        return np.array([part.T @ part for part in parts])
 
     @property
     def name(self) -> str:
@@ -87,7 +102,7 @@ class Tried:
         """Chi-square, not less than that of the simulation's own error."""
         return max(float(self.residual @ self.residual), self.floor)
 
-    @property
+    @cached_property
     def taus(self) -> list[float]:
         """Autocorrelation time of each curve, samples."""
         return [autocorrelation_time(part) for part in self.curves]
@@ -112,48 +127,15 @@ class Tried:
         return tuple(n for n, item in self.result.parameters.items() if item.state == state)
 
 
-def weigh(problem: Problem, result: Fit, damping: str, seconds: float) -> Tried:
-    """Take from a fit what is needed to compare it."""
-    objective = problem.objective
-    values, names = problem.vector(), problem.free()
-    jacobian = problem.slopes(values, names) * problem.sizes(names, values)
-    parts = np.split(jacobian, np.cumsum(objective.sizes)[:-1])
-    spans = tuple(
-        objective.weights[name] ** 0.5 * _range(objective.measured[name]) / objective.scale[name]
-        for name in objective.counted
-    )
-    stress = problem.measurement.stress
-    assert stress is not None
-    switches = objective.simulate(values, everything=True).motion.switches
-    places = branch_places(
-        problem.model.kinds, switches, objective.time, stress, kernels.BRANCH_NAMES
-    )
-    return Tried(
-        result=result,
-        damping=damping,
-        residual=objective.residual(values),
-        counted=objective.counted,
-        sizes=objective.sizes,
-        spans=spans,
-        places=tuple(places[objective.kept(name)] for name in objective.counted),
-        grams=np.array([part.T @ part for part in parts]),
-        seconds=seconds,
-    )
-
-
-def _range(curve: Array | None) -> float:
-    return 0.0 if curve is None else float(np.ptp(curve))
-
-
 @dataclass(frozen=True)
-class Evidence:
-    """What speaks for a rung, all rungs by one measure of the noise."""
+class Criteria:
+    """Information criteria of a rung, all rungs by one measure of the noise."""
 
     rank: int
     aicc: float
     bic: float
 
-    def beats(self, other: Evidence) -> bool:
+    def beats(self, other: Criteria) -> bool:
         """Whether AICc and BIC both speak for this one, strongly."""
         return self.aicc < other.aicc - MARGIN and self.bic < other.bic - MARGIN
 
@@ -177,17 +159,10 @@ def effective_samples(reference: Tried) -> float:
 def effective_parameters(grams: Array, reference: Tried) -> int:
     """How many combinations of its parameters the curves fix against the noise.
 
-    The rank of the Jacobian, counted against the noise: a direction counts if its 95 % interval is
-    narrower than ±`NOTHING` natural sizes, the limit at which a parameter is called not determined.
-    Where a linear spring in series only bends the branches of a bistable one, such directions are
-    combinations that leave no trace.
-
-    Parameters
-    ----------
-    grams : (n_curves, k, k) array
-        See `Tried`.
-    reference : Tried
-        Its residuals are the noise.
+    The rank of the Jacobian (`grams` as in `Tried`), counted against the residuals of `reference`
+    as noise: a direction counts if its 95 % interval is narrower than a relative change of
+    ±`NOTHING`, the limit at which a parameter is called not determined. Where a linear spring in
+    series only bends the branches of a bistable one, the curves do not depend on such combinations.
     """
     information = np.zeros(grams.shape[1:])
     for gram, part, tau in zip(grams, reference.curves, reference.taus, strict=True):
@@ -197,27 +172,22 @@ def effective_parameters(grams: Array, reference: Tried) -> int:
     return max(int(np.count_nonzero(NOTHING * singular > 1.96)), 1)
 
 
-def evidence(one: Tried, reference: Tried) -> Evidence:
+def criteria(one: Tried, reference: Tried) -> Criteria:
     """AICc and BIC of a rung: n_eff ln(χ²/n) and the penalty for its effective parameters."""
     n_eff = effective_samples(reference)
     rank = effective_parameters(one.grams, reference)
     fit = n_eff * math.log(max(one.chisqr, 1e-300) / one.residual.size)
-    room = n_eff - rank - 1.0
-    aicc = fit + 2.0 * rank + 2.0 * rank * (rank + 1.0) / room if room > 0.0 else math.inf
-    return Evidence(rank, aicc, fit + rank * math.log(max(n_eff, 1.0)))
+    freedom = n_eff - rank - 1.0
+    aicc = fit + 2.0 * rank + 2.0 * rank * (rank + 1.0) / freedom if freedom > 0.0 else math.inf
+    return Criteria(rank, aicc, fit + rank * math.log(max(n_eff, 1.0)))
 
 
-def choose(tried: Sequence[Tried]) -> tuple[int, list[Evidence]]:
-    """Index of the simplest rung that no richer one beats, and the evidence for each."""
+def choose(tried: Sequence[Tried]) -> tuple[int, list[Criteria]]:
+    """Index of the simplest rung that no richer one beats, and the criteria of each."""
     reference = reference_of(tried)
-    found = [evidence(one, reference) for one in tried]
+    found = [criteria(one, reference) for one in tried]
     best = 0
     for i in range(1, len(tried)):
         if found[i].beats(found[best]):
             best = i
     return best, found
-
-
-def least(values: Sequence[float]) -> int:
-    """Index of the least value."""
-    return min(range(len(values)), key=values.__getitem__)

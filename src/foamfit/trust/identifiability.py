@@ -1,8 +1,8 @@
-"""What a test can tell of its parameters: branches reached, sensitivities, information, directions.
+"""What a test can tell of its parameters: sensitivities, information, directions.
 
 Everything here is local: it holds at one point of the parameters, before a fit (a start) or after
-it. Sensitivities are counted in standard deviations of the noise per natural size of a parameter,
-so that parameters and curves can be compared.
+it. Sensitivities are in standard deviations of the noise per relative change of a parameter (over
+its scale, `fitting.box.Scales.of_parameter`), so that parameters and curves can be compared.
 """
 
 from __future__ import annotations
@@ -10,129 +10,38 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from foamfit.springs import kernels
-from foamfit.springs.model import BRANCHES, split_name
-
-if TYPE_CHECKING:
-    from foamfit.fitting.objective import Simulated
-    from foamfit.fitting.problem import Problem
-
-Array = NDArray[np.float64]
+from foamfit.arrays import Array
+from foamfit.fitting.box import scale_in_words
+from foamfit.fitting.branches import Section, sections
+from foamfit.text import listed, percent
+from foamfit.trust.best_point import BestPoint
 
 # Shares of a direction below which a parameter has no part in it, and of the largest below which
 # it is not named.
 PART, NAMED = 0.05, 0.3
 # Parameters of a joint change that are named at most.
 MOST = 3
-FLIGHT = "free flight"
-
-
-# ---------------------------------------------------------------- branches
-
-
-def visited(problem: Problem, simulated: Simulated) -> dict[str, tuple[str, ...]]:
-    """Branches that each spring went through, in the order of the first visit."""
-    seen = {
-        i: ["a" if kind == "bistable" else "line"] for i, kind in enumerate(problem.model.kinds)
-    }
-    for _, spring, _, entered, _ in simulated.motion.switches:
-        name = kernels.BRANCH_NAMES[int(entered)]
-        if name not in seen[int(spring)]:
-            seen[int(spring)].append(name)
-    return {f"s{i + 1}": tuple(names) for i, names in seen.items()}
-
-
-def unreached(problem: Problem, values: Array) -> dict[str, str]:
-    """Parameters whose branch was never reached, and that branch."""
-    seen = visited(problem, problem.objective.simulate(values, everything=True))
-    out = {}
-    for name in problem.model.names:
-        spring, short = split_name(name)
-        branch = BRANCHES.get(short)
-        bistable = branch and problem.model.kinds[spring] == "bistable"
-        if branch and bistable and branch not in seen[f"s{spring + 1}"]:
-            out[name] = branch
-    return out
-
-
-@dataclass(frozen=True)
-class Section:
-    """Samples `start` to `stop` (excluded) in which no spring changes its branch.
-
-    `branches` names those of the bistable springs from the base up, joined by a dot: "d" or "a·c".
-    """
-
-    branches: str
-    start: int
-    stop: int
-
-
-def sections(problem: Problem, simulated: Simulated) -> tuple[Section, ...]:
-    """Cut the samples of a run at its switches and at the end of contact, in the order of time."""
-    soft = [i for i, kind in enumerate(problem.model.kinds) if kind == "bistable"]
-    state = dict.fromkeys(soft, "a")
-    clock, motion = problem.objective.time, simulated.motion
-
-    def label() -> str:
-        return "·".join(state.values()) or "line"
-
-    cuts: list[tuple[int, str]] = [(0, label())]
-    for when, spring, _, entered, _ in motion.switches:
-        if int(spring) in state:
-            state[int(spring)] = kernels.BRANCH_NAMES[int(entered)]
-            cuts.append((int(np.searchsorted(clock, when)), label()))
-    if np.isfinite(motion.contact_end):
-        cuts.append((int(np.searchsorted(clock, motion.contact_end, side="right")), FLIGHT))
-    ends = [start for start, _ in cuts[1:]] + [clock.size]
-    return tuple(
-        Section(name, start, min(stop, clock.size))
-        for (start, name), stop in zip(cuts, ends, strict=True)
-        if stop > start
-    )
-
-
-# ---------------------------------------------------------------- sensitivities
 
 
 @dataclass(frozen=True, eq=False)
 class Insight:
-    """The sensitivities of all counted curves to the parameters that they can tell of.
+    """The sensitivities of all counted curves to the parameters that they can tell of."""
 
-    Attributes
-    ----------
-    names : (k,) tuple of str
-        Parameters that vary and whose branch was reached.
-    values, sizes : (k,) arrays
-        Where they stand and their natural sizes, SI.
-    curves : tuple of str
-        Counted curves, in the order of the rows of `scaled`.
-    clock : (n_samples,) array
-        Time of the samples, s; their number where the test has no time.
-    timed : bool
-        Whether the clock is a time.
-    scaled : (len(curves) * n_samples, k) array
-        By how many standard deviations of its noise a curve moves, sample by sample, if a parameter
-        changes by its natural size; to first order. Zero at samples that are not counted.
-    sections : tuple of Section
-        The stretches of the run between switches.
-    silent : tuple of str
-        Parameters that vary but whose branch was never reached.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # (k,): Parameters that vary and whose branch was reached
+    # (k,): Where they stand and their scales, SI.
     values: Array
     sizes: Array
-    curves: tuple[str, ...]
-    clock: Array
-    timed: bool
+    curves: tuple[str, ...]  # Counted curves, in the order of the rows of `scaled`
+    clock: Array  # (n_samples,): Time of the samples, s; their number where the test has no time
+    timed: bool  # Whether the clock is a time
+    # (len(curves): By how many standard deviations of its noise a curve moves, sample by sample, if
+    # a parameter changes by its scale; to first order. Zero at samples that are not counted.
     scaled: Array
-    sections: tuple[Section, ...]
-    silent: tuple[str, ...] = ()
+    sections: tuple[Section, ...]  # The stretches of the run between switches
+    silent: tuple[str, ...] = ()  # Parameters that vary but whose branch was never reached
 
     @cached_property
     def _directions(self) -> tuple[Array, Array]:
@@ -150,7 +59,7 @@ class Insight:
 
     @property
     def stderr(self) -> Array:
-        """Standard errors that the noise alone leaves, SI, (k,); infinite if nothing is told."""
+        """Standard errors that the noise alone leaves, SI, (k,); infinite if undetermined."""
         return np.sqrt(self._variance) * self.sizes
 
     @cached_property
@@ -217,7 +126,7 @@ class Insight:
     # ------------------------------------------------------------ in words
 
     def weakest(self) -> tuple[float, dict[str, float]]:
-        """Standard error along the weakest direction (natural sizes), and its largest parts.
+        """Standard error along the weakest direction (relative), and its largest parts.
 
         The direction is the right singular vector of the smallest singular value of `scaled`; its
         parts are over the largest of them, which is 1.
@@ -229,40 +138,36 @@ class Insight:
         return float(errors[-1]), named
 
     def sentence(self) -> str:
-        """Say what the test tells least, in one sentence; "" if there is nothing to tell of."""
+        """Say what the test determines least; "" if no parameter is left to speak of."""
         if not self.names:
             return ""
         error, parts = self.weakest()
-        size = "cannot be told at all" if error > 1e3 else f"has a standard error of {error:.2g}"
-        names, start = list(parts), "The test says least about"
-        if self.silent:
-            start = (
-                f"The test says nothing of {_listed(list(self.silent))}, and least of the rest of"
-            )
+        names = list(parts)
+        lost = "the curves do not depend on it"
         if len(names) == 1:
-            of = "" if error > 1e3 else " of its natural size"
-            return f"{start} {names[0]}, which {size}{of}."
-        joint = ", ".join(
-            f"{name} by {part:+.2g}".replace("-", "−") for name, part in parts.items()
+            at = self.names.index(names[0])
+            of = scale_in_words(names[0], float(self.values[at]), float(self.sizes[at]))
+            known = lost if error > 1e3 else f"its standard error is {percent(error)} of {of}"
+            told = f"The least determined parameter is {names[0]}: {known}."
+        else:
+            joint = listed(f"{name} ({part:+.2g})" for name, part in parts.items())
+            known = lost if error > 1e3 else f"its standard error is {percent(error)}"
+            told = (
+                f"The least determined combination is a joint relative change of "
+                f"{joint.replace('-', '−')}: {known}."
+            )
+        if not self.silent:
+            return told
+        return (
+            f"{listed(self.silent)} cannot be determined: no branch they act on was reached. {told}"
         )
-        joint += " (in natural sizes)"
-        return f"{start} {_listed(names)} together: a joint change of {joint} {size}."
 
     def combination(self, name: str, loose: float) -> str:
         """Say what the data fix instead of a parameter; "" if it is loose by itself.
 
-        Parameters
-        ----------
-        name : str
-            One of `names`.
-        loose : float
-            Directions whose standard error (natural sizes) is larger are taken for free.
-
-        Returns
-        -------
-        str
-            If one combination of the parameters that can move together is fixed, that one as a
-            product of powers, good to first order; else those that make up for a change of it.
+        Directions whose relative standard error is larger than `loose` are taken for free. If one
+        combination of the parameters that can move together is fixed, it is given as a product of
+        powers, good to first order; else those parameters that compensate a change of it.
         """
         errors, vt = self._directions
         free = vt[errors > loose]
@@ -273,27 +178,25 @@ class Insight:
         moving = int(np.sum(singular > NAMED))
         names = [self.names[i] for i in group]
         if moving == len(group):
-            return f"the data say nothing of {_listed(names)}"
+            return f"the curves determine no combination of {listed(names)}"
         if moving == len(group) - 1:
             # d ln|p| = (size/p) dx, so exponents are the weights of x times p/size.
             powers = left[:, -1] * self.values[group] / self.sizes[group]
             if np.all(self.values[group] != 0.0):
                 return f"the data fix only {_product(names, powers)}"
-        return self._made_up(name, free, errors[errors > loose])
+        return self._compensated(name, free, errors[errors > loose])
 
-    def _made_up(self, name: str, free: Array, errors: Array) -> str:
-        """Say which parameters make up for one: how they go with it along the free directions."""
+    def _compensated(self, name: str, free: Array, errors: Array) -> str:
+        """Say which parameters compensate a change of one, along the free directions."""
         me = self.names.index(name)
         change = (free[:, me] * np.minimum(errors, 1e6) ** 2) @ free
         change = change / change[me]
         change[me] = 0.0
         order = np.argsort(-np.abs(change), kind="stable")
         parts = [i for i in order if abs(change[i]) > NAMED * abs(change[order[0]])]
-        told = ", ".join(
-            f"{self.names[i]} ({change[i]:+.2g})".replace("-", "−") for i in parts[:MOST]
-        )
+        told = ", ".join(f"{self.names[i]} ({change[i]:+.2g})" for i in parts[:MOST])
         more = f" and {len(parts) - MOST} more" if len(parts) > MOST else ""
-        return f"a change by one natural size is made up for by {told}{more}"
+        return f"compensated by {told.replace('-', '−')}{more} (relative changes)"
 
     def _group(self, free: Array, member: int) -> list[int]:
         """Parameters that can move together with one, itself included, along free directions."""
@@ -307,65 +210,41 @@ class Insight:
         return sorted(group)
 
     def companion(self, name: str, correlation: float = 0.9) -> str:
-        """Say with which parameter one is told together; "" if no correlation is that strong."""
+        """Name the parameter that one is correlated with; "" if no correlation is that strong."""
         row = np.nan_to_num(self.correlation[self.names.index(name)])
         row[self.names.index(name)] = 0.0
         at = int(np.argmax(np.abs(row)))
         if abs(row[at]) < correlation:
             return ""
-        shown = f"{row[at]:.2f}".replace("-", "−")
-        return f"it is told only together with {self.names[at]} (correlation {shown})"
+        return f"correlated with {self.names[at]} (r = {row[at]:.2f})".replace("-", "−")
 
 
-def look(
-    problem: Problem,
-    values: Array,
-    names: tuple[str, ...],
-    slopes: Array,
-    noise: Mapping[str, float],
-) -> Insight:
-    """Gather what a test can tell at a point of the parameters.
+def look(best: BestPoint, noise: Mapping[str, float]) -> Insight:
+    """Gather what a test can tell at a point of the parameters, usually the best one.
 
-    Parameters
-    ----------
-    problem : Problem
-        What is fitted.
-    values : (n,) array
-        The point, SI, in the order of the model's names.
-    names : tuple of str
-        Parameters that vary and whose branch is reached.
-    slopes : (n_data, k) array
-        `Problem.slopes` there.
-    noise : mapping
-        One standard deviation of each counted curve, SI; of noise that is not white, the root of
-        its autocorrelation time larger.
+    `noise` is one standard deviation of each counted curve, SI; of noise that is not white, the
+    root of its autocorrelation time larger.
     """
-    objective = problem.objective
+    problem, objective = best.problem, best.problem.objective
     n, at = objective.time.size, 0
-    scaled = np.zeros((len(objective.counted) * n, len(names)))
+    scaled = np.zeros((len(objective.counted) * n, len(best.names)))
     for c, curve in enumerate(objective.counted):
         kept = objective.kept(curve)
         weighed = objective.weights[curve] ** 0.5 / objective.scale[curve]
-        rows = slopes[at : at + kept.size] * problem.sizes(names, values)
+        rows = best.jacobian[at : at + kept.size] * best.sizes
         scaled[c * n + kept] = rows / (weighed * noise[curve])
         at += kept.size
-    simulated = objective.simulate(values, everything=True)
-    lost = unreached(problem, values)
     return Insight(
-        names=names,
-        values=np.array([values[problem.index[name]] for name in names]),
-        sizes=problem.sizes(names, values),
+        names=best.names,
+        values=np.array([best.values[problem.index[name]] for name in best.names]),
+        sizes=best.sizes,
         curves=objective.counted,
         clock=objective.time,
         timed=problem.measurement.time is not None,
         scaled=scaled,
-        sections=sections(problem, simulated),
-        silent=tuple(name for name in problem.free() if name in lost),
+        sections=sections(problem, best.simulated),
+        silent=tuple(name for name in problem.free() if name in best.unreached),
     )
-
-
-def _listed(names: list[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 def _product(names: list[str], powers: Array) -> str:

@@ -1,174 +1,40 @@
-"""The neighbourhood of the best point: its covariance, and refits with some parameters held."""
+"""Least squares close to the best point with some parameters held."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from foamfit.fitting.objective import influence, soften, softness
-from foamfit.fitting.problem import Problem
+from foamfit.arrays import Array
+from foamfit.fitting.levenberg import Iterate, damped_step, descend_updated
+from foamfit.fitting.losses import soften, softness
 from foamfit.fitting.search import Tracker
-from foamfit.trust import covariance
-from foamfit.trust.covariance import Covariance
+from foamfit.trust.best_point import BestPoint
 
-Array = NDArray[np.float64]
-
-# How often a refit gets new slopes before it is taken as it is.
+# How often a refit gets a new Jacobian before it is taken as it is.
 RENEWALS = 2
 # Largest drop of the stress from A1 to C2 over the stress at A1.
 LAST_DROP = 0.999
 
 
-def m_estimate(residual: Array, sizes: tuple[int, ...], loss: str) -> tuple[Array, Array]:
-    """Weights of slopes and pseudo-residuals whose least squares have the covariance of a loss.
-
-    With the mean m of ψ'(r) over each curve: √m and ψ(r)/√m. The normal matrix of the slopes so
-    weighted is half the curvature of the cost, and the covariance of their least squares that of
-    an M-estimate (Huber 1981, Robust Statistics, section 7.6). Under the linear loss they are one
-    and the residuals.
-
-    Parameters
-    ----------
-    residual : (n,) array
-        Before the loss.
-    sizes : tuple of int
-        Samples of each curve.
-    loss : str
-        See `fitting.objective.soften`.
-    """
-    psi, slope = influence(residual, loss)
-    weights = np.empty(residual.size)
-    for part in covariance.parts(sizes):
-        weights[part] = max(float(slope[part].mean()), 0.05) ** 0.5
-    return weights, psi / weights
-
-
-@dataclass(frozen=True, eq=False)
-class Vicinity:
-    """The best point of a problem and its local covariance.
-
-    Attributes
-    ----------
-    problem : Problem
-        What was fitted.
-    values : (n,) array
-        All parameters of the model there, SI.
-    residual : (n_data,) array
-        Of the objective there, before its loss gives way to large ones.
-    names : tuple of str
-        Parameters that vary and whose branch was reached.
-    sizes : (k,) array
-        Their natural sizes.
-    jacobian : (n_data, k) array
-        Derivative of `residual` by them.
-    spread : Covariance
-        Of them, as estimated with the loss.
-    """
-
-    problem: Problem
-    values: Array
-    residual: Array
-    names: tuple[str, ...]
-    sizes: Array
-    jacobian: Array
-    spread: Covariance
-
-    @classmethod
-    def of(cls, problem: Problem, values: Array, names: tuple[str, ...]) -> Vicinity:
-        """Look around a point."""
-        objective = problem.objective
-        residual = objective.differences(values)
-        sizes = problem.sizes(names, values)
-        jacobian = problem.linear.slopes(values, names)
-        weights, pseudo = m_estimate(residual, objective.sizes, objective.loss)
-        spread = covariance.covariance(jacobian * weights[:, None], pseudo, objective.sizes, sizes)
-        return cls(problem, values, residual, names, sizes, jacobian, spread)
-
-    @property
-    def cost(self) -> float:
-        """Sum of squares of the residual, softened by the loss."""
-        soft = soften(self.residual, self.problem.objective.loss)
-        return float(soft @ soft)
-
-    @property
-    def index(self) -> dict[str, int]:
-        """Place of each parameter in `values`."""
-        return self.problem.index
-
-    @cached_property
-    def quantiles(self) -> Array:
-        """Student's t of the 95 % interval of each parameter, (k,)."""
-        return np.array([covariance.half_width(1.0, freedom) for freedom in self.spread.freedom])
-
-    def limits(self, name: str) -> tuple[float, float]:
-        """Limits of a parameter, SI."""
-        parameter = self.problem.params[name]
-        return float(parameter.min), float(parameter.max)
-
-    def knows(self, name: str) -> bool:
-        """Whether the local interval says anything of a parameter."""
-        column = self.names.index(name)
-        half = self.quantiles[column] * self.spread.stderr[column]
-        return bool(half <= covariance.NOTHING * self.sizes[column])
-
-    def along(self, name: str) -> Array:
-        """Change of all parameters per change of one, as their correlation has it, (k,)."""
-        column = self.names.index(name)
-        covariance = self.spread.matrix[:, column]
-        return np.asarray(np.nan_to_num(covariance / covariance[column]))
-
-
-@dataclass(frozen=True, eq=False)
-class Place:
-    """A point at which some parameters were refitted.
-
-    `slopes` are the derivatives of its residual by the scaled parameters of the vicinity, as far
-    as they are known there.
-    """
-
-    point: Array
-    residual: Array
-    slopes: Array
-
-    @property
-    def cost(self) -> float:
-        """Sum of squares."""
-        return float(self.residual @ self.residual)
-
-
 @dataclass(eq=False)
 class Refit:
-    """Least squares in the vicinity of the best point, with some parameters held.
+    """Least squares close to the best point, with some parameters held."""
 
-    Levenberg-Marquardt steps with the slopes of the neighbour, kept up by Broyden's rank-one
-    updates (Broyden 1965, Math. Comp. 19, 577) and made anew only where these do not get on.
-
-    Parameters
-    ----------
-    vicinity : Vicinity
-        Where to start.
-    tracker : Tracker
-        Simulates, counts and ends all at its deadline.
-    shift : (n_data,) array or float
-        Taken off the residual, before the loss: data that differ from those that were fitted.
-    """
-
-    vicinity: Vicinity
-    tracker: Tracker
+    best: BestPoint  # Where to start
+    tracker: Tracker  # Simulates, counts and ends all at its deadline
+    # (n_data,): Taken off the residual, before the loss: data that differ from those that were
+    # fitted.
     shift: Array | float = 0.0
-    _doubtful: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
         """Lay out the scaled parameters."""
-        best = self.vicinity
-        self.places = np.array([best.index[name] for name in best.names])
-        bounds = np.array([best.limits(name) for name in best.names])
-        self.low, self.high = bounds.T
+        best, index = self.best, self.best.index
+        self.places = np.array([index[name] for name in best.names])
+        self.low, self.high = np.array([best.limits(name) for name in best.names]).T
         self.complete = best.problem.space().complete
-        index = best.index
         self.drops = [
             ([index[own + "k0"], index[own + "eps_a"]], index[own + "dsigma"])
             for own in (name.removesuffix("dsigma") for name in best.names if "_dsigma" in name)
@@ -177,12 +43,15 @@ class Refit:
         cuts = best.quantiles**2 * best.spread.inflation  # NaN where the test says nothing
         self.enough = 1e-3 * float(min(cuts[np.isfinite(cuts)], default=1.0))
 
-    def start(self) -> Place:
+    def start(self) -> Iterate:
         """The best point itself."""
-        best, loss = self.vicinity, self.vicinity.problem.objective.loss
-        differences = best.residual - self.shift
-        slopes = softness(differences, loss)[:, None] * best.jacobian * best.sizes
-        return Place(best.values, soften(differences, loss), slopes)
+        return self._softened(self.best.values, self.best.residual - self.shift, self.best.jacobian)
+
+    def _softened(self, point: Array, differences: Array, jacobian: Array) -> Iterate:
+        """An iterate under the loss."""
+        loss = self.best.problem.objective.loss
+        slopes = softness(differences, loss)[:, None] * jacobian * self.best.sizes
+        return Iterate(point, soften(differences, loss), slopes)
 
     def residual(self, point: Array) -> Array | None:
         """Residual of a point that can be simulated, else None."""
@@ -191,73 +60,45 @@ class Refit:
         residual = self.tracker.residual(point, self.shift)
         return residual if objective.failures == failures else None
 
-    def fresh(self, point: Array, residual: Array) -> Place:
-        """A place with slopes of its own."""
-        best, objective = self.vicinity, self.vicinity.problem.objective
-        slopes = best.problem.linear.slopes(point, best.names) * best.sizes
-        if objective.loss != "linear":
-            differences = objective.differences(point) - self.shift
-            slopes *= softness(differences, objective.loss)[:, None]
-        return Place(point, residual, slopes)
+    def fresh(self, point: Array, residual: Array) -> Iterate:
+        """An iterate with a Jacobian of its own."""
+        problem, names = self.best.problem, self.best.names
+        jacobian = problem.linear.slopes(point, names)
+        if problem.objective.loss == "linear":
+            return Iterate(point, residual, jacobian * self.best.sizes)
+        return self._softened(point, problem.objective.differences(point) - self.shift, jacobian)
 
-    def moved(self, place: Place, step: Array) -> Array:
-        """Point that is off a place by a scaled step, within the limits."""
-        point = place.point.copy()
-        there = point[self.places] + step * self.vicinity.sizes
+    def moved(self, at: Iterate, step: Array) -> Array:
+        """Point that is off an iterate by a scaled step, within the limits."""
+        point = at.point.copy()
+        there = point[self.places] + step * self.best.sizes
         point[self.places] = np.clip(there, self.low, self.high)
         for sigma_a, drop in self.drops:  # no spring's stress at C2 falls below zero
             k0, eps_a = point[sigma_a]
             point[drop] = max(point[drop], -LAST_DROP * k0 * eps_a / (1.0 - eps_a))
         return self.complete(point)
 
-    def step(self, place: Place, free: NDArray[np.bool_], damping: float) -> tuple[Array, float]:
-        """Damped Gauss-Newton step of the free parameters, and the gain that it promises."""
-        gradient = place.slopes.T @ place.residual
-        at = place.point[self.places]
-        held = ((at <= self.low) & (gradient > 0)) | ((at >= self.high) & (gradient < 0)) | ~free
-        step = np.zeros(at.size)
-        if held.all():
-            return step, 0.0
-        own = place.slopes[:, ~held]
-        normal = own.T @ own
-        scale = np.maximum(np.diag(normal), 1e-12 * max(float(np.trace(normal)), 1e-300))
-        step[~held] = np.linalg.solve(normal + damping * np.diag(scale), -gradient[~held])
-        along = place.slopes @ step
-        return step, -float(along @ (2.0 * place.residual + along))
+    def taken(self, at: Iterate, point: Array) -> Array:
+        """Scaled step from an iterate to a point."""
+        return np.asarray((point - at.point)[self.places] / self.best.sizes)
 
-    def run(self, place: Place, free: NDArray[np.bool_], *, steps: int = 12) -> Place:
+    def step(self, at: Iterate, free: NDArray[np.bool_], damping: float) -> Array:
+        """Scaled step of the free parameters."""
+        return damped_step(at, at.point[self.places], self.low, self.high, damping, free)
+
+    def _move(self, at: Iterate, step: Array) -> tuple[Array, Array]:
+        point = self.moved(at, step)
+        return point, self.taken(at, point)
+
+    def run(self, at: Iterate, free: NDArray[np.bool_], *, steps: int = 12) -> Iterate:
         """Descend with these parameters free."""
         for renewal in range(RENEWALS + 1):
-            place, settled = self._descend(place, free, steps)
-            if settled and (renewal or not self._doubtful):
+            at, settled, poor = descend_updated(
+                self.residual, lambda here, damping: self.step(here, free, damping), self._move,
+                at, steps, self.enough,
+            )  # fmt: skip
+            if settled and (renewal or not poor):
                 break
             if renewal < RENEWALS:
-                place = self.fresh(place.point, place.residual)
-        return place
-
-    def _descend(self, place: Place, free: NDArray[np.bool_], steps: int) -> tuple[Place, bool]:
-        """Some steps with updated slopes; whether no more gain is promised."""
-        damping, growth = 1e-6, 4.0
-        self._doubtful = False
-        for _ in range(steps):
-            step, promise = self.step(place, free, damping)
-            if promise < self.enough:
-                return place, True
-            point = self.moved(place, step)
-            taken = (point - place.point)[self.places] / self.vicinity.sizes
-            residual = self.residual(point)
-            if residual is None or not taken.any():
-                damping, growth, self._doubtful = max(damping, 1e-3) * growth, growth * 2, True
-                continue
-            surprise = residual - place.residual - place.slopes @ taken
-            slopes = place.slopes + np.outer(surprise, taken / (taken @ taken))
-            gain = place.cost - float(residual @ residual)
-            if gain <= 0.25 * promise:
-                self._doubtful = True
-            if gain > 0.0:
-                place = Place(point, residual, slopes)
-                damping, growth = damping * (0.2 if gain > 0.75 * promise else 1.0), 4.0
-            else:
-                place = replace(place, slopes=slopes)
-                damping, growth = max(damping, 1e-3) * growth, growth * 2
-        return place, False
+                at = self.fresh(at.point, at.residual)
+        return at

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-Array = NDArray[np.float64]
+from foamfit.arrays import Array
 
 # A structure of which a parabola takes more than this share is called bent.
 BENT = 0.6
@@ -20,12 +20,8 @@ def runs_test(residual: Array) -> float:
 
     Given n₊ positive and n₋ negative residuals in random order, the number of runs has mean
     μ = 2 n₊n₋/n + 1 and variance (μ-1)(μ-2)/(n-1), and is nearly normal (here with the correction
-    for continuity). One-sided: slow waves make few runs; noise that alternates is no structure.
-
-    Parameters
-    ----------
-    residual : (n,) array
-        In the order of time; samples that are exactly zero are left out.
+    for continuity). One-sided: slow waves make few runs; noise that alternates is no structure. The
+    residuals are in the order of time; those that are exactly zero are left out.
     """
     signs = residual[residual != 0.0] > 0.0
     n, positive = signs.size, int(np.count_nonzero(signs))
@@ -48,11 +44,6 @@ def neighbours_test(residual: Array) -> float:
     Σ r_i r_{i+1} / Σ r_i² of white noise is normal with variance 1/n, nearly. One-sided. It weighs
     by size what the runs test only counts by sign, and so sees a short strong wave that the runs
     test does not; the runs test in turn is not led astray by a few large samples.
-
-    Parameters
-    ----------
-    residual : (n,) array
-        In the order of time.
     """
     power = float(residual @ residual)
     if residual.size < 2 or power == 0.0:
@@ -63,28 +54,17 @@ def neighbours_test(residual: Array) -> float:
 
 @dataclass(frozen=True)
 class Structure:
-    """Where the largest structure of a curve's residual sits.
+    """Where the largest structure of a curve's residual sits."""
 
-    Attributes
-    ----------
-    size : float
-        Root of the mean product of neighbouring residuals, in their unit: white noise adds nothing.
-    noise : float
-        One standard deviation of what is left of a residual over the mean of its neighbours, as
-        white noise would have it (its variance there is 3/2 of its own); by the median, which jumps
-        do not move.
-    place : str
-        Branches that the springs are on, and whether on loading or unloading.
-    share : float
-        Share of the structure that this place holds.
-    bent : float
-        Share of the squares of the residual there that a parabola over the samples takes off.
-    """
-
+    # Root of the mean product of neighbouring residuals, in their unit: white noise adds nothing.
     size: float
+    # One standard deviation of what is left of a residual over the mean of its neighbours, as white
+    # noise would have it (its variance there is 3/2 of its own); by the median, which jumps do not
+    # move.
     noise: float
-    place: str
-    share: float
+    place: str  # Branches that the springs are on, and whether on loading or unloading
+    share: float  # Share of the structure that this place holds
+    # Share of the squares of the residual there that a parabola over the samples takes off.
     bent: float
 
     @property
@@ -94,14 +74,9 @@ class Structure:
 
 
 def find_structure(residual: Array, places: NDArray[np.str_]) -> Structure:
-    """Find the place that holds the largest part of the structure of a residual.
+    """Find the place that holds the largest part of the structure of the residual of one curve.
 
-    Parameters
-    ----------
-    residual : (n,) array
-        Of one curve.
-    places : (n,) array of str
-        See `branch_places`.
+    `places` are as from `fitting.branches.branch_of_samples`.
     """
     product = residual[1:] * residual[:-1]
     rough = residual[1:-1] - 0.5 * (residual[2:] + residual[:-2])
@@ -114,40 +89,6 @@ def find_structure(residual: Array, places: NDArray[np.str_]) -> Structure:
         place=place,
         share=sums[place] / held if held > 0.0 else 0.0,
         bent=_bent(residual[places == place]),
-    )
-
-
-def branch_places(
-    kinds: tuple[str, ...],
-    switches: Array,
-    clock: Array,
-    stress: Array,
-    names: tuple[str, ...],
-) -> NDArray[np.str_]:
-    """Which branches the springs are on at each sample, in words, (n,).
-
-    Parameters
-    ----------
-    kinds : (n_springs,) tuple of str
-        Of the model.
-    switches : (m, 5) array
-        As `Response.switches`.
-    clock, stress : (n,) arrays
-        Time that the switches refer to, and the measured stress (Pa), whose peak ends loading.
-    names : tuple of str
-        Names of the branches by their number.
-    """
-    bistable = [i for i, kind in enumerate(kinds) if kind == "bistable"]
-    branch = {i: np.full(clock.size, "a", dtype="<U4") for i in bistable}
-    for when, spring, _, entered, _ in switches:
-        if int(spring) in branch:
-            branch[int(spring)][np.searchsorted(clock, when) :] = names[int(entered)]
-    way = np.where(np.arange(clock.size) <= np.argmax(stress), "loading", "unloading")
-    return np.array(
-        [
-            f"{way[at]}, " + " and ".join(f"spring {i + 1} on {branch[i][at]}" for i in bistable)
-            for at in range(clock.size)
-        ]
     )
 
 

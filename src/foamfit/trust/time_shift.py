@@ -1,59 +1,41 @@
-"""Whether the clocks of force and motion agree: what a time shift between them would explain."""
+"""What a time shift between the channels of force and motion would explain."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
-from typing import TYPE_CHECKING
-
 import numpy as np
-from numpy.typing import NDArray
 
+from foamfit.fitting.problem import Problem
 from foamfit.trust import covariance
-
-if TYPE_CHECKING:
-    from foamfit.fitting.problem import Problem
-    from foamfit.results import ParameterEstimate
-
-Array = NDArray[np.float64]
+from foamfit.trust.best_point import BestPoint
 
 
-def shift_hint(
-    problem: Problem,
-    values: Array,
-    residual: Array,
-    estimates: Mapping[str, ParameterEstimate],
-) -> float | None:
+def shift_hint(best: BestPoint, determined: list[str]) -> float | None:
     """Time by which the motion channel is late (s), where the test plainly shows it, else None.
 
-    In the residuals: one linear step of all determined parameters and the shift together, told
+    In the residuals: one linear step of all determined parameters and the shift together, accepted
     where the shift is more than four standard errors and a quarter of a sample, and takes a fifth
     of χ². Where a large shift has spoilt the fit, in the balance of the striker's motion. The test
-    must have both channels in time; see `fitting.objective.check_time_shift`.
+    must have both channels in time; see `fitting.curves.check_time_shift`.
     """
-    late = _shift_of_residuals(problem, values, residual, estimates)
-    return _shift_of_motion(problem) if late is None else late
+    late = _shift_of_residuals(best, determined)
+    return _shift_of_motion(best.problem) if late is None else late
 
 
-def _shift_of_residuals(
-    problem: Problem,
-    values: Array,
-    residual: Array,
-    estimates: Mapping[str, ParameterEstimate],
-) -> float | None:
+def _shift_of_residuals(best: BestPoint, determined: list[str]) -> float | None:
     """Time by which the motion is late (s), if one linear step plainly finds it."""
+    problem, objective, residual = best.problem, best.problem.objective, best.residual
     assert problem.measurement.time is not None
     step = float(np.median(np.diff(problem.measurement.time)))
-    shifted = replace(problem.objective, time_shift=True, loss="linear")
-    sides = [shifted.differences(np.append(values, side * step)) for side in (-0.5, 0.5)]
-    names = tuple(name for name, item in estimates.items() if item.stderr is not None)
-    plain = problem.linear
-    slope = (sides[1] - sides[0]) / step
-    jacobian = np.column_stack([plain.slopes(values, names), slope]) if names else slope[:, None]
-    sizes = np.append(plain.sizes(names, values), step)
+    sides = [
+        objective.compare(objective.shifted(best.simulated, side * step)) for side in (-0.5, 0.5)
+    ]
+    columns = [best.names.index(name) for name in determined]
+    own = best.jacobian[:, columns] if columns else np.empty((residual.size, 0))
+    jacobian = np.column_stack([own, (sides[1] - sides[0]) / step])
+    sizes = np.append(problem.sizes(tuple(determined), best.values), step)
     move = np.linalg.lstsq(jacobian * sizes, -residual, rcond=1e-10)[0]
     left = residual + jacobian @ (sizes * move)
-    spread = covariance.covariance(jacobian, left, shifted.sizes, sizes)
+    spread = covariance.covariance(jacobian, left, objective.sizes, sizes)
     late, error = float(move[-1] * step), float(spread.stderr[-1])
     gained = float(left @ left) < 0.8 * float(residual @ residual)
     return late if gained and abs(late) > max(4.0 * error, 0.25 * step) else None
@@ -63,8 +45,8 @@ def _shift_of_motion(problem: Problem) -> float | None:
     """Time by which the motion is late (s), if the striker's balance of motion plainly shows it.
 
     m w'' = -F: the force, integrated twice, must give the motion, but for its scale and for where
-    its zero lies. Told where a shift of a sample or more takes half of what is left, down to the
-    noise, or nine tenths.
+    its zero lies. Accepted where a shift of a sample or more halves what is left, down to the
+    noise, or takes nine tenths.
     """
     test, striker = problem.measurement, problem.measurement.striker
     time, stress, motion = test.time, test.stress, test.displacement

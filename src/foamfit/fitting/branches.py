@@ -1,0 +1,91 @@
+"""Which branches the springs are on along a simulated run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foamfit.fitting.objective import Simulated
+from foamfit.fitting.problem import Problem
+from foamfit.springs import kernels
+from foamfit.springs.model import BRANCHES, split_name
+
+FLIGHT = "free flight"
+
+
+def visited(problem: Problem, simulated: Simulated) -> dict[str, tuple[str, ...]]:
+    """Branches that each spring went through, in the order of the first visit."""
+    seen = {
+        i: ["a" if kind == "bistable" else "line"] for i, kind in enumerate(problem.model.kinds)
+    }
+    for _, spring, _, entered, _ in simulated.motion.switches:
+        name = kernels.BRANCH_NAMES[int(entered)]
+        if name not in seen[int(spring)]:
+            seen[int(spring)].append(name)
+    return {f"s{i + 1}": tuple(names) for i, names in seen.items()}
+
+
+def unreached(problem: Problem, simulated: Simulated) -> dict[str, str]:
+    """Parameters whose branch was never reached, and that branch."""
+    seen = visited(problem, simulated)
+    out = {}
+    for name in problem.model.names:
+        spring, short = split_name(name)
+        branch = BRANCHES.get(short)
+        bistable = branch and problem.model.kinds[spring] == "bistable"
+        if branch and bistable and branch not in seen[f"s{spring + 1}"]:
+            out[name] = branch
+    return out
+
+
+def _states(problem: Problem, simulated: Simulated) -> list[tuple[int, dict[int, str]]]:
+    """Samples from which on the bistable springs (0 at the base) are on these branches."""
+    state = {i: "a" for i, kind in enumerate(problem.model.kinds) if kind == "bistable"}
+    out = [(0, dict(state))]
+    for when, spring, _, entered, _ in simulated.motion.switches:
+        if int(spring) in state:
+            state[int(spring)] = kernels.BRANCH_NAMES[int(entered)]
+            out.append((int(np.searchsorted(problem.objective.time, when)), dict(state)))
+    return out
+
+
+@dataclass(frozen=True)
+class Section:
+    """Samples `start` to `stop` (excluded) in which no spring changes its branch.
+
+    `branches` names those of the bistable springs from the base up, joined by a dot: "d" or "a·c".
+    """
+
+    branches: str
+    start: int
+    stop: int
+
+
+def sections(problem: Problem, simulated: Simulated) -> tuple[Section, ...]:
+    """Cut the samples of a run at its switches and at the end of contact, in the order of time."""
+    clock, contact_end = problem.objective.time, simulated.motion.contact_end
+    cuts = [(at, "·".join(on.values()) or "line") for at, on in _states(problem, simulated)]
+    if np.isfinite(contact_end):
+        cuts.append((int(np.searchsorted(clock, contact_end, side="right")), FLIGHT))
+    ends = [start for start, _ in cuts[1:]] + [clock.size]
+    return tuple(
+        Section(name, start, min(stop, clock.size))
+        for (start, name), stop in zip(cuts, ends, strict=True)
+        if stop > start
+    )
+
+
+def branch_of_samples(problem: Problem, simulated: Simulated) -> NDArray[np.str_]:
+    """Which branches the springs are on at each sample, in words, (n,).
+
+    For example "loading, spring 1 on d"; loading ends at the peak of the measured stress.
+    """
+    stress = problem.measurement.stress
+    assert stress is not None
+    words = np.empty(problem.objective.time.size, dtype=object)
+    for at, on in _states(problem, simulated):
+        words[at:] = " and ".join(f"spring {i + 1} on {branch}" for i, branch in on.items())
+    loading = np.arange(words.size) <= np.argmax(stress)
+    return (np.where(loading, "loading, ", "unloading, ").astype(object) + words).astype(str)

@@ -1,0 +1,151 @@
+"""Which curves a test and a drive allow to compare, and how much each counts."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import lstsq
+from scipy.ndimage import convolve1d
+
+from foamfit.arrays import Array
+from foamfit.data.measurement import INTEGRATED, Measurement, interior_channel
+from foamfit.errors import InputError
+from foamfit.springs.model import Model
+
+# Of every objective; to them come displacement_1_time … where masses inside were followed.
+CURVES = ("stress_time", "displacement_time", "stress_strain")
+# Those that need a motion.
+MOTION_CURVES = ("displacement_time", "stress_strain")
+DRIVES = ("impact", "stress", "displacement")
+
+
+def choose_drive(measurement: Measurement) -> str:
+    """Choose the drive: impact if striker and time are known, else displacement.
+
+    Raises InputError if the test has neither.
+    """
+    striker = measurement.striker
+    if (
+        striker is not None
+        and striker.mass is not None
+        and striker.velocity
+        and measurement.time is not None
+    ):
+        return "impact"
+    if measurement.displacement is not None:
+        return "displacement"
+    raise InputError(
+        f"{measurement.name}: no drive is possible; give a displacement or strain column, "
+        "or time and a [striker] with mass and velocity"
+    )
+
+
+def check_drive(measurement: Measurement, drive: str) -> None:
+    """Refuse a drive that the test cannot feed (InputError, naming what is missing)."""
+    if drive not in DRIVES:
+        raise InputError(f"drive '{drive}' is unknown; it must be one of {', '.join(DRIVES)}")
+    striker = measurement.striker
+    missing = []
+    if measurement.stress is None:
+        missing.append("a force or stress column")
+    if drive == "impact":
+        if measurement.time is None:
+            missing.append("a time column")
+        if striker is None or striker.mass is None:
+            missing.append("[striker] mass")
+        if striker is None or not striker.velocity:
+            missing.append("[striker] velocity greater than zero")
+    elif measurement.displacement is None:
+        missing.append("a displacement or strain column")
+    if missing:
+        raise InputError(f"{measurement.name}: the {drive} drive needs {' and '.join(missing)}")
+    force = measurement.outliers.get("stress")
+    if drive == "stress" and force is not None and force.clipped_at is not None:
+        raise InputError(
+            f"{measurement.name}: the force is clipped, so it cannot drive the specimen; choose "
+            "the displacement or the impact drive"
+        )
+
+
+def interior_curves(measurement: Measurement, springs: int) -> dict[str, int]:
+    """Curves of the masses inside a chain of so many springs that were followed, and their node."""
+    nodes = sorted(node for node in measurement.interior if node < springs)
+    return {f"{interior_channel(node)}_time": node for node in nodes}
+
+
+def check_interior(measurement: Measurement, springs: int) -> None:
+    """Refuse the displacement of a mass that is not inside a chain of so many springs (InputError).
+
+    A single spring has nothing inside; the result's notes say so.
+    """
+    wrong = [node for node in sorted(measurement.interior) if node >= springs]
+    if not wrong or springs == 1:
+        return
+    name = interior_channel(wrong[0])
+    top = (
+        f"node {springs} of a {springs}-spring chain is the top, which is the 'displacement' column"
+    )
+    raise InputError(
+        f"{measurement.name}: {name} is no mass inside a chain of {springs} springs: {top}; take "
+        "a model of more springs, or rename or leave out that column"
+    )
+
+
+def default_weights(measurement: Measurement, drive: str, springs: int = 1) -> dict[str, float]:
+    """Weights that count each measured channel once, for a chain of so many springs.
+
+    In the impact drive stress and displacement are compared in time; a displacement that was
+    integrated from the force is no second measurement. In the displacement drive the stress along
+    the measured displacement is the one curve, in the stress drive the displacement. Displacements
+    of masses inside count in all drives: they tell the springs apart.
+    """
+    weights = dict.fromkeys(CURVES, 0.0)
+    weights |= dict.fromkeys(interior_curves(measurement, springs), 1.0)
+    if drive == "impact":
+        weights["stress_time"] = 1.0
+        if measurement.displacement is not None and measurement.motion != INTEGRATED:
+            weights["displacement_time"] = 1.0
+    elif drive == "stress":
+        weights["displacement_time"] = 1.0
+    else:
+        weights["stress_strain"] = 1.0
+    return weights
+
+
+def smoothed(values: Array, window: int) -> Array:
+    """Smooth samples by the parabola through each (odd) window of them (Savitzky & Golay 1964).
+
+    Analytical Chemistry 36, 1627; as `scipy.signal.savgol_filter`, whose package takes longer to
+    import than a search. The first and the last half of a window lie on its parabola.
+    """
+    half, clock = window // 2, np.arange(float(window))
+    weights, *_ = lstsq(np.vander(half - clock, 3, increasing=True).T, np.array([1.0, 0.0, 0.0]))
+    out = convolve1d(values, weights, mode="constant")
+    for edge, part in ((slice(half), slice(window)), (slice(-half, None), slice(-window, None))):
+        out[edge] = np.polyval(np.polyfit(clock, values[part], 2), clock[edge])
+    return np.asarray(out)
+
+
+def driving_stress(stress: Array, model: Model) -> Array:
+    """Smooth a measured stress (Pa) that is to drive a model.
+
+    The noise of a driving stress is taken for stress that acted, and biases the soft branches
+    (errors in variables): a parabola over a twenty-fifth of the samples takes it off. A chain with
+    a unilateral spring carries no tension.
+    """
+    window = 2 * (stress.size // 50) + 1
+    smooth = smoothed(stress, window) if window > 3 else stress
+    return np.maximum(smooth, 0.0) if "unilateral" in model.kinds else smooth
+
+
+def check_time_shift(measurement: Measurement, drive: str) -> None:
+    """Refuse a time shift where the test has no two channels in time (InputError)."""
+    missing = None
+    if measurement.time is None:
+        missing = "it has no time"
+    elif measurement.displacement is None or measurement.motion == INTEGRATED:
+        missing = "its motion is not measured apart from the force"
+    if missing:
+        raise InputError(
+            f"{measurement.name}: a time shift between force and motion cannot be fitted in the "
+            f"{drive} drive, {missing}; both channels must be measured in time"
+        )

@@ -1,0 +1,125 @@
+"""The best point of a problem: its curves, residual, Jacobian and covariance, each computed once.
+
+All that is concluded from a fit reads this: one plain simulation and one with sensitivities.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from foamfit.arrays import Array
+from foamfit.fitting.branches import unreached
+from foamfit.fitting.losses import influence, soften
+from foamfit.fitting.objective import Simulated
+from foamfit.fitting.problem import Problem
+from foamfit.trust import covariance
+from foamfit.trust.covariance import Covariance
+
+
+def m_estimate(residual: Array, sizes: tuple[int, ...], loss: str) -> tuple[Array, Array]:
+    """Weights of slopes and pseudo-residuals whose least squares have the covariance of a loss.
+
+    With the mean m of ψ'(r) over each curve (so many samples in `sizes`): √m and ψ(r)/√m. The
+    normal matrix of the slopes so weighted is half the curvature of the cost, and the covariance of
+    their least squares that of an M-estimate (Huber 1981, Robust Statistics, section 7.6). Under
+    the linear loss they are one and the residuals.
+    """
+    psi, slope = influence(residual, loss)
+    weights = np.empty(residual.size)
+    for part in covariance.parts(sizes):
+        weights[part] = max(float(slope[part].mean()), 0.05) ** 0.5
+    return weights, psi / weights
+
+
+@dataclass(frozen=True, eq=False)
+class BestPoint:
+    """A point of the parameters (SI), usually the best one, and what holds locally there.
+
+    `chosen` are the parameters whose uncertainty is asked for; by default those that vary and
+    whose branch was reached.
+    """
+
+    problem: Problem
+    values: Array
+    chosen: tuple[str, ...] | None = None
+
+    @cached_property
+    def simulated(self) -> Simulated:
+        """All curves."""
+        return self.problem.objective.simulate(self.values, everything=True)
+
+    @cached_property
+    def residual(self) -> Array:
+        """Residual before its loss gives way to large ones, (n_data,)."""
+        return self.problem.objective.compare(self.simulated)
+
+    @cached_property
+    def unreached(self) -> dict[str, str]:
+        """Parameters whose branch was never reached, and that branch."""
+        return unreached(self.problem, self.simulated)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the k parameters whose uncertainty is asked for."""
+        if self.chosen is not None:
+            return self.chosen
+        return tuple(name for name in self.problem.free() if name not in self.unreached)
+
+    @cached_property
+    def sizes(self) -> Array:
+        """Their characteristic sizes, (k,)."""
+        return self.problem.sizes(self.names, self.values)
+
+    @cached_property
+    def jacobian(self) -> Array:
+        """Derivative of `residual` by them, (n_data, k)."""
+        return self.problem.linear.slopes(self.values, self.names)
+
+    @cached_property
+    def spread(self) -> Covariance:
+        """Their local covariance, as estimated with the loss."""
+        objective = self.problem.objective
+        weights, pseudo = m_estimate(self.residual, objective.sizes, objective.loss)
+        jacobian = self.jacobian * weights[:, None]
+        return covariance.covariance(jacobian, pseudo, objective.sizes, self.sizes)
+
+    @cached_property
+    def cost(self) -> float:
+        """Sum of squares of the residual, softened by the loss."""
+        soft = soften(self.residual, self.problem.objective.loss)
+        return float(soft @ soft)
+
+    @property
+    def index(self) -> dict[str, int]:
+        """Place of each parameter in `values`."""
+        return self.problem.index
+
+    @cached_property
+    def quantiles(self) -> Array:
+        """Student's t of the 95 % interval of each parameter, (k,)."""
+        return np.array([covariance.half_width(1.0, freedom) for freedom in self.spread.freedom])
+
+    @cached_property
+    def halves(self) -> Array:
+        """Half of each local 95 % interval, (k,)."""
+        return self.quantiles * self.spread.stderr
+
+    @cached_property
+    def known(self) -> list[str]:
+        """Parameters of which the local interval says anything."""
+        told = self.halves <= covariance.NOTHING * self.sizes
+        return [name for name, known in zip(self.names, told, strict=True) if known]
+
+    def limits(self, name: str) -> tuple[float, float]:
+        """Limits of a parameter, SI."""
+        parameter = self.problem.params[name]
+        return float(parameter.min), float(parameter.max)
+
+    def along(self, name: str) -> Array:
+        """Change of all k parameters per change of one, as their correlation has it, (k,)."""
+        column = self.names.index(name)
+        row = self.spread.matrix[:, column]
+        return np.asarray(np.nan_to_num(row / row[column]))

@@ -1,0 +1,293 @@
+"""Profiles of the cost: its least value with one parameter held.
+
+A rise of the cost is compared with what the noise would make of it, correlated as it is
+(`Covariance.inflation`), so that on a parabola profile and local interval are the same.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foamfit.arrays import Array
+from foamfit.fitting.levenberg import Iterate
+from foamfit.fitting.search import STOPPING, Tracker, what_stopped
+from foamfit.trust.best_point import BestPoint
+from foamfit.trust.refit import Refit
+
+# A profile is followed until its χ² is this many times that of the 95 % cut: small barriers
+# between shallow minima are crossed.
+BEYOND = 2.0
+# Refits of one side of a profile: to get beyond the cut, and to place it.
+OUTWARD, INWARD = 14, 6
+# The cut is placed to this share of the root of its χ².
+PLACED = 0.02
+# A profile that falls below the best point by this share of the cut has found a better minimum.
+BETTER = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """Least cost along one parameter."""
+
+    name: str  # The parameter
+    values: Array  # (m,): Where it was held, ascending, SI; the best point is among them
+    rises: Array  # (m,): Rise of the cost there as a χ² of one degree of freedom
+    points: Array  # (m, n): All parameters of the model at each
+    cut: float  # χ² of the 95 % interval
+    # Outermost crossings of the cut; a limit of the parameter where there is none.
+    ci95: tuple[float, float]
+    # Whether the cost does not reach the cut on that side.
+    open_low: bool
+    open_high: bool
+    # What ended it before its end on both sides: "the time limit", "Ctrl-C".
+    stopped: str | None = None
+
+    @property
+    def complete(self) -> bool:
+        """Whether it was followed to its end on both sides."""
+        return self.stopped is None
+
+
+def profile(
+    best: BestPoint, name: str, tracker: Tracker | None = None, minima: Sequence[Array] = ()
+) -> Profile:
+    """Follow the least cost along a parameter to both sides, past the 95 % cut.
+
+    The adjusted likelihood ratio: the rise of the cost over `Covariance.inflation`, which is χ²
+    with one degree of freedom also where the noise is correlated (Chandler & Bate 2007,
+    Biometrika 94, 167). `minima` are other points at which descents ended: the profile goes on
+    beyond them where they are within the cut, whatever barrier lies between. It is incomplete if
+    the deadline or Ctrl-C ended it: `ci95` is then that of what was done.
+    """
+    tracker = Tracker(best.problem.objective) if tracker is None else tracker
+    tracing = Tracing(best, name, tracker)
+    tracing.follow(minima)
+    return tracing.profile
+
+
+@dataclass(eq=False)
+class _Side:
+    """One side of a profile: down (-1) or up (+1)."""
+
+    best: BestPoint
+    name: str
+    refit: Refit
+    sign: float
+
+    def __post_init__(self) -> None:
+        """Begin at the best point."""
+        best = self.best
+        self.column = best.names.index(self.name)
+        self.place = best.index[self.name]
+        self.unit = float(best.spread.inflation[self.column])
+        self.quantile = float(best.quantiles[self.column])
+        self.half = self.quantile * float(best.spread.stderr[self.column])
+        self.others = np.arange(len(best.names)) != self.column
+        self.refits = [self.refit.start()]
+        low, high = best.limits(self.name)
+        self.limit = low if self.sign < 0 else high
+
+    def value(self, at: Iterate) -> float:
+        """Where the parameter was held."""
+        return float(at.point[self.place])
+
+    def rise(self, at: Iterate) -> float:
+        """Rise of the cost as a χ²."""
+        return (at.cost - self.best.cost) / self.unit
+
+    def root(self, at: Iterate) -> float:
+        """Root of the rise, straight along a parabola."""
+        return math.sqrt(max(self.rise(at), 0.0))
+
+    def follow(self, minima: Sequence[Array]) -> None:
+        """Go outward until well beyond the cut and place the crossing; go on beyond the minima.
+
+        What was followed before is not followed again.
+        """
+        if len(self.refits) == 1:
+            self._outward()
+            self._inward()
+        reach = PLACED * self.half
+        for point in sorted(minima, key=lambda point: -self.sign * float(point[self.place])):
+            value = float(point[self.place])
+            edge = self.value(self.refits[-1]) if self.is_open else self.bound
+            if self.better or self.sign * (value - edge) <= reach:
+                break
+            residual = self.refit.residual(point)
+            if residual is None:
+                continue
+            found = self.refit.run(self.refit.fresh(point, residual), self.others)
+            if self.rise(found) < self.quantile**2:
+                # Refits farther out are of another minimum, or have stalled.
+                inside = [at for at in self.refits if self.sign * (self.value(at) - value) < 0.0]
+                self.refits = [*inside, found]
+                self._outward()
+                self._inward()
+
+    def _outward(self) -> None:
+        """Go on from the outermost refit until well beyond the cut."""
+        step, refused = 0.5 * self.half, 0
+        for _ in range(OUTWARD):
+            last = self.refits[-1]
+            if self.value(last) == self.limit or refused > 3:
+                break
+            value = self.value(last) + self.sign * step
+            value = max(value, self.limit) if self.sign < 0 else min(value, self.limit)
+            found = self._hold(value, last)
+            if found is None:
+                step, refused = 0.3 * step, refused + 1
+                continue
+            self.refits.append(found)
+            if self.rise(found) >= BEYOND * self.quantile**2 or self.better:
+                break
+            if self.root(found) - self.root(last) < 0.35 * self.quantile:
+                step *= 1.6
+
+    def _inward(self) -> None:
+        """Place the outermost crossing of the cut."""
+        for _ in range(INWARD):
+            inner, outer = self._bracket()
+            if outer is None or self.better:
+                break
+            miss = min(abs(self.root(at) - self.quantile) for at in (inner, outer))
+            if miss <= PLACED * self.quantile:
+                break
+            found = self._hold(self.bound, inner)
+            if found is None:
+                break
+            self.refits.append(found)
+            self.refits.sort(key=lambda at: self.sign * self.value(at))
+
+    @property
+    def better(self) -> bool:
+        """Whether a better point than the best was met."""
+        return min(map(self.rise, self.refits)) < -BETTER * self.quantile**2
+
+    def _hold(self, value: float, near: Iterate) -> Iterate | None:
+        """Refit with the parameter held, starting from a refit near by; None if nothing is found.
+
+        The others follow to first order; where that cannot be simulated they stay.
+        """
+        shift = np.zeros(self.others.size)
+        shift[self.column] = (value - self.value(near)) / self.best.sizes[self.column]
+        ahead = replace(near, residual=near.residual + near.jacobian @ shift)
+        for step in (shift + self.refit.step(ahead, self.others, 1e-9), shift):
+            point = self.refit.moved(near, step)
+            point[self.place] = value
+            residual = self.refit.residual(point)
+            if residual is not None:
+                start = near.updated(point, residual, self.refit.taken(near, point))
+                return self.refit.run(start, self.others)
+        return None
+
+    def _bracket(self) -> tuple[Iterate, Iterate | None]:
+        """The outermost refit below the cut, and the next one."""
+        last = max(i for i, at in enumerate(self.refits) if self.root(at) < self.quantile)
+        return self.refits[last], self.refits[last + 1] if last + 1 < len(self.refits) else None
+
+    @property
+    def bound(self) -> float:
+        """Where the root of the rise crosses that of the cut; where it never does, the limit."""
+        inner, outer = self._bracket()
+        if outer is None:
+            return self.limit
+        share = (self.quantile - self.root(inner)) / (self.root(outer) - self.root(inner))
+        return self.value(inner) + share * (self.value(outer) - self.value(inner))
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the cost never reached the cut."""
+        return self._bracket()[1] is None
+
+
+class Tracing:
+    """A profile that is being followed; a side that was not begun ends at the best point."""
+
+    def __init__(self, best: BestPoint, name: str, tracker: Tracker) -> None:
+        refit = Refit(best, tracker)
+        self.low, self.high = (_Side(best, name, refit, sign) for sign in (-1.0, 1.0))
+        self.stopped: str | None = None
+        self._turned = False
+
+    def follow(self, minima: Sequence[Array]) -> None:
+        """Follow both sides, or go on beyond further minima; incomplete if that was ended."""
+        try:
+            self.low.follow(minima)
+            self._turned = True
+            self.high.follow(minima)
+        except STOPPING as error:
+            self.stopped = what_stopped(error)
+
+    @property
+    def refits(self) -> list[Iterate]:
+        """All refits in the order of the parameter."""
+        return self.low.refits[::-1] + self.high.refits[1:]
+
+    @property
+    def better(self) -> Array | None:
+        """A point that is better than the best."""
+        least = min(self.refits, key=lambda at: at.cost)
+        return least.point if self.low.better or self.high.better else None
+
+    @property
+    def profile(self) -> Profile:
+        """What was found so far."""
+        low, high = self.low, self.high
+        return Profile(
+            name=low.name,
+            values=np.array([low.value(at) for at in self.refits]),
+            rises=np.array([low.rise(at) for at in self.refits]),
+            points=np.array([at.point for at in self.refits]),
+            cut=low.quantile**2,
+            ci95=(low.bound, high.bound if self._turned else high.value(high.refits[0])),
+            open_low=low.is_open,
+            open_high=high.is_open or not self._turned,
+            stopped=self.stopped,
+        )
+
+
+def departures(best: BestPoint) -> Array:
+    """How far the cost is from a parabola at either end of each local interval, (k, 2).
+
+    One evaluation each: the parameter is put at the end of its interval (nearer if nothing can be
+    simulated there), the others follow their correlation, and what they could still gain is read
+    off the local slopes. Given is the root of the rise over what a parabola has, less one; zero
+    where a limit is next to the best point, infinite where nothing can be simulated.
+    """
+    refit = Refit(best, Tracker(best.problem.objective))
+    start = refit.start()
+    normal = start.jacobian.T @ start.jacobian
+    out = np.zeros((len(best.names), 2))
+    for i, name in enumerate(best.names):
+        others = np.arange(len(best.names)) != i
+        inverse = np.linalg.pinv(normal[np.ix_(others, others)], rcond=1e-10, hermitian=True)
+        own = start.jacobian[:, others]
+        here = _least(start.residual, own, inverse)
+        stderr, half = float(best.spread.stderr[i]), float(best.halves[i])
+        value = best.values[best.index[name]]
+        low, high = best.limits(name)
+        for side, to_limit in enumerate((value - low, high - value)):
+            if not to_limit > 0.05 * half:
+                continue
+            out[i, side] = np.inf
+            for share in (1.0, 0.5, 0.25):
+                shift = min(share * half, to_limit)
+                along = best.along(name) * (-shift if side == 0 else shift) / best.sizes
+                residual = refit.residual(refit.moved(start, along))
+                if residual is not None:
+                    rise = (_least(residual, own, inverse) - here) / best.spread.inflation[i]
+                    out[i, side] = math.sqrt(max(rise, 0.0)) * stderr / shift - 1.0
+                    break
+    return out
+
+
+def _least(residual: Array, own: Array, inverse: NDArray[Any]) -> float:
+    """Sum of squares after one linear step of some parameters, from the inverse of their normal."""
+    slope = own.T @ residual
+    return float(residual @ residual - slope @ inverse @ slope)
