@@ -9,12 +9,13 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from foamfit.arrays import Array
 from foamfit.data.measurement import Outliers, interior_channel
 from foamfit.errors import InputError
 from foamfit.files import reason, replacing
 from foamfit.report.page import render_report
 from foamfit.report.plots import image, laid_out, plot_fit
-from foamfit.results import SCHEMA, Array, Curves, Fit, ParameterEstimate, plain
+from foamfit.results import SCHEMA, Curves, Fit, ParameterEstimate, plain
 from foamfit.trust.intervals import Intervals
 
 # All that `save_result` may write.
