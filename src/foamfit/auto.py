@@ -24,7 +24,8 @@ from foamfit.fitting.objective import choose_drive
 from foamfit.fitting.problem import make_params
 from foamfit.one_model import Found, Options, Progress, Tell
 from foamfit.results import FitResult
-from foamfit.springs.model import Model, split_name
+from foamfit.springs.model import Model
+from foamfit.springs.parameters import split_name
 from foamfit.trust.evidence import (
     MARGIN,
     Evidence,

@@ -26,7 +26,8 @@ from foamfit.fitting.search import (
     what_stopped,
 )
 from foamfit.results import FitResult
-from foamfit.springs.model import Model, split_name
+from foamfit.springs.model import Model
+from foamfit.springs.parameters import split_name
 from foamfit.trust.conclude import conclude
 from foamfit.trust.covariance import AT_LIMIT
 from foamfit.trust.identifiability import unreached

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.data.measurement import Measurement
-from foamfit.springs.model import Model, split_name
+from foamfit.springs.model import Model
+from foamfit.springs.parameters import split_name
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,8 @@ from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError
 from foamfit.fitting.box import LARGEST_SHIFT, Scales, Space
 from foamfit.fitting.objective import Objective, check_interior, choose_drive, default_weights
-from foamfit.springs.model import Model, split_name
+from foamfit.springs.model import Model
+from foamfit.springs.parameters import split_name
 
 Array = NDArray[np.float64]
 

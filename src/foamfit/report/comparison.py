@@ -23,9 +23,10 @@ from foamfit.files import write_file
 from foamfit.report.page import readable
 from foamfit.results import FitResult, ParameterEstimate, load_result
 from foamfit.springs.model import Model
+from foamfit.springs.parameters import BISTABLE_NAMES, LINEAR_NAMES
 from foamfit.springs.published import MM, MPA, PublishedSet
 from foamfit.springs.published import published as published_sets
-from foamfit.springs.spring import BISTABLE_NAMES, LINEAR_NAMES, LinearSpring
+from foamfit.springs.spring import LinearSpring
 
 Result = FitResult | Mapping[str, Any] | str | Path
 

@@ -15,7 +15,7 @@ from foamfit.data.measurement import INTEGRATED
 from foamfit.data.prepare import engineering
 from foamfit.errors import InputError
 from foamfit.fitting.objective import check_time_shift
-from foamfit.springs.model import split_name
+from foamfit.springs.parameters import split_name
 from foamfit.trust.covariance import AT_LIMIT, WEAK
 from foamfit.trust.time_shift import shift_hint
 

@@ -26,7 +26,7 @@ from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import SearchRecord
 from foamfit.results import Correlation, Curves, FitResult, ParameterEstimate, Switch
 from foamfit.springs import kernels
-from foamfit.springs.model import split_name, unit_of
+from foamfit.springs.parameters import split_name, unit_of
 from foamfit.trust import covariance
 from foamfit.trust.checklist import MAY_VANISH, Evidence, make_checklist, status_of, warnings_of
 from foamfit.trust.identifiability import Insight, look, unreached, visited

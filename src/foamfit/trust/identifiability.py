@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.springs import kernels
-from foamfit.springs.model import BRANCHES, split_name
+from foamfit.springs.parameters import BRANCHES, split_name
 
 if TYPE_CHECKING:
     from foamfit.fitting.objective import Simulated
