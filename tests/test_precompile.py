@@ -17,7 +17,7 @@ from numba import types
 import foamfit as ff
 from conftest import EXPERIMENTS
 from foamfit import cli
-from foamfit.solve import precompile
+from foamfit.solve import cache, precompile
 from foamfit.solve.explicit import taylor
 from foamfit.solve.implicit import vibration
 from foamfit.springs import kernels, sensitivities
@@ -66,7 +66,7 @@ def test_the_first_use_says_that_it_compiles(
 
     monkeypatch.setattr(precompile, "side_by_side", quickly)
     for ready in (False, True):
-        monkeypatch.setattr(precompile, "compiled", lambda ready=ready: ready)
+        monkeypatch.setattr(cache, "compiled", lambda ready=ready: ready)
         with cli._compiling(quiet=False) as compile_rest:
             compile_rest()
         assert ("compiling the solver" in capsys.readouterr().err) == (not ready)
@@ -98,14 +98,14 @@ def test_the_other_process_finds_this_package_and_is_stopped(
 def test_what_was_compiled_of_another_source_is_no_use(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(precompile, "_caches", lambda: {tmp_path})
-    assert not precompile.compiled()
+    monkeypatch.setattr(cache, "_caches", lambda: {tmp_path})
+    assert not cache.compiled()
     made = [tmp_path / f"taylor.integrate-30.py311.{end}" for end in ("nbi", "1.nbc")]
     for path in made:
         path.touch()
-    assert precompile.compiled()
+    assert cache.compiled()
     os.utime(made[1], (0.0, 0.0))
-    assert not precompile.compiled()
+    assert not cache.compiled()
     assert [path.exists() for path in made] == [True, False]
 
 
@@ -116,14 +116,14 @@ def test_what_is_compiled_where_it_is_needed_is_announced_once(
         __name__ = "integrate_slowly"
         signatures: tuple[object, ...] = ()
 
-    monkeypatch.setattr(precompile, "_caches", lambda: {tmp_path})
+    monkeypatch.setattr(cache, "_caches", lambda: {tmp_path})
     caplog.set_level(logging.WARNING, logger="foamfit")  # a quiet command may have silenced it
     new, known, kept = Loop(), Loop(), Loop()
     known.signatures = ((),)
     for loop in (new, new, known):
-        precompile.announce(loop, "the solver of slow scenes")
+        cache.announce(loop, "the solver of slow scenes")
     (tmp_path / "implicit.integrate_slowly-30.py311.1.nbc").touch()
-    precompile.announce(kept, "the solver of slow scenes")
+    cache.announce(kept, "the solver of slow scenes")
     assert [record.getMessage() for record in caplog.records] == [
         "foamfit: compiling the solver of slow scenes, once after installation"
     ]
@@ -131,8 +131,8 @@ def test_what_is_compiled_where_it_is_needed_is_announced_once(
 
 def test_every_module_with_compiled_loops_is_known() -> None:
     written = {
-        path.relative_to(precompile.PACKAGE).parts[0]
-        for path in precompile.PACKAGE.rglob("*.py")
+        path.relative_to(cache.PACKAGE).parts[0]
+        for path in cache.PACKAGE.rglob("*.py")
         if re.search(r"^@(compiled|inner|inlined|piece|maker|once)$", path.read_text(), re.M)
     }
-    assert set(precompile.FOLDERS) == written
+    assert set(cache.FOLDERS) == written

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foamfit.errors import InputError, SimulationError
-from foamfit.solve import many, precompile
+from foamfit.solve import cache, many
 from foamfit.solve import scene as scenes
 from foamfit.solve.explicit import taylor
 from foamfit.solve.implicit import steps, vibration
@@ -168,7 +168,7 @@ class Plan(NamedTuple):
         start = _AT_REST if self.top in _RESTING else self._start(rows, heights, directions)
         log = np.empty((LOGGED, 5)) if everything else NO_SWITCHES
         if not stiff:
-            precompile.announce(taylor.integrate, "the solver")
+            cache.announce(taylor.integrate, "the solver")
             most = self.max_explicit if self.implicit is None else self.max_steps
             ending: Sequence[Any] = taylor.integrate(
                 given, self.margin * rtol, most, directions, start, curves, slopes, log
@@ -176,7 +176,7 @@ class Plan(NamedTuple):
             if self.implicit is False or ending[0] not in _WRONG_TOOL:
                 return _motion(TAYLOR, ending, curves, slopes, log)
         margin = OF_MASSES_IMPLICIT if len(self.ends) > 1 else IMPLICIT
-        precompile.announce(steps.integrate_implicit, "the solver of stiff scenes")
+        cache.announce(steps.integrate_implicit, "the solver of stiff scenes")
         *ending, lost = steps.integrate_implicit(
             given, max(margin * rtol, LEAST_IMPLICIT), rtol, self.max_steps, directions, start,
             curves, slopes, log, np.zeros(2, np.int64),
@@ -254,7 +254,7 @@ class Plan(NamedTuple):
         """Springs under one stress count as one: one step to a switch."""
         count = len(given[0])
         log, tolerance = np.empty((4 * count + 64, 5)), AS_ONE * rtol / count
-        precompile.announce(many.integrate_aggregate, "the solver of many springs")
+        cache.announce(many.integrate_aggregate, "the solver of many springs")
         ending = many.integrate_aggregate(
             given, tolerance, self.max_steps, curves, log, np.zeros(2, np.int64)
         )
