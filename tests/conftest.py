@@ -14,7 +14,7 @@ import pytest
 
 import foamfit as ff
 from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
-from foamfit.solve import precompile
+from foamfit.solve import cache, precompile
 
 ROOT = Path(__file__).parent.parent
 EXPERIMENTS = ROOT / "experiments"
@@ -40,7 +40,7 @@ def compiled() -> Iterator[None]:
 
     The loops of implicit steps are compiled beside the first tests.
     """
-    if precompile.compiled():
+    if cache.compiled():
         yield
         return
     with precompile.side_by_side() as compile_rest:

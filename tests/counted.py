@@ -113,7 +113,7 @@ def _dashpot_lines(filename: str) -> frozenset[int]:
 def tracer(frame: Any, event: str, _: Any) -> Any:
     """Count the lines run on which something is reckoned with a dashpot."""
     lines = _dashpot_lines(frame.f_code.co_filename)
-    if not lines or _module(frame.f_code.co_filename) in ("steps", "vibration"):
+    if not lines or _module(frame.f_code.co_filename) in ("steps", "control", "vibration"):
         return None
     if event == "line" and frame.f_lineno in lines:
         COUNTS["dashpot lines"] += 1

@@ -112,9 +112,8 @@ def effort(count: int, rtol: float = 1e-6) -> tuple[int, int, int, int]:
     scene = plan(chain, ff.Impact(STRIKER, 2.1), TIME)
     spent = np.zeros(2, np.int64)
     _, contact_end, steps, switches = many.integrate_aggregate(
-        chain.arrays.rows, chain.arrays.heights, scene.mass[0], 0.0, scene.speed, TIME,
-        1e-4 * rtol / count, 10**6, np.empty((2, TIME.size)),
-        np.empty((0, 5)), spent,
+        scene.given(chain.arrays.rows, chain.arrays.heights), 1e-4 * rtol / count, 10**6,
+        np.empty((2, TIME.size)), np.empty((0, 5)), spent,
     )  # fmt: skip
     assert contact_end > 0.0
     return steps, switches, int(spent[0]), int(spent[1])

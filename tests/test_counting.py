@@ -2,8 +2,8 @@
 
 `counted.py` runs the scenes in a process of its own, where the compiled loops are plain Python, and
 counts from outside: what is read of each spring and mass, what is reckoned with each dashpot, which
-functions are called. `steps` and `vibration` are left out where they only decide, once per run,
-how to step.
+functions are called. `steps`, `control` and `vibration` are left out where they only decide how to
+step.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def counts(counted: dict[str, dict[str, dict[str, Any]]]) -> dict[str, dict[str,
 
 
 def total(
-    scene: dict[str, Any], start: str, without: tuple[str, ...] = ("steps", "vibration")
+    scene: dict[str, Any], start: str, without: tuple[str, ...] = ("steps", "control", "vibration")
 ) -> int:
     """Sum of the counts whose names start so."""
     return sum(

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import foamfit as ff
-from foamfit.solve.explicit import taylor
 from foamfit.solve.implicit import collocation, steps
 from foamfit.solve.plan import NO_DIRECTIONS, NO_SLOPES, RADAU, TAYLOR, Motion, plan
+from foamfit.solve.scene import DONE
 from reference import Bistable, Chain, Impact, Linear, energy_balance
 from test_simulate import (
     AREA,
@@ -380,13 +380,12 @@ def test_cost_of_a_long_chain_is_linear(kind: str) -> None:
         scene = plan(built(chain), ff.Impact(7e-3, 2.0), TIME)
         rows = np.array([spring.row for spring in built(chain).springs])
         tally, curves = np.zeros(2, np.int64), np.empty((2, TIME.size))
-        outcome, end, taken, switches = steps.integrate_implicit(
-            rows, np.array(chain.heights), scene.ends, scene.mass, scene.drag, scene.top,
-            scene.values, scene.speed, scene.time, 3e-8, 10_000, NO_DIRECTIONS, np.zeros((1, 0)),
-            curves, NO_SLOPES, np.empty((4, 5)), tally, 1e-6, np.zeros(1),
+        outcome, end, taken, switches, _ = steps.integrate_implicit(
+            scene.given(rows, np.array(chain.heights)), 3e-8, 1e-6, 10_000, NO_DIRECTIONS,
+            np.zeros((1, 0)), curves, NO_SLOPES, np.empty((4, 5)), tally,
         )  # fmt: skip
         stress = curves[0]
-        assert outcome == taylor.DONE
+        assert outcome == DONE
         assert switches == 2 * n
         assert tally[1] == n * tally[0]  # one block per spring and correction
         counts.append((end, stress.max(), tally[0], taken))

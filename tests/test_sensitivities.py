@@ -8,7 +8,8 @@ import pytest
 import foamfit as ff
 from foamfit.fitting.problem import make_problem
 from foamfit.springs.chain import Drive
-from foamfit.springs.spring import BISTABLE_NAMES, LINEAR_NAMES, Spring
+from foamfit.springs.parameters import BISTABLE_NAMES, LINEAR_NAMES
+from foamfit.springs.spring import Spring
 
 AREA = 1.9635e-5
 TIME = np.linspace(0.0, 8e-4, 81)

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 POINTS = 8  # Gauss points of a panel; its ends are known too
 MOST_PANELS, MOST_NUMBERS, MOST_DRIVEN = 3_000, 400_000, 40_000
-MOST_HURRY = 1e5
+MOST_RADIANS = 1e5
 
 _x, _w = np.polynomial.legendre.leggauss(POINTS)
 NODES = np.concatenate(([0.0], 0.5 * (1.0 + _x), [1.0]))
@@ -470,7 +470,7 @@ def explicit_fits(scene: Scene) -> bool:
     chain, drive, time = scene
     made = plan(chain, drive, time)
     rows = np.array([spring.row for spring in chain.springs])
-    return max(made.hurry(rows, np.array(chain.heights), made.drag)) < MOST_HURRY
+    return max(made.fastest_rates(rows, np.array(chain.heights))) < MOST_RADIANS
 
 
 def refined(

@@ -24,7 +24,8 @@ from foamfit.fitting.curves import choose_drive
 from foamfit.fitting.problem import make_params
 from foamfit.one_model import Found, Options, Progress
 from foamfit.results import Fit, Ladder, Rung, rung_name
-from foamfit.springs.model import Model, split_name
+from foamfit.springs.model import Model
+from foamfit.springs.parameters import split_name
 from foamfit.text import counted, percent
 from foamfit.trust.evidence import (
     MARGIN,

@@ -434,11 +434,11 @@ def _compiling(quiet: bool) -> Iterator[Callable[[], None]]:
     """Compile at first use, beside the body; it calls what is given before it simulates."""
     import logging
 
-    from foamfit.solve import precompile
+    from foamfit.solve import cache, precompile
 
     if quiet:  # what is compiled later is announced by the log
         logging.getLogger("foamfit").setLevel(logging.ERROR)
-    if precompile.compiled():
+    if cache.compiled():
         yield lambda: None
         return
     if not quiet:

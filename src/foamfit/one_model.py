@@ -26,7 +26,8 @@ from foamfit.fitting.search import (
     what_stopped,
 )
 from foamfit.results import Fit
-from foamfit.springs.model import Model, split_name
+from foamfit.springs.model import Model
+from foamfit.springs.parameters import split_name
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
 from foamfit.trust.covariance import AT_LIMIT

@@ -19,15 +19,9 @@ from foamfit.errors import InputError
 from foamfit.files import write_file
 from foamfit.solve.simulation import Response
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
-from foamfit.springs.model import KINDS
+from foamfit.springs.parameters import BISTABLE_NAMES, KINDS, LINEAR_NAMES
 from foamfit.springs.published import published
-from foamfit.springs.spring import (
-    BISTABLE_NAMES,
-    LINEAR_NAMES,
-    BistableSpring,
-    LinearSpring,
-    Spring,
-)
+from foamfit.springs.spring import BistableSpring, LinearSpring, Spring
 
 Made = TypeVar("Made")
 

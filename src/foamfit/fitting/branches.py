@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from foamfit.fitting.objective import Simulated
 from foamfit.fitting.problem import Problem
 from foamfit.springs import kernels
-from foamfit.springs.model import BRANCHES, split_name
+from foamfit.springs.parameters import BRANCHES, split_name
 
 FLIGHT = "free flight"
 

@@ -15,7 +15,8 @@ from foamfit.errors import InputError
 from foamfit.fitting.box import LARGEST_SHIFT, Scales, Space
 from foamfit.fitting.curves import check_interior, choose_drive, default_weights
 from foamfit.fitting.objective import Objective
-from foamfit.springs.model import Model, split_name
+from foamfit.springs.model import Model
+from foamfit.springs.parameters import split_name
 
 
 def make_params(

@@ -24,9 +24,10 @@ from foamfit.report.folder import load_result
 from foamfit.report.readable import readable
 from foamfit.results import Fit, ParameterEstimate
 from foamfit.springs.model import Model
+from foamfit.springs.parameters import BISTABLE_NAMES, LINEAR_NAMES
 from foamfit.springs.published import MM, MPA, PublishedSet
 from foamfit.springs.published import published as published_sets
-from foamfit.springs.spring import BISTABLE_NAMES, LINEAR_NAMES, LinearSpring
+from foamfit.springs.spring import LinearSpring
 
 Result = Fit | Mapping[str, Any] | str | Path
 

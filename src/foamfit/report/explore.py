@@ -370,7 +370,7 @@ def rough_guess(measurement: Measurement) -> dict[str, float]:
     """Read a spring off the loop as the fit does for its starts, the points only roughly placed."""
     from foamfit.fitting.box import Scales
     from foamfit.fitting.search import Loop, read_spring, smooth_loop
-    from foamfit.springs.spring import BISTABLE_NAMES
+    from foamfit.springs.parameters import BISTABLE_NAMES
 
     strain, stress = loop_of(smooth_loop(measurement))
     spring = read_spring(Loop(strain, stress), ROUGH, Scales.of(measurement))

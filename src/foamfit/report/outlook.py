@@ -27,7 +27,8 @@ from foamfit.results import ParameterEstimate
 from foamfit.solve.simulation import simulate
 from foamfit.springs import kernels
 from foamfit.springs.chain import Chain, Impact
-from foamfit.springs.model import Model, split_name, unit_of
+from foamfit.springs.model import Model
+from foamfit.springs.parameters import split_name, unit_of
 from foamfit.springs.published import published
 from foamfit.springs.spring import BistableSpring
 from foamfit.text import engineering

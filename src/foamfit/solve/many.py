@@ -24,15 +24,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from foamfit.solve.explicit.taylor import (
-    DONE,
-    NOT_FINITE,
-    STEP_UNDERFLOW,
-    TOO_MANY_STEPS,
-    before_contact,
-    first_past,
-    fly,
-)
 from foamfit.solve.polynomial import (
     LEAST_TRUNCATION,
     fill_values,
@@ -40,6 +31,18 @@ from foamfit.solve.polynomial import (
     order_for,
     value_and_slope,
     value_at,
+)
+from foamfit.solve.scene import (
+    DONE,
+    NOT_FINITE,
+    STEP_UNDERFLOW,
+    TOO_MANY_STEPS,
+    Scene,
+    SceneTuple,
+    before_contact,
+    first_past,
+    fly,
+    log_switch,
 )
 from foamfit.springs.kernels import (
     ETA,
@@ -260,11 +263,8 @@ def _switch(
         i = _winner(tree)
         left = group.branches[i]
         entered = above(left) if rising else below(left)
-        if switches < log.shape[0]:
-            log[switches, 0], log[switches, 1] = now, i
-            log[switches, 2], log[switches, 3] = left, entered
-            log[switches, 4] = _strain(group, i, stress)
-        switches += 1
+        strain = _strain(group, i, stress)
+        switches = log_switch(log, switches, now, i, left, entered, strain)
         _swap(group, i, entered)
     return switches
 
@@ -384,41 +384,12 @@ def _scales(group: Group, mass: float, drag: float, speed: float) -> tuple[float
 
 @compiled
 def integrate_aggregate(
-    rows: Array,
-    heights: Array,
-    mass: float,
-    drag: float,
-    speed: float,
-    t: Array,
-    tol: float,
-    max_steps: int,
-    curves: Array,
-    log: Array,
-    effort: Branches,
+    given: SceneTuple, tol: float, max_steps: int, curves: Array, log: Array, effort: Branches
 ) -> tuple[int, float, int, int]:
-    """Integrate an impact on springs without dashpots or masses between them, over the samples t.
+    """Integrate an impact on springs without dashpots or masses between them, over the samples.
 
-    Parameters
-    ----------
-    rows : (springs, columns) array
-        The springs, base first, as `holds` wants them; see `springs.kernels`.
-    heights : (springs,) array
-        m.
-    mass, drag : float
-        Areal mass, kg/m², and onsite damping η_site/H, Pa·s/m, of the top.
-    speed : float
-        Velocity of the striker at contact, at the time 0, m/s.
-    t : (n,) array
-        Samples, s.
-    tol, max_steps
-        Truncation of a step relative to the motion; bound on steps.
-    curves : (1 + springs or 1, n) array
-        Filled with the base stress, Pa, and the displacements above each spring, or of the top
-        alone, m.
-    log : (m, 5) array
-        Filled with the switches: time, spring, branch left, branch entered, strain.
-    effort : (2,) array
-        Added to: sums over all springs, and orders of all steps.
+    The arguments are those of `explicit.taylor.integrate`, of springs as `holds` wants them;
+    `effort` (2,) is added to: sums over all springs, and orders of all steps.
 
     Returns
     -------
@@ -426,8 +397,10 @@ def integrate_aggregate(
         Outcome, end of contact (NaN if none; where there is no answer, how far it came), steps
         taken, switches (also those past the log).
     """
+    scene = Scene(*given)
+    heights, mass, drag, speed, t = scene.heights, scene.mass[0], scene.drag, scene.speed, scene.t
     tol = max(tol, LEAST_TRUNCATION)
-    count, group, order = heights.size, _make_group(rows, heights), order_for(tol, DEGREE)
+    count, group, order = heights.size, _make_group(scene.rows, heights), order_for(tol, DEGREE)
     now = Step(
         np.zeros(order + 1), np.zeros(order + 1), np.zeros(order + 1),
         np.zeros((order + 1, order + 1)), np.zeros(DEGREE + 1),

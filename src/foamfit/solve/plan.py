@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foamfit.errors import InputError, SimulationError
-from foamfit.solve import many, precompile
-from foamfit.solve.explicit import series, taylor
-from foamfit.solve.explicit.series import equilibrium_tangents
+from foamfit.solve import cache, many
+from foamfit.solve import scene as scenes
+from foamfit.solve.explicit import taylor
 from foamfit.solve.implicit import steps, vibration
 from foamfit.springs import kernels
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.springs.law import BISTABLE
+from foamfit.springs.parameters import OWN_ETA, OWN_HEIGHT
+from foamfit.springs.sensitivities import equilibrium_tangents
 from foamfit.springs.spring import as_samples
 
 Array = NDArray[np.float64]
@@ -45,14 +48,14 @@ LEAST_AGGREGATE, LEAST_ELONGATED = 9, 3
 LOGGED = 1024
 
 _OUTCOMES = {
-    taylor.TOO_MANY_STEPS: "the bound of {steps} steps was reached: something in the scene is "
+    scenes.TOO_MANY_STEPS: "the bound of {steps} steps was reached: something in the scene is "
     "too fast to be followed (a light mass or a heavy dashpot)",
-    taylor.STEP_UNDERFLOW: "the step shrank to nothing near t = {time:g} s: there the scene "
+    scenes.STEP_UNDERFLOW: "the step shrank to nothing near t = {time:g} s: there the scene "
     "changes faster than numbers can tell (a strain at the end of its branch, a very light mass, "
     "or many springs on a flat branch)",
-    taylor.FLAT_UNDER_STRESS: "a prescribed stress acts on a flat branch (kh_plus or kh_minus = 0) "
+    scenes.FLAT_UNDER_STRESS: "a prescribed stress acts on a flat branch (kh_plus or kh_minus = 0) "
     "that nothing slows; give the top a mass or the spring a dashpot",
-    taylor.NOT_FINITE: "a stress or strain is no longer finite: the drive goes past the end of a "
+    scenes.NOT_FINITE: "a stress or strain is no longer finite: the drive goes past the end of a "
     "branch (strain 1 on branch a, 1 + eps_star on branch c)",
 }
 
@@ -61,9 +64,9 @@ NO_DIRECTIONS: Directions = np.empty((0, 2), np.int64)
 NO_SWITCHES = np.empty((0, 5))
 _NOTHING = np.zeros(1)
 # Tops under which springs start from rest, and what they start from.
-_RESTING, _AT_REST = (taylor.FREE, taylor.VISCOUS), np.zeros((1, 0))
+_RESTING, _AT_REST = (scenes.FREE, scenes.VISCOUS), np.zeros((1, 0))
 # Outcomes of explicit steps after which implicit ones are tried.
-_WRONG_TOOL = (taylor.TOO_MANY_STEPS, taylor.STEP_UNDERFLOW)
+_WRONG_TOOL = (scenes.TOO_MANY_STEPS, scenes.STEP_UNDERFLOW)
 NO_SLOPES = np.empty((0, 0, 0))
 
 
@@ -97,11 +100,11 @@ class Plan(NamedTuple):
     height : float
         H, m.
     ends, mass : arrays
-        The groups of springs and the areal masses between them; see `explicit.taylor.integrate`.
+        The groups of springs and the areal masses between them; see `solve.scene.Scene`.
     drag : float
         η_site/H, Pa·s/m.
     top : int
-        What is known of the top; see `explicit.taylor`.
+        What is known of the top; see `solve.scene`.
     values, time : (n,) arrays
         The drive and its samples.
     speed : float
@@ -145,7 +148,7 @@ class Plan(NamedTuple):
 
         `drag` replaces the scene's own. With `everything` false only the base stress and the
         displacement of the top, shape (1, n_t), are sure to be there. `directions` (p, 2) are those
-        of the derivatives to carry along; see `explicit.series`.
+        of the derivatives to carry along; see `springs.parameters`.
 
         Raises
         ------
@@ -158,43 +161,47 @@ class Plan(NamedTuple):
         curves = np.empty((1 + len(heights) if everything else 2, time.size))
         slopes = np.empty((p, *curves.shape)) if p else NO_SLOPES
         bounces = self.plain and not drag and self.implicit is None
-        stiff = not bounces and self._is_stiff(rows, heights, drag)
-        drag = self.drag if drag is None else drag
+        given = self.given(rows, heights, drag)
+        stiff = not bounces and self._is_stiff(given)
         if p == 0 and not stiff and len(heights) >= LEAST_AGGREGATE and self._is_one(rows):
-            return self._aggregate(rows, heights, rtol, drag, curves)
+            return self._aggregate(given, rtol, curves)
         start = _AT_REST if self.top in _RESTING else self._start(rows, heights, directions)
         log = np.empty((LOGGED, 5)) if everything else NO_SWITCHES
         if not stiff:
-            precompile.announce(taylor.integrate, "the solver")
-            ending = taylor.integrate(
-                rows, heights, self.ends, self.mass, drag, self.top, self.values, self.speed, time,
-                self.margin * rtol, self.max_explicit if self.implicit is None else self.max_steps,
-                directions, start, curves, slopes, log,
-            )  # fmt: skip
+            cache.announce(taylor.integrate, "the solver")
+            most = self.max_explicit if self.implicit is None else self.max_steps
+            ending: Sequence[Any] = taylor.integrate(
+                given, self.margin * rtol, most, directions, start, curves, slopes, log
+            )
             if self.implicit is False or ending[0] not in _WRONG_TOOL:
                 return _motion(TAYLOR, ending, curves, slopes, log)
         margin = OF_MASSES_IMPLICIT if len(self.ends) > 1 else IMPLICIT
-        lost = np.zeros(1)
-        precompile.announce(steps.integrate_implicit, "the solver of stiff scenes")
-        ending = steps.integrate_implicit(
-            rows, heights, self.ends, self.mass, drag, self.top, self.values, self.speed, time,
-            max(margin * rtol, LEAST_IMPLICIT), self.max_steps, directions, start, curves, slopes,
-            log, np.zeros(2, np.int64), rtol, lost,
+        cache.announce(steps.integrate_implicit, "the solver of stiff scenes")
+        *ending, lost = steps.integrate_implicit(
+            given, max(margin * rtol, LEAST_IMPLICIT), rtol, self.max_steps, directions, start,
+            curves, slopes, log, np.zeros(2, np.int64),
         )  # fmt: skip
-        return _motion(RADAU, ending, curves, slopes, log, float(lost[0]))
+        return _motion(RADAU, ending, curves, slopes, log, lost)
+
+    def given(self, rows: Array, heights: Array, drag: float | None = None) -> scenes.SceneTuple:
+        """The scene with these springs (and onsite damping) as the compiled integrators take it."""
+        return (
+            rows, heights, self.ends, self.mass, self.drag if drag is None else drag, self.top,
+            self.values, self.speed, self.time,
+        )  # fmt: skip
 
     def _closed_form(
         self, rows: Array, heights: Array, everything: bool, directions: Directions
     ) -> Motion:
         """Undamped and massless: one stress in all springs; or one spring under known motion."""
-        moved, wanted = self.top == taylor.MOTION, everything or len(directions) > 0
+        moved, wanted = self.top == scenes.MOTION, everything or len(directions) > 0
         if moved:
             top = np.array(self.values)
             stress, strain, branches = self._stretched(rows, heights, wanted)
             fine = True
         else:
             stress, top = np.array(self.values), np.empty(self.time.size)
-            strain, branches = _room(len(heights) if wanted else 0, self.time.size)
+            strain, branches = _new_history(len(heights) if wanted else 0, self.time.size)
             fine = kernels.strains_along(rows, heights, stress, top, strain, branches)
         slopes: Slopes | None = None
         if len(directions):
@@ -206,12 +213,12 @@ class Plan(NamedTuple):
             rate = np.gradient(strain[0], self.time)
             stress = stress + eta * rate
             for p, (_, what) in enumerate(directions):
-                if slopes is not None and what == series.OWN_ETA:
+                if slopes is not None and what == OWN_ETA:
                     slopes.base_stress[p] += rate
-                elif slopes is not None and what == series.OWN_HEIGHT:
+                elif slopes is not None and what == OWN_HEIGHT:
                     slopes.base_stress[p] -= eta * rate / heights[0]
         if not (fine and math.isfinite(kernels.total(stress))):
-            raise SimulationError(_OUTCOMES[taylor.NOT_FINITE])
+            raise SimulationError(_OUTCOMES[scenes.NOT_FINITE])
         if not everything:
             if slopes is not None:
                 slopes = Slopes(slopes.displacement[:, -1:], slopes.base_stress)
@@ -233,26 +240,24 @@ class Plan(NamedTuple):
             return stress, strain[None, :], history[None, :]
         stress = np.empty(n)
         if count >= LEAST_ELONGATED and many.holds(rows):
-            strain, branches = _room(count if wanted else 0, n)
+            strain, branches = _new_history(count if wanted else 0, n)
             if many.equilibrium_along(rows, heights, self.values, stress, strain, branches):
                 return stress, strain, branches
-        strain, branches = _room(count, n)
+        strain, branches = _new_history(count, n)
         kernels.equilibrium_along(rows, heights, self.values, stress, strain, branches)
         miss = np.abs(heights @ strain - self.values).max()
         if not miss <= 1e-9 * (self.height + np.abs(self.values).max()):
-            raise SimulationError(_OUTCOMES[taylor.NOT_FINITE])
+            raise SimulationError(_OUTCOMES[scenes.NOT_FINITE])
         return stress, strain, branches
 
-    def _aggregate(
-        self, rows: Array, heights: Array, rtol: float, drag: float, curves: Array
-    ) -> Motion:
+    def _aggregate(self, given: scenes.SceneTuple, rtol: float, curves: Array) -> Motion:
         """Springs under one stress count as one: one step to a switch."""
-        log, tolerance = np.empty((4 * len(heights) + 64, 5)), AS_ONE * rtol / len(heights)
-        precompile.announce(many.integrate_aggregate, "the solver of many springs")
+        count = len(given[0])
+        log, tolerance = np.empty((4 * count + 64, 5)), AS_ONE * rtol / count
+        cache.announce(many.integrate_aggregate, "the solver of many springs")
         ending = many.integrate_aggregate(
-            rows, heights, self.mass[0], drag, self.speed, self.time, tolerance, self.max_steps,
-            curves, log, np.zeros(2, np.int64),
-        )  # fmt: skip
+            given, tolerance, self.max_steps, curves, log, np.zeros(2, np.int64)
+        )
         return _motion(AGGREGATE, ending, curves, NO_SLOPES, log)
 
     def _start(self, rows: Array, heights: Array, directions: Directions) -> Array:
@@ -262,8 +267,8 @@ class Plan(NamedTuple):
         """
         start = np.zeros((1 + len(directions), len(heights)))
         first = self.ends[-2] if len(self.ends) > 1 else 0
-        rows, heights, moved = rows[first:], heights[first:], self.top == taylor.MOTION
-        stress, (strain, branches) = self.values[:1].copy(), _room(len(heights), 1)
+        rows, heights, moved = rows[first:], heights[first:], self.top == scenes.MOTION
+        stress, (strain, branches) = self.values[:1].copy(), _new_history(len(heights), 1)
         if moved:
             kernels.equilibrium_along(rows, heights, self.values[:1], stress, strain, branches)
         else:
@@ -271,7 +276,7 @@ class Plan(NamedTuple):
             held = rows[:, kernels.ETA] > 0.0
             strain[held] = 0.0  # a dashpot holds its spring where it is
             if not np.isfinite(strain).all():
-                raise SimulationError(_OUTCOMES[taylor.NOT_FINITE])
+                raise SimulationError(_OUTCOMES[scenes.NOT_FINITE])
             branches[held, 0] = np.where(
                 rows[held, kernels.KIND] == BISTABLE, kernels.A, kernels.LINE
             )
@@ -282,7 +287,7 @@ class Plan(NamedTuple):
             above, _ = equilibrium_tangents(rows, heights, strain, branches, moved, local)
             longer = np.diff(above[:, :, 0], axis=1, prepend=0.0)
             for p, (spring, what) in enumerate(local):
-                longer[p, spring] -= strain[spring, 0] if what == series.OWN_HEIGHT else 0.0
+                longer[p, spring] -= strain[spring, 0] if what == OWN_HEIGHT else 0.0
             start[1 + own, first:] = longer / heights
         return start
 
@@ -290,30 +295,28 @@ class Plan(NamedTuple):
         """Tell whether an impact acts on springs so many and so plain that they count as one."""
         return (
             len(self.ends) == 1
-            and self.top == taylor.FREE
+            and self.top == scenes.FREE
             and self.speed > 0.0
             and bool(many.holds(rows))
         )
 
-    def hurry(self, rows: Array, heights: Array, drag: float) -> tuple[float, float]:
+    def fastest_rates(self, rows: Array, heights: Array) -> tuple[float, float]:
         """Vibration and relaxation (radians) that explicit steps would have to go through."""
-        return vibration.hurry_of(
-            rows, heights, self.ends, self.mass, drag, self.top, self.speed, self.time
-        )
+        return vibration.fastest_rates(self.given(rows, heights))
 
-    def _is_stiff(self, rows: Array, heights: Array, drag: float | None) -> bool:
+    def _is_stiff(self, given: scenes.SceneTuple) -> bool:
         """Tell whether explicit steps would have to follow what is long over."""
         if self.implicit is not None:
             return self.implicit
-        if self.speed > 0.0 and vibration.parts_faintly(rows, heights, self.mass[-1]):
+        if self.speed > 0.0 and vibration.stops_the_striker(given):
             return True
-        swings, decays = self.hurry(rows, heights, self.drag if drag is None else drag)
+        swings, decays = vibration.fastest_rates(given)
         return bool(swings > MOST_VIBRATION or decays > MOST_RELAXATION)
 
 
 def _motion(
     method: str,
-    ending: tuple[int, float, int, int],
+    ending: Sequence[Any],
     curves: Array,
     slopes: Array,
     log: Array,
@@ -321,15 +324,15 @@ def _motion(
 ) -> Motion:
     """Gather what an integrator found, or say why it found nothing."""
     outcome, time, steps, switches = ending
-    if outcome != taylor.DONE:
+    if outcome != scenes.DONE:
         raise SimulationError(_OUTCOMES[outcome].format(steps=steps, time=time))
     slope = None if slopes is NO_SLOPES else Slopes(slopes[:, 1:], slopes[:, 0])
     seen = log if log is NO_SWITCHES else log[:switches]
     return Motion(curves[1:], curves[0], time, seen, steps, method, slope, unresolved)
 
 
-def _room(count: int, n: int) -> tuple[Array, NDArray[np.int64]]:
-    """Room for the strains and branches of springs along a history."""
+def _new_history(count: int, n: int) -> tuple[Array, NDArray[np.int64]]:
+    """Empty arrays for the strains and branches of springs along a history."""
     return np.empty((count, n)), np.empty((count, n), np.int64)
 
 
@@ -385,7 +388,7 @@ def plan(
     time = _time(t)
     above = chain.masses[-1]
     speed, values = 0.0, _NOTHING
-    top = taylor.FREE
+    top = scenes.FREE
     if isinstance(drive, Impact):
         above += drive.mass
         speed = drive.velocity
@@ -398,18 +401,18 @@ def plan(
             )
         if isinstance(drive, DisplacementDrive):
             above = 0.0
-            top = taylor.MOTION
+            top = scenes.MOTION
         elif above == 0.0:
-            top = taylor.VISCOUS if chain.site_damping > 0.0 else taylor.STRESS
+            top = scenes.VISCOUS if chain.site_damping > 0.0 else scenes.STRESS
     ends, masses = chain.arrays.top, np.array([above / chain.area])
     if chain.arrays.heavy:
         inside = np.flatnonzero(chain.arrays.masses[:-1] > 0.0)
         ends = np.append(inside + 1, ends)
         masses = np.append(chain.arrays.masses[inside] / chain.area, masses)
-    damped = dashpots or chain.arrays.damped or top == taylor.VISCOUS
+    damped = dashpots or chain.arrays.damped or top == scenes.VISCOUS
     if len(ends) > 1 or above > 0.0:
         solver = SECOND_ORDER
-    elif damped and not (top == taylor.MOTION and len(chain.springs) == 1):
+    elif damped and not (top == scenes.MOTION and len(chain.springs) == 1):
         solver = FIRST_ORDER
     else:
         solver = CLOSED_FORM

@@ -6,143 +6,101 @@ is compiled where it is first needed, and said so.
 
 from __future__ import annotations
 
-import functools
 import gc
-import logging
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from pathlib import Path
-from typing import Any, NamedTuple
+from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 
-_LOG = logging.getLogger(__name__)
-
-Call = tuple[Any, tuple[Any, ...]]
-
-# The modules that compiled loops are written in, and the package that they lie in.
-PACKAGE = Path(__file__).parents[1]
-COMPILED = (
-    "springs/law", "springs/kernels", "solve/polynomial", "solve/many", "solve/explicit/series",
-    "solve/explicit/taylor", "solve/implicit/collocation", "solve/implicit/steps",
-    "solve/implicit/vibration",
-)  # fmt: skip
+from foamfit.solve.cache import PACKAGE
 
 
-class _Calls(NamedTuple):
-    """Functions to compile, with examples of their arguments.
+def _run(drive: str, count: int = 1, eta: float = 0.0) -> None:
+    """Simulate a few samples of a small chain, and a derivative, without a look at its rates."""
+    from foamfit.solve.plan import plan
+    from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
+    from foamfit.springs.spring import BistableSpring
 
-    `pieces` of the integrator are made by the other process, and then the `rest`, those last that
-    an impact on one spring does not need; `own` pieces and the integrator itself, `whole`, by this.
+    spring = BistableSpring(5e6, 8e7, -2e5, 0.14, 0.31, 1.4e7, 2.5e6, eta)
+    chain, shape = Chain([spring] * count, [1e-3] * count, 2e-5), np.array([0.0, 1.0, 0.5, 0.0])
+    loads: dict[str, Drive] = {
+        "impact": Impact(7e-3, 2.0),
+        "stress": StressDrive(1e6 * shape),
+        "displacement": DisplacementDrive(1e-4 * shape),
+    }
+    scene = plan(chain, loads[drive], np.linspace(0.0, 1e-3, 4))._replace(implicit=False)
+    directions = np.zeros((1, 2), np.int64)
+    scene.run(chain.arrays.rows, chain.arrays.heights, 1e-2, directions=directions)
+
+
+def _calls() -> dict[Any, tuple[Any, ...]]:
+    """The explicit integrator, the loops that it calls, and the types of their arguments.
+
+    Some small scenes run uncompiled, which shows them.
     """
-
-    pieces: list[Call]
-    rest: list[Call]
-    own: list[Call]
-    whole: list[Call]
-
-
-def _calls() -> _Calls:
-    from foamfit.solve import polynomial
-    from foamfit.solve.explicit import series, taylor
-    from foamfit.solve.implicit import vibration
-    from foamfit.springs import kernels
-
-    one, flat, cube = np.zeros(1), np.zeros((1, 1)), np.zeros((1, 1, 1))
-    whole, table = np.zeros(1, np.int64), np.zeros((1, 1), np.int64)
-    directions = np.zeros((0, 2), np.int64)
-    links = series.Links(flat, whole, one, 0.0, taylor.FREE)
-    _, d = series.make_series.py_func(1, 6, directions)
-    out = taylor.Samples(one, flat, cube)
-    scene = (flat, one, whole, one, 0.0, 0, one, 0.0, one, 0.0, 0, directions, flat)
-    return _Calls(
-        pieces=[
-            (series.expand_tangents, (links, cube, d, 0)),
-            (polynomial.first_crossing, (one, 0, 0.0, 0.0, 0.0)),
-            (taylor.sample, (links, cube, 0, out, 0, 0, 0.0, one)),
-            (taylor.sample_tangents, (links, cube, d, 0, out, 0, 0, 0.0, one)),
-            (series.make_series, (1, 0, directions)),
-            (series.advance_tangents, (d, 0, 0, 0.0)),
-            (taylor.depart, (links, cube, d, 0, 0, 0.0, 0.0, out, 0, flat)),
-            (taylor.first_switch, (flat, cube, 0, 0.0)),
-            (taylor.tangent_length, (one, d, 0, 0.0, 0.0, flat)),
-            (taylor.first_lift, (cube, 0, True, True, 0.0)),
-        ],
-        rest=[
-            (kernels.fault, (one,)),
-            (kernels.fill_rows, (whole, one, flat)),
-            (kernels.total, (one,)),
-            (kernels.stress_along, (one, one)),
-            (series.equilibrium_tangents, (flat, one, flat, table, True, directions)),
-            (vibration.parts_faintly, (flat, one, 0.0)),
-            (vibration.hurry_of, (flat, one, whole, one, 0.0, 0, 0.0, one)),
-            (kernels.strains_along, (flat, one, one, one, flat, table)),
-            (kernels.equilibrium_along, (flat, one, one, one, flat, table)),
-        ],
-        own=[
-            (series.expand, (links, cube, one, one, 0)),
-            (taylor.begin, (flat, one, flat, directions, whole, flat, cube, d)),
-            (taylor.switch, (flat, whole, flat, cube, d, directions, 0, 0.0, 0.0, 0, 0, flat, 0)),
-            (series.expand_bare, (links, cube, one, 0)),
-            (series.advance, (cube, 0, 0, 0.0)),
-            (taylor.before_contact, (flat, one, 0.0)),
-            (taylor.step_length, (links, cube, one, 0, 0.0, 0.0, 0.0, 0.0, 0.0)),
-            (taylor.settle, (links, cube)),
-        ],
-        whole=[(taylor.integrate, (*scene, flat, cube, flat))],
-    )
-
-
-def _compile(calls: list[Call]) -> None:
     from numba import typeof
 
+    from foamfit.solve import plan, polynomial, scene
+    from foamfit.solve.explicit import series, taylor
+    from foamfit.springs import kernels, sensitivities
+
+    calls: dict[Any, tuple[Any, ...]] = {}
+
+    def plain(loop: Any, direct: bool) -> Callable[..., Any]:
+        def call(*arguments: Any) -> Any:
+            if direct and loop not in calls:
+                calls[loop] = tuple(map(typeof, arguments))
+            return loop.py_func(*arguments)
+
+        return call
+
+    modules = (kernels, sensitivities, polynomial, scene, series, taylor, plan)
+    was = {module: dict(vars(module)) for module in modules}
+    try:
+        for module, names in was.items():
+            for name, loop in names.items():
+                if hasattr(loop, "py_func"):
+                    setattr(module, name, plain(loop, module is taylor))
+        with np.errstate(all="ignore"):
+            _run("impact")
+            _run("impact", eta=50.0)
+            _run("displacement", 2, eta=50.0)
+    finally:
+        for module, names in was.items():
+            vars(module).update(names)
+    return calls
+
+
+def _compile(calls: dict[Any, tuple[Any, ...]], cached: bool) -> None:
+    """Compile the loops that have, or have not, a file of their own in the cache."""
     gc.disable()  # what compiling makes stays
     try:
-        for function, arguments in calls:
-            function.compile(tuple(typeof(value) for value in arguments))  # type: ignore[no-untyped-call]
+        for loop, types in calls.items():
+            if (loop.stats.cache_path is not None) == cached:
+                loop.compile(types)
     finally:
         gc.enable()
 
 
-def _caches() -> set[Path]:
-    """Folders in which numba keeps what it compiled of this package: one beside each of its own."""
-    from foamfit.solve import polynomial
-    from foamfit.solve.explicit import taylor
+def _rest() -> None:
+    """Call what else a fit calls; last what an impact on one spring does not need."""
+    from foamfit.solve import scene
     from foamfit.solve.implicit import vibration
     from foamfit.springs import kernels
+    from foamfit.springs.model import Model
 
-    loops = (kernels.fault, polynomial.first_crossing, taylor.integrate, vibration.hurry_of)
-    return {Path(loop.stats.cache_path or ".") for loop in loops}
-
-
-@functools.cache
-def announce(function: Any, what: str) -> None:
-    """Log, once in a process, that `function` is about to be compiled, unless it has been."""
-    made = getattr(function, "signatures", True)  # where numba is switched off there are none
-    if not made and not compiled(function.__name__):
-        _LOG.warning("foamfit: compiling %s, once after installation", what)
-
-
-def compiled(name: str = "integrate") -> bool:
-    """Tell whether an earlier run left a loop, compiled of this very source, in the cache.
-
-    What is older than any module that compiled loops are written in is removed: numba itself
-    compares it with the module of the outermost loop alone.
-    """
-    times = [(PACKAGE / f"{name}.py").stat().st_mtime for name in COMPILED]
-    written = max((at for at in times if at <= time.time()), default=0.0)  # some clocks are wrong
-    fresh = False
-    for made in (path for cache in _caches() for path in cache.glob("*.nb[ci]")):
-        if made.stat().st_mtime < written:
-            with suppress(OSError):  # not ours to remove
-                made.unlink(missing_ok=True)
-        elif f".{name}-" in made.name:
-            fresh = fresh or made.suffix == ".nbc"
-    return fresh
+    Model(("linear",)).rows(np.ones(2))
+    one, rows = np.ones(1), np.ones((1, kernels.N_COLUMNS))
+    given = (rows, one, np.ones(1, np.int64), one, 0.0, scene.FREE, one, 1.0, one)
+    vibration.stops_the_striker(given)
+    vibration.fastest_rates(given)
+    _run("displacement")
+    _run("displacement", 2)
+    _run("stress")
 
 
 @contextmanager
@@ -160,11 +118,11 @@ def side_by_side() -> Iterator[Callable[[], None]]:
     ) as other:
 
         def finish() -> None:
-            calls = _calls()
-            _compile(calls.own)
+            integrator, *calls = _calls().items()
+            _compile(dict(calls), cached=False)
             if other.stdout is not None:
                 other.stdout.readline()  # the pieces are there, or the other process has failed
-            _compile(calls.whole)
+            _compile(dict([integrator]), cached=True)
 
         try:
             yield finish
@@ -175,10 +133,10 @@ def side_by_side() -> Iterator[Callable[[], None]]:
 
 
 def _other() -> None:
-    calls = _calls()
-    _compile(calls.pieces)
+    _, *calls = _calls().items()
+    _compile(dict(calls), cached=True)
     print("pieces", flush=True)
-    _compile(calls.rest)
+    _rest()
 
 
 if __name__ == "__main__":

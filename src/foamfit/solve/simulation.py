@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foamfit.errors import InputError, SimulationError
-from foamfit.solve.explicit import series
 from foamfit.solve.plan import (
     AGGREGATE,
     CLOSED_FORM,
@@ -27,16 +26,12 @@ from foamfit.solve.plan import (
 from foamfit.springs import kernels
 from foamfit.springs.chain import Chain, Drive, check_scene
 from foamfit.springs.law import BISTABLE
-from foamfit.springs.spring import (
-    BISTABLE_NAMES,
-    LINEAR_NAMES,
-    BistableSpring,
-    as_number,
-)
+from foamfit.springs.parameters import DRAG, KINDS, OWN_HEIGHT, direction
+from foamfit.springs.spring import as_number
 
 Array = NDArray[np.float64]
 
-_RINGING = (
+_UNRESOLVED = (
     "masses vibrate too fast to be followed, by up to {size:.1g} of the range: ask for no smaller "
     "rtol than that, give the springs heavier dashpots, or leave the masses out"
 )
@@ -120,17 +115,17 @@ def _verified(
     if lost > 0.7 * rtol:  # the comparison below leaves 0.3
         scene = scene._replace(implicit=False)
         # an explicit step goes through two or three radians
-        if max(scene.hurry(rows, heights, scene.drag)) / 3.0 > MOST_WORK / len(heights):
-            raise SimulationError(_RINGING.format(size=lost))
+        if max(scene.fastest_rates(rows, heights)) / 3.0 > MOST_WORK / len(heights):
+            raise SimulationError(_UNRESOLVED.format(size=lost))
         motion = _followed(scene, rows, heights, rtol, directions, lost)
-    room = _room_at_peak(scene, rows, heights, motion, rtol)
-    if 0.3 * rtol * room < 1e-15:
+    distance = _distance_at_peak(scene, rows, heights, motion, rtol)
+    if 0.3 * rtol * distance < 1e-15:
         raise SimulationError(
-            f"a strain comes within {room:.1g} of the end of its branch, 1 + eps_star: there "
+            f"a strain comes within {distance:.1g} of the end of its branch, 1 + eps_star: there "
             f"rounding alone makes errors above rtol = {rtol:g}"
         )
     forced = 0 if scene.speed > 0.0 else scene.time.size
-    many = _many(scene, motion, FEW_STEPS + 2 * forced) or inside or room < CLOSE
+    many = _many(scene, motion, FEW_STEPS + 2 * forced) or inside or distance < CLOSE
     many = many and scene.solver == SECOND_ORDER
     if not (many or motion.method == RADAU) or rtol < 1e-12:  # no finer run could tell
         return motion
@@ -184,7 +179,7 @@ def _followed(
     except SimulationError:
         if scene.implicit is not False:
             raise
-        raise SimulationError(_RINGING.format(size=lost)) from None
+        raise SimulationError(_UNRESOLVED.format(size=lost)) from None
 
 
 def _many(scene: Plan, motion: Motion, few: int) -> bool:
@@ -204,7 +199,7 @@ def _difference(one: Array, other: Array) -> float:
     return float(np.abs(one - other).max()) / span if span > 0.0 else 0.0
 
 
-def _room(rows: Array, heights: Array, displacement: Array) -> float:
+def _distance_to_pole(rows: Array, heights: Array, displacement: Array) -> float:
     """Least distance, in strain, of a spring on branch c from its end at 1 + ε_*."""
     strain = np.diff(displacement, axis=0, prepend=0.0).max(axis=1) / heights
     bistable = (rows[:, kernels.KIND] == BISTABLE) & (strain > rows[:, kernels.EPS_C])
@@ -217,31 +212,33 @@ def _hard(scene: Plan, rows: Array, heights: Array) -> bool:
     return brought >= 6.0 * float(heights.dot(rows[:, kernels.KC]))
 
 
-def _room_at_peak(scene: Plan, rows: Array, heights: Array, motion: Motion, rtol: float) -> float:
-    """Room at the peak of an impact that may come close to the end of a branch.
+def _distance_at_peak(
+    scene: Plan, rows: Array, heights: Array, motion: Motion, rtol: float
+) -> float:
+    """Least distance, at the peak of an impact, of a spring from the end of its branch.
 
     The peak of a hard blow is so short that no sample need lie in it: it is closed in on. In
     equilibrium all springs are longest together.
     """
     if scene.solver == CLOSED_FORM:
         peak = int(motion.displacement[-1].argmax())
-        return _room(rows, heights, motion.displacement[:, peak : peak + 1])
-    room = _room(rows, heights, motion.displacement)
+        return _distance_to_pole(rows, heights, motion.displacement[:, peak : peak + 1])
+    distance = _distance_to_pole(rows, heights, motion.displacement)
     bistable = rows[:, kernels.KIND] == BISTABLE
     if scene.speed == 0.0 or not bistable.any():
-        return room
+        return distance
     if not _hard(scene, rows, heights):
-        return room
+        return distance
     low, high = 0.0, float(scene.time[-1])
     for _ in range(12):
         grid = np.linspace(low, high, 201)
         top = scene._replace(time=grid).run(rows, heights, rtol).displacement
-        room = min(room, _room(rows, heights, top))
+        distance = min(distance, _distance_to_pole(rows, heights, top))
         at = int(top[-1].argmax())
         low, high = float(grid[max(at - 1, 0)]), float(grid[min(at + 1, 200)])
         if high - low < 1e-15 * high or at == 200:
             break
-    return room
+    return distance
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,25 +258,6 @@ class Sensitivity:
     base_stress: Array
 
 
-def _direction(chain: Chain, name: str) -> tuple[int, int]:
-    """Spring and own parameter, or height, or onsite damper, that a name like "s1_kc" means."""
-    if name == "site_eta":
-        return -1, series.DRAG
-    prefix, _, short = name.partition("_")
-    known = [f"s{i}" for i in range(1, len(chain.springs) + 1)]
-    if prefix in known:
-        spring = known.index(prefix)
-        own = BISTABLE_NAMES if isinstance(chain.springs[spring], BistableSpring) else LINEAR_NAMES
-        if short == "height":
-            return spring, series.OWN_HEIGHT
-        if short in own:
-            return spring, BISTABLE_NAMES.index(short)
-    raise InputError(
-        f"sensitivities: '{name}' is not a parameter of this chain; give names like s1_k0, "
-        "s2_height or site_eta"
-    )
-
-
 def _sensitivities(
     chain: Chain, names: Sequence[str], directions: Directions, slopes: Slopes
 ) -> dict[str, Sensitivity]:
@@ -288,9 +266,9 @@ def _sensitivities(
     drag = chain.site_damping / chain.height
     for p, name in enumerate(names):
         moved, pressed = slopes.displacement[p], slopes.base_stress[p]
-        if directions[p, 1] == series.DRAG:
+        if directions[p, 1] == DRAG:
             moved, pressed = moved / chain.height, pressed / chain.height
-        elif directions[p, 1] == series.OWN_HEIGHT and drag > 0.0:
+        elif directions[p, 1] == OWN_HEIGHT and drag > 0.0:
             moved = moved - drag / chain.height * slopes.displacement[-1]
             pressed = pressed - drag / chain.height * slopes.base_stress[-1]
         out[name] = Sensitivity(moved, pressed)
@@ -338,10 +316,11 @@ def simulate(
         raise InputError(f"rtol = {rtol:g} is not admissible: it must be between 1e-14 and 0.1")
     directions = NO_DIRECTIONS
     if sensitivities:
-        wanted = [_direction(chain, name) for name in sensitivities]
-        longer = any(what == series.OWN_HEIGHT for _, what in wanted)
+        kinds = tuple(KINDS[spring.kind] for spring in chain.springs)
+        wanted = [direction(kinds, name) for name in sensitivities]
+        longer = any(what == OWN_HEIGHT for _, what in wanted)
         if longer and chain.site_damping > 0.0:  # the onsite damper acts over the whole height
-            wanted.append((-1, series.DRAG))
+            wanted.append((-1, DRAG))
         directions = np.array(wanted)
     scene = plan(chain, drive, t, dashpots=any(name.endswith("_eta") for name in sensitivities))
     motion = _verified(scene, chain.arrays.rows, chain.arrays.heights, rtol, directions)

@@ -1,4 +1,4 @@
-"""The parameters of a model: their names, units, bounds and how they become springs.
+"""The parameters of a model: one flat vector, and how it becomes springs.
 
 A model names its springs from the base up, joined by "+": "bistable", "linear+bistable", … Its
 parameters are one flat vector in SI: for each spring its own (prefix s1_, s2_, …), then the heights
@@ -14,43 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.errors import InputError
-from foamfit.solve.explicit import series
 from foamfit.springs import kernels
 from foamfit.springs.chain import Chain
-from foamfit.springs.spring import (
-    BISTABLE_NAMES,
-    LINEAR_NAMES,
-    BistableSpring,
-    LinearSpring,
-    Spring,
-)
+from foamfit.springs.parameters import KINDS, direction, names_of
+from foamfit.springs.spring import BistableSpring, LinearSpring, Spring
 
 Array = NDArray[np.float64]
-
-KINDS = ("bistable", "linear", "unilateral")
-UNITS = {
-    "k0": "Pa",
-    "kc": "Pa",
-    "dsigma": "Pa",
-    "eps_a": "",
-    "eps_c": "",
-    "kh_plus": "Pa",
-    "kh_minus": "Pa",
-    "eta": "Pa s",
-    "height": "m",
-    "time_shift": "s",
-}
-
-# The branches of which a test must have reached one for the parameter to leave a trace in it.
-BRANCHES = {
-    "k0": "a",
-    "eps_a": "d",
-    "kh_plus": "d",
-    "kc": "c",
-    "eps_c": "e",
-    "dsigma": "e",
-    "kh_minus": "e",
-}
 
 
 @dataclass(frozen=True)
@@ -96,7 +65,7 @@ class Model:
         names = [
             f"s{i}_{short}"
             for i, kind in enumerate(self.kinds, start=1)
-            for short in (BISTABLE_NAMES if kind == "bistable" else LINEAR_NAMES)
+            for short in names_of(kind)
         ]
         if len(self.kinds) > 1:
             names += [f"s{i}_height" for i in range(1, len(self.kinds) + 1)]
@@ -109,17 +78,8 @@ class Model:
 
     @cached_property
     def directions(self) -> NDArray[np.int64]:
-        """What each parameter moves, (n, 2): spring and own parameter; see `explicit.series`."""
-        out = []
-        for name in self.names:
-            spring, short = split_name(name)
-            if short == "height":
-                out.append((spring, series.OWN_HEIGHT))
-            elif spring < 0:
-                out.append((-1, series.DRAG))
-            else:
-                out.append((spring, BISTABLE_NAMES.index(short)))
-        return np.array(out)
+        """Direction of the derivative by each parameter, (n, 2)."""
+        return np.array([direction(self.kinds, name) for name in self.names])
 
     @cached_property
     def _codes(self) -> NDArray[np.int64]:
@@ -163,16 +123,3 @@ class Model:
             area,
             site_damping=float(values[-1]),
         )
-
-
-def split_name(name: str) -> tuple[int, str]:
-    """Split "s2_kh_plus" into (1, "kh_plus"); (-1, "eta") for "site_eta", (-1, "time_shift")."""
-    if name in ("site_eta", "time_shift"):
-        return -1, name.removeprefix("site_")
-    prefix, short = name.split("_", 1)
-    return int(prefix[1:]) - 1, short
-
-
-def unit_of(name: str) -> str:
-    """Unit of a parameter, SI; "" for a strain."""
-    return UNITS[split_name(name)[1]]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -17,10 +18,6 @@ if TYPE_CHECKING:
     from foamfit.springs.kernels import Row
 
 Array = NDArray[np.float64]
-
-# Parameters of the two kinds of spring, in their order.
-BISTABLE_NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus", "eta")
-LINEAR_NAMES = ("k0", "eta")
 
 
 def _require(holds: bool, name: str, value: float, wanted: str) -> None:
@@ -60,6 +57,20 @@ def as_samples(values: ArrayLike, name: str) -> Array:
     raise InputError(f"{name} must be an array of numbers")
 
 
+def _freeze_numbers(spring: object, *names: str) -> None:
+    """Make the parameters of a spring finite floats, slopes and dashpots of the right sign."""
+    for name in names:
+        value = as_number(getattr(spring, name), name)
+        _require(math.isfinite(value), name, value, "finite")
+        object.__setattr__(spring, name, value)
+    for name in names:
+        value = getattr(spring, name)
+        if name in ("k0", "kc"):
+            _require(value > 0, name, value, "positive")
+        elif name in ("kh_plus", "kh_minus", "eta"):
+            _require(value >= 0, name, value, "zero or positive")
+
+
 def _as_history(values: ArrayLike, name: str) -> Array:
     history = np.ascontiguousarray(as_samples(values, name))
     if history.ndim > 1:
@@ -73,8 +84,74 @@ def _first(mask: NDArray[np.bool_]) -> int:
     return int(np.argmax(np.atleast_1d(mask)))
 
 
+class _Law(ABC):
+    """What a spring does along a history, without its dashpot."""
+
+    @property
+    @abstractmethod
+    def row(self) -> Row:
+        """The spring as the kernels know it."""
+
+    def stress(self, strain: ArrayLike) -> Array:
+        """Stress (Pa) along a strain history, shape (n,), from rest.
+
+        One flag is carried along the history (eqs. 2 and 3); the first sample starts with flag a.
+        A single strain gives a single stress.
+
+        Raises
+        ------
+        SimulationError
+            If a strain is at or past the end of its branch (1 on a, 1 + ε_* on c).
+        """
+        return self._along(strain)[1].reshape(np.shape(strain))
+
+    def strain(self, stress: ArrayLike) -> Array:
+        """Strain along a stress history (Pa), shape (n,), from rest; the inverse of `stress`.
+
+        Where a branch is flat (k_h± = 0) a stress beyond it jumps to the next branch.
+
+        Raises
+        ------
+        SimulationError
+            If the spring cannot carry a tension: beyond the pole of branch a (-k0), or any on a
+            unilateral spring.
+        """
+        from foamfit.springs import kernels
+
+        history = _as_history(stress, "stress")
+        strain, none = np.empty(history.size), np.empty((0, history.size))
+        row = self.row[None, :]  # of height 1: its elongation is its strain
+        if not kernels.strains_along(row, np.ones(1), history, strain, none, none.astype(np.int64)):
+            at = _first(~np.isfinite(strain))
+            raise SimulationError(
+                f"stress {history[at]:g} Pa (sample {at}) is a tension that the spring cannot carry"
+            )
+        return strain.reshape(np.shape(stress))
+
+    def tangent(self, strain: ArrayLike) -> Array:
+        """Slope dσ/dε (Pa) on the branch of each sample of a strain history, shape (n,)."""
+        from foamfit.springs import kernels
+
+        history, _, branches = self._along(strain)
+        return kernels.tangent_along(self.row, history, branches).reshape(np.shape(strain))
+
+    def _along(self, strain: ArrayLike) -> tuple[Array, Array, NDArray[np.int64]]:
+        """Strains, stresses and branches of a strain history."""
+        from foamfit.springs import kernels
+
+        history = _as_history(strain, "strain")
+        stress, branches = kernels.stress_along(self.row, history)
+        if not np.all(np.isfinite(stress)):
+            at = _first(~np.isfinite(stress))
+            raise SimulationError(
+                f"strain {history[at]:g} (sample {at}) is at or past the end of its branch, "
+                "where the stress is infinite: 1 on branch a, 1 + eps_star on branch c"
+            )
+        return history, stress, branches
+
+
 @dataclass(frozen=True)
-class BistableSpring:
+class BistableSpring(_Law):
     """The hysteretic bistable spring of eqs. 2-5 with a dashpot in parallel.
 
     Parameters
@@ -113,39 +190,19 @@ class BistableSpring:
 
     def __post_init__(self) -> None:
         """Refuse what is not admissible, by name."""
-        for item in fields(self):
-            value = as_number(getattr(self, item.name), item.name)
-            _require(math.isfinite(value), item.name, value, "finite")
-            object.__setattr__(self, item.name, value)
-        _require(self.k0 > 0, "k0", self.k0, "positive")
-        _require(self.kc > 0, "kc", self.kc, "positive")
+        _freeze_numbers(self, *(item.name for item in fields(self)))
         _require(0 < self.eps_a < 1, "eps_a", self.eps_a, "between 0 and 1")
-        _require(
-            self.eps_c > self.eps_a, "eps_c", self.eps_c, f"greater than eps_a = {self.eps_a:g}"
-        )
-        sigma_a = self.k0 * self.eps_a / (1 - self.eps_a)
-        _require(
-            -sigma_a < self.dsigma <= 0,
-            "dsigma",
-            self.dsigma,
-            f"greater than -sigma_a = {-sigma_a:g} and at most 0",
-        )
-        _require(self.kh_plus >= 0, "kh_plus", self.kh_plus, "zero or positive")
-        _require(self.kh_minus >= 0, "kh_minus", self.kh_minus, "zero or positive")
-        _require(self.eta >= 0, "eta", self.eta, "zero or positive")
+        past = f"greater than eps_a = {self.eps_a:g}"
+        _require(self.eps_c > self.eps_a, "eps_c", self.eps_c, past)
+        least = -self.k0 * self.eps_a / (1 - self.eps_a)
+        allowed = f"greater than -sigma_a = {least:g} and at most 0"
+        _require(least < self.dsigma <= 0, "dsigma", self.dsigma, allowed)
 
     @property
     def seven(self) -> tuple[float, float, float, float, float, float, float]:
         """The seven parameters of the law in their order, SI."""
-        return (
-            self.k0,
-            self.kc,
-            self.dsigma,
-            self.eps_a,
-            self.eps_c,
-            self.kh_plus,
-            self.kh_minus,
-        )
+        first = (self.k0, self.kc, self.dsigma, self.eps_a)
+        return *first, self.eps_c, self.kh_plus, self.kh_minus
 
     @property
     def sigma_a(self) -> float:
@@ -196,49 +253,16 @@ class BistableSpring:
 
         return kernels.bistable_row(*self.seven, self.eta)
 
-    def stress(self, strain: ArrayLike) -> Array:
-        """Stress (Pa) of the spring without its dashpot along a strain history, shape (n,).
-
-        One flag is carried along the history (eqs. 2 and 3); the first sample starts with flag a.
-        A single strain gives a single stress.
-
-        Raises
-        ------
-        SimulationError
-            If a strain is at or past the end of its branch (1 on a, 1 + ε_* on c).
-        """
-        return _along_strain(self, strain)[0].reshape(np.shape(strain))
-
-    def strain(self, stress: ArrayLike) -> Array:
-        """Strain of the spring along a stress history (Pa), shape (n,); the inverse of `stress`.
-
-        Where a branch is flat (k_h± = 0) a stress beyond it jumps to the next branch.
-
-        Raises
-        ------
-        SimulationError
-            If a tension is beyond the pole of branch a (-k0).
-        """
-        return _along_stress(self, stress).reshape(np.shape(stress))
-
-    def tangent(self, strain: ArrayLike) -> Array:
-        """Slope dσ/dε (Pa) on the branch of each sample of a strain history, shape (n,)."""
-        from foamfit.springs import kernels
-
-        history = _as_history(strain, "strain")
-        slope = kernels.tangent_along(self.row, history, _along_strain(self, history)[1])
-        return slope.reshape(np.shape(strain))
-
     def branches(self, strain: ArrayLike) -> NDArray[np.str_]:
         """Name the branch, "a", "d", "c" or "e", of each sample of a strain history, shape (n,)."""
         from foamfit.springs import kernels
 
-        names = np.array(kernels.BRANCH_NAMES)[_along_strain(self, strain)[1]]
+        names = np.array(kernels.BRANCH_NAMES)[self._along(strain)[2]]
         return names.reshape(np.shape(strain))
 
 
 @dataclass(frozen=True)
-class LinearSpring:
+class LinearSpring(_Law):
     """The linear spring S1 of the two-spring models, σ = k0 ε, with a dashpot in parallel.
 
     Parameters
@@ -262,12 +286,7 @@ class LinearSpring:
 
     def __post_init__(self) -> None:
         """Refuse what is not admissible, by name."""
-        for name in ("k0", "eta"):
-            value = as_number(getattr(self, name), name)
-            _require(math.isfinite(value), name, value, "finite")
-            object.__setattr__(self, name, value)
-        _require(self.k0 > 0, "k0", self.k0, "positive")
-        _require(self.eta >= 0, "eta", self.eta, "zero or positive")
+        _freeze_numbers(self, "k0", "eta")
 
     @property
     def kind(self) -> int:
@@ -281,55 +300,5 @@ class LinearSpring:
 
         return kernels.linear_row(self.k0, self.eta, self.unilateral)
 
-    def stress(self, strain: ArrayLike) -> Array:
-        """Stress (Pa) of the spring without its dashpot along a strain history, shape (n,)."""
-        return _along_strain(self, strain)[0].reshape(np.shape(strain))
-
-    def strain(self, stress: ArrayLike) -> Array:
-        """Strain along a stress history (Pa), shape (n,).
-
-        Raises
-        ------
-        SimulationError
-            If a unilateral spring is asked for its strain under tension, which it cannot carry.
-        """
-        return _along_stress(self, stress).reshape(np.shape(stress))
-
-    def tangent(self, strain: ArrayLike) -> Array:
-        """Slope dσ/dε (Pa) at each sample of a strain history, shape (n,)."""
-        from foamfit.springs import kernels
-
-        history = _as_history(strain, "strain")
-        slope = kernels.tangent_along(self.row, history, _along_strain(self, history)[1])
-        return slope.reshape(np.shape(strain))
-
 
 Spring = BistableSpring | LinearSpring
-
-
-def _along_strain(spring: Spring, strain: ArrayLike) -> tuple[Array, NDArray[np.int64]]:
-    from foamfit.springs import kernels
-
-    history = _as_history(strain, "strain")
-    stress, branches = kernels.stress_along(spring.row, history)
-    if not np.all(np.isfinite(stress)):
-        at = _first(~np.isfinite(stress))
-        raise SimulationError(
-            f"strain {history[at]:g} (sample {at}) is at or past the end of its branch, "
-            "where the stress is infinite: 1 on branch a, 1 + eps_star on branch c"
-        )
-    return stress, branches
-
-
-def _along_stress(spring: Spring, stress: ArrayLike) -> Array:
-    from foamfit.springs import kernels
-
-    history = _as_history(stress, "stress")
-    strain, none = np.empty(history.size), np.empty((0, history.size))
-    row = spring.row[None, :]  # of height 1: its elongation is its strain
-    if not kernels.strains_along(row, np.ones(1), history, strain, none, none.astype(np.int64)):
-        at = _first(~np.isfinite(strain))
-        raise SimulationError(
-            f"stress {history[at]:g} Pa (sample {at}) is a tension that the spring cannot carry"
-        )
-    return strain

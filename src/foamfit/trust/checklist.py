@@ -18,7 +18,7 @@ from foamfit.fitting.curves import check_time_shift
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.search import SearchRecord
 from foamfit.results import Check, ParameterEstimate
-from foamfit.springs.model import split_name
+from foamfit.springs.parameters import split_name
 from foamfit.text import engineering
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import AT_LIMIT, WEAK

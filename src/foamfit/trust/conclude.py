@@ -23,7 +23,7 @@ from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import SearchRecord
 from foamfit.results import Correlation, Curves, Fit, ParameterEstimate, Switch
 from foamfit.springs import kernels
-from foamfit.springs.model import split_name, unit_of
+from foamfit.springs.parameters import split_name, unit_of
 from foamfit.text import engineering, percent
 from foamfit.trust import covariance
 from foamfit.trust.best_point import BestPoint

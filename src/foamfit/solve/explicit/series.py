@@ -22,21 +22,11 @@ from typing import NamedTuple
 import numpy as np
 
 from foamfit.solve.polynomial import value_at
+from foamfit.solve.scene import FREE, MOTION, STRESS, VISCOUS
 from foamfit.springs.kernels import (
-    EPS_A,
-    K0,
-    KC,
-    KIND,
-    OPEN,
-    SIGMA_C,
-    A,
     Array,
     Branches,
-    D,
-    E,
-    Row,
     branch_shape,
-    compiled,
     inlined,
     inner,
     interval,
@@ -44,10 +34,9 @@ from foamfit.springs.kernels import (
     once,
     piece,
 )
-from foamfit.springs.law import BISTABLE
+from foamfit.springs.parameters import DRAG, OWN_ETA, OWN_HEIGHT
+from foamfit.springs.sensitivities import branch_derivative
 
-# What is known of the top node.
-FREE, VISCOUS, STRESS, MOTION = range(4)
 # Rows of the series of a chain: displacement and velocity of the nodes above the groups, strain and
 # stress of the springs, common stress of the groups, slope T = dσ/dε of the springs.
 W, V, EPS, SIG, GROUP, TILT, N_SERIES = range(7)
@@ -56,10 +45,7 @@ W, V, EPS, SIG, GROUP, TILT, N_SERIES = range(7)
 # between which the spring stays on it, and what a step keeps of a curved one: 1/(1 - x) at its
 # start.
 SLOPE, ORIGIN, OFFSET, DASHPOT, HEIGHT, N_MOVES = range(6)
-CURVED, LOW, HIGH, ROOM, N_LAW = range(N_MOVES, 10)
-# What a direction of derivatives moves, besides a spring's own parameters 0 … 7 (k0 … eta): its
-# height, or (of no spring, -1) the onsite damping of the top.
-OWN_ETA, OWN_HEIGHT, DRAG = 7, 8, 9
+CURVED, LOW, HIGH, INVERSE, N_LAW = range(N_MOVES, 10)
 
 
 class Links(NamedTuple):
@@ -82,14 +68,16 @@ class Links(NamedTuple):
     top: int
 
 
-class Tangents(NamedTuple):
+class SeriesTangents(NamedTuple):
     """Derivatives of a chain and of its series in p directions.
 
-    law (p, springs, N_MOVES) holds those of the first columns of `Links.law`, `drag` (p,) those of
-    the onsite damping, series (p, N_SERIES, springs, order + 2) those of the series but for TILT;
-    `live` (p,) is 1 for those that have left zero.
+    directions (p, 2) are those of `springs.parameters`; law (p, springs, N_MOVES) holds the
+    derivatives of the first columns of `Links.law`, `drag` (p,) those of the onsite damping, series
+    (p, N_SERIES, springs, order + 2) those of the series but for TILT; `live` (p,) is 1 for those
+    that have left zero.
     """
 
+    directions: Branches
     law: Array
     drag: Array
     live: Array
@@ -105,49 +93,32 @@ def enter(rows: Array, i: int, branch: int, law: Array) -> None:
 
 
 @inner
-def branch_derivative(row: Row, branch: int, own: int) -> tuple[float, float, float]:
-    """Derivatives of (k, x0, s0) of a branch of eq. 2 by a spring's own parameter k0 … kh_minus.
-
-    Across an open gap nothing acts, whatever the spring is.
-    """
-    if branch == OPEN:
-        return 0.0, 0.0, 0.0
-    if row[KIND] != BISTABLE or branch == A:
-        return (1.0 if own == 0 else 0.0), 0.0, 0.0
-    eps_a, v = row[EPS_A], 1.0 - row[EPS_A]
-    d_sigma_a = (eps_a / v if own == 0 else 0.0) + (row[K0] / (v * v) if own == 3 else 0.0)
-    if branch == D:
-        return (1.0 if own == 5 else 0.0), (1.0 if own == 3 else 0.0), d_sigma_a
-    d_sigma_c = d_sigma_a + (1.0 if own == 2 else 0.0)
-    d_eps_c = 1.0 if own == 4 else 0.0
-    if branch == E:
-        return (1.0 if own == 6 else 0.0), d_eps_c, d_sigma_c
-    d_kc = 1.0 if own == 1 else 0.0
-    stiff = row[KC] + row[SIGMA_C]
-    d_eps_star = d_eps_c - (row[KC] * d_sigma_c - row[SIGMA_C] * d_kc) / (stiff * stiff)
-    return d_kc, d_eps_star, 0.0
+def slope_now(law: Array, i: int, eps: float) -> float:
+    """Slope dσ/dε on the branch that spring i is on."""
+    k, y = law[i, SLOPE], 1.0 - (eps - law[i, ORIGIN])
+    return k / (y * y) if law[i, CURVED] != 0.0 else k
 
 
 @inner
-def enter_tangents(rows: Array, i: int, branch: int, directions: Branches, d: Tangents) -> None:
+def enter_tangents(rows: Array, i: int, branch: int, d: SeriesTangents) -> None:
     """Write the derivatives of the branch that spring i enters."""
-    for p in range(directions.shape[0]):
-        if directions[p, 0] == i and directions[p, 1] < OWN_ETA:
-            dk, dx0, ds0 = branch_derivative(rows[i], branch, directions[p, 1])
+    for p in range(d.drag.size):
+        if d.directions[p, 0] == i and d.directions[p, 1] < OWN_ETA:
+            dk, dx0, ds0 = branch_derivative(rows[i], branch, d.directions[p, 1])
             d.law[p, i, SLOPE], d.law[p, i, ORIGIN], d.law[p, i, OFFSET] = dk, dx0, ds0
             if dk != 0.0 or dx0 != 0.0 or ds0 != 0.0:
                 d.live[p] = 1.0
 
 
 @maker
-def make_series(count: int, order: int, directions: Branches) -> tuple[Array, Tangents]:
+def make_series(count: int, order: int, directions: Branches) -> tuple[Array, SeriesTangents]:
     """Make the series of a chain at rest, and derivatives, of branches that are yet to be entered.
 
     All is zero but what the directions say.
     """
     p = directions.shape[0]
     series, ways = np.zeros((1 + p, N_SERIES, count, order + 2)), np.zeros((2, p))
-    d = Tangents(np.zeros((p, count, N_MOVES)), ways[0], ways[1], series[1:])
+    d = SeriesTangents(directions, np.zeros((p, count, N_MOVES)), ways[0], ways[1], series[1:])
     for q in range(p):
         i, what = directions[q, 0], directions[q, 1]
         if what >= OWN_ETA:
@@ -191,12 +162,12 @@ def _stress_term(law: Array, i: int, eps: Array, sig: Array, n: int) -> float:
         if law[i, CURVED] == 0.0:
             return k * eps[i, n]
         known = _product(eps, sig, i, n)
-        return ((k + sig[i, 0]) * eps[i, n] + known) * law[i, ROOM]
+        return ((k + sig[i, 0]) * eps[i, n] + known) * law[i, INVERSE]
     x = eps[i, 0] - law[i, ORIGIN]
     if law[i, CURVED] == 0.0:
         return law[i, OFFSET] + k * x
-    law[i, ROOM] = 1.0 / (1.0 - x) if x < 1.0 else math.inf
-    return k * x * law[i, ROOM]
+    law[i, INVERSE] = 1.0 / (1.0 - x) if x < 1.0 else math.inf
+    return k * x * law[i, INVERSE]
 
 
 @inlined
@@ -560,7 +531,7 @@ def _expand_tangent(links: Links, s: Array, m: Array, drag: float, d: Array, ord
 
 
 @piece
-def expand_tangents(links: Links, s: Array, d: Tangents, order: int) -> None:
+def expand_tangents(links: Links, s: Array, d: SeriesTangents, order: int) -> None:
     """Fill the derivatives up to `order`, after `expand`; those that are still zero stay so."""
     for i in range(links.law.shape[0]):
         _fill_tilt(links.law, i, s[SIG], s[TILT], order)
@@ -581,91 +552,8 @@ def advance(s: Array, groups: int, order: int, span: float) -> None:
 
 
 @piece
-def advance_tangents(d: Tangents, groups: int, order: int, span: float) -> None:
+def advance_tangents(d: SeriesTangents, groups: int, order: int, span: float) -> None:
     """Carry the derivatives of the state over a step of length `span`."""
     for p in range(d.drag.size):
         if d.live[p] > 0.0:
             advance(d.series[p], groups, order, span)
-
-
-# ---------------------------------------------------------------- without inertia and damping
-
-
-@compiled
-def equilibrium_tangents(
-    rows: Array,
-    heights: Array,
-    eps: Array,
-    branches: Branches,
-    moved: bool,
-    directions: Branches,
-) -> tuple[Array, Array]:
-    """Derivatives along a history of springs in series, undamped and massless.
-
-    Parameters
-    ----------
-    rows, heights : arrays
-        The springs.
-    eps, branches : (springs, n) arrays
-        Their strains and branches.
-    moved : bool
-        Whether the displacement of the top is prescribed, or else the stress.
-    directions : (p, 2) array
-        See `explicit.taylor.integrate`.
-
-    Returns
-    -------
-    tuple of arrays
-        Derivatives of the displacements above the springs (p, springs, n), m, and of the common
-        stress (p, n), Pa, per unit of the parameters.
-    """
-    count, n = eps.shape
-    size = directions.shape[0]
-    out_w, out_s = np.empty((size, count, n)), np.empty((size, n))
-    law, branch = np.empty((count, N_LAW)), np.full(count, -1)
-    change = np.zeros((size, 3))  # of k, x0 and s0 of the branch that the direction's spring is on
-    slope, soft = np.empty(count), np.empty(count + 1)
-    for j in range(n):
-        flat = -1
-        soft[0] = 0.0  # compliance of the springs below each node
-        for i in range(count):
-            if branches[i, j] != branch[i]:
-                branch[i] = branches[i, j]
-                enter(rows, i, branch[i], law)
-                for p in range(size):
-                    if directions[p, 0] == i and directions[p, 1] < OWN_ETA:
-                        change[p, 0], change[p, 1], change[p, 2] = branch_derivative(
-                            rows[i], branch[i], directions[p, 1]
-                        )
-            x = eps[i, j] - law[i, ORIGIN]
-            slope[i] = law[i, SLOPE]
-            if law[i, CURVED] != 0.0:
-                slope[i] /= (1.0 - x) * (1.0 - x)
-            soft[i + 1] = soft[i]
-            if slope[i] > 0.0:
-                soft[i + 1] += heights[i] / slope[i]
-            elif flat < 0:
-                flat = i
-        for p in range(size):
-            i = directions[p, 0]
-            known = longer = 0.0  # δσ at fixed strain, δ of the elongation at fixed stress
-            if i >= 0 and directions[p, 1] == OWN_HEIGHT:
-                longer = eps[i, j]
-            elif i >= 0:
-                x = eps[i, j] - law[i, ORIGIN]
-                factor = x / (1.0 - x) if law[i, CURVED] != 0.0 else x
-                known = factor * change[p, 0] - slope[i] * change[p, 1] + change[p, 2]
-                longer = -heights[i] * known / slope[i] if slope[i] > 0.0 else 0.0
-            common = gap = 0.0
-            if moved and flat < 0:
-                common = -longer / float(soft[count])
-            elif moved:  # a flat branch takes up all that the others leave
-                common = known if i == flat else 0.0
-                gap = -longer - common * float(soft[count])
-            out_s[p, j] = common
-            for node in range(count):
-                own = longer if 0 <= i <= node else 0.0
-                out_w[p, node, j] = own + common * soft[node + 1]
-                if 0 <= flat <= node:
-                    out_w[p, node, j] += gap
-    return out_w, out_s

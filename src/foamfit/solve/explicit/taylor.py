@@ -14,23 +14,16 @@ from typing import NamedTuple
 import numpy as np
 
 from foamfit.solve.explicit.series import (
-    CURVED,
     DASHPOT,
     EPS,
-    FREE,
     GROUP,
     HEIGHT,
     HIGH,
     LOW,
-    MOTION,
     N_LAW,
-    ORIGIN,
     SIG,
-    SLOPE,
-    STRESS,
-    VISCOUS,
     Links,
-    Tangents,
+    SeriesTangents,
     V,
     W,
     advance,
@@ -42,6 +35,7 @@ from foamfit.solve.explicit.series import (
     expand_tangents,
     is_bare,
     make_series,
+    slope_now,
     springs_of,
 )
 from foamfit.solve.polynomial import (
@@ -51,6 +45,24 @@ from foamfit.solve.polynomial import (
     order_for,
     slope_at,
     value_at,
+)
+from foamfit.solve.scene import (
+    DONE,
+    FLAT_UNDER_STRESS,
+    LEAST_BASE,
+    MOTION,
+    NOT_FINITE,
+    STEP_UNDERFLOW,
+    STRESS,
+    TOO_MANY_STEPS,
+    Samples,
+    Scene,
+    SceneTuple,
+    before_contact,
+    fill_line,
+    first_past,
+    fly,
+    log_switch,
 )
 from foamfit.springs.kernels import (
     ETA,
@@ -66,30 +78,19 @@ from foamfit.springs.kernels import (
     piece,
 )
 
-__all__ = ["FREE", "MOTION", "STRESS", "VISCOUS", "integrate"]
-
-# Outcomes.
-DONE, TOO_MANY_STEPS, STEP_UNDERFLOW, FLAT_UNDER_STRESS, NOT_FINITE = range(5)
 # Strains closer than this to the end of a branch are at it.
 CLOSE = 1e-13
 MOST_ORDERS = 24
-# The base stress is followed to its own size where that is at least so much of the springs'
-# stresses: what has not come through to the base yet is not worth a step.
-LEAST_BASE = 1e-6
 # Truncation of derivatives, relative to what they were so far, over that of the motion.
 OF_TANGENTS = 1e3
 
 
-class Samples(NamedTuple):
-    """The curves to fill, over the samples t (n,).
+class Scales(NamedTuple):
+    """Largest displacement (m), stress and base stress (Pa) so far."""
 
-    curves (1 + springs or 1, n) holds the base stress, Pa, then the displacements above each spring
-    or of the top alone, m; slopes (p, …) are their derivatives in p directions.
-    """
-
-    t: Array
-    curves: Array
-    slopes: Array
+    motion: float
+    stress: float
+    base: float
 
 
 # ---------------------------------------------------------------- the length of a step
@@ -118,20 +119,13 @@ def is_apart(links: Links) -> bool:
 
 @inlined
 def step_length(
-    links: Links,
-    s: Array,
-    push: Array,
-    order: int,
-    tol: float,
-    span: float,
-    w_scale: float,
-    s_scale: float,
-    b_scale: float,
+    links: Links, s: Array, push: Array, order: int, tol: float, span: float, scales: Scales
 ) -> float:
     """Longest step within `span` whose last two terms fall below `tol` of motion and stress.
 
-    The base stress is measured by its own size: by that of all springs if `b_scale` is infinite.
+    The base stress is measured by its own size: by that of all springs if its scale is infinite.
     """
+    w_scale, s_scale, b_scale = scales
     reach, load = w_scale, max(s_scale, abs(push[0]))
     for _ in range(60):  # at rest the only scale is what the step itself reaches
         tried = span
@@ -161,7 +155,7 @@ def step_length(
 
 @piece
 def tangent_length(
-    heights: Array, d: Tangents, order: int, tol: float, span: float, sizes: Array
+    heights: Array, d: SeriesTangents, order: int, tol: float, span: float, sizes: Array
 ) -> float:
     """Longest step within `span` whose last two terms fall below `tol` of the derivatives so far.
 
@@ -207,17 +201,9 @@ def first_switch(law: Array, s: Array, order: int, span: float) -> tuple[float, 
 
 
 @inner
-def _enough(
-    law: Array,
-    s: Array,
-    order: int,
-    span: float,
-    tol: float,
-    w_scale: float,
-    s_scale: float,
-    b_scale: float,
-) -> int:
+def _enough(law: Array, s: Array, order: int, span: float, tol: float, scales: Scales) -> int:
     """Orders that are enough over a step that a switch or a sample made short."""
+    w_scale, s_scale, b_scale = scales
     base = max(b_scale, LEAST_BASE * s_scale)
     if w_scale == 0.0 or s_scale == 0.0 or span == 0.0:
         return order
@@ -232,30 +218,6 @@ def _enough(
 
 
 # ---------------------------------------------------------------- samples
-
-
-@inner
-def first_past(t: Array, first: int, end: float, last: bool) -> int:
-    """First sample from `first` on at the time `end` or later; where it is the `last`, later."""
-    low, high, step = first, first, 1
-    while high < t.size and (t[high] < end or (last and t[high] == end)):
-        low, high = high + 1, high + step
-        step *= 2
-    high = min(high, t.size)
-    while low < high:
-        mid = (low + high) // 2
-        if t[mid] < end or (last and t[mid] == end):
-            low = mid + 1
-        else:
-            high = mid
-    return low
-
-
-@inner
-def fill_line(at: float, rate: float, t: Array, now: float, out: Array) -> None:
-    """Write at + rate (t - now) to `out`."""
-    for j in range(t.size):
-        out[j] = at + rate * (t[j] - now)
 
 
 @piece
@@ -282,7 +244,7 @@ def sample(
 def sample_tangents(
     links: Links,
     s: Array,
-    d: Tangents,
+    d: SeriesTangents,
     order: int,
     out: Samples,
     first: int,
@@ -313,7 +275,7 @@ def sample_tangents(
 
 
 @inner
-def _mend_kink(out: Samples, s: Array, d: Tangents, knot: int) -> None:
+def _mend_kink(out: Samples, s: Array, d: SeriesTangents, knot: int) -> None:
     """A dashpot feels the mean rate where the prescribed motion has a kink."""
     before, after = out.t[knot] - out.t[knot - 1], out.t[knot + 1] - out.t[knot]
     share = before / (before + after)
@@ -322,41 +284,17 @@ def _mend_kink(out: Samples, s: Array, d: Tangents, knot: int) -> None:
         out.slopes[p, 0, knot] += share * (d.series[p, GROUP, 0, 0] - out.slopes[p, 0, knot])
 
 
-@inner
-def before_contact(curves: Array, t: Array, speed: float) -> int:
-    """Fill the samples before contact, at time 0, and return how many these are.
-
-    Nothing presses and only the striker moves.
-    """
-    rows = curves.shape[0]
-    none = rows - rows  # not the literals, which are types: compiled anew
-    done = first_past(t, none, 0.0, none > 0)
-    for i in range(rows):
-        fill_line(0.0, speed if i == rows - 1 else 0.0, t[:done], 0.0, curves[i, :done])
-    return done
-
-
 # ---------------------------------------------------------------- the end of contact
 
 
 @inner
-def fly(curves: Array, t: Array, first: int, t_end: float, w_end: Array, speed: float) -> None:
-    """After contact the chain keeps its shape and moves with the striker; nothing presses."""
-    fill_line(0.0, 0.0, t[first:], t_end, curves[0, first:])
-    for i in range(curves.shape[0] - 1):
-        fill_line(w_end[i], speed, t[first:], t_end, curves[1 + i, first:])
-
-
-@inner
-def _delay(s: Array, d: Tangents, order: int, span: float, late: Array) -> None:
+def _delay(s: Array, d: SeriesTangents, order: int, span: float, late: Array) -> None:
     """Derivative of the time at which the base stress meets zero at the end of a step.
 
     Where a unilateral spring has just opened it is that of the step before, which brought it there.
     """
     fall = slope_at(s[GROUP, 0], order, span)
-    if fall == 0.0:
-        return
-    for p in range(d.drag.size):
+    for p in range(d.drag.size if fall != 0.0 else 0):
         late[p] = -value_at(d.series[p, GROUP, 0], order, span) / fall
 
 
@@ -364,21 +302,21 @@ def _delay(s: Array, d: Tangents, order: int, span: float, late: Array) -> None:
 def depart(
     links: Links,
     s: Array,
-    d: Tangents,
+    d: SeriesTangents,
     order: int,
     more: int,
     span: float,
     now: float,
     out: Samples,
     done: int,
-    room: Array,
+    scratch: Array,
 ) -> None:
     """Fill the samples after contact, which ends at the end of this step, at the time `now`.
 
-    A later end (room[0], by direction) leaves the nodes as they move until then, and the top with
-    the velocity that it has then. The rest of `room` (3, …) is scratch.
+    A later end (scratch[0], by direction) leaves the nodes as they move until then, and the top
+    with the velocity that it has then. The rest of `scratch` (3, …) is scratch.
     """
-    late, rate, place = room[0], room[1], room[2]
+    late, rate, place = scratch[0], scratch[1], scratch[2]
     law, nodes, groups = links.law, out.curves.shape[0] - 1, links.ends.size
     count, top = law.shape[0], groups - 1
     pull = slope_at(s[V, top], order, span)
@@ -419,30 +357,22 @@ def settle(links: Links, s: Array) -> None:
         compliance = 0.0
         miss = s[W, g, 0] - (s[W, g - 1, 0] if g > 0 else 0.0)
         for i in range(i0, i1):
-            slope = _slope_now(law, i, s[EPS, i, 0])
+            slope = slope_now(law, i, s[EPS, i, 0])
             plain = plain and law[i, DASHPOT] == 0.0 and slope > 0.0
             compliance += law[i, HEIGHT] / slope
             miss -= law[i, HEIGHT] * s[EPS, i, 0]
         if plain:
             for i in range(i0, i1):
-                s[EPS, i, 0] += miss / compliance / _slope_now(law, i, s[EPS, i, 0])
-
-
-@inner
-def _slope_now(law: Array, i: int, eps: float) -> float:
-    """Slope dσ/dε on the branch that spring i is on."""
-    k, y = law[i, SLOPE], 1.0 - (eps - law[i, ORIGIN])
-    return k / (y * y) if law[i, CURVED] != 0.0 else k
+                s[EPS, i, 0] += miss / compliance / slope_now(law, i, s[EPS, i, 0])
 
 
 @inner
 def switch(
-    rows: Array,
+    scene: Scene,
     branches: Branches,
     law: Array,
     s: Array,
-    d: Tangents,
-    directions: Branches,
+    d: SeriesTangents,
     order: int,
     span: float,
     now: float,
@@ -463,16 +393,12 @@ def switch(
             out = -1
         if out == 0:
             continue
-        entered = above(branches[i]) if out > 0 else below(branches[i])
+        left = branches[i]
+        branches[i] = above(left) if out > 0 else below(left)
         s[EPS, i, 0] = high if out > 0 else low
-        if switches < log.shape[0]:
-            log[switches, 0], log[switches, 1] = now, i
-            log[switches, 2], log[switches, 3] = branches[i], entered
-            log[switches, 4] = s[EPS, i, 0]
-        switches += 1
-        branches[i] = entered
-        enter(rows, i, entered, law)
-        enter_tangents(rows, i, entered, directions, d)
+        switches = log_switch(log, switches, now, i, left, branches[i], s[EPS, i, 0])
+        enter(scene.rows, i, branches[i], law)
+        enter_tangents(scene.rows, i, branches[i], d)
     return switches
 
 
@@ -480,15 +406,14 @@ def switch(
 
 
 @inner
-def _prescribe(
-    top: int, values: Array, t: Array, knot: int, now: float, push: Array, motion: Array
-) -> float:
+def _prescribe(scene: Scene, knot: int, now: float, push: Array, motion: Array) -> float:
     """Write what the top is given between samples knot and knot + 1; returns when that ends."""
-    horizon, rate = t[t.size - 1], 0.0
+    values, t, rate = scene.values, scene.t, 0.0
+    horizon = t[t.size - 1]
     if t.size > 1:
         horizon = t[knot + 1]
         rate = (values[knot + 1] - values[knot]) / (t[knot + 1] - t[knot])
-    driven = motion if top == MOTION else push
+    driven = motion if scene.top == MOTION else push
     driven[0], driven[1] = values[knot] + rate * (now - t[knot]), rate
     return horizon
 
@@ -511,28 +436,22 @@ def first_lift(s: Array, order: int, first: bool, pressed: bool, span: float) ->
 
 @inner
 def begin(
-    rows: Array,
-    heights: Array,
-    start: Array,
-    directions: Branches,
-    branches: Branches,
-    law: Array,
-    s: Array,
-    d: Tangents,
+    scene: Scene, start: Array, branches: Branches, law: Array, s: Array, d: SeriesTangents
 ) -> None:
     """Write the state at the first sample: branches, strains and their derivatives."""
+    rows = scene.rows
     for i in range(branches.size):
         branches[i] = first_branch(rows[i])
         if start.shape[1] > 0:
             s[EPS, i, 0] = start[0, i]
             branches[i] = branch_at_strain(rows[i], branches[i], start[0, i])
-            for p in range(directions.shape[0]):
+            for p in range(d.drag.size):
                 d.series[p, EPS, i, 0] = start[1 + p, i]
                 if start[1 + p, i] != 0.0:
                     d.live[p] = 1.0
-        law[i, DASHPOT], law[i, HEIGHT] = rows[i, ETA], heights[i]
+        law[i, DASHPOT], law[i, HEIGHT] = rows[i, ETA], scene.heights[i]
         enter(rows, i, branches[i], law)
-        enter_tangents(rows, i, branches[i], directions, d)
+        enter_tangents(rows, i, branches[i], d)
 
 
 @inner
@@ -558,15 +477,7 @@ def _reached(links: Links, s: Array, w_scale: float) -> tuple[float, float]:
 
 @compiled
 def integrate(
-    rows: Array,
-    heights: Array,
-    ends: Branches,
-    mass: Array,
-    drag: float,
-    top: int,
-    values: Array,
-    speed: float,
-    t: Array,
+    given: SceneTuple,
     tol: float,
     max_steps: int,
     directions: Branches,
@@ -575,40 +486,20 @@ def integrate(
     slopes: Array,
     log: Array,
 ) -> tuple[int, float, int, int]:
-    """Integrate a chain over the samples t.
+    """Integrate a chain over the samples of a scene.
 
     Parameters
     ----------
-    rows : (springs, columns) array
-        The springs, base first; see `springs.kernels`.
-    heights : (springs,) array
-        m.
-    ends : (groups,) array
-        One past the last spring of each group; a node lies above each group.
-    mass : (groups,) array
-        Areal mass m/A of the node above each group, kg/m².
-    drag : float
-        Onsite damping of the top, η_site/H, Pa·s/m.
-    top : int
-        FREE (a mass), VISCOUS (no mass, but the onsite damper), STRESS or MOTION.
-    values : (n,) array
-        Prescribed stress (Pa) or, for MOTION, displacement (m) of the top; zeros in an impact.
-    speed : float
-        Velocity of the striker at contact, m/s; 0 = no impact. Contact then ends with base stress.
-    t : (n,) array
-        Samples, s; an impact starts at 0, every other drive at t[0].
+    given : tuple
+        The `Scene`. An impact ends when the base stress is back at zero.
     tol, max_steps
         Truncation of a step relative to the motion so far; bound on steps.
     directions : (p, 2) array
-        What derivatives are carried along: spring and its own parameter, or OWN_HEIGHT, or -1 and
-        DRAG.
+        What derivatives are carried along; see `springs.parameters`.
     start : (1 + p, springs or 0) array
-        The strains from which the springs start, never loaded before, and their derivatives; none
-        where they start from rest.
-    curves, slopes : arrays
+        Strains, and their derivatives, from which springs never loaded before start; none: rest.
+    curves, slopes, log : arrays
         Filled; see `Samples`. The derivatives have p = 0 where none are wanted.
-    log : (m, 5) array
-        Filled with the switches: time, spring, branch left, branch entered, strain.
 
     Returns
     -------
@@ -616,24 +507,26 @@ def integrate(
         Outcome, end of contact (NaN if none; where there is no answer, how far it came), steps
         taken, switches (also those past the log).
     """
+    scene = Scene(*given)
+    heights, t, top, speed = scene.heights, scene.t, scene.top, scene.speed
     tol = max(tol, LEAST_TRUNCATION)
-    count, groups, size = rows.shape[0], ends.size, directions.shape[0]
+    count, groups, size = heights.size, scene.ends.size, directions.shape[0]
     struck, tangent, order = speed > 0.0, size > 0, order_for(tol, MOST_ORDERS)
-    links = Links(np.empty((count, N_LAW)), ends, mass, drag, top)
-    law, out = links.law, Samples(t, curves, slopes)
+    links = Links(np.empty((count, N_LAW)), scene.ends, scene.mass, scene.drag, top)
+    law, out = links.law, Samples(t, curves, slopes, log)
     s, d = make_series(count, order, directions)
     branches = np.empty(count, np.int64)
-    room = np.empty((6, max(order + 1, max(size, curves.shape[0]))))
-    late, c, push, motion = room[0], room[3], room[4], room[5]
+    scratch = np.empty((6, max(order + 1, max(size, curves.shape[0]))))
+    late, c, push, motion = scratch[0], scratch[3], scratch[4], scratch[5]
     sizes = np.zeros((size, 2))
     push[0] = push[1] = 0.0
     for p in range(size):
         late[p] = 0.0
-    begin(rows, heights, start, directions, branches, law, s, d)
+    begin(scene, start, branches, law, s, d)
     bare, apart = is_bare(links), is_apart(links)
-    w_scale, s_scale, b_scale, pressed, knot, stalled = 0.0, 0.0, math.inf, False, 0, 0
+    w_scale, s_scale, b_scale, pressed, knot, stalled, done = 0.0, 0.0, math.inf, False, 0, 0, 0
     switches = count - count  # a whole number, and no constant: one type to compile for
-    now, done = (0.0 if struck else t[0]), 0
+    now = 0.0 if struck else t[0]
     if struck:
         s[V, groups - 1, 0] = speed
         done = before_contact(curves, t, speed)
@@ -647,7 +540,7 @@ def integrate(
             while knot < t.size - 2 and now >= t[knot + 1]:
                 knot += 1
                 fresh = True
-            horizon = _prescribe(top, values, t, knot, now, push, motion)
+            horizon = _prescribe(scene, knot, now, push, motion)
         if bare:
             expand_bare(links, s, push, order)
         elif not expand(links, s, push, motion, order):
@@ -656,7 +549,8 @@ def integrate(
             s_scale = _loaded(s, s_scale)
         if apart:
             b_scale = max(b_scale if step > 0 else 0.0, abs(s[GROUP, 0, 0]))
-        span = step_length(links, s, push, order, tol, horizon - now, w_scale, s_scale, b_scale)
+        scales = Scales(w_scale, s_scale, b_scale)
+        span = step_length(links, s, push, order, tol, horizon - now, scales)
         if not math.isfinite(span) or not math.isfinite(s[GROUP, 0, order]):
             return NOT_FINITE, now, step, switches
         span, spring, side = first_switch(law, s, order, span)
@@ -667,7 +561,7 @@ def integrate(
             spring = -1 if leaves else spring
         least = order
         if spring >= 0 or leaves or now + span >= horizon:  # not its own error ended the step
-            least = _enough(law, s, order, span, 1e-3 * tol, w_scale, s_scale, b_scale)
+            least = _enough(law, s, order, span, 1e-3 * tol, scales)
         more = min(least + 2, order)  # for what is, in time, a derivative of these
         if tangent:
             expand_tangents(links, s, d, more)
@@ -690,7 +584,7 @@ def integrate(
             if leaves or spring >= 0:  # the base stress may end with this step
                 _delay(s, d, more, span, late)
         if leaves:
-            depart(links, s, d, order, more, span, end, out, done, room)
+            depart(links, s, d, order, more, span, end, out, done, scratch)
             return DONE, end, step + 1, switches
         now = end
         advance(s, groups, order, span)
@@ -702,7 +596,6 @@ def integrate(
         settle(links, s)
         if spring >= 0:
             switches = switch(
-                rows, branches, law, s, d, directions, order, span, now, spring, side,
-                log, switches,
-            )  # fmt: skip
+                scene, branches, law, s, d, order, span, now, spring, side, log, switches
+            )
     return TOO_MANY_STEPS, now, max_steps, switches

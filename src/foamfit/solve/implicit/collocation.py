@@ -21,14 +21,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from foamfit.solve.explicit.series import DRAG, OWN_ETA, OWN_HEIGHT, branch_derivative
 from foamfit.solve.polynomial import value_at
 from foamfit.springs.kernels import (
     ETA,
     K0,
     Array,
     Branches,
-    Row,
     branch_shape,
     inner,
     maker,
@@ -36,6 +34,8 @@ from foamfit.springs.kernels import (
     slope_on,
     stress_on,
 )
+from foamfit.springs.parameters import DRAG, OWN_ETA, OWN_HEIGHT
+from foamfit.springs.sensitivities import stress_tangent
 
 STAGES = 5
 
@@ -110,20 +110,25 @@ class Points(NamedTuple):
 
 
 class State(NamedTuple):
-    """What a step starts from: displacement, velocity of masses, strain, branch; all (springs,)."""
+    """What a step starts from, all (springs,).
+
+    Displacements and velocities w and v of the nodes, v0 of those with a mass (0 of the others),
+    strains and branches.
+    """
 
     w: Array
+    v: Array
     v0: Array
     eps0: Array
     branches: Branches
 
 
-class Tangents(NamedTuple):
+class PointTangents(NamedTuple):
     """Derivatives by p parameters of a state and of what a step finds at its points.
 
-    directions (p, 2) are those of `explicit.series`. w, v0 and eps0 are (springs, p); eps and total
-    are (p, springs, points), like z, which is `work.delta`; base (p,) is the base stress at the
-    last step's end.
+    directions (p, 2) are those of `springs.parameters`. w, v0 and eps0 are (springs, p); eps and
+    total are (p, springs, points), like z, which is `work.delta`; base (p,) is the base stress at
+    the last step's end.
     """
 
     directions: Branches
@@ -156,11 +161,11 @@ def make_points(count: int) -> Points:
 
 
 @maker
-def make_tangents(count: int, directions: Branches) -> Tangents:
+def make_tangents(count: int, directions: Branches) -> PointTangents:
     """Make derivatives of a chain at rest."""
     p = directions.shape[0]
     at, points = (count, p), (p, count, STAGES)
-    return Tangents(
+    return PointTangents(
         directions, np.zeros(at), np.zeros(at), np.zeros(at), np.zeros(points), np.zeros(points),
         np.zeros(p), _make_work(count if p > 0 else 0, p),
     )  # fmt: skip
@@ -387,7 +392,7 @@ def collocate(
 
 
 @once
-def linearise(body: Body, state: State, span: float, at: Points, d: Tangents) -> bool:
+def linearise(body: Body, state: State, span: float, at: Points, d: PointTangents) -> bool:
     """Derivatives at the points of a step that was found, and at its end; false if singular.
 
     The equations of the step, linearised: first what the parameters and the derivatives at the
@@ -435,19 +440,9 @@ def _relative(z: Array, i: int, j: int, c: int) -> tuple[float, float]:
 
 
 @inner
-def stress_tangent(row: Row, branch: int, eps: float, d_eps: float, own: int) -> float:
-    """Derivative of a spring's stress by its `own` parameter (or -1), by which eps moves d_eps."""
-    dk = dx0 = ds0 = 0.0
-    if 0 <= own < OWN_ETA:
-        dk, dx0, ds0 = branch_derivative(row, branch, own)
-    curved, _, x0, _ = branch_shape(row, branch)
-    x = eps - x0
-    at_rest = (x / (1.0 - x) if curved else x) * dk + ds0
-    return at_rest + slope_on(row, branch, eps) * (d_eps - dx0)
-
-
-@inner
-def _rest(body: Body, state: State, span: float, at: Points, d: Tangents, i: int, c: int) -> None:
+def _rest(
+    body: Body, state: State, span: float, at: Points, d: PointTangents, i: int, c: int
+) -> None:
     """Derivatives of strain and stress of spring i at the points in direction c, while z rests."""
     row, branch, height = body.rows[i], state.branches[i], body.heights[i]
     own = d.directions[c, 1] if d.directions[c, 0] == i else -1
@@ -483,16 +478,15 @@ def truncation(c: Array) -> float:
 
 
 @inner
-def guess(
-    moves: Array, v: Array, v0: Array, moving: int, span: float, taken: float, z: Array
-) -> None:
+def guess(moves: Array, state: State, moving: int, span: float, taken: float, z: Array) -> None:
     """Fill z with the motion of the last step, of length `taken`, carried on over the next."""
-    for i in range(v.size):
+    for i in range(state.v.size):
         ahead = i < moving and 0.0 < span <= 2.0 * taken
         last = value_at(moves[i], STAGES, 1.0)
         for j in range(STAGES):
             time = NODES[j] * span
             if ahead:
-                z[i, j] = value_at(moves[i], STAGES, 1.0 + time / taken) - last - time * v0[i]
+                z[i, j] = value_at(moves[i], STAGES, 1.0 + time / taken) - last
+                z[i, j] -= time * state.v0[i]
             else:
-                z[i, j] = time * (v[i] - v0[i]) if i < moving else 0.0
+                z[i, j] = time * (state.v[i] - state.v0[i]) if i < moving else 0.0

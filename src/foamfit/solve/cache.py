@@ -1,0 +1,52 @@
+"""What an earlier run left compiled, and an announcement of what has to be compiled yet."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+_LOG = logging.getLogger(__name__)
+# The package, and its folders in which compiled loops are written.
+PACKAGE = Path(__file__).parents[1]
+FOLDERS = ("springs", "solve")
+
+
+def _caches() -> set[Path]:
+    """Folders in which numba keeps what it compiled of this package: one beside each of its own."""
+    from foamfit.solve import polynomial
+    from foamfit.solve.explicit import taylor
+    from foamfit.solve.implicit import vibration
+    from foamfit.springs import kernels
+
+    loops = (kernels.fault, polynomial.first_crossing, taylor.integrate, vibration.fastest_rates)
+    return {Path(loop.stats.cache_path or ".") for loop in loops}
+
+
+@functools.cache
+def announce(function: Any, what: str) -> None:
+    """Log, once in a process, that `function` is about to be compiled, unless it has been."""
+    made = getattr(function, "signatures", True)  # where numba is switched off there are none
+    if not made and not compiled(function.__name__):
+        _LOG.warning("foamfit: compiling %s, once after installation", what)
+
+
+def compiled(name: str = "integrate") -> bool:
+    """Tell whether an earlier run left a loop, compiled of this very source, in the cache.
+
+    What is older than any module beside those that compiled loops are written in is removed: numba
+    itself compares it with the module of the outermost loop alone.
+    """
+    times = [path.stat().st_mtime for name in FOLDERS for path in (PACKAGE / name).rglob("*.py")]
+    written = max((at for at in times if at <= time.time()), default=0.0)  # some clocks are wrong
+    fresh = False
+    for made in (path for cache in _caches() for path in cache.glob("*.nb[ci]")):
+        if made.stat().st_mtime < written:
+            with suppress(OSError):  # not ours to remove
+                made.unlink(missing_ok=True)
+        elif f".{name}-" in made.name:
+            fresh = fresh or made.suffix == ".nbc"
+    return fresh

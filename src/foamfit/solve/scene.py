@@ -1,0 +1,112 @@
+"""What all compiled integrators share: the scene, its samples, and how a run can end."""
+
+# mypy: disallow-untyped-decorators=False, warn-return-any=False
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from foamfit.springs.kernels import Array, Branches, inner
+
+# What is known of the top: it has a mass, no mass but the onsite damper, its stress, its motion.
+FREE, VISCOUS, STRESS, MOTION = range(4)
+# Outcomes.
+DONE, TOO_MANY_STEPS, STEP_UNDERFLOW, FLAT_UNDER_STRESS, NOT_FINITE = range(5)
+# The base stress is followed to its own size where that is at least so much of the springs'
+# stresses: what has not come through to the base yet is not worth a step.
+LEAST_BASE = 1e-6
+
+# A `Scene` as integrators are given it: a named tuple would cost each call a microsecond more.
+SceneTuple = tuple[Array, Array, Branches, Array, float, int, Array, float, Array]
+
+
+class Scene(NamedTuple):
+    """A chain under a drive.
+
+    rows (springs, columns) are the springs, base first (see `springs.kernels`), heights (springs,)
+    is in m. ends (groups,) is one past the last spring of each group; above each lies a node of
+    areal mass m/A, mass (groups,), kg/m². `drag` is the onsite damping of the top, η_site/H,
+    Pa·s/m, and `top` what is known of it. values (n,) is the prescribed stress (Pa) or, for MOTION,
+    displacement (m) of the top at the samples t (n,), s. `speed` is the velocity of a striker, m/s,
+    at the time 0; 0 = no impact, and every other drive starts at t[0].
+    """
+
+    rows: Array
+    heights: Array
+    ends: Branches
+    mass: Array
+    drag: float
+    top: int
+    values: Array
+    speed: float
+    t: Array
+
+
+class Samples(NamedTuple):
+    """The curves to fill, over the samples t (n,).
+
+    curves (1 + springs or 1, n) holds the base stress, Pa, then the displacements above each spring
+    or of the top alone, m; slopes (p, …) are their derivatives in p directions. log (m, 5) takes
+    the switches: time, spring, branch left, branch entered, strain.
+    """
+
+    t: Array
+    curves: Array
+    slopes: Array
+    log: Array
+
+
+@inner
+def log_switch(
+    log: Array, switches: int, now: float, i: int, left: int, entered: int, eps: float
+) -> int:
+    """Note a change of branch where the log has place for it; returns how many there are now."""
+    if switches < log.shape[0]:
+        log[switches, 0], log[switches, 1], log[switches, 2] = now, i, left
+        log[switches, 3], log[switches, 4] = entered, eps
+    return switches + 1
+
+
+@inner
+def first_past(t: Array, first: int, end: float, last: bool) -> int:
+    """First sample from `first` on at the time `end` or later; where it is the `last`, later."""
+    low, high, step = first, first, 1
+    while high < t.size and (t[high] < end or (last and t[high] == end)):
+        low, high = high + 1, high + step
+        step *= 2
+    high = min(high, t.size)
+    while low < high:
+        mid = (low + high) // 2
+        if t[mid] < end or (last and t[mid] == end):
+            low = mid + 1
+        else:
+            high = mid
+    return low
+
+
+@inner
+def fill_line(at: float, rate: float, t: Array, now: float, out: Array) -> None:
+    """Write at + rate (t - now) to `out`."""
+    for j in range(t.size):
+        out[j] = at + rate * (t[j] - now)
+
+
+@inner
+def before_contact(curves: Array, t: Array, speed: float) -> int:
+    """Fill the samples before contact, at time 0, and return how many these are.
+
+    Nothing presses and only the striker moves.
+    """
+    rows = curves.shape[0]
+    none = rows - rows  # not the literals, which are types: compiled anew
+    done = first_past(t, none, 0.0, none > 0)
+    for i in range(rows):
+        fill_line(0.0, speed if i == rows - 1 else 0.0, t[:done], 0.0, curves[i, :done])
+    return done
+
+
+@inner
+def fly(curves: Array, t: Array, first: int, t_end: float, w_end: Array, speed: float) -> None:
+    """After contact the chain keeps its shape and moves with the striker; nothing presses."""
+    fill_line(0.0, 0.0, t[first:], t_end, curves[0, first:])
+    for i in range(curves.shape[0] - 1):
+        fill_line(w_end[i], speed, t[first:], t_end, curves[1 + i, first:])
