@@ -16,8 +16,8 @@ import pytest
 from click.testing import CliRunner
 
 import fabricated
+import foamfit.report.figures
 import foamfit.report.folder
-import foamfit.report.plots
 import foamfit.results
 from conftest import EXPERIMENTS
 from foamfit import files
@@ -37,7 +37,7 @@ posix = pytest.mark.skipif(os.name != "posix", reason="signals and permissions o
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty working directory, and results of one file that need no time."""
     monkeypatch.setattr(foamfit.report.folder, "_write", write_json)
-    monkeypatch.setattr(foamfit.report.plots, "image", lambda *_: b"\x89PNG" + bytes(20))
+    monkeypatch.setattr(foamfit.report.figures, "image", lambda *_: b"\x89PNG" + bytes(20))
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

@@ -19,7 +19,8 @@ from foamfit import auto, one_model
 from foamfit.cli import main
 from foamfit.data.measurement import Measurement, Outliers, Specimen, Striker
 from foamfit.fitting.problem import make_problem
-from foamfit.report.page import render_report, summary_text
+from foamfit.report.page import render_report
+from foamfit.report.summary import summary_text
 from foamfit.trust import evidence
 from foamfit.trust.residual_tests import branch_places, find_structure, neighbours_test, runs_test
 
@@ -416,11 +417,11 @@ def test_the_folder_holds_the_ladder(climbed, tmp_path):
 
 def test_the_report_and_the_summary_show_the_ladder(climbed):
     page = render_report(climbed, fit_png=b"\x89PNG" + bytes(20))
-    text = summary_text(climbed)
+    text = summary_text(climbed, verbose=True)
     assert "Ladder of models" in page
     for rung in climbed.ladder.rungs:
         assert rung.why in page
-        assert f"{rung.bic:.1f}".replace("-", "−") in page
+        assert f"{rung.bic:.0f}".replace("-", "−") in page
         assert f"{rung.bic:.0f}".replace("-", "−") in text
         assert f" {rung.rank}/{rung.n_vary} " in text
         assert f"{rung.name}: {rung.why}" in " ".join(text.split())

@@ -181,7 +181,7 @@ def check(
             if value is not None:
                 raise InputError(f"{option} needs --model; give one, as --model bistable")
     if plot is not None:
-        from foamfit.report.plots import figure_format
+        from foamfit.report.figures import figure_format
 
         check_file(plot)
         figure_format(plot)
@@ -194,19 +194,24 @@ def check(
     if model is None:
         say(description, newline=False)
         return
-    from foamfit.report.outlook import describe_plan, plan_test
+    from foamfit.report.outlook import outlook_of
+    from foamfit.report.outlook_text import outlook_text
 
     with _compiling(quiet=False) as compile_rest:
         compile_rest()
-    plan = plan_test(test, specimen, model, drive, published_set=published_set, result=params)
+    outlook = outlook_of(test, specimen, model, drive, published_set=published_set, result=params)
     if description:
         say(description)
-    say(describe_plan(plan))
+    say(outlook_text(outlook))
     if plot is not None:
-        from foamfit.report.outlook_plot import plot_plan
+        from foamfit.report.identifiability_plots import plot_insight
 
-        plot_plan(plan, plot)
-        say(f"\ndrawn in {plot}")
+        name, insight = outlook.problem.measurement.name, outlook.planned.insight
+        if insight is None:
+            say("\nnothing is drawn: no parameter changes the curves")
+        else:
+            plot_insight(insight, f"{name} · {outlook.problem.model.name} · before the fit", plot)
+            say(f"\ndrawn in {plot}")
 
 
 def _fixes(
@@ -390,7 +395,7 @@ def _tell_result(result: FitResult, folder: Path | None, as_json: bool, quiet: b
 
         say(json.dumps(result.to_json_dict(), allow_nan=False))
     elif not quiet:
-        from foamfit.report.page import summary_text
+        from foamfit.report.summary import summary_text
 
         say(summary_text(result))
         if folder is not None:
@@ -508,7 +513,7 @@ def simulate(scene: Path, out: Path | None, plot: Path | None, rtol: float) -> N
     target = Path(scene.with_suffix(".csv").name) if out is None else out
     _check_files((target, plot), files_of_scene(scene))
     if plot is not None:
-        from foamfit.report.plots import figure_format
+        from foamfit.report.figures import figure_format
 
         figure_format(plot)
     with _compiling(quiet=False) as compile_rest:
@@ -560,7 +565,7 @@ def compare(
     from foamfit.report.comparison import compare as side_by_side
     from foamfit.report.comparison import comparison_text, write_csv
     from foamfit.report.comparison_plot import plot_comparison
-    from foamfit.report.plots import figure_format
+    from foamfit.report.figures import figure_format
 
     _check_files((plot, table), [p / "fit.json" if p.is_dir() else p for p in results])
     if plot is not None:

@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 import math
+import re
 import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from foamfit.report.comparison import Comparison, Row, Section
-from foamfit.report.plots import GREY, IN_MATH, MARKS, MATH, STYLE, save, say_nothing_there
+from foamfit.report.figures import BLUE, GREY, VERMILION, drawing, save, say_nothing_there
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+MARKS = ((BLUE, "o"), (VERMILION, "s"), ("black", "^"), (GREY, "D"))  # of the results
+MATH = {
+    "k0": "$k_0$", "σ_a": r"$\sigma_a$", "ε_a": r"$\varepsilon_a$", "ε_c": r"$\varepsilon_c$",
+    "k_h+": "$k_{h+}$", "k_h−": "$k_{h-}$", "k_c": "$k_c$", "Δσ": r"$\Delta\sigma$",
+    "η": r"$\eta$",
+}  # fmt: skip
+IN_MATH = re.compile("|".join(map(re.escape, MATH)))
 
 
 def plot_comparison(comparison: Comparison, path: str | Path | None = None) -> Figure:
@@ -31,18 +40,13 @@ def plot_comparison(comparison: Comparison, path: str | Path | None = None) -> F
         One panel for each reference, 7 in wide; shaded are one and three standard errors. What is
         not compared is left out, what is not determined is named.
     """
-    import matplotlib
-    from matplotlib.figure import Figure
-
     groups: dict[str, list[Section]] = {}
     for section in comparison.sections:
         groups.setdefault(section.reference, []).append(section)
     columns = min(len(groups), 2)
     rows = [list(groups.items())[i : i + columns] for i in range(0, len(groups), columns)]
     lines = [max(_comparison_lines(sections) for _, sections in row) for row in rows]
-    with matplotlib.rc_context(STYLE):
-        size = (7.0, 0.5 + sum(0.6 + 0.12 * n for n in lines))
-        figure = Figure(figsize=size, layout="constrained")
+    with drawing(7.0, 0.5 + sum(0.6 + 0.12 * n for n in lines)) as figure:
         grid = figure.add_gridspec(len(rows), columns, height_ratios=[n + 2 for n in lines])
         for i, row in enumerate(rows):
             for j, (reference, sections) in enumerate(row):

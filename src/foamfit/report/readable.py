@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+from foamfit import text
 from foamfit.results import ParameterEstimate
 
 SYMBOLS = {
@@ -61,6 +62,13 @@ class Readable:
         """The value with its standard error, where there is one."""
         return f"{self.value} ± {self.stderr}" if self.stderr else self.value
 
+    @property
+    def matters(self) -> bool:
+        """Whether its reason is to be read: it is not determined, or more is said of it."""
+        return self.state not in ("determined", "fixed") or (
+            self.state == "determined" and ";" in self.why
+        )
+
 
 def readable(name: str, p: ParameterEstimate) -> Readable:
     """Return a parameter as it is to be read.
@@ -89,18 +97,13 @@ def readable(name: str, p: ParameterEstimate) -> Readable:
 
 def number(value: Any) -> str:
     """Return anything as text; a number with four digits, an integer with all of its own."""
-    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+    if value is None:
         return "–"
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, list | tuple):
         return ", ".join(number(item) for item in value)
-    if not isinstance(value, float):
-        return str(value)
-    if value == 0 or 1e-3 <= abs(value) < 1e6:
-        decimals = 0 if value == 0 else max(0, 3 - math.floor(math.log10(abs(value))))
-        return _fixed(value, decimals)
-    return f"{value:.3e}".replace("-", "−")
+    return text.number(value) if isinstance(value, float) else str(value)
 
 
 def _symbol(name: str) -> tuple[str, str]:
@@ -122,7 +125,5 @@ def _rounded(value: float, stderr: float) -> tuple[str, str, int]:
 
 
 def _fixed(value: float, places: int) -> str:
-    text = f"{round(value, places):.{max(places, 0)}f}"
-    if float(text) == 0:
-        text = text.lstrip("-")
-    return text.replace("-", "−")
+    shown = f"{round(value, places):.{max(places, 0)}f}"
+    return (shown.lstrip("-") if float(shown) == 0 else shown).replace("-", "−")

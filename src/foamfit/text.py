@@ -1,0 +1,94 @@
+"""Numbers and sentences for people: the one home of their formatting.
+
+Numbers: `engineering` writes a value with a prefix of its unit ("3.839 MPa"), `number` one without
+a unit ("0.01230", "−1.200e−07"), `significant` a few digits without an exponent ("140"), `percent`
+a share ("140 %", "0.23 %").
+Words: `counted` writes a count with its noun ("1 sample", "3 samples"), `listed` a list ("a, b and
+c").
+Lines: `wrapped` breaks a paragraph into lines, `aligned` makes a table of cells, `labelled` sets
+labels before wrapped texts.
+"""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Iterable, Sequence
+
+WIDTH = 100  # characters of a line
+_PREFIXES = {9: "G", 6: "M", 3: "k", 0: "", -3: "m", -6: "µ", -9: "n"}
+
+
+def engineering(value: float, unit: str) -> str:
+    """Write a value with four digits and a prefix: 3.839e6, "Pa" gives "3.839 MPa"."""
+    exponent = math.log10(abs(value)) if value and math.isfinite(value) else 0.0
+    power = min(max(3 * math.floor(exponent / 3.0), -9), 9)
+    return f"{value / 10.0**power:.4g} {_PREFIXES[power]}{unit}"
+
+
+def number(value: float) -> str:
+    """Write a number with four digits and a minus sign; "–" for one that is not finite."""
+    if not math.isfinite(value):
+        return "–"
+    if value == 0 or 1e-3 <= abs(value) < 1e6:
+        decimals = 0 if value == 0 else max(0, 3 - math.floor(math.log10(abs(value))))
+        return f"{value:.{decimals}f}".replace("-", "−")
+    return f"{value:.3e}".replace("-", "−")
+
+
+def significant(value: float, digits: int = 2) -> str:
+    """Write a few significant digits, never an exponent: 138.4, 2 gives "140"."""
+    if value == 0 or not math.isfinite(value):
+        return f"{value:.0f}"
+    rounded = float(f"{value:.{digits}g}")
+    decimals = max(0, digits - 1 - math.floor(math.log10(abs(rounded))))
+    text = f"{rounded:.{decimals}f}"
+    return text.rstrip("0").rstrip(".") if "." in text else text
+
+
+def percent(share: float, digits: int = 2) -> str:
+    """Write a share with a few significant digits: 1.384 gives "140 %"."""
+    return f"{significant(100.0 * share, digits)} %"
+
+
+def counted(count: int, noun: str) -> str:
+    """Write a count with its noun: "1 sample", "3 samples"."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def listed(items: Iterable[str]) -> str:
+    """Write a list: "a", "a and b", "a, b and c"."""
+    *others, last = items
+    return f"{', '.join(others)} and {last}" if others else last
+
+
+def wrapped(text: str, indent: int = 2, width: int = WIDTH) -> list[str]:
+    """Break a paragraph into lines; all but the first are indented by so many spaces."""
+    return textwrap.wrap(text, width, subsequent_indent=" " * indent)
+
+
+def aligned(rows: Sequence[Sequence[str]], gap: str = "  ", right: Iterable[int] = ()) -> list[str]:
+    """Make lines of equal columns from rows of cells.
+
+    The columns whose numbers are in `right` are aligned to the right below the first row, which is
+    the header; all others to the left.
+    """
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    right, lines = set(right), []
+    for row in rows:
+        cells = [
+            cell.rjust(width) if i in right and row is not rows[0] else cell.ljust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ]
+        lines.append(gap.join(cells).rstrip())
+    return lines
+
+
+def labelled(items: Iterable[tuple[str, Iterable[str]]], column: int = 10) -> str:
+    """Set each label before its texts, which are wrapped from `column` on, no last newline."""
+    lines = list[str]()
+    for label, texts in items:
+        for i, text in enumerate(texts):
+            start, indent = label if i == 0 else "", " " * (column + 2)
+            lines += textwrap.wrap(f"{start:<{column}}{text}", WIDTH, subsequent_indent=indent)
+    return "\n".join(lines)
