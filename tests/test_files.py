@@ -25,7 +25,8 @@ from foamfit.api import FitResult
 from foamfit.cli import main
 from foamfit.errors import InputError
 from foamfit.files import check_file, replacing, write_file
-from foamfit.report.comparison import compare, write_csv
+from foamfit.report.comparison import compare
+from foamfit.report.comparison_text import write_csv
 from foamfit.report.folder import check_target, load_result
 from foamfit.report.plots import plot_fit
 

@@ -19,7 +19,8 @@ from foamfit.api import FitResult
 from foamfit.cli import main
 from foamfit.data.measurement import Measurement, Outliers
 from foamfit.fitting.objective import LOSSES, Objective, default_weights, influence, soften
-from foamfit.report.comparison import compare, comparison_text
+from foamfit.report.comparison import compare
+from foamfit.report.comparison_text import comparison_text
 from foamfit.report.folder import load_result
 from foamfit.report.page import render_report
 from foamfit.report.plots import plot_fit
