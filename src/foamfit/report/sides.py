@@ -43,6 +43,7 @@ class Side:
 
 
 def side_of(result: Result) -> Side:
+    """Return the parameters of a fit; InputError if the result is not whole."""
     if isinstance(result, Fit):
         content: Mapping[str, Any] = result.to_json_dict()
     else:
@@ -99,6 +100,7 @@ def _correlation(content: Any, where: str) -> dict[tuple[str, str], float]:
 
 
 def published_side(name: str) -> Side:
+    """Return the parameters of a published set."""
     item = published_sets[name]
     estimates: dict[str, ParameterEstimate] = {}
     kinds = []
