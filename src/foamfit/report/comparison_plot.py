@@ -27,18 +27,8 @@ IN_MATH = re.compile("|".join(map(re.escape, MATH)))
 def plot_comparison(comparison: Comparison, path: str | Path | None = None) -> Figure:
     """Draw how far each parameter is from its reference, in standard errors, and in percent.
 
-    Parameters
-    ----------
-    comparison : Comparison
-        From `report.comparison.compare`.
-    path : str or Path, optional
-        Where to save the figure; the suffix gives the format.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        One panel for each reference, 7 in wide; shaded are one and three standard errors. What is
-        not compared is left out, what is not determined is named.
+    One panel for each reference, 7 in wide; shaded are one and three standard errors. What is not
+    compared is left out, what is not determined is named.
     """
     groups: dict[str, list[Pair]] = {}
     for pair in comparison.pairs:

@@ -54,14 +54,7 @@ def laid_out(figure: Figure, dpi: int = DPI) -> Iterator[None]:
     """Keep one layout of a figure for all images that are made of it within.
 
     Left to itself matplotlib lays a figure out anew for every image, and draws it once more for
-    that, unseen. Within another `laid_out` of the same figure this does nothing.
-
-    Parameters
-    ----------
-    figure : matplotlib.figure.Figure
-        What will be rendered; its engine is put back at the end.
-    dpi : int
-        Resolution at which its texts are measured.
+    that, unseen. `dpi` is the resolution at which its texts are measured.
     """
     import matplotlib
 
@@ -89,17 +82,7 @@ def _unnamed_letters() -> Iterator[None]:
 
 
 def image(figure: Figure, form: Literal["png", "pdf", "svg"], dpi: int = DPI) -> bytes:
-    """Return the figure as the bytes of a file (PDF with embedded TrueType fonts).
-
-    Parameters
-    ----------
-    figure : matplotlib.figure.Figure
-        What to render.
-    form : {"png", "pdf", "svg"}
-        The format.
-    dpi : int
-        Of a PNG.
-    """
+    """Return the figure as the bytes of a file; `dpi` is that of a PNG."""
     import matplotlib
 
     buffer = io.BytesIO()

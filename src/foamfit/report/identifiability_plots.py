@@ -35,18 +35,8 @@ CELL = 0.24  # height of a cell, in
 def plot_sensitivities(insight: Insight, path: str | Path | None = None) -> Figure:
     """Draw by how much each curve moves with each parameter, along time, over shaded branches.
 
-    Parameters
-    ----------
-    insight : Insight
-        What the test can tell.
-    path : str or Path, optional
-        Where to save the figure; the suffix gives the format.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        One row for each parameter, one panel for each counted curve. A row has one scale, its
-        largest value, in standard deviations of the noise per 1 % of the natural size.
+    One row for each parameter, one panel for each counted curve. A row has one scale, its largest
+    value, in standard deviations of the noise per 1 % of the natural size.
     """
     with drawing(7.0, _strips_height(insight)) as figure:
         _draw_sensitivities(figure, insight)
@@ -58,14 +48,7 @@ def plot_information(
 ) -> Figure:
     """Draw which part of which curve fixes each parameter, and the correlation of the estimates.
 
-    Parameters
-    ----------
-    insight : Insight
-        What the test can tell.
-    correlation : (k, k) array, optional
-        Of the estimates, where it is better known than from `insight`.
-    path : str or Path, optional
-        Where to save the figure; the suffix gives the format.
+    `correlation` is (k, k), where it is better known than from `insight`.
     """
     with drawing(7.0, _cells_height(insight)) as figure:
         _draw_information(figure, insight, correlation)
@@ -99,17 +82,8 @@ def _cells_height(insight: Insight) -> float:
 def plot_profiles(result: Fit, path: str | Path | None = None) -> Figure:
     """Draw the profile of each parameter that was followed, with its 95 % cut and its interval.
 
-    Parameters
-    ----------
-    result : Fit
-        The fit; a profile that was stopped is drawn as far as it came.
-    path : str or Path, optional
-        Where to save the figure; the suffix gives the format.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        7 in wide, four panels a row; dashed is the parabola of the local covariance.
+    Four panels a row; dashed is the parabola of the local covariance. A profile that was stopped is
+    drawn as far as it came.
     """
     profiles = result.intervals.profiles if result.intervals is not None else ()
     rows = max(-(-len(profiles) // 4), 1)

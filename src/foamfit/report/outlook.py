@@ -48,16 +48,9 @@ GUESSED = "the best"  # how a source begins that is no knowledge
 class Expected:
     """What to expect of an experiment with one velocity of the striker.
 
-    Attributes
-    ----------
-    velocity : float or None
-        Of the striker, m/s; None in other drives.
-    estimates : dict of str to ParameterEstimate
-        Start values with expected standard errors and states, of the parameters that vary.
-    visited : dict
-        Branches that each spring goes through.
-    insight : Insight or None
-        The sensitivities; None if no parameter changes the curves.
+    `velocity` (m/s) is None in other drives than the impact; `estimates` are the start values of
+    the parameters that vary, with expected standard errors and states; `visited` are the branches
+    of each spring; `insight` is None if no parameter changes the curves.
     """
 
     velocity: float | None
@@ -70,23 +63,10 @@ class Expected:
 class Outlook:
     """What is to be said of an experiment before it is fitted.
 
-    Attributes
-    ----------
-    problem : Problem
-        The test and its model.
-    values : (n,) array
-        The point that everything holds at, SI.
-    source : str
-        Where it comes from.
-    planned : Expected
-        The experiment as planned.
-    closing : dict of str to (float or None)
-        For each bistable spring the velocity (m/s) from which on its loop closes; None if none up
-        to 30 times the planned one does. Empty in other drives than the impact.
-    faster : Expected or None
-        The same experiment 5 % faster than what closes all loops, where it now leaves one open.
-    noise : dict of str to NoiseLevel
-        Of each counted curve.
+    All holds at `values` (SI), which come from `source`. `closing` is for each bistable spring the
+    velocity (m/s) from which on its loop closes, None if none up to 30 times the planned one does;
+    empty in other drives than the impact. `faster` is the experiment 5 % faster than what closes
+    all loops, where it leaves one open. `noise` is that of each counted curve.
     """
 
     problem: Problem
@@ -144,13 +124,7 @@ def start_values(problem: Problem, seed: int = 0) -> tuple[Array, str]:
 
 
 def published_values(problem: Problem, name: str) -> tuple[Array, str]:
-    """Start values of a published set, its heights scaled to the specimen, its damping left out.
-
-    Raises
-    ------
-    InputError
-        If there is no such set or it has other springs.
-    """
+    """Start values of a published set, its heights scaled to the specimen, without its damping."""
     if name not in published:
         known = ", ".join(published)
         raise InputError(f"there is no published set '{name}'; there are {known}")
@@ -172,13 +146,7 @@ def published_values(problem: Problem, name: str) -> tuple[Array, str]:
 
 
 def result_values(problem: Problem, folder: Path) -> tuple[Array, str]:
-    """Start values of an earlier result, from its folder or its fit.json.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read or has other springs.
-    """
+    """Start values of an earlier result, from its folder or its fit.json."""
     content = load_result(folder)
     given = content.get("parameters", {})
     missing = [name for name in problem.names if name not in given]
@@ -197,15 +165,7 @@ def result_values(problem: Problem, folder: Path) -> tuple[Array, str]:
 def planned_test(settings_file: Path) -> Measurement:
     """Make a test without curves of what a TOML plans; `simulated_test` fills them in.
 
-    Parameters
-    ----------
-    settings_file : Path
-        With [specimen] height and diameter and [striker] mass and velocity; [noise] counts.
-
-    Raises
-    ------
-    InputError
-        If something is missing; the message names it.
+    It needs [specimen] height and diameter and [striker] mass and velocity; [noise] counts.
     """
     settings = read_settings(settings_file, settings_file, channels=())
     striker = settings.striker or Striker()
@@ -286,22 +246,9 @@ def chain_of(problem: Problem, values: Array) -> Chain:
 def closing_velocity(chain: Chain, striker: Striker, spring: int) -> float | None:
     """Velocity (m/s) from which on an impact closes the loop of a spring: it snaps, and snaps back.
 
-    By bisection of forward runs, to 1e-5. With light interior masses that ring, loops may close and
-    open again above it.
-
-    Parameters
-    ----------
-    chain : Chain
-        What is struck.
-    striker : Striker
-        Its mass, and the planned velocity from which the search starts.
-    spring : int
-        1 at the base.
-
-    Returns
-    -------
-    float or None
-        None if no velocity from a hundredth to thirty times the planned one parts open from closed.
+    By bisection of forward runs, to 1e-5, from the planned velocity of the striker; springs count
+    from 1 at the base. With light interior masses that vibrate, loops may close and open again
+    above it. None if no velocity from a hundredth to thirty times the planned one parts the two.
     """
     assert striker.mass is not None
     assert striker.velocity is not None
@@ -405,23 +352,8 @@ def outlook_of(
 ) -> Outlook:
     """Read a test, or a TOML that plans one, and look ahead.
 
-    Parameters
-    ----------
-    test : Path
-        A CSV; or a TOML, which then needs one of the sources of start values.
-    specimen : Path or None
-        See `foamfit.read_test`.
-    model, drive
-        See `foamfit.fit`.
-    published_set : str, optional
-        A published set to start from.
-    result : Path, optional
-        An earlier result to start from.
-
-    Raises
-    ------
-    InputError
-        If something is missing or wrong; the message names it.
+    A TOML needs one of the sources of start values: `published_set`, or `result`, an earlier one.
+    InputError names what is missing or wrong.
     """
     from foamfit.data.csv_file import read_test
 

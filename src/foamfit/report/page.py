@@ -65,17 +65,7 @@ CITATION = (
 def render_report(result: Fit, *, fit_png: bytes | None = None) -> str:
     """Return the report as one HTML page that needs nothing else.
 
-    Parameters
-    ----------
-    result : Fit
-        What to report.
-    fit_png : bytes, optional
-        The figure of `plots.plot_fit` as PNG, if it is there already.
-
-    Returns
-    -------
-    str
-        HTML with its style and figures inside.
+    `fit_png` is the figure of `plots.plot_fit` as PNG, if it is there already.
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
 

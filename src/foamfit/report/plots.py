@@ -106,20 +106,7 @@ def plot_residuals(result: Fit, path: str | Path | None = None) -> Figure:
 
 
 def plot_response(response: Response, path: str | Path | None = None) -> Figure:
-    """Draw what a forward run gave: base stress and displacements over time, stress over strain.
-
-    Parameters
-    ----------
-    response : Response
-        From `foamfit.simulate`.
-    path : str or Path, optional
-        Where to save the figure; the suffix gives the format.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        7 in wide, three panels; it belongs to no pyplot state.
-    """
+    """Draw what a forward run gave: base stress and displacements over time, stress over strain."""
     time, stress, nodes = response.time, response.base_stress, response.displacement
     with drawing(7.0, 2.75) as figure:
         axes = figure.subplots(1, 3)

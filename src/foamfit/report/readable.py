@@ -23,21 +23,9 @@ UNITS = {
 
 
 def readable_unit(size: float, unit: str) -> tuple[float, str]:
-    """Return the unit in which a number of this size reads well.
+    """Return factor and name of the unit in which a number of this size reads well.
 
-    Parameters
-    ----------
-    size : float
-        The largest number to show, in `unit`.
-    unit : str
-        "Pa", "s" or "m"; any other unit is kept.
-
-    Returns
-    -------
-    factor : float
-        What one of the readable units is in `unit`.
-    name : str
-        Its name, for example "MPa".
+    `size` is the largest number to show, in `unit`: "Pa", "s" or "m"; any other unit is kept.
     """
     scales = UNITS.get(unit, ((1.0, unit),))
     return next((scale for scale in scales if abs(size) >= scale[0]), scales[-1])
@@ -73,13 +61,7 @@ class Readable:
 def readable(name: str, p: ParameterEstimate) -> Readable:
     """Return a parameter as it is to be read.
 
-    Parameters
-    ----------
-    name : str
-        Its name, for example "s1_k0".
-    p : ParameterEstimate
-        Its value in SI; it is shown with the digits that its standard error leaves (two of the
-        error), or with four where there is none.
+    It is shown with the digits that its standard error leaves (two of the error), or with four.
     """
     factor, unit = readable_unit(p.value or p.stderr or 0.0, p.unit)
     value = p.value / factor
