@@ -21,9 +21,7 @@ from foamfit.fitting.problem import Problem, make_params, make_problem
 from foamfit.fitting.search import SearchRecord
 from foamfit.report import outlook as planning
 from foamfit.report.identifiability_plots import (
-    plot_information,
     plot_insight,
-    plot_sensitivities,
 )
 from foamfit.report.page import render_report
 from foamfit.report.summary import summary_text
@@ -521,13 +519,14 @@ def test_a_plan_says_what_it_needs(tmp_path: Path) -> None:
 def test_the_pictures_show_every_parameter_and_curve() -> None:
     result = concluded()
     names, curves = result.insight.names, result.insight.curves
-    for panel, curve in zip(plot_sensitivities(result.insight).axes, curves, strict=True):
+    above, below = plot_insight(result.insight, result.correlation.matrix).subfigs
+    for panel, curve in zip(above.axes, curves, strict=True):
         traces = [line.get_ydata() for line in panel.lines if len(line.get_xdata()) > 2]
         assert len(traces) == len(names)
         for i, (name, trace) in enumerate(zip(names, traces, strict=True)):
             shown, true = i - np.asarray(trace), result.insight.along(name, curve)
             assert np.corrcoef(shown, true)[0, 1] > 0.999
-    left, right = plot_information(result.insight, result.correlation.matrix).axes
+    left, right = below.axes
     assert [label.get_text() for label in left.get_yticklabels()] == list(names)
     diagonal = [text for text in right.texts if text.get_text() == "1"]
     assert len(diagonal) >= len(names)
@@ -536,15 +535,15 @@ def test_the_pictures_show_every_parameter_and_curve() -> None:
 def test_report_and_plan_show_them_too() -> None:
     result = concluded()
     page = render_report(result, fit_png=b"\x89PNG" + bytes(20))
-    assert page.count("data:image/png;base64,") == 4
-    for words in ("Checklist", "What this test can tell", "Is the noise floor reached?"):
+    assert page.count("data:image/png;base64,") == 3
+    for words in ("Checklist", "What the test determines", "Is the noise floor reached?"):
         assert words in page
     assert result.insight.sentence() in page
     assert result.insight.sentence() in " ".join(summary_text(result, verbose=True).split())
     spring, test = synthetic_impact()
     problem = problem_of(test)
     plan = planning.make_outlook(problem, values_of(problem, spring), "the truth")
-    figure = plot_insight(plan.planned.insight, "before the fit")
+    figure = plot_insight(plan.planned.insight, title="before the fit")
     assert [len(half.axes) for half in figure.subfigs] == [2, 2]
 
 

@@ -124,7 +124,7 @@ def test_the_statistics_and_the_energy_are_labelled() -> None:
     energy = balance.as_dict() | {"sentences": balance.sentences(), "missing": "a long text"}
     words = page(statistics=statistics | {"n_agreeing": 11}, energy=energy).words
     told = "effective samples 986.0 χ² 979.9 trials that could not be simulated 1"
-    assert f"{told} valleys searched 2 descents that agree 11" in words
+    assert f"{told} local minima refined 2 descents that reached the best 11" in words
     assert "striker's energy 458.7 kJ/m³ absorbed energy" in words
     assert "impulse of the force" in words
     assert "a long text" not in words

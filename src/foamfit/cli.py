@@ -135,7 +135,7 @@ _DRIVE = click.option(
 @main.command()
 @_TEST
 @_SPECIMEN
-@click.option("--model", help="Also say what the test can tell of this model, before it is fitted.")
+@click.option("--model", help="Also estimate what the test determines of this model.")
 @_DRIVE
 @click.option("--published", "published_set", metavar="NAME", help="Start from a published set.")
 @click.option(
@@ -197,7 +197,8 @@ def check(
         if insight is None:
             say("\nnothing is drawn: no parameter changes the curves")
         else:
-            plot_insight(insight, f"{name} · {outlook.problem.model.name} · before the fit", plot)
+            title = f"{name} · {outlook.problem.model.name} · before the fit"
+            plot_insight(insight, title=title, path=plot)
             say(f"\ndrawn in {plot}")
 
 
@@ -319,7 +320,7 @@ class _FitOptions:
 @click.option("--time-shift", is_flag=True, help="Fit how late the motion is against the force.")
 @click.option(
     "--loss", type=click.Choice(["linear", "soft_l1", "huber", "cauchy"]), default="linear",
-    show_default=True, help="All but linear give way to large residuals.",
+    show_default=True, help="All but linear weigh large residuals less.",
 )  # fmt: skip
 @click.option("--profile", is_flag=True, help="95 % intervals by profile likelihood.")
 @click.option(

@@ -18,7 +18,7 @@ from foamfit.report.sides import Result, Side, published_side, side_of
 from foamfit.springs.published import MM, MPA
 from foamfit.springs.published import published as published_sets
 
-NOTHING = 3.0  # standard error over value past which a difference says nothing
+NOTHING = 3.0  # standard error over value past which a difference means nothing
 WORST_FIRST = ("not determined", "weak", "determined", "fixed")
 ETA_PUBLISHED = (
     "the published η is numerical, it sets how the paper's relaxation under a held stress "
@@ -44,7 +44,7 @@ SAME_DATA = (
     "Both fits are to the same data, so their errors are not independent, and the deviations in "
     "standard errors are only a guide."
 )
-VAGUE = "its standard error is many times its value, so the test says nothing of it"
+VAGUE = "its standard error is many times its value, so the test does not determine it"
 INPUT = (
     "The measured {channel} is the input of this fit: its noise can bias the parameters, which the "
     "standard errors do not count."
@@ -77,7 +77,7 @@ class Row:
 
     @property
     def lost(self) -> bool:
-        """Whether there is a reference, but the test says nothing of the parameter."""
+        """Whether there is a reference, but the test does not determine the parameter."""
         nothing = self.state == "not determined" or self.remark == VAGUE
         return nothing and self.reference is not None
 

@@ -32,48 +32,26 @@ STRIP = 0.4  # height of a strip, in
 CELL = 0.24  # height of a cell, in
 
 
-def plot_sensitivities(insight: Insight, path: str | Path | None = None) -> Figure:
-    """Draw by how much each curve moves with each parameter, along time, over shaded branches.
-
-    One row for each parameter, one panel for each counted curve. A row has one scale, its largest
-    value, in standard deviations of the noise per 1 % of the natural size.
-    """
-    with drawing(7.0, _strips_height(insight)) as figure:
-        _draw_sensitivities(figure, insight)
-    return save(figure, path)
-
-
-def plot_information(
-    insight: Insight, correlation: Array | None = None, path: str | Path | None = None
+def plot_insight(
+    insight: Insight,
+    correlation: Array | None = None,
+    title: str = "",
+    path: str | Path | None = None,
 ) -> Figure:
-    """Draw which part of which curve fixes each parameter, and the correlation of the estimates.
+    """Draw the sensitivity of each curve to each parameter, what fixes it, and the correlation.
 
-    `correlation` is (k, k), where it is better known than from `insight`.
+    Above, a row has one scale, its largest value, in standard deviations of the noise per 1 % of
+    the natural size. `correlation` is (k, k), where it is better known than from `insight`.
     """
-    with drawing(7.0, _cells_height(insight)) as figure:
-        _draw_information(figure, insight, correlation)
-    return save(figure, path)
-
-
-def plot_insight(insight: Insight, title: str, path: str | Path | None = None) -> Figure:
-    """Draw sensitivities, information and correlation in one figure."""
-    heights = [_strips_height(insight), _cells_height(insight)]
-    with drawing(7.0, sum(heights) + 0.3) as figure:
-        figure.suptitle(title, x=0.012, ha="left", fontsize=8.5, weight="bold", parse_math=False)
+    heights = [0.75 + STRIP * len(insight.names), 1.15 + CELL * len(insight.names)]
+    with drawing(7.0, sum(heights) + 0.3 * bool(title)) as figure:
+        if title:
+            look = {"ha": "left", "fontsize": 8.5, "weight": "bold", "parse_math": False}
+            figure.suptitle(title, x=0.012, **look)
         halves = figure.subfigures(2, 1, height_ratios=heights, squeeze=False)[:, 0]
         _draw_sensitivities(halves[0], insight)
-        _draw_information(halves[1], insight, None)
+        _draw_information(halves[1], insight, correlation)
     return save(figure, path)
-
-
-def _strips_height(insight: Insight) -> float:
-    """Height of the strips, inches."""
-    return 0.75 + STRIP * len(insight.names)
-
-
-def _cells_height(insight: Insight) -> float:
-    """Height of the matrices, inches."""
-    return 1.15 + CELL * len(insight.names)
 
 
 # ---------------------------------------------------------------- profiles
@@ -177,7 +155,7 @@ def _color(curve: str) -> str:
 
 
 def _draw_information(figure: FigureBase, insight: Insight, correlation: Array | None) -> None:
-    """Draw what `plot_information` shows into a figure or a part of one."""
+    """Draw which part of which curve fixes each parameter, and the correlation."""
     parts, shares = insight.shares()
     told = [c for c in range(len(parts)) if np.nanmax(shares[:, c], initial=0.0) > 0.005]
     parts, shares = tuple(parts[c] for c in told), shares[:, told]

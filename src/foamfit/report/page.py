@@ -8,11 +8,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 from foamfit.report.figures import DPI, image
-from foamfit.report.identifiability_plots import (
-    plot_information,
-    plot_profiles,
-    plot_sensitivities,
-)
+from foamfit.report.identifiability_plots import plot_insight, plot_profiles
 from foamfit.report.plots import origin_word, plot_fit, plot_residuals
 from foamfit.report.readable import number, readable, readable_unit
 from foamfit.report.summary import ANSWERS, LADDER, conclusions, ladder_cells, misfits
@@ -39,8 +35,8 @@ POINTS = (  # attribute of the spring, symbol and its index, meaning, unit
 STATISTICS = {
     "n_data": "data points", "n_effective": "effective samples", "n_vary": "parameters varied",
     "chisqr": "χ²", "redchi": "reduced χ²", "aic": "AIC", "aicc": "AICc", "bic": "BIC",
-    "n_failed": "trials that could not be simulated", "n_descents": "valleys searched",
-    "n_agreeing": "descents that agree", "n_left_out": "outliers left out",
+    "n_failed": "trials that could not be simulated", "n_descents": "local minima refined",
+    "n_agreeing": "descents that reached the best", "n_left_out": "outliers left out",
 }  # fmt: skip
 ENERGY = {  # of the audit: label and unit
     "striker_energy": ("striker's energy", "J/m³"),
@@ -80,6 +76,8 @@ def render_report(result: Fit, *, fit_png: bytes | None = None) -> str:
     plain = result.to_json_dict()
     energy = plain["energy"]
     profiled = result.intervals is not None and result.intervals.profiles
+    matrix = None if result.correlation is None else result.correlation.matrix
+    insight = None if result.insight is None else plot_insight(result.insight, matrix)
     return environment.get_template("report.html").render(
         result=result,
         version=version("foamfit"),
@@ -104,20 +102,11 @@ def render_report(result: Fit, *, fit_png: bytes | None = None) -> str:
         fit_figure=_figure(fit_png or image(plot_fit(result), "png")),
         answers=ANSWERS,
         badges=BADGES,
-        insight_figures=_insight_figures(result),
+        insight_figure=insight and _figure(image(insight, "png", COARSE), COARSE),
         residual_figure=_figure(image(plot_residuals(result), "png")),
         profile_figure=_figure(image(plot_profiles(result), "png")) if profiled else None,
         citation=CITATION,
     )
-
-
-def _insight_figures(result: Fit) -> list[tuple[str, float]]:
-    """Give the figures of what the test can tell; none where it tells nothing."""
-    if result.insight is None:
-        return []
-    matrix = None if result.correlation is None else result.correlation.matrix
-    figures = (plot_information(result.insight, matrix), plot_sensitivities(result.insight))
-    return [_figure(image(figure, "png", COARSE), COARSE) for figure in figures]
 
 
 def _points(spring: Any) -> list[tuple[tuple[str, str], str, str, str]]:

@@ -125,7 +125,7 @@ def _unknown(result: Fit) -> str:
         return f"{told}."
     if result.insight is None or len(names := list(result.insight.weakest()[1])) < 2:
         return "No varied parameter is weak or not determined."
-    return f"None is weak; the least determined combination is that of {listed(names)}."
+    return f"No varied parameter is weak; least determined is the combination of {listed(names)}."
 
 
 def _rows(result: Fit) -> str:
