@@ -149,8 +149,8 @@ def check(
 ) -> None:  # fmt: skip
     """Say what the loader understood of TEST.csv: columns, contact, specimen, energy.
 
-    With --model also what the test can tell: the velocity that closes the loop, the standard errors
-    to expect, the channel worth measuring better. A TOML in the place of the CSV plans a test that
+    With --model also what the test determines: the velocity that closes the loop, the standard
+    errors to expect, the channel worth measuring better. A TOML in place of the CSV plans a test that
     is not made yet, if --published or --params says what foam it will be.
 
     \b
@@ -167,11 +167,7 @@ def check(
         for option, value in given.items():
             if value is not None:
                 raise InputError(f"--{option} needs --model; give one, as --model bistable")
-    if plot is not None:
-        from foamfit.report.figures import figure_format
-
-        check_file(plot)
-        figure_format(plot)
+    _check_files(None, plot, ())
     if published_set is not None and params is not None:
         raise InputError("--published and --params exclude each other; give one of them")
     description = ""
@@ -483,11 +479,7 @@ def simulate(scene: Path, out: Path | None, plot: Path | None, rtol: float) -> N
     from foamfit.solve.simulation import simulate as run
 
     target = Path(scene.with_suffix(".csv").name) if out is None else out
-    _check_files((target, plot), files_of_scene(scene))
-    if plot is not None:
-        from foamfit.report.figures import figure_format
-
-        figure_format(plot)
+    _check_files(target, plot, files_of_scene(scene))
     with _compiling(quiet=False) as compile_rest:
         chain, drive, time = read_scene(scene)
         compile_rest()
@@ -501,15 +493,19 @@ def simulate(scene: Path, out: Path | None, plot: Path | None, rtol: float) -> N
         say(f"drawn in {plot}")
 
 
-def _check_files(outputs: tuple[Path | None, ...], inputs: Iterable[Path]) -> None:
+def _check_files(table: Path | None, plot: Path | None, inputs: Iterable[Path]) -> None:
     """Refuse files that could not be written, or that are read too, before anything is computed."""
-    given = [path for path in outputs if path is not None]
+    given = [path for path in (table, plot) if path is not None]
     for path in given:
         check_file(path)
         if path.resolve() in [source.resolve() for source in inputs]:
             raise InputError(f"{path} is read by this command and would be lost; name another file")
     if len({path.resolve() for path in given}) < len(given):
         raise InputError(f"{given[0]} cannot be two things; name two files")
+    if plot is not None:
+        from foamfit.report.figures import figure_format
+
+        figure_format(plot)
 
 
 @main.command()
@@ -533,11 +529,8 @@ def compare(
     from foamfit.report.comparison import compare as side_by_side
     from foamfit.report.comparison_plot import plot_comparison
     from foamfit.report.comparison_text import comparison_text, write_csv
-    from foamfit.report.figures import figure_format
 
-    _check_files((plot, table), [p / "fit.json" if p.is_dir() else p for p in results])
-    if plot is not None:
-        figure_format(plot)
+    _check_files(table, plot, [p / "fit.json" if p.is_dir() else p for p in results])
     comparison = side_by_side(results, name)
     say(comparison_text(comparison))
     if plot is not None:

@@ -20,7 +20,6 @@ from foamfit.report.figures import GREY, STYLE, VERMILION, image
 from foamfit.springs.spring import BistableSpring
 
 Array = NDArray[np.float64]
-
 MPA = 1e6
 # Of each parameter in the order of the loop: the unit of its slider.
 UNITS = {
