@@ -454,13 +454,15 @@ def loop_file(tmp_path, monkeypatch):
 def test_the_command_writes_to_auto(loop_file, tmp_path):
     done = run("fit", loop_file, "--model", "auto", "--starts", 4)
     assert done.exit_code == 0, done.output
-    assert "The first rung bistable is the simplest that holds" in done.stdout
+    assert "chosen of 1 model tried: bistable: its residuals are structureless" in done.stdout
     assert "no richer rung was tried" in done.stdout
     folder = tmp_path / "fits" / "loop" / "auto"
     content = json.loads((folder / "fit.json").read_text())
     assert content["model"] == "bistable"
     assert [rung["chosen"] for rung in content["ladder"]["rungs"]] == [True]
     assert (folder / "ladder.csv").is_file()
+    page = (folder / "report.html").read_text()
+    assert "The first rung bistable is the simplest that holds" in page
 
 
 def test_the_command_refuses_parameters_of_one_model(loop_file, tmp_path):

@@ -150,8 +150,8 @@ def check(
     """Say what the loader understood of TEST.csv: columns, contact, specimen, energy.
 
     With --model also what the test determines: the velocity that closes the loop, the standard
-    errors to expect, the channel worth measuring better. A TOML in place of the CSV plans a test that
-    is not made yet, if --published or --params says what foam it will be.
+    errors to expect, the channel worth measuring better. A TOML in place of the CSV plans a test
+    that is not made yet, if --published or --params says what foam it will be.
 
     \b
     Examples:
