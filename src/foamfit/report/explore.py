@@ -110,11 +110,10 @@ class Turner:
         self.sliders: dict[str, Any] = {}
         for name, unit in UNITS.items():
             value = self.start[name] / unit
-            ends = sorted((0.0, 4.0 * value or -0.1))
+            low, high = sorted((0.0, 4.0 * value or -0.1))
             self.sliders[name] = widgets.FloatSlider(
-                value, min=ends[0], max=ends[1], step=(ends[1] - ends[0]) / 4000,
-                description=name if unit == 1.0 else f"{name} (MPa)", readout_format=".4g",
-                style={"description_width": "105px"},
+                value, min=low, max=high, step=(high - low) / 4000, readout_format=".4g",
+                description=name if unit == 1.0 else f"{name} (MPa)", style={"description_width": "105px"},
             )  # fmt: skip
             self.sliders[name].observe(lambda _: self.update(), names="value")
         self.buttons = {n: widgets.Button(description=n) for n in ("reset", "fit from here")}

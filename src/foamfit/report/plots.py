@@ -113,22 +113,21 @@ def plot_response(response: Response, path: str | Path | None = None) -> Figure:
         ft, t_unit = readable_unit(_size(time), "s")
         fs, s_unit = readable_unit(_size(stress), "Pa")
         fw, w_unit = readable_unit(_size(nodes), "m")
-        axes[0].plot(time / ft, stress / fs, color=VERMILION, lw=1.3)
+        last = {"color": VERMILION, "lw": 1.3}
+        axes[0].plot(time / ft, stress / fs, **last)
         # From the base up: light to dark, the top in the colour of what is simulated.
         shades = np.linspace(0.7, 0.35, max(len(nodes) - 1, 1))
         for i, node in enumerate(nodes[:-1]):
             axes[1].plot(time / ft, node / fw, color=str(shades[i]), lw=1.0, label=f"node {i + 1}")
-        axes[1].plot(time / ft, nodes[-1] / fw, color=VERMILION, lw=1.3, label="top")
+        axes[1].plot(time / ft, nodes[-1] / fw, label="top", **last)
         end = np.inf if response.contact_end is None else response.contact_end
         loop = time <= end  # then the striker flies
-        axes[2].plot(response.strain[loop], stress[loop] / fs, color=VERMILION, lw=1.3)
-        for ax, x_label, y_label in (
-            (axes[0], f"time ({t_unit})", f"base stress ({s_unit})"),
-            (axes[1], f"time ({t_unit})", f"displacement ({w_unit})"),
-            (axes[2], "overall strain (–)", f"base stress ({s_unit})"),
-        ):
-            ax.set_xlabel(x_label)
-            ax.set_ylabel(y_label)
+        axes[2].plot(response.strain[loop], stress[loop] / fs, **last)
+        base = f"base stress ({s_unit})"
+        axes[0].set(xlabel=f"time ({t_unit})", ylabel=base)
+        axes[1].set(xlabel=f"time ({t_unit})", ylabel=f"displacement ({w_unit})")
+        axes[2].set(xlabel="overall strain (–)", ylabel=base)
+        for ax in axes:
             ax.margins(0.05, 0.11)
         if response.contact_end is not None:
             for ax in axes[:2]:

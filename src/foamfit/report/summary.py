@@ -117,7 +117,7 @@ def _unknown(result: Fit) -> str:
             reasons.setdefault(result.parameters[name].why, []).append(name)
         groups = [f"{', '.join(names)} ({why})" for why, names in reasons.items()]
         if len("; ".join(groups)) > LONGEST:
-            groups = [", ".join(_of_state(result, state))]
+            groups = [f"{', '.join(_of_state(result, state))} (see why in the report)"]
         if groups:
             parts.append(f"{state}: {'; '.join(groups)}")
     if parts:
