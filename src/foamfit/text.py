@@ -48,6 +48,8 @@ def significant(value: float, digits: int = 2) -> str:
 
 def percent(share: float, digits: int = 2) -> str:
     """Write a share with a few significant digits: 1.384 gives "140 %"."""
+    if 0.0 < abs(share) < 1e-5:
+        return "less than 0.001 %"
     return f"{significant(100.0 * share, digits)} %"
 
 

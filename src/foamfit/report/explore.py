@@ -113,7 +113,8 @@ class Turner:
             low, high = sorted((0.0, 4.0 * value or -0.1))
             self.sliders[name] = widgets.FloatSlider(
                 value, min=low, max=high, step=(high - low) / 4000, readout_format=".4g",
-                description=name if unit == 1.0 else f"{name} (MPa)", style={"description_width": "105px"},
+                description=name if unit == 1.0 else f"{name} (MPa)",
+                style={"description_width": "105px"},
             )  # fmt: skip
             self.sliders[name].observe(lambda _: self.update(), names="value")
         self.buttons = {n: widgets.Button(description=n) for n in ("reset", "fit from here")}
