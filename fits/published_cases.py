@@ -23,8 +23,9 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import foamfit as ff
-from foamfit.report.comparison import Comparison, compare, comparison_text
+from foamfit.report.comparison import Comparison, compare
 from foamfit.report.comparison_plot import plot_comparison
+from foamfit.report.comparison_text import comparison_text
 from foamfit.report.folder import load_result
 
 HERE = Path(__file__).parent
@@ -82,7 +83,7 @@ def fit(case: str, drive: str) -> Path:
 def verdict(comparison: Comparison) -> str:
     """Say how many parameters were recovered, and name those that were not."""
     missed, lost, compared = [], [], 0
-    for section in comparison.sections:
+    for section in comparison.pairs:
         where = f"{section.reference.removeprefix('published ')}, {section.drive} drive"
         for row in section.rows:
             errors = row.standard_errors

@@ -78,6 +78,7 @@ def parameters() -> dict[str, ParameterEstimate]:
     made["s1_kc"] = estimate(
         "s1_kc", SPRING.kc, state="weak", why="its interval is wider than half of its value"
     )
+    made["s1_dsigma"] = estimate("s1_dsigma", SPRING.dsigma, stderr=21.5e3, ci95=(-221e3, -137e3))
     made["s1_kh_minus"] = estimate(
         "s1_kh_minus", SPRING.kh_minus, stderr=None, ci95=None, state="not determined",
         why="branch e was never reached",

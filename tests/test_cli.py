@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+import fabricated
 from conftest import EXPERIMENTS
 from foamfit.cli import main
 from foamfit.report.page import STATISTICS
@@ -204,6 +205,21 @@ def test_what_no_spring_follows_fails_and_is_written(here: Path) -> None:
     content = json.loads((here / "out" / "fit.json").read_text())
     assert content["status"] == "failed"
     assert "not acceptable" in content["warnings"][0]
+
+
+def test_the_terminal_is_one_screen_and_verbose_says_the_rest(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found = fabricated.result(notes=("Noise of stress 30 kPa, given.",))
+    monkeypatch.setattr("foamfit.api.fit", lambda *_, **__: found)
+    monkeypatch.setattr("foamfit.api.save_result", lambda _, folder: folder)
+    short = accepted("fit", RECONSTRUCTION).stdout
+    assert len(short.splitlines()) <= 30
+    assert "rows: 601 read, 601 used" in short
+    assert "warning: s1_kh_minus is not determined" in short
+    assert "note: Noise of stress" not in short
+    whole = accepted("fit", RECONSTRUCTION, "--verbose").stdout
+    assert "note: Noise of stress 30 kPa, given." in whole
 
 
 def test_compare(here: Path, fitted: tuple[Path, Result]) -> None:

@@ -20,14 +20,13 @@ from foamfit.api import FitResult
 from foamfit.cli import main
 from foamfit.report.comparison import (
     Comparison,
+    Pair,
     Row,
-    Section,
     compare,
-    comparison_text,
     recognised,
-    write_csv,
 )
 from foamfit.report.comparison_plot import plot_comparison
+from foamfit.report.comparison_text import comparison_text, write_csv
 from foamfit.results import Correlation
 
 NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
@@ -66,12 +65,12 @@ def with_parameter(result: FitResult, name: str, **changed: Any) -> FitResult:
     return replace(result, parameters=result.parameters | {name: changed_one})
 
 
-def only(comparison: Comparison) -> Section:
-    (section,) = comparison.sections
+def only(comparison: Comparison) -> Pair:
+    (section,) = comparison.pairs
     return section
 
 
-def row(section: Section, label: str) -> Row:
+def row(section: Pair, label: str) -> Row:
     return next(row for row in section.rows if row.label == label)
 
 
@@ -306,7 +305,7 @@ def test_the_csv_holds_every_row(tmp_path: Path) -> None:
     write_csv(comparison, tmp_path / "c.csv")
     with (tmp_path / "c.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == sum(len(section.rows) for section in comparison.sections)
+    assert len(rows) == sum(len(section.rows) for section in comparison.pairs)
     first = rows[0]
     assert (first["parameter"], first["unit"]) == ("k0", "MPa")
     assert float(first["standard_errors"]) == pytest.approx(2.0)
@@ -327,7 +326,7 @@ def test_the_figure_has_a_panel_for_each_reference_and_a_mark_for_each_deviation
     ]  # fmt: skip
     first = figure.axes[0]
     marks = [line.get_xdata() for line in first.lines if line.get_marker() in ("o", "s")]
-    drawn = [r.standard_errors for s in comparison.sections[:2] for r in s.rows]
+    drawn = [r.standard_errors for s in comparison.pairs[:2] for r in s.rows]
     expected = [z for z in drawn if z is not None]
     np.testing.assert_allclose(sorted(x[0] for x in marks if len(x)), sorted(expected))
     assert "not determined" in [text.get_text() for text in first.texts]

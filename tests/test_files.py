@@ -16,8 +16,8 @@ import pytest
 from click.testing import CliRunner
 
 import fabricated
+import foamfit.report.figures
 import foamfit.report.folder
-import foamfit.report.plots
 import foamfit.results
 from conftest import EXPERIMENTS
 from foamfit import files
@@ -25,7 +25,8 @@ from foamfit.api import FitResult
 from foamfit.cli import main
 from foamfit.errors import InputError
 from foamfit.files import check_file, replacing, write_file
-from foamfit.report.comparison import compare, write_csv
+from foamfit.report.comparison import compare
+from foamfit.report.comparison_text import write_csv
 from foamfit.report.folder import check_target, load_result
 from foamfit.report.plots import plot_fit
 
@@ -37,7 +38,7 @@ posix = pytest.mark.skipif(os.name != "posix", reason="signals and permissions o
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty working directory, and results of one file that need no time."""
     monkeypatch.setattr(foamfit.report.folder, "_write", write_json)
-    monkeypatch.setattr(foamfit.report.plots, "image", lambda *_: b"\x89PNG" + bytes(20))
+    monkeypatch.setattr(foamfit.report.figures, "image", lambda *_: b"\x89PNG" + bytes(20))
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

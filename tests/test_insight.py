@@ -21,9 +21,11 @@ from foamfit.fitting.branches import FLIGHT, Section
 from foamfit.fitting.problem import Problem, make_params, make_problem
 from foamfit.fitting.search import SearchRecord
 from foamfit.report import outlook as planning
-from foamfit.report.identifiability_plots import plot_information, plot_sensitivities
-from foamfit.report.outlook_plot import plot_plan
-from foamfit.report.page import render_report, summary_text
+from foamfit.report.identifiability_plots import (
+    plot_insight,
+)
+from foamfit.report.page import render_report
+from foamfit.report.summary import summary_text
 from foamfit.springs.chain import Chain, Impact
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.checklist import Check, _by_reason, status_of
@@ -138,7 +140,7 @@ def test_the_errors_to_expect_are_the_scatter_of_refits() -> None:
 
         fit = least_squares(residual, values[places] / sizes, jac=lambda _: slopes * sizes)
         found.append(fit.x * sizes)
-    expected = [outlook.expected[name].stderr for name in names]
+    expected = [outlook.estimates[name].stderr for name in names]
     ratios = np.std(found, axis=0, ddof=1) / expected
     assert np.all((ratios > 0.72) & (ratios < 1.32)), dict(zip(names, ratios, strict=True))
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.12)
@@ -159,7 +161,7 @@ def test_the_worth_of_a_channel_is_that_of_a_test_with_less_noise() -> None:
     quiet = planning.expect(problem, values, noise | {"displacement_time": 2e-6})
     for name, ratio in planning.worth(now.insight)["displacement_time"].items():
         assert 0.5 <= ratio <= 1.0
-        direct = quiet.expected[name].stderr / now.expected[name].stderr
+        direct = quiet.estimates[name].stderr / now.estimates[name].stderr
         assert ratio == pytest.approx(direct, rel=1e-6)
 
 
@@ -290,7 +292,7 @@ def test_a_good_fit_passes_every_question() -> None:
     result = concluded()
     assert set(answers(result).values()) == {True}
     assert (result.status, result.warnings) == ("ok", ())
-    assert summary_text(result).count("\nyes  ") == len(result.checklist)
+    assert summary_text(result, verbose=True).count("\nyes  ") == len(result.checklist)
 
 
 def _wave(test: Measurement) -> Measurement:
@@ -451,7 +453,7 @@ def test_check_answers_for_a_test_that_is_there(tmp_path: Path) -> None:
     text = said(
         "check", SLOW, "--model", "bistable", "--published", "foam-1/model-1", "--plot", picture
     )
-    assert "At 1.75 m/s spring 1 turns back on branch d; from 1.911 m/s on its loop closes." in text
+    assert "At 1.75 m/s spring 1 turns back on branch d; the loop closes from 1.911 m/s on." in text
     assert "The channel worth measuring better is stress-time." in text
     assert "s1_kc: not determined, branch c of spring 1 is not reached." in text
     assert "s1_kc MPa 82.50 not determined 82.50 ± " in text
@@ -461,7 +463,9 @@ def test_check_answers_for_a_test_that_is_there(tmp_path: Path) -> None:
 def test_check_calls_a_guess_a_guess() -> None:
     text = said("check", SLOW, "--model", "bistable")
     assert "the best of 4 quick descents" in text
-    assert "is a guess: this test does not tell s1_kc, s1_dsigma, s1_eps_c, s1_kh_minus" in text
+    assert (
+        "is a guess: this test does not determine s1_kc, s1_dsigma, s1_eps_c, s1_kh_minus" in text
+    )
 
 
 def test_check_answers_for_a_test_that_is_only_planned(tmp_path: Path) -> None:
@@ -471,14 +475,14 @@ def test_check_answers_for_a_test_that_is_only_planned(tmp_path: Path) -> None:
         '[striker]\nmass = "7 g"\nvelocity = "2.1 m/s"\n[noise]\nstress = "20 kPa"\n'
     )
     text = said("check", plan, "--model", "bistable", "--published", "foam-1/model-1")
-    assert "the loop of spring 1 closes, as it does from 1.911 m/s on." in text
+    assert "spring 1 closes its loop; the loop closes from 1.911 m/s on." in text
     assert "stress-time 20 kPa (stated)" in text
 
 
 def test_a_slow_test_is_told_by_its_strain() -> None:
     text = said("check", SLOW, "--model", "bistable", "--drive", "displacement",
                 "--published", "foam-1/model-1")  # fmt: skip
-    assert "from an overall strain of 0.346 (3.839 MPa) on its loop closes" in text
+    assert "the loop closes from an overall strain of 0.346 (3.839 MPa) on." in text
 
 
 @pytest.mark.parametrize(
@@ -522,13 +526,14 @@ def test_a_plan_says_what_it_needs(tmp_path: Path) -> None:
 def test_the_pictures_show_every_parameter_and_curve() -> None:
     result = concluded()
     names, curves = result.insight.names, result.insight.curves
-    for panel, curve in zip(plot_sensitivities(result.insight).axes, curves, strict=True):
+    above, below = plot_insight(result.insight, result.correlation.matrix).subfigs
+    for panel, curve in zip(above.axes, curves, strict=True):
         traces = [line.get_ydata() for line in panel.lines if len(line.get_xdata()) > 2]
         assert len(traces) == len(names)
         for i, (name, trace) in enumerate(zip(names, traces, strict=True)):
             shown, true = i - np.asarray(trace), result.insight.along(name, curve)
             assert np.corrcoef(shown, true)[0, 1] > 0.999
-    left, right = plot_information(result.insight, result.correlation.matrix).axes
+    left, right = below.axes
     assert [label.get_text() for label in left.get_yticklabels()] == list(names)
     diagonal = [text for text in right.texts if text.get_text() == "1"]
     assert len(diagonal) >= len(names)
@@ -537,15 +542,16 @@ def test_the_pictures_show_every_parameter_and_curve() -> None:
 def test_report_and_plan_show_them_too() -> None:
     result = concluded()
     page = render_report(result, fit_png=b"\x89PNG" + bytes(20))
-    assert page.count("data:image/png;base64,") == 4
-    for words in ("Checklist", "What this test can tell", "Is the noise floor reached?"):
+    assert page.count("data:image/png;base64,") == 3
+    for words in ("Checklist", "What the test determines", "Is the noise floor reached?"):
         assert words in page
     assert result.insight.sentence() in page
-    assert result.insight.sentence() in " ".join(summary_text(result).split())
+    assert result.insight.sentence() in " ".join(summary_text(result, verbose=True).split())
     spring, test = synthetic_impact()
     problem = problem_of(test)
-    plan = planning.make_plan(problem, values_of(problem, spring), "the truth")
-    assert [len(half.axes) for half in plot_plan(plan).subfigs] == [2, 2]
+    plan = planning.make_outlook(problem, values_of(problem, spring), "the truth")
+    figure = plot_insight(plan.planned.insight, title="before the fit")
+    assert [len(half.axes) for half in figure.subfigs] == [2, 2]
 
 
 # ---------------------------------------------------------------- what the words leave out

@@ -27,7 +27,7 @@ from foamfit.fitting.losses import soften
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.search import SearchRecord, Tracker
 from foamfit.one_model import Found, judge
-from foamfit.report.plots import plot_profiles
+from foamfit.report.identifiability_plots import plot_profiles
 from foamfit.trust import intervals, resample
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude

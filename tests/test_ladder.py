@@ -20,7 +20,8 @@ from foamfit.cli import main
 from foamfit.data.measurement import Measurement, Outliers, Specimen, Striker
 from foamfit.fitting.branches import branch_of_samples
 from foamfit.fitting.problem import make_problem
-from foamfit.report.page import render_report, summary_text
+from foamfit.report.page import render_report
+from foamfit.report.summary import summary_text
 from foamfit.trust import evidence
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.residual_tests import find_structure, neighbours_test, runs_test
@@ -423,11 +424,11 @@ def test_the_folder_holds_the_ladder(climbed, tmp_path):
 
 def test_the_report_and_the_summary_show_the_ladder(climbed):
     page = render_report(climbed, fit_png=b"\x89PNG" + bytes(20))
-    text = summary_text(climbed)
+    text = summary_text(climbed, verbose=True)
     assert "Ladder of models" in page
     for rung in climbed.ladder.rungs:
         assert rung.why in page
-        assert f"{rung.bic:.1f}".replace("-", "−") in page
+        assert f"{rung.bic:.0f}".replace("-", "−") in page
         assert f"{rung.bic:.0f}".replace("-", "−") in text
         assert f" {rung.rank}/{rung.n_vary} " in text
         assert f"{rung.name}: {rung.why}" in " ".join(text.split())
@@ -460,16 +461,15 @@ def loop_file(tmp_path, monkeypatch):
 def test_the_command_writes_to_auto(loop_file, tmp_path):
     done = run("fit", loop_file, "--model", "auto", "--starts", 4)
     assert done.exit_code == 0, done.output
-    assert (
-        "bistable was chosen of 1 model: it is the simplest whose residuals are structureless"
-        in done.stdout
-    )
-    assert "no richer model was tried" in done.stdout
+    assert "chosen of 1 model tried: bistable: its residuals are structureless" in done.stdout
+    assert "no richer rung was tried" in done.stdout
     folder = tmp_path / "fits" / "loop" / "auto"
     content = json.loads((folder / "fit.json").read_text())
     assert content["model"] == "bistable"
     assert [rung["chosen"] for rung in content["ladder"]["rungs"]] == [True]
     assert (folder / "ladder.csv").is_file()
+    page = (folder / "report.html").read_text()
+    assert "The first rung bistable is the simplest that holds" in page
 
 
 def test_the_command_refuses_parameters_of_one_model(loop_file, tmp_path):

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import io
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +14,10 @@ import fabricated
 import foamfit as ff
 from foamfit.api import FitResult
 from foamfit.errors import InputError
-from foamfit.report.plots import (
-    STYLE,
-    image,
-    laid_out,
-    origin_word,
-    plot_fit,
-    plot_residuals,
-    plot_response,
-    readable_unit,
-)
+from foamfit.report.figures import STYLE, image, laid_out
+from foamfit.report.plots import origin_word, plot_fit, plot_residuals, plot_response
+from foamfit.report.readable import readable_unit
+from foamfit.results import Switch
 
 
 def with_curves(result: FitResult, **changed: Any) -> FitResult:
@@ -120,11 +115,28 @@ def test_a_point_that_is_passed_twice_is_named_once() -> None:
     assert texts(ax) == ["A1", "C1", "C2", "A2"]
 
 
-def test_springs_that_switch_at_one_place_are_named_to_both_sides() -> None:
+@pytest.mark.parametrize("later", [0.0, 15e-6])
+def test_names_of_springs_that_switch_together_do_not_overprint(later: float) -> None:
     result = fabricated.chain_result()
-    first = result.switches[0]
-    ax = plot_fit(replace(result, switches=(first, replace(first, spring=1)))).axes[0]
-    assert {text.get_ha() for text in ax.texts} == {"left", "right"}
+    curves, switches = result.curves, list(result.switches)
+    for switch in result.switches:
+        at = int(np.argmin(np.abs(curves.time - switch.time - later)))
+        place = (curves.time[at], curves.displacement[at], curves.stress[at])
+        switches.append(Switch(1, switch.source, switch.target, *map(float, place)))
+    figure = plot_fit(replace(result, switches=tuple(switches)))
+    image(figure, "png", 100)
+    for ax in figure.axes:
+        assert len(ax.texts) == 8
+        boxes = [text.get_window_extent() for text in ax.texts]
+        assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
+
+
+def test_curves_that_coincide_are_told_apart() -> None:
+    result = fabricated.result()
+    loop = plot_fit(with_curves(result, stress_along=result.curves.stress)).axes[-1]
+    fitted, along = line(loop, "fitted"), line(loop, "springs along measured strain")
+    assert along.get_linewidth() > 2.0 * fitted.get_linewidth()
+    assert along.get_zorder() < line(loop, "measured").get_zorder() < fitted.get_zorder()
 
 
 @pytest.mark.parametrize(

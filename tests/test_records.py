@@ -18,7 +18,8 @@ from foamfit.data.energy import audit
 from foamfit.data.measurement import Outliers
 from foamfit.errors import InputError
 from foamfit.fitting.curves import check_drive
-from foamfit.report.page import render_report, summary_text
+from foamfit.report.page import render_report
+from foamfit.report.summary import summary_text
 
 SPECIMEN = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\n'
 STRIKER = '[striker]\nmass = "1 kg"\nvelocity = "1 m/s"\n'
@@ -183,9 +184,9 @@ def test_the_rows_stand_in_the_terminal_and_in_the_result(tmp_path):
     assert "101 in the file, 100 used." in CliRunner().invoke(main, ["check", str(path)]).stdout
     result = fabricated.result(measurement=read_test(path))
     told = summary_text(result)
-    assert "rows: 101 in the file, 100 used." in told
-    assert "rows: Not used: row 9: the time stamp of the row before" in told
-    assert "data: Check: 1 of 101 rows" in told
+    assert "rows: 101 read, 100 used; not used: 1 (the time stamp of the row before" in told
+    assert "warning: Check: 1 of 101 rows" in told
+    assert "rows: Not used: row 9: the time" in summary_text(result, verbose=True)
     data = result.to_json_dict()["data"]
     assert (data["rows"], data["used"]) == (101, 100)
     (item,) = data["dropped"]

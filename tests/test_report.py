@@ -10,8 +10,9 @@ import pytest
 
 import fabricated
 from foamfit.data.energy import audit
-from foamfit.report.page import render_report, summary_text
+from foamfit.report.page import render_report
 from foamfit.report.readable import number, readable
+from foamfit.report.summary import summary_text
 
 
 class Page(HTMLParser):
@@ -77,7 +78,8 @@ def test_text_from_files_is_escaped() -> None:
 def test_warnings_come_first() -> None:
     words = page().words
     warning = words.index("s1_kh_minus is not determined: branch e was never reached.")
-    assert warning < words.index("What was fitted") < words.index("Parameters")
+    assert words.index("The model follows stress-time to 1.2 %") < warning
+    assert warning < words.index("Parameters") < words.index("What was fitted")
     assert "Warnings" not in page(warnings=(), status="ok").words
     assert "No acceptable fit was found" in page(status="failed").words
 
@@ -87,13 +89,13 @@ def test_warnings_come_first() -> None:
     [
         "bistable model, impact drive · reconstruction, not a measurement",
         "SHA-256 5d41402abc4b2a76",
-        "stress-time 1.2 displacement-time 0.4 stress-strain none",
+        "stress-time 1.2 % displacement-time 0.4 % stress-strain none",
         "reduced χ² 1.020",
         "s1_kc k c,1 82.50 ± 0.99 MPa 80.56 to 84.44 weak its interval is wider than half",
         "s1_kh_minus k h−,1 2.300 MPa – not determined branch e was never reached",
         "σ a stress at A1, where snapping starts 895.3 kPa",
         "The striker brings 0.0107 J. The loop takes less. striker kinetic J 0.01072",
-        "absorbed J 0.009500 What was done",
+        "absorbed J 0.009500 Data: 601 rows read, 601 used",
         "The force was divided by the area 19.6 mm².",
         "starts 16 simulations 4210 run time 21.4 s",
         "Journal of Applied Mechanics 81, 121006",
@@ -110,7 +112,7 @@ def test_masses_inside_are_in_the_table_of_misfits() -> None:
         "curves": replace(result.curves, interior={1: (inside, inside)}),
         "misfit": result.misfit | {"displacement_1_time": 0.021},
     }
-    assert "displacement-time of mass 1 2.1" in page(**changed).words
+    assert "displacement-time of mass 1 2.1 %" in page(**changed).words
     summary = summary_text(fabricated.result(**changed))
     assert "displacement-time of mass 1 2.1 %" in " ".join(summary.split())
     assert "mass 1" not in summary_text(result)
@@ -122,7 +124,7 @@ def test_the_statistics_and_the_energy_are_labelled() -> None:
     energy = balance.as_dict() | {"sentences": balance.sentences(), "missing": "a long text"}
     words = page(statistics=statistics | {"n_agreeing": 11}, energy=energy).words
     told = "effective samples 986.0 χ² 979.9 trials that could not be simulated 1"
-    assert f"{told} valleys searched 2 descents that agree 11" in words
+    assert f"{told} local minima refined 2 descents that reached the best 11" in words
     assert "striker's energy 458.7 kJ/m³ absorbed energy" in words
     assert "impulse of the force" in words
     assert "a long text" not in words
@@ -222,7 +224,7 @@ def test_the_terminal_says_why_a_parameter_is_not_determined() -> None:
         ),
         third: fabricated.estimate(third, 1.0, state="determined", why="±5% of its size"),
     }
-    text = summary_text(fabricated.result(parameters=parameters))
+    text = summary_text(fabricated.result(parameters=parameters), verbose=True)
     assert f"\nweak: {first}, its interval is wide\n" in text
     assert f"\ndetermined: {second}, ±5%; its profile stalled\n" in text
     assert "±5% of its size" not in text

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import fabricated
+import foamfit.report.figures
 import foamfit.report.folder
 import foamfit.report.page
-import foamfit.report.plots
 from foamfit.errors import InputError
 from foamfit.report.folder import check_target, load_result
 
@@ -33,7 +33,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Save without the time that figures take, where the test is about the folder."""
-    for module in (foamfit.report.plots, foamfit.report.page):
+    for module in (foamfit.report.figures, foamfit.report.page):
         monkeypatch.setattr(module, "image", lambda *_: b"\x89PNG" + bytes(20))
 
 

@@ -12,8 +12,8 @@ from scipy.optimize import least_squares
 
 import fabricated
 import foamfit as ff
+import foamfit.report.figures
 import foamfit.report.page
-import foamfit.report.plots
 from conftest import AREA, HEIGHT, synthetic_impact, synthetic_loop
 from foamfit.api import FitResult
 from foamfit.cli import main
@@ -21,10 +21,12 @@ from foamfit.data.measurement import Measurement, Outliers
 from foamfit.fitting.curves import default_weights
 from foamfit.fitting.losses import LOSSES, influence, soften
 from foamfit.fitting.objective import Objective
-from foamfit.report.comparison import compare, comparison_text
+from foamfit.report.comparison import compare
+from foamfit.report.comparison_text import comparison_text
 from foamfit.report.folder import load_result
-from foamfit.report.page import render_report, summary_text
+from foamfit.report.page import render_report
 from foamfit.report.plots import plot_fit
+from foamfit.report.summary import summary_text
 from foamfit.springs.model import Model
 from foamfit.trust import covariance
 from foamfit.trust.best_point import m_estimate
@@ -137,7 +139,10 @@ def test_what_stands_at_an_outlier_does_not_matter():
 
 
 def test_outliers_are_in_the_result_and_crossed_in_the_figure(tmp_path, monkeypatch):
-    for module in (foamfit.report.plots, foamfit.report.page):  # the folder needs no pictures here
+    for module in (
+        foamfit.report.figures,
+        foamfit.report.page,
+    ):  # no pictures are needed
         monkeypatch.setattr(module, "image", lambda *_: b"\x89PNG" + bytes(20))
     _, test, at = spoilt_impact()
     result = ff.fit(test, starts=4)

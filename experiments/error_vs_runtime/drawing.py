@@ -10,7 +10,7 @@ import matplotlib
 import pandas as pd
 from matplotlib.figure import Figure
 
-from foamfit.report.plots import STYLE
+from foamfit.report.figures import STYLE
 
 # Okabe and Ito's colours; the mark tells solvers apart where colours do not.
 SOLVERS: dict[str, dict[str, Any]] = {

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from foamfit.report.plots import STYLE
+from foamfit.report.figures import STYLE
 
 Array = NDArray[np.float64]
 

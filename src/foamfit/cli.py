@@ -13,8 +13,9 @@ import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 import click
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     import lmfit
 
     from foamfit.api import FitResult
+    from foamfit.data.measurement import Measurement
 
 # Exit codes: the input or the call is wrong; no acceptable fit; a defect (EX_SOFTWARE of
 # sysexits.h). The number of a signal that ended the command is added to the last.
@@ -116,51 +118,40 @@ def main(context: click.Context) -> None:
         say(context.get_help())
 
 
-_TEST = click.argument("test", metavar="TEST.csv", type=click.Path(path_type=Path))
+_FILE = click.Path(path_type=Path)
+_TEST = click.argument("test", metavar="TEST.csv", type=_FILE)
 _SPECIMEN = click.option(
-    "--specimen",
-    metavar="FILE.toml",
-    type=click.Path(path_type=Path),
+    "--specimen", metavar="FILE.toml", type=_FILE,
     help="Specimen, striker, columns, noise, window, data. Default: TEST.toml beside the CSV.",
-)
-
-
+)  # fmt: skip
+_PLOT = click.option("--plot", type=_FILE, help="Also draw a PNG, PDF or SVG.")
 _DRIVE = click.option(
     "--drive",
     type=click.Choice(["impact", "stress", "displacement"]),
     help="Default: impact if striker and time are known, else displacement.",
-)
+)  # fmt: skip
 
 
 @main.command()
 @_TEST
 @_SPECIMEN
-@click.option("--model", help="Also say what the test can tell of this model, before it is fitted.")
+@click.option("--model", help="Also estimate what the test determines of this model.")
 @_DRIVE
 @click.option("--published", "published_set", metavar="NAME", help="Start from a published set.")
 @click.option(
-    "--params",
-    metavar="RESULT",
-    type=click.Path(path_type=Path),
+    "--params", metavar="RESULT", type=_FILE,
     help="Start from an earlier result. Default: a quick descent from the measured loop.",
-)
-@click.option(
-    "--plot", type=click.Path(path_type=Path), help="Draw what fixes what, PNG, PDF, SVG."
-)
+)  # fmt: skip
+@_PLOT
 def check(
-    test: Path,
-    specimen: Path | None,
-    model: str | None,
-    drive: str | None,
-    published_set: str | None,
-    params: Path | None,
-    plot: Path | None,
-) -> None:
+    test: Path, specimen: Path | None, model: str | None, drive: str | None,
+    published_set: str | None, params: Path | None, plot: Path | None,
+) -> None:  # fmt: skip
     """Say what the loader understood of TEST.csv: columns, contact, specimen, energy.
 
-    With --model also what the test can tell: the velocity that closes the loop, the standard errors
-    to expect, the channel worth measuring better. A TOML in the place of the CSV plans a test that
-    is not made yet, if --published or --params says what foam it will be.
+    With --model also what the test determines: the velocity that closes the loop, the standard
+    errors to expect, the channel worth measuring better. A TOML in place of the CSV plans a test
+    that is not made yet, if --published or --params says what foam it will be.
 
     \b
     Examples:
@@ -173,19 +164,11 @@ def check(
     from foamfit.data.energy import audit
 
     if model is None:
-        for option, value in (
-            ("--drive", drive),
-            ("--published", published_set),
-            ("--params", params),
-            ("--plot", plot),
-        ):
+        given = {"drive": drive, "published": published_set, "params": params, "plot": plot}
+        for option, value in given.items():
             if value is not None:
-                raise InputError(f"{option} needs --model; give one, as --model bistable")
-    if plot is not None:
-        from foamfit.report.plots import figure_format
-
-        check_file(plot)
-        figure_format(plot)
+                raise InputError(f"--{option} needs --model; give one, as --model bistable")
+    _check_files(None, plot, ())
     if published_set is not None and params is not None:
         raise InputError("--published and --params exclude each other; give one of them")
     description = ""
@@ -195,19 +178,25 @@ def check(
     if model is None:
         say(description, newline=False)
         return
-    from foamfit.report.outlook import describe_plan, plan_test
+    from foamfit.report.outlook import outlook_of
+    from foamfit.report.outlook_text import outlook_text
 
     with _compiling(quiet=False) as compile_rest:
         compile_rest()
-    plan = plan_test(test, specimen, model, drive, published_set=published_set, result=params)
+    outlook = outlook_of(test, specimen, model, drive, published_set=published_set, result=params)
     if description:
         say(description)
-    say(describe_plan(plan))
+    say(outlook_text(outlook))
     if plot is not None:
-        from foamfit.report.outlook_plot import plot_plan
+        from foamfit.report.identifiability_plots import plot_insight
 
-        plot_plan(plan, plot)
-        say(f"\ndrawn in {plot}")
+        name, insight = outlook.problem.measurement.name, outlook.planned.insight
+        if insight is None:
+            say("\nnothing is drawn: no parameter changes the curves")
+        else:
+            title = f"{name} · {outlook.problem.model.name} · before the fit"
+            plot_insight(insight, title=title, path=plot)
+            say(f"\ndrawn in {plot}")
 
 
 def _fixes(
@@ -250,75 +239,99 @@ def _hold_and_vary(
         params[name].set(vary=True)
 
 
+class _Shown(NamedTuple):
+    """How a result is printed."""
+
+    as_json: bool
+    quiet: bool
+    verbose: bool
+
+
+@dataclass(frozen=True)
+class _FitOptions:
+    """What the options of `fit` say of the search and of the intervals, by their names."""
+
+    drive: str | None
+    seed: int
+    starts: int | None
+    max_time: float | None
+    fix: dict[str, float]
+    vary: tuple[str, ...]
+    interior_mass: bool
+    time_shift: bool
+    loss: str
+    profile: bool
+    bootstrap: int | None
+    mcmc: int | None
+
+    def arguments(self) -> dict[str, Any]:
+        """Return the arguments of `foamfit.fit` that do not depend on the test."""
+        methods = {"profile": None, "bootstrap": self.bootstrap, "mcmc": self.mcmc}
+        given = [name for name, draws in methods.items() if draws is not None]
+        given = (["profile"] if self.profile else []) + given
+        if len(given) > 1:
+            names = " and ".join(f"--{name}" for name in given)
+            raise InputError(f"{names} exclude each other; choose one way to make the intervals")
+        taken = ("drive", "seed", "starts", "max_time", "interior_mass", "time_shift", "loss")
+        way = {"intervals": given[0], "draws": methods[given[0]]} if given else {}
+        return {name: getattr(self, name) for name in taken} | way
+
+    def params(self, measurement: Measurement, model: str) -> lmfit.Parameters | None:
+        """Return the parameters of a model as --fix and --vary want them; None for auto."""
+        from foamfit.fitting.curves import check_time_shift, choose_drive
+        from foamfit.fitting.problem import make_params
+
+        if self.time_shift:
+            check_time_shift(measurement, self.drive or choose_drive(measurement))
+        if model == "auto":
+            if self.fix or self.vary:
+                raise InputError(
+                    "--fix and --vary belong to one model; name it instead of --model auto"
+                )
+            return None
+        params = make_params(measurement, model, self.drive, time_shift=self.time_shift)
+        _hold_and_vary(params, model, self.fix, self.vary)
+        return params
+
+
 @main.command()
 @_TEST
 @_SPECIMEN
 @click.option(
-    "--model",
-    default="bistable",
-    show_default=True,
+    "--model", default="bistable", show_default=True,
     help="Springs from the base up; auto takes the simplest that holds.",
-)
+)  # fmt: skip
 @_DRIVE
+@click.option("--out", type=_FILE, help="Result folder. Default: fits/<test>/<model>.")
 @click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    help="Result folder. Default: fits/<test>/<model>.",
-)
-@click.option(
-    "--seed",
-    type=click.IntRange(min=0),
-    default=0,
-    show_default=True,
+    "--seed", type=click.IntRange(min=0), default=0, show_default=True,
     help="Same test and seed, same numbers.",
-)
+)  # fmt: skip
 @click.option(
-    "--starts",
-    type=click.IntRange(min=1),
-    help="Descents of the search. Default: 16 per spring.",
-)
+    "--starts", type=click.IntRange(min=1), help="Descents of the search. Default: 16 per spring."
+)  # fmt: skip
 @click.option("--max-time", type=float, metavar="SECONDS", help="Then the best so far is taken.")
 @click.option("--fix", multiple=True, metavar="NAME=VALUE", callback=_fixes, help="Hold one (SI).")
 @click.option("--vary", multiple=True, metavar="NAME", help="Vary one that is held by default.")
 @click.option("--interior-mass", is_flag=True, help="Put the specimen's mass between the springs.")
 @click.option("--time-shift", is_flag=True, help="Fit how late the motion is against the force.")
 @click.option(
-    "--loss",
-    type=click.Choice(["linear", "soft_l1", "huber", "cauchy"]),
-    default="linear",
-    show_default=True,
-    help="All but linear give way to large residuals.",
-)
+    "--loss", type=click.Choice(["linear", "soft_l1", "huber", "cauchy"]), default="linear",
+    show_default=True, help="All but linear weigh large residuals less.",
+)  # fmt: skip
 @click.option("--profile", is_flag=True, help="95 % intervals by profile likelihood.")
 @click.option(
-    "--bootstrap",
-    type=int,
-    metavar="N",
+    "--bootstrap", type=int, metavar="N",
     help="95 % intervals by N >= 40 refits to resampled blocks.",
-)
+)  # fmt: skip
 @click.option("--mcmc", type=int, metavar="N", help="95 % intervals by N steps of emcee.")
 @click.option("--json", "as_json", is_flag=True, help="Print fit.json on stdout, nothing else.")
 @click.option("--quiet", is_flag=True, help="Print nothing but warnings of failure.")
+@click.option("--verbose", is_flag=True, help="Print the checklist, reasons, notes and rungs too.")
 def fit(
-    test: Path,
-    specimen: Path | None,
-    model: str,
-    drive: str | None,
-    out: Path | None,
-    seed: int,
-    starts: int | None,
-    max_time: float | None,
-    fix: dict[str, float],
-    vary: tuple[str, ...],
-    interior_mass: bool,
-    time_shift: bool,
-    loss: str,
-    profile: bool,
-    bootstrap: int | None,
-    mcmc: int | None,
-    as_json: bool,
-    quiet: bool,
-) -> int:
+    test: Path, specimen: Path | None, model: str, out: Path | None,
+    as_json: bool, quiet: bool, verbose: bool, **given: Any,
+) -> int:  # fmt: skip
     """Identify the parameters of TEST.csv and write a result folder.
 
     Exit code 0: a fit was made; 1: the input or the call is wrong; 2: no acceptable fit was found
@@ -335,65 +348,45 @@ def fit(
     from foamfit.data.csv_file import read_test
     from foamfit.springs.model import Model
 
-    intervals, draws = _intervals(profile, bootstrap, mcmc)
-    auto = model.strip() == "auto"
-    model = "auto" if auto else Model.parse(model).name
-    if auto and (fix or vary):
-        raise InputError("--fix and --vary belong to one model; name it instead of --model auto")
+    options = _FitOptions(**given)
+    arguments = options.arguments()
+    model = "auto" if model.strip() == "auto" else Model.parse(model).name
+    show = _Shown(as_json, quiet, verbose)
     with _compiling(quiet or as_json) as compile_rest:
         measurement = read_test(test, specimen)
         folder = _result_folder(out, test, specimen, model)
         from foamfit import api
-        from foamfit.fitting.curves import check_time_shift, choose_drive
-        from foamfit.fitting.problem import make_params
 
-        if time_shift:
-            check_time_shift(measurement, drive or choose_drive(measurement))
-        params = None
-        if not auto:
-            params = make_params(measurement, model, drive, time_shift=time_shift)
-            _hold_and_vary(params, model, fix, vary)
+        params = options.params(measurement, model)
         compile_rest()
         with _progress(quiet or as_json) as progress:
             result = api.fit(
-                measurement,
-                model=model,
-                drive=drive,
-                seed=seed,
-                starts=starts,
-                max_time=max_time,
-                params=params,
-                interior_mass=interior_mass,
-                time_shift=time_shift,
-                loss=loss,
-                intervals=intervals,
-                draws=draws,
-                progress=progress,
+                measurement, model=model, params=params, progress=progress, **arguments,
                 tell=None if quiet else lambda told: say(f"foamfit: {told}", err=True),
-            )
+            )  # fmt: skip
         try:
             with without_ctrl_c():
                 result.save(folder)
         except InputError:  # the numbers are not lost with the folder
-            _tell_result(result, None, as_json, quiet)
+            _tell_result(result, None, show)
             raise
-    _tell_result(result, folder, as_json, quiet)
+    _tell_result(result, folder, show)
     if result.status == "failed":
         say(f"foamfit: no acceptable fit was found; see {folder}", err=True)
         return NOT_ACCEPTABLE
     return 0
 
 
-def _tell_result(result: FitResult, folder: Path | None, as_json: bool, quiet: bool) -> None:
+def _tell_result(result: FitResult, folder: Path | None, show: _Shown) -> None:
     """Print a result, and the folder that it was written to."""
-    if as_json:
+    if show.as_json:
         import json
 
         say(json.dumps(result.to_json_dict(), allow_nan=False))
-    elif not quiet:
-        from foamfit.report.page import summary_text
+    elif not show.quiet:
+        from foamfit.report.summary import summary_text
 
-        say(summary_text(result))
+        say(summary_text(result, verbose=show.verbose))
         if folder is not None:
             say(f"\nwritten to {folder}: open {folder / 'report.html'}")
 
@@ -410,23 +403,6 @@ def _result_folder(out: Path | None, test: Path, specimen: Path | None, model: s
                 f"{folder} holds {path.name} and would be replaced as a whole; choose another --out"
             )
     return folder
-
-
-def _intervals(profile: bool, bootstrap: int | None, mcmc: int | None) -> tuple[str, int | None]:
-    """Return the method of the intervals and its draws."""
-    chosen: list[tuple[str, int | None]] = [
-        (name, draws)
-        for name, draws, given in (
-            ("profile", None, profile),
-            ("bootstrap", bootstrap, bootstrap is not None),
-            ("mcmc", mcmc, mcmc is not None),
-        )
-        if given
-    ]
-    if len(chosen) > 1:
-        names = " and ".join(f"--{name}" for name, _ in chosen)
-        raise InputError(f"{names} exclude each other; choose one way to make the intervals")
-    return chosen[0] if chosen else ("auto", None)
 
 
 @contextmanager
@@ -467,16 +443,13 @@ def _progress(quiet: bool) -> Iterator[Callable[[float, str], None]]:
 
 
 @main.command()
-@click.argument("scene", metavar="SCENE.toml", type=click.Path(path_type=Path))
-@click.option("--out", type=click.Path(path_type=Path), help="CSV. Default: SCENE.csv here.")
-@click.option("--plot", type=click.Path(path_type=Path), help="Also draw a PNG, PDF or SVG.")
+@click.argument("scene", metavar="SCENE.toml", type=_FILE)
+@click.option("--out", type=_FILE, help="CSV. Default: SCENE.csv here.")
+@_PLOT
 @click.option(
-    "--rtol",
-    type=click.FloatRange(1e-14, 0.1),
-    default=1e-6,
-    show_default=True,
+    "--rtol", type=click.FloatRange(1e-14, 0.1), default=1e-6, show_default=True,
     help="Wanted error over the range.",
-)
+)  # fmt: skip
 def simulate(scene: Path, out: Path | None, plot: Path | None, rtol: float) -> None:
     """Run any chain under any drive forward and write its response as CSV.
 
@@ -507,11 +480,7 @@ def simulate(scene: Path, out: Path | None, plot: Path | None, rtol: float) -> N
     from foamfit.solve.simulation import simulate as run
 
     target = Path(scene.with_suffix(".csv").name) if out is None else out
-    _check_files((target, plot), files_of_scene(scene))
-    if plot is not None:
-        from foamfit.report.plots import figure_format
-
-        figure_format(plot)
+    _check_files(target, plot, files_of_scene(scene))
     with _compiling(quiet=False) as compile_rest:
         chain, drive, time = read_scene(scene)
         compile_rest()
@@ -525,29 +494,29 @@ def simulate(scene: Path, out: Path | None, plot: Path | None, rtol: float) -> N
         say(f"drawn in {plot}")
 
 
-def _check_files(outputs: tuple[Path | None, ...], inputs: Iterable[Path]) -> None:
+def _check_files(table: Path | None, plot: Path | None, inputs: Iterable[Path]) -> None:
     """Refuse files that could not be written, or that are read too, before anything is computed."""
-    given = [path for path in outputs if path is not None]
+    given = [path for path in (table, plot) if path is not None]
     for path in given:
         check_file(path)
         if path.resolve() in [source.resolve() for source in inputs]:
             raise InputError(f"{path} is read by this command and would be lost; name another file")
     if len({path.resolve() for path in given}) < len(given):
         raise InputError(f"{given[0]} cannot be two things; name two files")
+    if plot is not None:
+        from foamfit.report.figures import figure_format
+
+        figure_format(plot)
 
 
 @main.command()
-@click.argument(
-    "results", metavar="RESULT [RESULT …]", nargs=-1, required=True, type=click.Path(path_type=Path)
-)
+@click.argument("results", metavar="RESULT [RESULT …]", nargs=-1, required=True, type=_FILE)
 @click.option(
-    "--published",
-    "name",
-    metavar="NAME",
+    "--published", "name", metavar="NAME",
     help="The published set to compare with. Default: the one that the name of the test contains.",
-)
-@click.option("--plot", type=click.Path(path_type=Path), help="Also draw a PNG, PDF or SVG.")
-@click.option("--csv", "table", type=click.Path(path_type=Path), help="Also write a table.")
+)  # fmt: skip
+@_PLOT
+@click.option("--csv", "table", type=_FILE, help="Also write a table.")
 def compare(
     results: tuple[Path, ...], name: str | None, plot: Path | None, table: Path | None
 ) -> None:
@@ -559,13 +528,10 @@ def compare(
         foamfit compare fits/TEST/bistable --published foam-1/model-1 --plot comparison.png
     """
     from foamfit.report.comparison import compare as side_by_side
-    from foamfit.report.comparison import comparison_text, write_csv
     from foamfit.report.comparison_plot import plot_comparison
-    from foamfit.report.plots import figure_format
+    from foamfit.report.comparison_text import comparison_text, write_csv
 
-    _check_files((plot, table), [p / "fit.json" if p.is_dir() else p for p in results])
-    if plot is not None:
-        figure_format(plot)
+    _check_files(table, plot, [p / "fit.json" if p.is_dir() else p for p in results])
     comparison = side_by_side(results, name)
     say(comparison_text(comparison))
     if plot is not None:

@@ -3,51 +3,45 @@
 from __future__ import annotations
 
 import math
+import re
 import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from foamfit.report.comparison import Comparison, Row, Section
-from foamfit.report.plots import GREY, IN_MATH, MARKS, MATH, STYLE, save, say_nothing_there
+from foamfit.report.comparison import Comparison, Pair, Row
+from foamfit.report.figures import BLUE, GREY, VERMILION, drawing, save, say_nothing_there
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+MARKS = ((BLUE, "o"), (VERMILION, "s"), ("black", "^"), (GREY, "D"))  # of the results
+MATH = {
+    "k0": "$k_0$", "σ_a": r"$\sigma_a$", "ε_a": r"$\varepsilon_a$", "ε_c": r"$\varepsilon_c$",
+    "k_h+": "$k_{h+}$", "k_h−": "$k_{h-}$", "k_c": "$k_c$", "Δσ": r"$\Delta\sigma$",
+    "η": r"$\eta$",
+}  # fmt: skip
+IN_MATH = re.compile("|".join(map(re.escape, MATH)))
+
 
 def plot_comparison(comparison: Comparison, path: str | Path | None = None) -> Figure:
     """Draw how far each parameter is from its reference, in standard errors, and in percent.
 
-    Parameters
-    ----------
-    comparison : Comparison
-        From `report.comparison.compare`.
-    path : str or Path, optional
-        Where to save the figure; the suffix gives the format.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        One panel for each reference, 7 in wide; shaded are one and three standard errors. What is
-        not compared is left out, what is not determined is named.
+    One panel for each reference, 7 in wide; shaded are one and three standard errors. What is not
+    compared is left out, what is not determined is named.
     """
-    import matplotlib
-    from matplotlib.figure import Figure
-
-    groups: dict[str, list[Section]] = {}
-    for section in comparison.sections:
-        groups.setdefault(section.reference, []).append(section)
+    groups: dict[str, list[Pair]] = {}
+    for pair in comparison.pairs:
+        groups.setdefault(pair.reference, []).append(pair)
     columns = min(len(groups), 2)
     rows = [list(groups.items())[i : i + columns] for i in range(0, len(groups), columns)]
-    lines = [max(_comparison_lines(sections) for _, sections in row) for row in rows]
-    with matplotlib.rc_context(STYLE):
-        size = (7.0, 0.5 + sum(0.6 + 0.12 * n for n in lines))
-        figure = Figure(figsize=size, layout="constrained")
+    lines = [max(_comparison_lines(pairs) for _, pairs in row) for row in rows]
+    with drawing(7.0, 0.5 + sum(0.6 + 0.12 * n for n in lines)) as figure:
         grid = figure.add_gridspec(len(rows), columns, height_ratios=[n + 2 for n in lines])
         for i, row in enumerate(rows):
-            for j, (reference, sections) in enumerate(row):
+            for j, (reference, pairs) in enumerate(row):
                 ax = figure.add_subplot(grid[i, j])
-                _draw_comparison(ax, sections)
+                _draw_comparison(ax, pairs)
                 title = textwrap.fill(f"beside {reference}", 58 if columns == 2 else 110)
                 ax.set_title(
                     title, loc="left", fontsize=7.5, pad=4, weight="bold", parse_math=False
@@ -62,38 +56,38 @@ def _is_shown(row: Row) -> bool:
     return row.standard_errors is not None or row.lost
 
 
-def _shown(sections: list[Section]) -> list[str]:
+def _shown(pairs: list[Pair]) -> list[str]:
     """Return the parameters of which some result has something to show, in their order."""
-    rows = [row for section in sections for row in section.rows]
+    rows = [row for pair in pairs for row in pair.rows]
     there = {row.label for row in rows if _is_shown(row)}
     return list(dict.fromkeys(row.label for row in rows if row.label in there))
 
 
-def _lanes(sections: list[Section]) -> list[int]:
+def _lanes(pairs: list[Pair]) -> list[int]:
     """Return the places of the results that have anything to show: each gets a lane."""
-    return [k for k, section in enumerate(sections) if any(map(_is_shown, section.rows))]
+    return [k for k, pair in enumerate(pairs) if any(map(_is_shown, pair.rows))]
 
 
-def _comparison_lines(sections: list[Section]) -> int:
-    return max(len(_shown(sections)), 1) * (len(_lanes(sections)) + 1)
+def _comparison_lines(pairs: list[Pair]) -> int:
+    return max(len(_shown(pairs)), 1) * (len(_lanes(pairs)) + 1)
 
 
-def _draw_comparison(ax: Axes, sections: list[Section]) -> None:
+def _draw_comparison(ax: Axes, pairs: list[Pair]) -> None:
     """One line for each parameter of each result; results of a parameter stand together."""
-    labels = _shown(sections)
+    labels = _shown(pairs)
     if not labels:
         say_nothing_there(ax)
         return
-    found = [row.standard_errors for section in sections for row in section.rows]
+    found = [row.standard_errors for pair in pairs for row in pair.rows]
     reach = max(4.0, 1.1 * max((abs(z) for z in found if z is not None), default=0.0))
     for half, shade in ((3.0, "0.95"), (1.0, "0.88")):
         ax.axvspan(-half, half, color=shade, lw=0, zorder=0)
     ax.axvline(0.0, color=GREY, lw=0.6, zorder=1)
-    lanes = _lanes(sections)
+    lanes = _lanes(pairs)
     step = len(lanes) + 1
     for lane, k in enumerate(lanes):
         color, mark = MARKS[k % len(MARKS)]
-        for row in sections[k].rows:
+        for row in pairs[k].rows:
             if row.label not in labels:
                 continue
             y = labels.index(row.label) * step + lane
@@ -122,9 +116,9 @@ def _draw_comparison(ax: Axes, sections: list[Section]) -> None:
     ax.spines["left"].set_visible(False)
 
 
-def _name_results(figure: Figure, groups: list[list[Section]]) -> None:
+def _name_results(figure: Figure, groups: list[list[Pair]]) -> None:
     """Say once what the colours mean: the drives, where these are the same in every panel."""
-    drives = [[f"{section.drive} drive" for section in sections] for sections in groups]
+    drives = [[f"{pair.drive} drive" for pair in pairs] for pairs in groups]
     longest = max(drives, key=len)
     alike = all(names == longest[: len(names)] for names in drives)
     if alike and len(set(longest)) == len(longest):
@@ -133,12 +127,12 @@ def _name_results(figure: Figure, groups: list[list[Section]]) -> None:
         names = [f"{s.test}: {s.model}, {s.drive} drive" for s in groups[0]]
     else:
         names = [f"result {k + 1}" for k in range(len(longest))]
-    drawn = {k for sections in groups for k in _lanes(sections)}
+    drawn = {k for pairs in groups for k in _lanes(pairs)}
     for k, name in enumerate(names):
         color, mark = MARKS[k % len(MARKS)]
         label = name if k in drawn else f"{name}: nothing to compare"
         figure.axes[0].plot([], [], mark, ms=3.4, color=color, label=label)
-    if any(row.state == "weak" for group in groups for section in group for row in section.rows):
+    if any(row.state == "weak" for group in groups for pair in group for row in pair.rows):
         figure.axes[0].plot(
             [], [], "o", ms=3.4, color=GREY, mfc="white", label="hollow: weakly determined"
         )

@@ -13,8 +13,9 @@ from foamfit.arrays import Array
 from foamfit.data.measurement import Outliers, interior_channel
 from foamfit.errors import InputError
 from foamfit.files import reason, replacing
+from foamfit.report.figures import image, laid_out
 from foamfit.report.page import render_report
-from foamfit.report.plots import image, laid_out, plot_fit
+from foamfit.report.plots import plot_fit
 from foamfit.results import SCHEMA, Curves, Fit, ParameterEstimate, plain
 from foamfit.trust.intervals import Intervals
 

@@ -1,4 +1,4 @@
-"""What fixes what, to look at: sensitivities along the curves, information and correlation."""
+"""Figures of what a test determines: sensitivities, information, correlation, profiles."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foamfit.report.plots import BLUE, GREY, INSIDE, STYLE, VERMILION, save
+from foamfit.report.figures import BLUE, GREY, INSIDE, VERMILION, drawing, save, say_nothing_there
 from foamfit.report.readable import readable_unit
 
 if TYPE_CHECKING:
@@ -16,7 +16,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, FigureBase
 
     from foamfit.fitting.branches import Section
+    from foamfit.results import Fit, ParameterEstimate
     from foamfit.trust.identifiability import Insight
+    from foamfit.trust.profile import Profile
 
 Array = NDArray[np.float64]
 
@@ -31,68 +33,78 @@ STRIP = 0.4  # height of a strip, in
 CELL = 0.24  # height of a cell, in
 
 
-def plot_sensitivities(insight: Insight, path: str | Path | None = None) -> Figure:
-    """Draw by how much each curve moves with each parameter, along time, over shaded branches.
-
-    Parameters
-    ----------
-    insight : Insight
-        What the test can tell.
-    path : str or Path, optional
-        Where to save the figure; the suffix gives the format.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        One row for each parameter, one panel for each counted curve. A row has one scale, its
-        largest value, in standard deviations of the noise per 1 % of the scale.
-    """
-    import matplotlib
-    from matplotlib.figure import Figure
-
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(7.0, strips_height(insight)), layout="constrained")
-        draw_sensitivities(figure, insight)
-    return save(figure, path)
-
-
-def plot_information(
-    insight: Insight, correlation: Array | None = None, path: str | Path | None = None
+def plot_insight(
+    insight: Insight,
+    correlation: Array | None = None,
+    title: str = "",
+    path: str | Path | None = None,
 ) -> Figure:
-    """Draw which part of which curve fixes each parameter, and the correlation of the estimates.
+    """Draw the sensitivity of each curve to each parameter, what fixes it, and the correlation.
 
-    Parameters
-    ----------
-    insight : Insight
-        What the test can tell.
-    correlation : (k, k) array, optional
-        Of the estimates, where it is better known than from `insight`.
-    path : str or Path, optional
-        Where to save the figure; the suffix gives the format.
+    Above, a row has one scale, its largest value, in standard deviations of the noise per 1 % of
+    the natural size. `correlation` is (k, k), where it is better known than from `insight`.
     """
-    import matplotlib
-    from matplotlib.figure import Figure
-
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(7.0, cells_height(insight)), layout="constrained")
-        draw_information(figure, insight, correlation)
+    heights = [0.75 + STRIP * len(insight.names), 1.15 + CELL * len(insight.names)]
+    with drawing(7.0, sum(heights) + 0.3 * bool(title)) as figure:
+        if title:
+            look = {"ha": "left", "fontsize": 8.5, "weight": "bold", "parse_math": False}
+            figure.suptitle(title, x=0.012, **look)
+        halves = figure.subfigures(2, 1, height_ratios=heights, squeeze=False)[:, 0]
+        _draw_sensitivities(halves[0], insight)
+        _draw_information(halves[1], insight, correlation)
     return save(figure, path)
 
 
-def strips_height(insight: Insight) -> float:
-    """Height of the strips, inches."""
-    return 0.75 + STRIP * len(insight.names)
+# ---------------------------------------------------------------- profiles
 
 
-def cells_height(insight: Insight) -> float:
-    """Height of the matrices, inches."""
-    return 1.15 + CELL * len(insight.names)
+def plot_profiles(result: Fit, path: str | Path | None = None) -> Figure:
+    """Draw the profile of each parameter that was followed, with its 95 % cut and its interval.
+
+    Four panels a row; dashed is the parabola of the local covariance. A profile that was stopped is
+    drawn as far as it came.
+    """
+    profiles = result.intervals.profiles if result.intervals is not None else ()
+    rows = max(-(-len(profiles) // 4), 1)
+    with drawing(7.0, 0.35 + 1.55 * rows) as figure:
+        axes = figure.subplots(rows, 4, squeeze=False, sharey=True).ravel()
+        for ax, profile in zip(axes, profiles, strict=False):
+            _draw_profile(ax, profile, result.parameters[profile.name])
+        for ax in axes[max(len(profiles), 1) :]:
+            ax.set_axis_off()
+        if profiles:
+            for ax in axes[: len(profiles) : 4]:
+                ax.set_ylabel("rise of χ²")
+        else:
+            say_nothing_there(axes[0])
+    return save(figure, path)
+
+
+def _draw_profile(ax: Axes, profile: Profile, estimate: ParameterEstimate) -> None:
+    """One profile, its cut, its interval, and the parabola of the standard error."""
+    factor, unit = readable_unit(float(np.max(np.abs(profile.values))), estimate.unit)
+    top = 2.0 * profile.cut
+    x = profile.values / factor
+    ax.axhline(profile.cut, color=GREY, lw=0.6, ls=(0, (2, 2)))
+    ax.axvspan(*(end / factor for end in profile.ci95), color="0.92", lw=0)
+    fine = np.linspace(x.min(), x.max(), 200)
+    if estimate.stderr:
+        parabola = ((fine * factor - estimate.value) / estimate.stderr) ** 2
+        ax.plot(fine, np.where(parabola <= top, parabola, np.nan), color=GREY, lw=0.8, ls="--")
+    root = np.sign(profile.values - estimate.value) * np.sqrt(np.maximum(profile.rises, 0.0))
+    ax.plot(fine, np.interp(fine, x, root) ** 2, color=BLUE, lw=1.1)
+    ax.plot(x, profile.rises, "o", color=BLUE, ms=2.2)
+    ax.plot(estimate.value / factor, 0.0, "o", color=VERMILION, ms=3.5)
+    ax.set_ylim(-0.04 * top, top)
+    ax.locator_params(axis="x", nbins=4)
+    name = f"{profile.name} ({unit})" if unit else profile.name
+    ax.set_xlabel(name if profile.complete else f"{name}, stopped", labelpad=1)
 
 
 # ---------------------------------------------------------------- sensitivities
 
 
-def draw_sensitivities(figure: FigureBase, insight: Insight) -> None:
+def _draw_sensitivities(figure: FigureBase, insight: Insight) -> None:
     """Set all rows of a curve in one panel: as panels of their own they take seconds to lay out."""
     k = len(insight.names)
     axes = figure.subplots(1, len(insight.curves), sharey=True, squeeze=False)[0]
@@ -143,8 +155,8 @@ def _color(curve: str) -> str:
 # ---------------------------------------------------------------- information and correlation
 
 
-def draw_information(figure: FigureBase, insight: Insight, correlation: Array | None) -> None:
-    """Draw what `plot_information` shows into a figure or a part of one."""
+def _draw_information(figure: FigureBase, insight: Insight, correlation: Array | None) -> None:
+    """Draw which part of which curve fixes each parameter, and the correlation."""
     parts, shares = insight.shares()
     told = [c for c in range(len(parts)) if np.nanmax(shares[:, c], initial=0.0) > 0.005]
     parts, shares = tuple(parts[c] for c in told), shares[:, told]

@@ -7,7 +7,6 @@ follows the foam down to the noise; what the model leaves unexplained makes them
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,19 +21,16 @@ from foamfit.fitting.branches import visited
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.search import Tracker, search
 from foamfit.report.folder import load_result
-from foamfit.report.readable import readable
 from foamfit.results import ParameterEstimate
-from foamfit.solve.simulation import simulate
+from foamfit.solve.simulation import Response, simulate
 from foamfit.springs import kernels
 from foamfit.springs.chain import Chain, Impact
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import split_name, unit_of
 from foamfit.springs.published import published
 from foamfit.springs.spring import BistableSpring
-from foamfit.text import engineering
 from foamfit.trust import covariance
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.checklist import ESTIMATED
 from foamfit.trust.conclude import state_of
 from foamfit.trust.identifiability import Insight, look
 
@@ -48,81 +44,53 @@ SLOWEST, FASTEST, CLOSE = 1e-2, 30.0, 1e-5
 BEYOND = 1.05
 # Of a planned test: samples, and noise over the range where none is stated.
 SAMPLES, NOISE = 501, 0.01
-WIDTH = 98
 GUESSED = "the best"  # how a source begins that is no knowledge
 
 
 @dataclass(frozen=True, eq=False)
-class Outlook:
-    """What to expect of a test.
+class Expected:
+    """What to expect of an experiment with one velocity of the striker.
 
-    Attributes
-    ----------
-    velocity : float or None
-        Of the striker, m/s; None in other drives.
-    expected : dict of str to ParameterEstimate
-        Start values with expected standard errors and states, of the parameters that vary.
-    visited : dict
-        Branches that each spring goes through.
-    insight : Insight or None
-        The sensitivities; None if no parameter leaves a trace.
+    `velocity` (m/s) is None in other drives than the impact; `estimates` are the start values of
+    the parameters that vary, with expected standard errors and states; `visited` are the branches
+    of each spring; `insight` is None if no parameter changes the curves.
     """
 
     velocity: float | None
-    expected: dict[str, ParameterEstimate]
+    estimates: dict[str, ParameterEstimate]
     visited: dict[str, tuple[str, ...]]
     insight: Insight | None
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class Outlook:
     """What is to be said of an experiment before it is fitted.
 
-    Attributes
-    ----------
-    problem : Problem
-        The test and its model.
-    values : (n,) array
-        The point that everything holds at, SI.
-    source : str
-        Where it comes from.
-    outlook : Outlook
-        The experiment as planned.
-    closing : dict of str to (float or None)
-        For each bistable spring the velocity (m/s) from which on its loop closes; None if none up
-        to 30 times the planned one does. Empty in other drives than the impact.
-    beyond : Outlook or None
-        The same experiment 5 % faster than what closes all loops, where it now leaves one open.
-    noise : dict of str to NoiseLevel
-        Of each counted curve.
+    All holds at `values` (SI), which come from `source`. `closing` is for each bistable spring the
+    velocity (m/s) from which on its loop closes, None if none up to 30 times the planned one does;
+    empty in other drives than the impact. `faster` is the experiment 5 % faster than what closes
+    all loops, where it leaves one open. `noise` is that of each counted curve.
     """
 
     problem: Problem
     values: Array
     source: str
-    outlook: Outlook
+    planned: Expected
     closing: dict[str, float | None]
-    beyond: Outlook | None
+    faster: Expected | None
     noise: dict[str, NoiseLevel]
 
 
-def make_plan(problem: Problem, values: Array, source: str) -> Plan:
-    """Look ahead at an experiment from a point of the parameters.
+def make_outlook(problem: Problem, values: Array, source: str) -> Outlook:
+    """Look ahead at an experiment from a point of the parameters (SI), and where it comes from.
 
-    Parameters
-    ----------
-    problem : Problem
-        The test and its model; its measured curves count by their range and noise only.
-    values : (n,) array
-        Start values, SI, in the order of the model's names.
-    source : str
-        Where they come from, for the reader.
+    The measured curves of the problem count by their range and noise only.
     """
     noise = {name: problem.objective.noise(name) for name in problem.objective.counted}
     sd = {name: level.sigma * level.time**0.5 for name, level in noise.items()}
-    outlook = expect(problem, values, sd)
+    planned = expect(problem, values, sd)
     closing: dict[str, float | None] = {}
-    beyond = None
+    quicker = None
     if problem.objective.drive == "impact":
         chain, striker = chain_of(problem, values), _striker(problem.measurement)
         closing = {
@@ -132,9 +100,8 @@ def make_plan(problem: Problem, values: Array, source: str) -> Plan:
         }
         fast = [v for v in closing.values() if v is not None]
         if fast and striker.velocity is not None and max(fast) > striker.velocity:
-            quicker = faster(problem, values, BEYOND * max(fast), sd)
-            beyond = expect(quicker, values, sd)
-    return Plan(problem, values, source, outlook, closing, beyond, noise)
+            quicker = expect(faster(problem, values, BEYOND * max(fast), sd), values, sd)
+    return Outlook(problem, values, source, planned, closing, quicker, noise)
 
 
 # ---------------------------------------------------------------- start values
@@ -160,13 +127,7 @@ def start_values(problem: Problem, seed: int = 0) -> tuple[Array, str]:
 
 
 def published_values(problem: Problem, name: str) -> tuple[Array, str]:
-    """Start values of a published set, its heights scaled to the specimen, its damping left out.
-
-    Raises
-    ------
-    InputError
-        If there is no such set or it has other springs.
-    """
+    """Start values of a published set, its heights scaled to the specimen, without its damping."""
     if name not in published:
         known = ", ".join(published)
         raise InputError(f"there is no published set '{name}'; there are {known}")
@@ -188,13 +149,7 @@ def published_values(problem: Problem, name: str) -> tuple[Array, str]:
 
 
 def result_values(problem: Problem, folder: Path) -> tuple[Array, str]:
-    """Start values of an earlier result, from its folder or its fit.json.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read or has other springs.
-    """
+    """Start values of an earlier result, from its folder or its fit.json."""
     content = load_result(folder)
     given = content.get("parameters", {})
     missing = [name for name in problem.names if name not in given]
@@ -211,17 +166,9 @@ def result_values(problem: Problem, folder: Path) -> tuple[Array, str]:
 
 
 def planned_test(settings_file: Path) -> Measurement:
-    """Make room for the test that a TOML plans; `simulated_test` fills in its curves.
+    """Make a test without curves of what a TOML plans; `simulated_test` fills them in.
 
-    Parameters
-    ----------
-    settings_file : Path
-        With [specimen] height and diameter and [striker] mass and velocity; [noise] counts.
-
-    Raises
-    ------
-    InputError
-        If something is missing; the message names it.
+    It needs [specimen] height and diameter and [striker] mass and velocity; [noise] counts.
     """
     settings = read_settings(settings_file, settings_file, channels=())
     striker = settings.striker or Striker()
@@ -266,15 +213,23 @@ def simulated_test(like: Measurement, chain: Chain, striker: Striker) -> Measure
     )  # fmt: skip
 
 
-def _duration(chain: Chain, drive: Impact) -> float:
-    """Duration of the contact of an impact, s."""
+def _runs(chain: Chain, drive: Impact) -> Iterator[Response]:
+    """Give runs of an impact that last longer and longer, up to one that ends its contact."""
     end = 4.0 * chain.height / drive.velocity
     for _ in range(20):
         response = simulate(chain, drive, np.linspace(0.0, end, 16))
+        yield response
         if response.contact_end is not None:
-            return response.contact_end
+            return
         end *= 2.0
-    raise SimulationError("the striker does not come back; check its mass and the damping")
+
+
+def _duration(chain: Chain, drive: Impact) -> float:
+    """Duration of the contact of an impact, s."""
+    *_, last = _runs(chain, drive)
+    if last.contact_end is None:
+        raise SimulationError("the striker does not come back; check its mass and the damping")
+    return last.contact_end
 
 
 # ---------------------------------------------------------------- the questions
@@ -294,22 +249,9 @@ def chain_of(problem: Problem, values: Array) -> Chain:
 def closing_velocity(chain: Chain, striker: Striker, spring: int) -> float | None:
     """Velocity (m/s) from which on an impact closes the loop of a spring: it snaps, and snaps back.
 
-    By bisection of forward runs, to 1e-5. With light interior masses that ring, loops may close and
-    open again above it.
-
-    Parameters
-    ----------
-    chain : Chain
-        What is struck.
-    striker : Striker
-        Its mass, and the planned velocity from which the search starts.
-    spring : int
-        1 at the base.
-
-    Returns
-    -------
-    float or None
-        None if no velocity from a hundredth to thirty times the planned one parts open from closed.
+    By bisection of forward runs, to 1e-5, from the planned velocity of the striker; springs count
+    from 1 at the base. With light interior masses that vibrate, loops may close and open again
+    above it. None if no velocity from a hundredth to thirty times the planned one parts the two.
     """
     assert striker.mass is not None
     assert striker.velocity is not None
@@ -333,26 +275,20 @@ def closing_velocity(chain: Chain, striker: Striker, spring: int) -> float | Non
 
 def closes(chain: Chain, drive: Impact, spring: int) -> bool:
     """Whether a spring (1 at the base) comes to branch e in an impact."""
-    end = 2.0 * chain.height / drive.velocity
-    for _ in range(20):
-        try:
-            response = simulate(chain, drive, np.linspace(0.0, end, 16))
-        except SimulationError:  # past the end of a branch: nothing is closed there
-            return False
-        mine = response.switches[response.switches[:, 1] == spring - 1]
-        if np.any(mine[:, 3] == kernels.E):
-            return True
-        if response.contact_end is not None:
-            return False
-        end *= 2.0
-    return False
+    try:
+        return any(
+            np.any((response.switches[:, 1] == spring - 1) & (response.switches[:, 3] == kernels.E))
+            for response in _runs(chain, drive)
+        )
+    except SimulationError:  # past the end of a branch: nothing is closed there
+        return False
 
 
 def faster(problem: Problem, values: Array, velocity: float, noise: Mapping[str, float]) -> Problem:
     """Return the same problem at another velocity of the striker, its curves simulated."""
     test = problem.measurement
-    loud = {name.startswith("displacement"): value for name, value in noise.items()}
-    test = replace(test, noise=Noise(loud.get(False), loud.get(True)))
+    given = {name.startswith("displacement"): value for name, value in noise.items()}
+    test = replace(test, noise=Noise(given.get(False), given.get(True)))
     striker = replace(_striker(test), velocity=velocity)
     test = simulated_test(test, chain_of(problem, values), striker)
     return make_problem(
@@ -361,17 +297,10 @@ def faster(problem: Problem, values: Array, velocity: float, noise: Mapping[str,
     )  # fmt: skip
 
 
-def expect(problem: Problem, values: Array, noise: Mapping[str, float]) -> Outlook:
+def expect(problem: Problem, values: Array, noise: Mapping[str, float]) -> Expected:
     """Standard errors and states to expect at a point, from the Fisher information.
 
-    Parameters
-    ----------
-    problem : Problem
-        The experiment.
-    values : (n,) array
-        Where the parameters are taken to lie, SI.
-    noise : mapping
-        One standard deviation of each counted curve, SI.
+    `noise` is one standard deviation of each counted curve, SI.
     """
     best, params = BestPoint(problem, values), problem.params
     lost, names = best.unreached, best.names
@@ -394,7 +323,7 @@ def expect(problem: Problem, values: Array, noise: Mapping[str, float]) -> Outlo
     seen = visited(problem, best.simulated)
     impact = problem.objective.drive == "impact"
     velocity = _striker(problem.measurement).velocity if impact else None
-    return Outlook(velocity, expected, seen, insight)
+    return Expected(velocity, expected, seen, insight)
 
 
 def worth(insight: Insight) -> dict[str, dict[str, float]]:
@@ -413,156 +342,7 @@ def _striker(test: Measurement) -> Striker:
     return test.striker
 
 
-# ---------------------------------------------------------------- in words
-
-
-def describe_plan(plan: Plan) -> str:
-    """Write a plan for people: at most 100 columns wide, no newline at the end."""
-    out = [("model", f"{plan.problem.model.name}, {plan.problem.objective.drive} drive")]
-    out.append(("start", f"{plan.source}; all that follows holds there"))
-    told = (
-        f"{_spoken(name)} {engineering(level.sigma, _unit(name))} "
-        f"({'stated' if level.given else 'estimated'})"
-        for name, level in plan.noise.items()
-    )
-    out.append(("noise", ", ".join(told)))
-    out += [("", text) for text in _unexplained(plan)]
-    out += [("loop" if i == 0 else "", text) for i, text in enumerate(closing_sentences(plan))]
-    if plan.outlook.insight is not None:
-        worths = list(worth_sentences(plan.outlook.insight))
-        out += [("channels" if i == 0 else "", text) for i, text in enumerate(worths)]
-        out.append(("least", plan.outlook.insight.sentence()))
-    text = "\n".join(f"{label:<10}{_wrap(sentence)}" for label, sentence in out)
-    return "\n".join([text, "", *_table(plan), "", *_reasons(plan)]).rstrip()
-
-
-def _unexplained(plan: Plan) -> Iterator[str]:
-    """Warn where the start values leave more than the noise: then the errors are too small."""
-    objective, at = plan.problem.objective, 0
-    residual = objective.differences(plan.values)
-    for (name, level), size in zip(plan.noise.items(), objective.sizes, strict=True):
-        noise = level.sigma
-        rms = float(np.sqrt(np.mean(residual[at : at + size] ** 2)))
-        rms *= objective.scale[name] / objective.weights[name] ** 0.5
-        at += size
-        if rms > ESTIMATED * noise:
-            yield (
-                f"The start values leave {rms / noise:.1f} times the noise of {_spoken(name)}, so "
-                "the errors to expect are larger than those below."
-            )
-
-
-def closing_sentences(plan: Plan) -> Iterator[str]:
-    """Say for each bistable spring how far it goes, and what would close its loop."""
-    velocity = plan.outlook.velocity
-    guessed = [name for name, item in plan.outlook.expected.items() if "reached" in item.why]
-    for spring, seen in plan.outlook.visited.items():
-        if "a" not in seen:
-            continue
-        at = f"At {velocity:.4g} m/s" if velocity is not None else "In this test"
-        mine = [name for name in guessed if name.startswith(f"{spring}_")]
-        text = f"{at} the loop of spring {spring[1:]} closes"
-        if "e" not in seen:
-            last = seen[-1] if "c" not in seen else "c"
-            text = f"{at} spring {spring[1:]} turns back on branch {last}"
-        if velocity is None:
-            strain, stress = _needed(plan, int(spring[1:]))
-            closing = f"an overall strain of {strain:.3g} ({engineering(stress, 'Pa')})"
-        else:
-            found = plan.closing.get(spring)
-            closing = "" if found is None else f"{found:.4g} m/s"
-        if not closing:
-            yield f"{text}; no velocity that was tried decides whether its loop closes."
-        elif "e" in seen:
-            yield f"{text}, as it does from {closing} on."
-        elif mine and plan.source.startswith(GUESSED):
-            yield (
-                f"{text}. That its loop would close from {closing} on is a guess: this test does "
-                f"not tell {', '.join(mine)}."
-            )
-        else:
-            yield f"{text}; from {closing} on its loop closes."
-
-
-def _needed(plan: Plan, spring: int) -> tuple[float, float]:
-    """Overall strain, and stress (Pa), at which a spring of a slow chain comes to its C1."""
-    chain = chain_of(plan.problem, plan.values)
-    soft = chain.springs[spring - 1]
-    assert isinstance(soft, BistableSpring)
-    stress = soft.sigma_hat_c
-    path = np.linspace(0.0, stress, 400)
-    strains = [
-        soft.eps_hat_c if i == spring - 1 else float(other.strain(path)[-1])
-        for i, other in enumerate(chain.springs)
-    ]
-    return float(np.dot(chain.heights, strains)) / chain.height, stress
-
-
-def worth_sentences(insight: Insight) -> Iterator[str]:
-    """Say what halving the noise of each channel would bring, and which is worth it most."""
-    ratios = worth(insight)
-    gains = {
-        curve: float(np.mean([1.0 - r for r in of.values()])) for curve, of in ratios.items() if of
-    }
-    for curve, of in ratios.items():
-        best = sorted(of, key=lambda name: of[name])[:3]
-        most = ", ".join(f"{name} by {1.0 - of[name]:.0%}" for name in best if of[name] < 0.98)
-        yield (
-            f"Half the noise of {_spoken(curve)} narrows the intervals by "
-            f"{gains.get(curve, 0.0):.0%} on average{f', most {most}' if most else ''}."
-        )
-    if len(gains) > 1:
-        first = max(gains, key=lambda curve: gains[curve])
-        yield f"The channel worth measuring better is {_spoken(first)}."
-    elif gains:
-        yield f"Only {_spoken(next(iter(gains)))} is compared in this drive."
-
-
-def _table(plan: Plan) -> list[str]:
-    """Align the expected standard errors, beside those of the faster test where there is one."""
-    outlooks = [plan.outlook] + ([plan.beyond] if plan.beyond is not None else [])
-    heads = [
-        "expected" if o.velocity is None else f"expected at {o.velocity:.4g} m/s" for o in outlooks
-    ]
-    table = [["parameter", "unit", *(x for head in heads for x in (head, "state"))]]
-    for name in plan.outlook.expected:
-        shown = [readable(name, outlook.expected[name]) for outlook in outlooks]
-        cells = [x for item in shown for x in (_with_error(item.value, item.stderr), item.state)]
-        table.append([name, shown[0].unit, *cells])
-    widths = [max(len(row[i]) for row in table) for i in range(len(table[0]))]
-    return [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in table
-    ]
-
-
-def _with_error(value: str, stderr: str) -> str:
-    return f"{value} ± {stderr}" if stderr else value
-
-
-def _reasons(plan: Plan) -> Iterator[str]:
-    for name, item in plan.outlook.expected.items():
-        if item.state != "determined":
-            yield from textwrap.wrap(
-                f"{name}: {item.state}, {item.why}.", WIDTH, subsequent_indent="  "
-            )
-
-
-def _unit(curve: str) -> str:
-    return "m" if curve.startswith("displacement") else "Pa"
-
-
-def _spoken(name: str) -> str:
-    return name.replace("_", "-")
-
-
-def _wrap(text: str) -> str:
-    return textwrap.fill(text, width=WIDTH, initial_indent=" " * 10, subsequent_indent=" " * 12)[
-        10:
-    ]
-
-
-def plan_test(
+def outlook_of(
     test: Path,
     specimen: Path | None,
     model: str,
@@ -570,26 +350,11 @@ def plan_test(
     *,
     published_set: str | None = None,
     result: Path | None = None,
-) -> Plan:
+) -> Outlook:
     """Read a test, or a TOML that plans one, and look ahead.
 
-    Parameters
-    ----------
-    test : Path
-        A CSV; or a TOML, which then needs one of the sources of start values.
-    specimen : Path or None
-        See `foamfit.read_test`.
-    model, drive
-        See `foamfit.fit`.
-    published_set : str, optional
-        A published set to start from.
-    result : Path, optional
-        An earlier result to start from.
-
-    Raises
-    ------
-    InputError
-        If something is missing or wrong; the message names it.
+    A TOML needs one of the sources of start values: `published_set`, or `result`, an earlier one.
+    InputError names what is missing or wrong.
     """
     from foamfit.data.csv_file import read_test
 
@@ -611,4 +376,4 @@ def plan_test(
         chain = chain_of(problem, values)
         measurement = simulated_test(measurement, chain, _striker(measurement))
         problem = make_problem(measurement, model, drive, None, None, interior_mass=False)
-    return make_plan(problem, values, source)
+    return make_outlook(problem, values, source)

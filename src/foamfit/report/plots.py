@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import io
+import math
 import re
 import textwrap
-import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -15,8 +13,15 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from foamfit.errors import InputError
-from foamfit.files import write_file
+from foamfit.report.figures import (
+    BLUE,
+    GREY,
+    INSIDE,
+    VERMILION,
+    drawing,
+    save,
+    say_nothing_there,
+)
 from foamfit.report.readable import readable_unit
 from foamfit.terminal import printable
 
@@ -24,32 +29,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from foamfit.results import Fit, ParameterEstimate
+    from foamfit.results import Fit
     from foamfit.solve.simulation import Response
-    from foamfit.trust.profile import Profile
 
 Array = NDArray[np.float64]
 
-GREY, BLUE, VERMILION = "#6b6b6b", "#0072B2", "#D55E00"  # of Okabe and Ito, told apart by all
-INSIDE = ("#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # of masses inside, from the base up
-STYLE: Any = {  # matplotlib types its keys one by one
-    "font.family": "DejaVu Sans",
-    "font.size": 7.5,
-    "axes.labelsize": 8,
-    "axes.titlesize": 8,
-    "axes.linewidth": 0.6,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.unicode_minus": True,
-    "xtick.labelsize": 7,
-    "ytick.labelsize": 7,
-    "xtick.major.width": 0.6,
-    "ytick.major.width": 0.6,
-    "legend.frameon": False,
-    "legend.fontsize": 7.5,
-    "pdf.fonttype": 42,
-}
-NO_LAYOUT = {"figure.autolayout": False, "figure.constrained_layout.use": False}
 POINTS = {
     ("a", "d"): "A1", ("d", "a"): "A1",
     ("d", "c"): "C1",
@@ -57,15 +41,9 @@ POINTS = {
     ("e", "a"): "A2",
 }  # fmt: skip
 BESIDE = {"a": (-6, 4), "d": (-6, 4), "c": (7, -3), "e": (4, -7)}  # points from the branch
-MARKS = ((BLUE, "o"), (VERMILION, "s"), ("black", "^"), (GREY, "D"))  # of results in a comparison
-MATH = {
-    "k0": "$k_0$", "σ_a": r"$\sigma_a$", "ε_a": r"$\varepsilon_a$", "ε_c": r"$\varepsilon_c$",
-    "k_h+": "$k_{h+}$", "k_h−": "$k_{h-}$", "k_c": "$k_c$", "Δσ": r"$\Delta\sigma$",
-    "η": r"$\eta$",
-}  # fmt: skip
-IN_MATH = re.compile("|".join(map(re.escape, MATH)))
-DPI = 250  # of a PNG
 MARKERS = 60  # of a measured curve: more of them blot
+PALE = "#A6CEE3"
+PANEL = (137.0, 133.0)  # size of one of three panels, typographic points
 
 
 def plot_fit(result: Fit, path: str | Path | None = None) -> Figure:
@@ -83,13 +61,8 @@ def plot_fit(result: Fit, path: str | Path | None = None) -> Figure:
     matplotlib.figure.Figure
         7 in wide where all three are there; it belongs to no pyplot state.
     """
-    import matplotlib
-    from matplotlib.figure import Figure
-
-    with matplotlib.rc_context(STYLE):
-        panels = list(_panels(result))
-        width = {0: 4.0, 1: 4.0, 2: 5.4, 3: 7.0}[len(panels)]
-        figure = Figure(figsize=(width, 2.75), layout="constrained")
+    panels = list(_panels(result))
+    with drawing({0: 4.0, 1: 4.0, 2: 5.4, 3: 7.0}[len(panels)], 2.75) as figure:
         for ax, panel in zip(_row(figure, len(panels)), panels, strict=True):
             _draw(ax, panel)
             _mark_outliers(ax, panel, result)
@@ -115,12 +88,8 @@ def plot_residuals(result: Fit, path: str | Path | None = None) -> Figure:
     matplotlib.figure.Figure
         7 in wide, one strip above the other, over time, or over the sample where there is no time.
     """
-    import matplotlib
-    from matplotlib.figure import Figure
-
-    with matplotlib.rc_context(STYLE):
-        strips = list(_residuals(result))
-        figure = Figure(figsize=(7.0, 0.45 + 0.85 * max(len(strips), 1)), layout="constrained")
+    strips = list(_residuals(result))
+    with drawing(7.0, 0.45 + 0.85 * max(len(strips), 1)) as figure:
         column = figure.subplots(max(len(strips), 1), 1, sharex=True, squeeze=False)[:, 0]
         time = result.curves.time
         for ax, (name, residual) in zip(column, strips, strict=False):
@@ -136,103 +105,29 @@ def plot_residuals(result: Fit, path: str | Path | None = None) -> Figure:
     return save(figure, path)
 
 
-def plot_profiles(result: Fit, path: str | Path | None = None) -> Figure:
-    """Draw the profile of each parameter that was followed, with its 95 % cut and its interval.
-
-    Parameters
-    ----------
-    result : Fit
-        The fit; a profile that was stopped is drawn as far as it came.
-    path : str or Path, optional
-        Where to save the figure; the suffix gives the format.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        7 in wide, four panels a row; dashed is the parabola of the local covariance.
-    """
-    import matplotlib
-    from matplotlib.figure import Figure
-
-    profiles = result.intervals.profiles if result.intervals is not None else ()
-    rows = max(-(-len(profiles) // 4), 1)
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(7.0, 0.35 + 1.55 * rows), layout="constrained")
-        axes = figure.subplots(rows, 4, squeeze=False, sharey=True).ravel()
-        for ax, profile in zip(axes, profiles, strict=False):
-            _draw_profile(ax, profile, result.parameters[profile.name])
-        for ax in axes[max(len(profiles), 1) :]:
-            ax.set_axis_off()
-        if profiles:
-            for ax in axes[: len(profiles) : 4]:
-                ax.set_ylabel("rise of χ²")
-        else:
-            say_nothing_there(axes[0])
-    return save(figure, path)
-
-
-def _draw_profile(ax: Axes, profile: Profile, estimate: ParameterEstimate) -> None:
-    """One profile, its cut, its interval, and the parabola of the standard error."""
-    factor, unit = readable_unit(_size(profile.values), estimate.unit)
-    top = 2.0 * profile.cut
-    x = profile.values / factor
-    ax.axhline(profile.cut, color=GREY, lw=0.6, ls=(0, (2, 2)))
-    ax.axvspan(*(end / factor for end in profile.ci95), color="0.92", lw=0)
-    fine = np.linspace(x.min(), x.max(), 200)
-    if estimate.stderr:
-        parabola = ((fine * factor - estimate.value) / estimate.stderr) ** 2
-        ax.plot(fine, np.where(parabola <= top, parabola, np.nan), color=GREY, lw=0.8, ls="--")
-    root = np.sign(profile.values - estimate.value) * np.sqrt(np.maximum(profile.rises, 0.0))
-    ax.plot(fine, np.interp(fine, x, root) ** 2, color=BLUE, lw=1.1)
-    ax.plot(x, profile.rises, "o", color=BLUE, ms=2.2)
-    ax.plot(estimate.value / factor, 0.0, "o", color=VERMILION, ms=3.5)
-    ax.set_ylim(-0.04 * top, top)
-    ax.locator_params(axis="x", nbins=4)
-    name = f"{profile.name} ({unit})" if unit else profile.name
-    ax.set_xlabel(name if profile.complete else f"{name}, stopped", labelpad=1)
-
-
 def plot_response(response: Response, path: str | Path | None = None) -> Figure:
-    """Draw what a forward run gave: base stress and displacements over time, stress over strain.
-
-    Parameters
-    ----------
-    response : Response
-        From `foamfit.simulate`.
-    path : str or Path, optional
-        Where to save the figure; the suffix gives the format.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        7 in wide, three panels; it belongs to no pyplot state.
-    """
-    import matplotlib
-    from matplotlib.figure import Figure
-
+    """Draw what a forward run gave: base stress and displacements over time, stress over strain."""
     time, stress, nodes = response.time, response.base_stress, response.displacement
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(7.0, 2.75), layout="constrained")
+    with drawing(7.0, 2.75) as figure:
         axes = figure.subplots(1, 3)
         ft, t_unit = readable_unit(_size(time), "s")
         fs, s_unit = readable_unit(_size(stress), "Pa")
         fw, w_unit = readable_unit(_size(nodes), "m")
-        axes[0].plot(time / ft, stress / fs, color=VERMILION, lw=1.3)
+        last = {"color": VERMILION, "lw": 1.3}
+        axes[0].plot(time / ft, stress / fs, **last)
         # From the base up: light to dark, the top in the colour of what is simulated.
         shades = np.linspace(0.7, 0.35, max(len(nodes) - 1, 1))
         for i, node in enumerate(nodes[:-1]):
             axes[1].plot(time / ft, node / fw, color=str(shades[i]), lw=1.0, label=f"node {i + 1}")
-        axes[1].plot(time / ft, nodes[-1] / fw, color=VERMILION, lw=1.3, label="top")
+        axes[1].plot(time / ft, nodes[-1] / fw, label="top", **last)
         end = np.inf if response.contact_end is None else response.contact_end
         loop = time <= end  # then the striker flies
-        axes[2].plot(response.strain[loop], stress[loop] / fs, color=VERMILION, lw=1.3)
-        for ax, x_label, y_label in (
-            (axes[0], f"time ({t_unit})", f"base stress ({s_unit})"),
-            (axes[1], f"time ({t_unit})", f"displacement ({w_unit})"),
-            (axes[2], "overall strain (–)", f"base stress ({s_unit})"),
-        ):
-            ax.set_xlabel(x_label)
-            ax.set_ylabel(y_label)
+        axes[2].plot(response.strain[loop], stress[loop] / fs, **last)
+        base = f"base stress ({s_unit})"
+        axes[0].set(xlabel=f"time ({t_unit})", ylabel=base)
+        axes[1].set(xlabel=f"time ({t_unit})", ylabel=f"displacement ({w_unit})")
+        axes[2].set(xlabel="overall strain (–)", ylabel=base)
+        for ax in axes:
             ax.margins(0.05, 0.11)
         if response.contact_end is not None:
             for ax in axes[:2]:
@@ -245,67 +140,6 @@ def plot_response(response: Response, path: str | Path | None = None) -> Figure:
         if len(nodes) > 1:
             axes[1].legend(loc="best", handlelength=1.4)
     return save(figure, path)
-
-
-@contextmanager
-def laid_out(figure: Figure, dpi: int = DPI) -> Iterator[None]:
-    """Keep one layout of a figure for all images that are made of it within.
-
-    Left to itself matplotlib lays a figure out anew for every image, and draws it once more for
-    that, unseen. Within another `laid_out` of the same figure this does nothing.
-
-    Parameters
-    ----------
-    figure : matplotlib.figure.Figure
-        What will be rendered; its engine is put back at the end.
-    dpi : int
-        Resolution at which its texts are measured.
-    """
-    import matplotlib
-
-    engine, own_dpi = figure.get_layout_engine(), figure.dpi
-    if engine is None:
-        yield
-        return
-    with matplotlib.rc_context(STYLE | NO_LAYOUT), _unnamed_letters():
-        figure.dpi = dpi
-        engine.execute(figure)
-        figure.dpi = own_dpi
-        figure.set_layout_engine(None)  # "none" leaves a dummy, for which all is drawn twice
-    try:
-        yield
-    finally:
-        figure.set_layout_engine(engine)
-
-
-@contextmanager
-def _unnamed_letters() -> Iterator[None]:
-    """Let a test be named in letters that the font lacks: the figure is good without them."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Glyph .* missing")
-        yield
-
-
-def image(figure: Figure, form: Literal["png", "pdf", "svg"], dpi: int = DPI) -> bytes:
-    """Return the figure as the bytes of a file (PDF with embedded TrueType fonts).
-
-    Parameters
-    ----------
-    figure : matplotlib.figure.Figure
-        What to render.
-    form : {"png", "pdf", "svg"}
-        The format.
-    dpi : int
-        Of a PNG.
-    """
-    import matplotlib
-
-    buffer = io.BytesIO()
-    # Without the date, the same fit gives the same file.
-    metadata = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(form)
-    with laid_out(figure, dpi), matplotlib.rc_context(STYLE), _unnamed_letters():
-        figure.savefig(buffer, format=form, dpi=dpi, metadata=metadata)
-    return buffer.getvalue()
 
 
 def origin_word(result: Fit) -> str | None:
@@ -383,12 +217,6 @@ def _row(figure: Figure, n: int) -> list[Axes]:
     return axes[:n]
 
 
-def say_nothing_there(ax: Axes) -> None:
-    """Write into an empty panel that there is no curve."""
-    ax.set_axis_off()
-    ax.text(0.5, 0.5, "no curve to compare", ha="center", va="center", transform=ax.transAxes)
-
-
 def _draw(ax: Axes, panel: _Panel) -> None:
     fx, x_label, fy, y_label = panel.scale()
     for line in panel.lines:
@@ -397,21 +225,19 @@ def _draw(ax: Axes, panel: _Panel) -> None:
         if line.kind == "measured":
             some = _evenly(x, y, MARKERS)
             of_its_own = line.source == "measured"
-            ax.plot(x, y, color=GREY, lw=0.5, alpha=0.6, zorder=1)
+            ax.plot(x, y, color="0.82", lw=0.5, zorder=1)
             ax.plot(
-                x[some], y[some], "o" if of_its_own else "s", ms=2.6, mfc="white", mec=GREY,
-                mew=0.6, zorder=2,
+                x[some], y[some], "o" if of_its_own else "s", ms=3.4, mfc="white", mec="0.6",
+                mew=0.6, zorder=3,
                 label="_measured inside" if line.node
                 else "measured" if of_its_own else f"measured, motion {line.source}",
             )  # fmt: skip
         elif line.kind == "fitted":
             name = f"mass {line.node}" if line.node else "fitted"
-            ax.plot(x, y, color=color, lw=1.3, zorder=3, label=name)
+            ax.plot(x, y, color=color, lw=0.9, zorder=4, label=name)
         else:
-            ax.plot(
-                x, y, color=BLUE, lw=1.0, ls=(0, (4, 2)), zorder=4,
-                label="springs along measured strain",
-            )  # fmt: skip
+            # Wide and pale below the others, with which it coincides where the fit is good.
+            ax.plot(x, y, color=PALE, lw=3.2, zorder=2, label="springs along measured strain")
     ax.set_xlabel(x_label)
     ax.set_ylabel(y_label)
     ax.margins(0.05, 0.11)
@@ -452,11 +278,10 @@ def _mark_outliers(ax: Axes, panel: _Panel, result: Fit) -> None:
 
 
 def _mark_switches(ax: Axes, panel: _Panel, result: Fit) -> None:
+    """Mark the points where a spring changes its branch, and name each where it first does."""
     from matplotlib.patheffects import withStroke
 
     fx, _, fy, _ = panel.scale()
-    inside = any(line.node for line in panel.lines)  # then the name of A1 may lie on its line
-    halo = [withStroke(linewidth=1.5, foreground="white")]
     at: dict[str, list[tuple[float, float]]] = {}
     for switch in result.switches:
         point = POINTS.get((switch.source, switch.target), f"{switch.source}→{switch.target}")
@@ -467,22 +292,50 @@ def _mark_switches(ax: Axes, panel: _Panel, result: Fit) -> None:
         y = switch.displacement if panel.key == "displacement_time" else switch.stress
         if x is not None:
             at.setdefault(name, []).append((x / fx, y / fy))
-    named: list[tuple[Array, float]] = []
+    corner, span = np.array([ax.get_xlim()[0], ax.get_ylim()[0]]), np.array(PANEL)
+    span = span / [np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim())]  # typographic points per unit
+    fitted = [line for line in panel.lines if line.kind == "fitted"]
+    some = [_evenly(line.x / fx, line.y / fy, 4 * MARKERS) for line in fitted]
+    curve = [
+        np.column_stack((line.x[i] / fx, line.y[i] / fy))
+        for line, i in zip(fitted, some, strict=True)
+    ]
+    points = [np.array(places) for places in at.values()]
+    avoid = (np.concatenate([np.empty((0, 2)), *curve, *points, *points]) - corner) * span
+    taken: list[Array] = []
     for name, places in at.items():
         ax.plot(*zip(*places, strict=True), "o", ms=3.2, color="black", zorder=5)
-        offset = _offset(name[-2:], panel.key)
-        here = np.array(places[0]) / [np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim())]
-        if panel.key != "stress_strain" and any(
-            offset[0] * side > 0.0 and (np.abs(here - there) < (0.2, 0.05)).all()
-            for there, side in named
-        ):  # two springs switch at nearly one place: one name to each side
-            offset = (-offset[0], -offset[1])
-        named.append((here, offset[0]))
-        ax.annotate(  # a spring that goes to and fro is named where it first does
+        anchor = (np.array(places[0]) - corner) * span
+        offset = _free_offset(anchor, name, _offset(name[-2:], panel.key), avoid, taken)
+        ax.annotate(
             name, places[0], offset, textcoords="offset points", zorder=6,
             ha="left" if offset[0] > 0 else "right", va="center", fontsize=7,
-            path_effects=halo if name.endswith("A1") and inside else None,
+            path_effects=[withStroke(linewidth=1.5, foreground="white")],
         )  # fmt: skip
+
+
+def _free_offset(
+    anchor: Array, name: str, wanted: tuple[float, float], avoid: Array, taken: list[Array]
+) -> tuple[float, float]:
+    """Return where a name stands beside its anchor: on no other name, on little of the curves.
+
+    All in typographic points; `avoid` has a row for each sample of the curves, and the box of the
+    name (left, low, right, high) is added to `taken`.
+    """
+    x, y = wanted
+    size, best, found = np.array([4.2 * len(name), 9.0]), math.inf, (wanted, np.zeros(4))
+    for factor in (1.0, 2.5, 4.0):
+        for dx, dy in ((x, factor * y), (-x, -factor * y), (x, -factor * y), (-x, factor * y)):
+            low = np.add(anchor, (dx - (size[0] if dx < 0 else 0.0), dy - 0.5 * size[1]))
+            high = low + size
+            names = sum(bool(np.all((low < b[2:]) & (b[:2] < high))) for b in taken)
+            beyond = bool(np.any((low < 0.0) | (high > PANEL)))
+            inside = int(np.all((avoid > low) & (avoid < high), axis=1).sum())
+            cost = 1000 * names + 50 * beyond + inside + 2.0 * factor
+            if cost < best:
+                best, found = cost, ((dx, dy), np.concatenate((low, high)))
+    taken.append(found[1])
+    return found[0]
 
 
 def _offset(point: str, key: str) -> tuple[float, float]:
@@ -570,19 +423,3 @@ def _residuals(result: Fit) -> Iterator[tuple[str, Array]]:
 
 def _size(values: Array) -> float:
     return float(np.nanmax(np.abs(values), initial=0.0))
-
-
-def figure_format(path: str | Path) -> Literal["png", "pdf", "svg"]:
-    """Return the format that the suffix of a path names; any other is refused."""
-    forms: dict[str, Literal["png", "pdf", "svg"]] = {".png": "png", ".pdf": "pdf", ".svg": "svg"}
-    form = forms.get(Path(path).suffix.lower())
-    if form is None:
-        raise InputError(f"a figure is saved as .png, .pdf or .svg, not {Path(path).name!r}")
-    return form
-
-
-def save(figure: Figure, path: str | Path | None) -> Figure:
-    """Save a figure, if there is a path, in the format of its suffix; returns the figure."""
-    if path is not None:
-        write_file(path, image(figure, figure_format(path)))
-    return figure

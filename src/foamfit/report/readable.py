@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+from foamfit import text
 from foamfit.results import ParameterEstimate
 
 SYMBOLS = {
@@ -22,21 +23,9 @@ UNITS = {
 
 
 def readable_unit(size: float, unit: str) -> tuple[float, str]:
-    """Return the unit in which a number of this size reads well.
+    """Return factor and name of the unit in which a number of this size reads well.
 
-    Parameters
-    ----------
-    size : float
-        The largest number to show, in `unit`.
-    unit : str
-        "Pa", "s" or "m"; any other unit is kept.
-
-    Returns
-    -------
-    factor : float
-        What one of the readable units is in `unit`.
-    name : str
-        Its name, for example "MPa".
+    `size` is the largest number to show, in `unit`: "Pa", "s" or "m"; any other unit is kept.
     """
     scales = UNITS.get(unit, ((1.0, unit),))
     return next((scale for scale in scales if abs(size) >= scale[0]), scales[-1])
@@ -61,17 +50,18 @@ class Readable:
         """The value with its standard error, where there is one."""
         return f"{self.value} ± {self.stderr}" if self.stderr else self.value
 
+    @property
+    def matters(self) -> bool:
+        """Whether its reason is to be read: it is not determined, or more is said of it."""
+        return self.state not in ("determined", "fixed") or (
+            self.state == "determined" and ";" in self.why
+        )
+
 
 def readable(name: str, p: ParameterEstimate) -> Readable:
     """Return a parameter as it is to be read.
 
-    Parameters
-    ----------
-    name : str
-        Its name, for example "s1_k0".
-    p : ParameterEstimate
-        Its value in SI; it is shown with the digits that its standard error leaves (two of the
-        error), or with four where there is none.
+    It is shown with the digits that its standard error leaves (two of the error), or with four.
     """
     factor, unit = readable_unit(p.value or p.stderr or 0.0, p.unit)
     value = p.value / factor
@@ -89,18 +79,13 @@ def readable(name: str, p: ParameterEstimate) -> Readable:
 
 def number(value: Any) -> str:
     """Return anything as text; a number with four digits, an integer with all of its own."""
-    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+    if value is None:
         return "–"
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, list | tuple):
         return ", ".join(number(item) for item in value)
-    if not isinstance(value, float):
-        return str(value)
-    if value == 0 or 1e-3 <= abs(value) < 1e6:
-        decimals = 0 if value == 0 else max(0, 3 - math.floor(math.log10(abs(value))))
-        return _fixed(value, decimals)
-    return f"{value:.3e}".replace("-", "−")
+    return text.number(value) if isinstance(value, float) else str(value)
 
 
 def _symbol(name: str) -> tuple[str, str]:
@@ -122,7 +107,5 @@ def _rounded(value: float, stderr: float) -> tuple[str, str, int]:
 
 
 def _fixed(value: float, places: int) -> str:
-    text = f"{round(value, places):.{max(places, 0)}f}"
-    if float(text) == 0:
-        text = text.lstrip("-")
-    return text.replace("-", "−")
+    shown = f"{round(value, places):.{max(places, 0)}f}"
+    return (shown.lstrip("-") if float(shown) == 0 else shown).replace("-", "−")

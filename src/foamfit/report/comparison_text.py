@@ -1,0 +1,119 @@
+"""A comparison as a text and as a CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+from foamfit.files import write_file
+from foamfit.report.comparison import Comparison, Pair, Row
+from foamfit.report.readable import readable
+from foamfit.results import ParameterEstimate
+from foamfit.springs.published import published
+from foamfit.text import aligned, significant, wrapped
+
+ZETA = "ζ = η/(2 H √(ρ k_c)) with ρ = m/(A H), m, A and H of the paper's striker and specimen"
+
+
+def comparison_text(comparison: Comparison) -> str:
+    """Return a comparison as aligned text, at most 100 columns wide, no newline at the end."""
+    reference = "published" if comparison.with_published else "reference"
+    parts = ["\n".join(_pair_lines(pair, reference)) for pair in comparison.pairs]
+    if comparison.with_published:
+        parts.append(
+            "Published numbers carry no uncertainty and are taken as exact; s.e. = standard errors."
+        )
+    else:
+        parts.append("The deviation is in standard errors (s.e.) of both fits.")
+    return "\n\n".join(parts)
+
+
+def _pair_lines(pair: Pair, reference: str) -> Iterator[str]:
+    yield from wrapped(f"{pair.test}: {pair.model}, {pair.drive} drive ({pair.status})")
+    yield from wrapped(f"beside {pair.reference}")
+    yield ""
+    titles = ("parameter", "unit", "fitted", reference, "deviation", "", "state")
+    yield from aligned([titles, *map(_cells, pair.rows)], right=(4, 5))
+    lines = list(pair.remarks)
+    whole = {remark[:-1].casefold() for remark in pair.remarks}
+    apart = dict[str, list[str]]()
+    for row in pair.rows:
+        if row.remark and row.remark.casefold() not in whole:
+            apart.setdefault(row.remark, []).append(row.label)
+    lines += [f"{', '.join(labels)}: {remark}." for remark, labels in apart.items()]
+    if any(row.name == "ζ" for row in pair.rows):
+        lines.append(f"{ZETA}.{_damping_ratio(pair)}")
+    if lines:
+        yield ""
+    for line in lines:
+        yield from wrapped(line)
+
+
+def _damping_ratio(pair: Pair) -> str:
+    """Say whether the paper's damping ratio follows from its table."""
+    item = published.get(pair.reference.removeprefix("published "))
+    ratio = None if item is None else item.damping_ratio_by_formula()
+    if item is None or ratio is None or item.damping_ratio is None:
+        return ""
+    agrees = math.isclose(ratio, item.damping_ratio, rel_tol=2e-3)
+    rest = "as the paper says" if agrees else f"where the paper says {item.damping_ratio:g}"
+    return f" The published η gives {ratio:.3g}, {rest}."
+
+
+def _cells(row: Row) -> tuple[str, ...]:
+    off = "not compared" if row.remark and row.reference is not None else None
+    return (
+        row.label,
+        row.unit or "–",
+        _with_error(row.value, row.stderr),
+        _with_error(row.reference, row.reference_stderr),
+        off or _signed(row.percent, " %"),
+        _signed(row.standard_errors, " s.e."),
+        row.state,
+    )
+
+
+def _signed(value: float | None, unit: str) -> str:
+    if value is None:
+        return ""
+    shown = f"{value:+.{0 if abs(value) >= 99.5 else 1}f}"
+    return (shown[1:] if float(shown) == 0.0 else shown.replace("-", "−")) + unit
+
+
+def _with_error(value: float | None, stderr: float | None) -> str:
+    """Return a number with its error, rounded to two digits of the error; "–" for none."""
+    if value is None:
+        return "–"
+    if stderr is None:
+        return f"{value:.4g}".replace("-", "−")
+    if max(abs(value), stderr) >= 1e5:
+        return f"{significant(value, 3)} ± {significant(stderr)}".replace("-", "−")
+    return readable("", ParameterEstimate(value, stderr, None, "", True, "", "")).with_error
+
+
+def write_csv(comparison: Comparison, path: str | Path) -> None:
+    """Write a comparison as a table, one parameter of one result per line.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    """
+    head = (
+        "test", "model", "drive", "reference", "spring", "parameter", "unit", "value", "stderr",
+        "state", "reference_value", "reference_stderr", "percent", "standard_errors", "remark",
+    )  # fmt: skip
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(head)
+    for pair in comparison.pairs:
+        for row in pair.rows:
+            writer.writerow((
+                pair.test, pair.model, pair.drive, pair.reference, row.spring or "", row.name,
+                row.unit, row.value, row.stderr, row.state, row.reference,
+                row.reference_stderr, row.percent, row.standard_errors, row.remark,
+            ))  # fmt: skip
+    write_file(path, text.getvalue().encode(errors="replace"))

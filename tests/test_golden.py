@@ -1,0 +1,137 @@
+"""What the commands print, word for word: one file for each in tests/golden.
+
+    FOAMFIT_RENEW_GOLDEN=1 pytest tests/test_golden.py
+
+writes the files anew; look at what changed with `git diff tests/golden` before it is committed.
+The results are made up, so that no number depends on a search or on the machine.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import zip_longest
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+import fabricated
+from conftest import ROOT
+from foamfit.cli import main
+from foamfit.data.measurement import Dropped, RowCount
+from foamfit.report.comparison import compare
+from foamfit.report.comparison_text import comparison_text
+from foamfit.report.summary import summary_text
+from foamfit.results import Check, Fit, Ladder, Rung
+
+GOLDEN = Path(__file__).parent / "golden"
+RENEW = "FOAMFIT_RENEW_GOLDEN"
+TEST = "experiments/foam-1/model-1-1.75mps-reconstruction.csv"
+
+
+def printed(*args: object) -> str:
+    done = CliRunner().invoke(main, [str(arg) for arg in args])
+    assert done.exit_code == 0, done.output
+    return done.stdout
+
+
+def with_rows(result: Fit) -> Fit:
+    dropped = (
+        Dropped(50, 5, 54, "before contact starts"),
+        Dropped(49, 556, 604, "after contact ends"),
+    )
+    count = RowCount(700, 601, dropped)
+    return replace(result, measurement=replace(result.measurement, count=count))
+
+
+def one_spring() -> Fit:
+    weak = "Not determined: s1_kh_minus (branch e was never reached)."
+    floor = "The residuals of stress_time are 1.6 times the stated noise."
+    return with_rows(
+        fabricated.result(
+            warnings=(floor, weak),
+            checklist=(
+                Check("followed", "Does the model follow the curves?", True, "1.2 % and 0.4 %."),
+                Check("floor", "Is the noise floor reached?", False, "1.60 and 1.02.", (floor,)),
+                Check("determined", "Are all parameters determined?", False, "5 of 7.", (weak,)),
+            ),
+            notes=("Noise of stress 30 kPa, given.",),
+        )
+    )
+
+
+def failed() -> Fit:
+    warnings = tuple(
+        f"The misfit of {name} is not acceptable: the model goes its own way, and what it gives "
+        "for the parameters is no property of the foam."
+        for name in ("stress_time", "displacement_time", "stress_strain")
+    )
+    misfit = {"stress_time": 1.384, "displacement_time": 0.221, "stress_strain": 12.2}
+    return with_rows(
+        fabricated.result(status="failed", misfit=misfit, warnings=warnings, stopped="Ctrl-C")
+    )
+
+
+def auto() -> Fit:
+    def rung(model: str, damping: str, chisqr: float, bic: float, why: str) -> Rung:
+        misfit = {"stress_time": 0.012, "displacement_time": 0.004, "stress_strain": 0.02}
+        return Rung(
+            model=model, damping=damping, misfit=misfit, chisqr=chisqr, n_vary=8, rank=7,
+            n_eff=986.4, aicc=bic - 40.0, bic=bic, runs_p=0.43, neighbours_p=2e-9,
+            not_determined=("s1_kc",), weak=(), seconds=12.3, stopped=None,
+            chosen=why.startswith("its"), why=why,
+        )  # fmt: skip
+
+    rungs = (
+        rung("bistable", "without", 1738.2, -301.2, "BIC +12.0, AICc +14.0"),
+        rung("linear+bistable", "none", 979.9, -313.2, "its residuals are structureless"),
+    )
+    ladder = Ladder(
+        rungs=rungs, n_eff=986.4, noise_from="linear+bistable", ended="the test is told",
+        stopped=None, skipped=("bistable+bistable needs heights",),
+        sentences=("Of 2 rungs linear+bistable is the simplest that holds.",), cautions=(),
+    )  # fmt: skip
+    return with_rows(replace(fabricated.chain_result(), ladder=ladder))
+
+
+CASES: dict[str, Callable[[], str]] = {
+    "published": lambda: printed("published"),
+    "check": lambda: printed("check", TEST),
+    "check_model": lambda: printed(
+        "check", TEST, "--model", "bistable", "--published", "foam-1/model-1"
+    ),
+    "fit_one_spring": lambda: summary_text(one_spring()),
+    "fit_one_spring_verbose": lambda: summary_text(one_spring(), verbose=True),
+    "fit_two_springs": lambda: summary_text(with_rows(fabricated.chain_result())),
+    "fit_failed": lambda: summary_text(failed()),
+    "fit_auto": lambda: summary_text(auto()),
+    "fit_auto_verbose": lambda: summary_text(auto(), verbose=True),
+    "compare_published": lambda: comparison_text(compare([one_spring()], "foam-1/model-1")),
+    "compare_fits": lambda: comparison_text(compare([one_spring(), failed()])),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_what_is_printed_is_the_golden_file(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    text, path = CASES[name]().rstrip("\n") + "\n", GOLDEN / f"{name}.txt"
+    if os.environ.get(RENEW):
+        path.write_text(text, encoding="utf-8")
+    expected = path.read_text(encoding="utf-8").splitlines()
+    for i, (was, now) in enumerate(zip_longest(expected, text.splitlines()), start=1):
+        assert now == was, f"line {i} of {path.name} differs; {RENEW}=1 writes the files anew"
+
+
+def test_every_golden_file_is_of_a_case() -> None:
+    assert {path.stem for path in GOLDEN.iterdir()} == set(CASES)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_what_is_printed_is_narrow_and_a_fit_is_one_screen(name: str) -> None:
+    lines = (GOLDEN / f"{name}.txt").read_text(encoding="utf-8").splitlines()
+    assert max(map(len, lines)) <= 100
+    assert len(lines) <= 28 or not name.startswith("fit_") or name.endswith("_verbose")
+    assert not re.search(r"\de\+\d", "".join(lines))
