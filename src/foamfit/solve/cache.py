@@ -37,8 +37,8 @@ def announce(function: Any, what: str) -> None:
 def compiled(name: str = "integrate") -> bool:
     """Tell whether an earlier run left a loop, compiled of this very source, in the cache.
 
-    What is older than any module beside those that compiled loops are written in is removed: numba
-    itself compares it with the module of the outermost loop alone.
+    What is older than any module in these folders is removed: numba itself compares it with the
+    module of the outermost loop alone.
     """
     times = [path.stat().st_mtime for name in FOLDERS for path in (PACKAGE / name).rglob("*.py")]
     written = max((at for at in times if at <= time.time()), default=0.0)  # some clocks are wrong

@@ -161,25 +161,26 @@ class Plan(NamedTuple):
         curves = np.empty((1 + len(heights) if everything else 2, time.size))
         slopes = np.empty((p, *curves.shape)) if p else NO_SLOPES
         bounces = self.plain and not drag and self.implicit is None
-        given = self.given(rows, heights, drag)
-        stiff = not bounces and self._is_stiff(given)
+        stiff = not bounces and self._is_stiff(self.given(rows, heights, drag))
         if p == 0 and not stiff and len(heights) >= LEAST_AGGREGATE and self._is_one(rows):
-            return self._aggregate(given, rtol, curves)
+            return self._aggregate(self.given(rows, heights, drag), rtol, curves)
         start = _AT_REST if self.top in _RESTING else self._start(rows, heights, directions)
         log = np.empty((LOGGED, 5)) if everything else NO_SWITCHES
         if not stiff:
             cache.announce(taylor.integrate, "the solver")
             most = self.max_explicit if self.implicit is None else self.max_steps
             ending: Sequence[Any] = taylor.integrate(
-                given, self.margin * rtol, most, directions, start, curves, slopes, log
-            )
+                rows, heights, self.ends, self.mass, self.drag if drag is None else drag, self.top,
+                self.values, self.speed, time, self.margin * rtol, most, directions, start, curves,
+                slopes, log,
+            )  # fmt: skip
             if self.implicit is False or ending[0] not in _WRONG_TOOL:
                 return _motion(TAYLOR, ending, curves, slopes, log)
         margin = OF_MASSES_IMPLICIT if len(self.ends) > 1 else IMPLICIT
         cache.announce(steps.integrate_implicit, "the solver of stiff scenes")
         *ending, lost = steps.integrate_implicit(
-            given, max(margin * rtol, LEAST_IMPLICIT), rtol, self.max_steps, directions, start,
-            curves, slopes, log, np.zeros(2, np.int64),
+            self.given(rows, heights, drag), max(margin * rtol, LEAST_IMPLICIT), rtol,
+            self.max_steps, directions, start, curves, slopes, log, np.zeros(2, np.int64),
         )  # fmt: skip
         return _motion(RADAU, ending, curves, slopes, log, lost)
 

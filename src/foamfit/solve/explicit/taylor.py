@@ -56,8 +56,6 @@ from foamfit.solve.scene import (
     STRESS,
     TOO_MANY_STEPS,
     Samples,
-    Scene,
-    SceneTuple,
     before_contact,
     fill_line,
     first_past,
@@ -368,7 +366,7 @@ def settle(links: Links, s: Array) -> None:
 
 @inner
 def switch(
-    scene: Scene,
+    rows: Array,
     branches: Branches,
     law: Array,
     s: Array,
@@ -397,8 +395,8 @@ def switch(
         branches[i] = above(left) if out > 0 else below(left)
         s[EPS, i, 0] = high if out > 0 else low
         switches = log_switch(log, switches, now, i, left, branches[i], s[EPS, i, 0])
-        enter(scene.rows, i, branches[i], law)
-        enter_tangents(scene.rows, i, branches[i], d)
+        enter(rows, i, branches[i], law)
+        enter_tangents(rows, i, branches[i], d)
     return switches
 
 
@@ -406,14 +404,15 @@ def switch(
 
 
 @inner
-def _prescribe(scene: Scene, knot: int, now: float, push: Array, motion: Array) -> float:
+def _prescribe(
+    top: int, values: Array, t: Array, knot: int, now: float, push: Array, motion: Array
+) -> float:
     """Write what the top is given between samples knot and knot + 1; returns when that ends."""
-    values, t, rate = scene.values, scene.t, 0.0
-    horizon = t[t.size - 1]
+    horizon, rate = t[t.size - 1], 0.0
     if t.size > 1:
         horizon = t[knot + 1]
         rate = (values[knot + 1] - values[knot]) / (t[knot + 1] - t[knot])
-    driven = motion if scene.top == MOTION else push
+    driven = motion if top == MOTION else push
     driven[0], driven[1] = values[knot] + rate * (now - t[knot]), rate
     return horizon
 
@@ -436,10 +435,15 @@ def first_lift(s: Array, order: int, first: bool, pressed: bool, span: float) ->
 
 @inner
 def begin(
-    scene: Scene, start: Array, branches: Branches, law: Array, s: Array, d: SeriesTangents
+    rows: Array,
+    heights: Array,
+    start: Array,
+    branches: Branches,
+    law: Array,
+    s: Array,
+    d: SeriesTangents,
 ) -> None:
     """Write the state at the first sample: branches, strains and their derivatives."""
-    rows = scene.rows
     for i in range(branches.size):
         branches[i] = first_branch(rows[i])
         if start.shape[1] > 0:
@@ -449,7 +453,7 @@ def begin(
                 d.series[p, EPS, i, 0] = start[1 + p, i]
                 if start[1 + p, i] != 0.0:
                     d.live[p] = 1.0
-        law[i, DASHPOT], law[i, HEIGHT] = rows[i, ETA], scene.heights[i]
+        law[i, DASHPOT], law[i, HEIGHT] = rows[i, ETA], heights[i]
         enter(rows, i, branches[i], law)
         enter_tangents(rows, i, branches[i], d)
 
@@ -477,7 +481,15 @@ def _reached(links: Links, s: Array, w_scale: float) -> tuple[float, float]:
 
 @compiled
 def integrate(
-    given: SceneTuple,
+    rows: Array,
+    heights: Array,
+    ends: Branches,
+    mass: Array,
+    drag: float,
+    top: int,
+    values: Array,
+    speed: float,
+    t: Array,
     tol: float,
     max_steps: int,
     directions: Branches,
@@ -490,8 +502,9 @@ def integrate(
 
     Parameters
     ----------
-    given : tuple
-        The `Scene`. An impact ends when the base stress is back at zero.
+    rows … t
+        Field by field a `Scene`, which itself would cost a call a tenth more. An impact ends
+        when the base stress is back at zero.
     tol, max_steps
         Truncation of a step relative to the motion so far; bound on steps.
     directions : (p, 2) array
@@ -507,12 +520,10 @@ def integrate(
         Outcome, end of contact (NaN if none; where there is no answer, how far it came), steps
         taken, switches (also those past the log).
     """
-    scene = Scene(*given)
-    heights, t, top, speed = scene.heights, scene.t, scene.top, scene.speed
     tol = max(tol, LEAST_TRUNCATION)
-    count, groups, size = heights.size, scene.ends.size, directions.shape[0]
+    count, groups, size = heights.size, ends.size, directions.shape[0]
     struck, tangent, order = speed > 0.0, size > 0, order_for(tol, MOST_ORDERS)
-    links = Links(np.empty((count, N_LAW)), scene.ends, scene.mass, scene.drag, top)
+    links = Links(np.empty((count, N_LAW)), ends, mass, drag, top)
     law, out = links.law, Samples(t, curves, slopes, log)
     s, d = make_series(count, order, directions)
     branches = np.empty(count, np.int64)
@@ -522,7 +533,7 @@ def integrate(
     push[0] = push[1] = 0.0
     for p in range(size):
         late[p] = 0.0
-    begin(scene, start, branches, law, s, d)
+    begin(rows, heights, start, branches, law, s, d)
     bare, apart = is_bare(links), is_apart(links)
     w_scale, s_scale, b_scale, pressed, knot, stalled, done = 0.0, 0.0, math.inf, False, 0, 0, 0
     switches = count - count  # a whole number, and no constant: one type to compile for
@@ -540,7 +551,7 @@ def integrate(
             while knot < t.size - 2 and now >= t[knot + 1]:
                 knot += 1
                 fresh = True
-            horizon = _prescribe(scene, knot, now, push, motion)
+            horizon = _prescribe(top, values, t, knot, now, push, motion)
         if bare:
             expand_bare(links, s, push, order)
         elif not expand(links, s, push, motion, order):
@@ -596,6 +607,6 @@ def integrate(
         settle(links, s)
         if spring >= 0:
             switches = switch(
-                scene, branches, law, s, d, order, span, now, spring, side, log, switches
+                rows, branches, law, s, d, order, span, now, spring, side, log, switches
             )
     return TOO_MANY_STEPS, now, max_steps, switches
