@@ -45,14 +45,12 @@ class Samples(NamedTuple):
     """The curves to fill, over the samples t (n,).
 
     curves (1 + springs or 1, n) holds the base stress, Pa, then the displacements above each spring
-    or of the top alone, m; slopes (p, …) are their derivatives in p directions. log (m, 5) takes
-    the switches: time, spring, branch left, branch entered, strain.
+    or of the top alone, m; slopes (p, …) are their derivatives in p directions.
     """
 
     t: Array
     curves: Array
     slopes: Array
-    log: Array
 
 
 @inner

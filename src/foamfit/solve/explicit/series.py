@@ -71,13 +71,11 @@ class Links(NamedTuple):
 class SeriesTangents(NamedTuple):
     """Derivatives of a chain and of its series in p directions.
 
-    directions (p, 2) are those of `springs.parameters`; law (p, springs, N_MOVES) holds the
-    derivatives of the first columns of `Links.law`, `drag` (p,) those of the onsite damping, series
-    (p, N_SERIES, springs, order + 2) those of the series but for TILT; `live` (p,) is 1 for those
-    that have left zero.
+    law (p, springs, N_MOVES) holds those of the first columns of `Links.law`, `drag` (p,) those of
+    the onsite damping, series (p, N_SERIES, springs, order + 2) those of the series but for TILT;
+    `live` (p,) is 1 for those that have left zero.
     """
 
-    directions: Branches
     law: Array
     drag: Array
     live: Array
@@ -100,11 +98,13 @@ def slope_now(law: Array, i: int, eps: float) -> float:
 
 
 @inner
-def enter_tangents(rows: Array, i: int, branch: int, d: SeriesTangents) -> None:
+def enter_tangents(
+    rows: Array, i: int, branch: int, directions: Branches, d: SeriesTangents
+) -> None:
     """Write the derivatives of the branch that spring i enters."""
-    for p in range(d.drag.size):
-        if d.directions[p, 0] == i and d.directions[p, 1] < OWN_ETA:
-            dk, dx0, ds0 = branch_derivative(rows[i], branch, d.directions[p, 1])
+    for p in range(directions.shape[0]):
+        if directions[p, 0] == i and directions[p, 1] < OWN_ETA:
+            dk, dx0, ds0 = branch_derivative(rows[i], branch, directions[p, 1])
             d.law[p, i, SLOPE], d.law[p, i, ORIGIN], d.law[p, i, OFFSET] = dk, dx0, ds0
             if dk != 0.0 or dx0 != 0.0 or ds0 != 0.0:
                 d.live[p] = 1.0
@@ -118,7 +118,7 @@ def make_series(count: int, order: int, directions: Branches) -> tuple[Array, Se
     """
     p = directions.shape[0]
     series, ways = np.zeros((1 + p, N_SERIES, count, order + 2)), np.zeros((2, p))
-    d = SeriesTangents(directions, np.zeros((p, count, N_MOVES)), ways[0], ways[1], series[1:])
+    d = SeriesTangents(np.zeros((p, count, N_MOVES)), ways[0], ways[1], series[1:])
     for q in range(p):
         i, what = directions[q, 0], directions[q, 1]
         if what >= OWN_ETA:

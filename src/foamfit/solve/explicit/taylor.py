@@ -9,7 +9,6 @@ changes inside a step. Derivatives by parameters are carried along where they ar
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -83,17 +82,6 @@ MOST_ORDERS = 24
 OF_TANGENTS = 1e3
 
 
-class Scales(NamedTuple):
-    """Largest displacement (m), stress and base stress (Pa) so far."""
-
-    motion: float
-    stress: float
-    base: float
-
-
-# ---------------------------------------------------------------- the length of a step
-
-
 @inlined
 def _tail(
     law: Array, s: Array, n: int, per_reach: float, per_load: float, per_base: float
@@ -117,13 +105,20 @@ def is_apart(links: Links) -> bool:
 
 @inlined
 def step_length(
-    links: Links, s: Array, push: Array, order: int, tol: float, span: float, scales: Scales
+    links: Links,
+    s: Array,
+    push: Array,
+    order: int,
+    tol: float,
+    span: float,
+    w_scale: float,
+    s_scale: float,
+    b_scale: float,
 ) -> float:
     """Longest step within `span` whose last two terms fall below `tol` of motion and stress.
 
     The base stress is measured by its own size: by that of all springs if its scale is infinite.
     """
-    w_scale, s_scale, b_scale = scales
     reach, load = w_scale, max(s_scale, abs(push[0]))
     for _ in range(60):  # at rest the only scale is what the step itself reaches
         tried = span
@@ -199,9 +194,17 @@ def first_switch(law: Array, s: Array, order: int, span: float) -> tuple[float, 
 
 
 @inner
-def _enough(law: Array, s: Array, order: int, span: float, tol: float, scales: Scales) -> int:
+def _enough(
+    law: Array,
+    s: Array,
+    order: int,
+    span: float,
+    tol: float,
+    w_scale: float,
+    s_scale: float,
+    b_scale: float,
+) -> int:
     """Orders that are enough over a step that a switch or a sample made short."""
-    w_scale, s_scale, b_scale = scales
     base = max(b_scale, LEAST_BASE * s_scale)
     if w_scale == 0.0 or s_scale == 0.0 or span == 0.0:
         return order
@@ -371,6 +374,7 @@ def switch(
     law: Array,
     s: Array,
     d: SeriesTangents,
+    directions: Branches,
     order: int,
     span: float,
     now: float,
@@ -396,7 +400,7 @@ def switch(
         s[EPS, i, 0] = high if out > 0 else low
         switches = log_switch(log, switches, now, i, left, branches[i], s[EPS, i, 0])
         enter(rows, i, branches[i], law)
-        enter_tangents(rows, i, branches[i], d)
+        enter_tangents(rows, i, branches[i], directions, d)
     return switches
 
 
@@ -438,6 +442,7 @@ def begin(
     rows: Array,
     heights: Array,
     start: Array,
+    directions: Branches,
     branches: Branches,
     law: Array,
     s: Array,
@@ -455,7 +460,7 @@ def begin(
                     d.live[p] = 1.0
         law[i, DASHPOT], law[i, HEIGHT] = rows[i, ETA], heights[i]
         enter(rows, i, branches[i], law)
-        enter_tangents(rows, i, branches[i], d)
+        enter_tangents(rows, i, branches[i], directions, d)
 
 
 @inner
@@ -524,7 +529,7 @@ def integrate(
     count, groups, size = heights.size, ends.size, directions.shape[0]
     struck, tangent, order = speed > 0.0, size > 0, order_for(tol, MOST_ORDERS)
     links = Links(np.empty((count, N_LAW)), ends, mass, drag, top)
-    law, out = links.law, Samples(t, curves, slopes, log)
+    law, out = links.law, Samples(t, curves, slopes)
     s, d = make_series(count, order, directions)
     branches = np.empty(count, np.int64)
     scratch = np.empty((6, max(order + 1, max(size, curves.shape[0]))))
@@ -533,7 +538,7 @@ def integrate(
     push[0] = push[1] = 0.0
     for p in range(size):
         late[p] = 0.0
-    begin(rows, heights, start, branches, law, s, d)
+    begin(rows, heights, start, directions, branches, law, s, d)
     bare, apart = is_bare(links), is_apart(links)
     w_scale, s_scale, b_scale, pressed, knot, stalled, done = 0.0, 0.0, math.inf, False, 0, 0, 0
     switches = count - count  # a whole number, and no constant: one type to compile for
@@ -560,8 +565,7 @@ def integrate(
             s_scale = _loaded(s, s_scale)
         if apart:
             b_scale = max(b_scale if step > 0 else 0.0, abs(s[GROUP, 0, 0]))
-        scales = Scales(w_scale, s_scale, b_scale)
-        span = step_length(links, s, push, order, tol, horizon - now, scales)
+        span = step_length(links, s, push, order, tol, horizon - now, w_scale, s_scale, b_scale)
         if not math.isfinite(span) or not math.isfinite(s[GROUP, 0, order]):
             return NOT_FINITE, now, step, switches
         span, spring, side = first_switch(law, s, order, span)
@@ -572,7 +576,7 @@ def integrate(
             spring = -1 if leaves else spring
         least = order
         if spring >= 0 or leaves or now + span >= horizon:  # not its own error ended the step
-            least = _enough(law, s, order, span, 1e-3 * tol, scales)
+            least = _enough(law, s, order, span, 1e-3 * tol, w_scale, s_scale, b_scale)
         more = min(least + 2, order)  # for what is, in time, a derivative of these
         if tangent:
             expand_tangents(links, s, d, more)
@@ -607,6 +611,6 @@ def integrate(
         settle(links, s)
         if spring >= 0:
             switches = switch(
-                rows, branches, law, s, d, order, span, now, spring, side, log, switches
+                rows, branches, law, s, d, directions, order, span, now, spring, side, log, switches
             )
     return TOO_MANY_STEPS, now, max_steps, switches

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from foamfit.solve.implicit.collocation import (
     NODES,
@@ -20,9 +21,18 @@ from foamfit.solve.implicit.collocation import (
 )
 from foamfit.solve.implicit.control import Polynomials
 from foamfit.solve.polynomial import value_at
-from foamfit.solve.scene import Samples, Scene, fly
+from foamfit.solve.scene import Scene, fly
 from foamfit.springs.kernels import ETA, Array, inner
 from foamfit.springs.parameters import OWN_ETA, OWN_HEIGHT
+
+
+class LoggedSamples(NamedTuple):
+    """The curves to fill, as `scene.Samples`, and the switches (m, 5), as `scene.log_switch`."""
+
+    t: Array
+    curves: Array
+    slopes: Array
+    log: Array
 
 
 @inner
@@ -33,7 +43,7 @@ def _record(
     done: int,
     state: State,
     curves: Polynomials,
-    out: Samples,
+    out: LoggedSamples,
 ) -> None:
     """Write the samples first … done-1, which a step contains."""
     top = state.w.size - 1
@@ -66,7 +76,7 @@ def _through(values: Array, at: float) -> float:
 
 @inner
 def _record_tangents(
-    now: float, span: float, first: int, done: int, d: PointTangents, out: Samples
+    now: float, span: float, first: int, done: int, d: PointTangents, out: LoggedSamples
 ) -> None:
     """Write the derivatives at the samples first … done-1, which a step contains."""
     nodes, count = out.curves.shape[0] - 1, d.w.shape[0]
@@ -108,7 +118,7 @@ def record_step(
     first: int,
     done: int,
     d: PointTangents,
-    out: Samples,
+    out: LoggedSamples,
 ) -> bool:
     """Write the samples of a step and carry its derivatives; false if these are not finite."""
     for i in range(body.heights.size):
@@ -125,7 +135,9 @@ def record_step(
 
 
 @inner
-def record_rest(first: int, state: State, base: float, d: PointTangents, out: Samples) -> None:
+def record_rest(
+    first: int, state: State, base: float, d: PointTangents, out: LoggedSamples
+) -> None:
     """Write a single sample, or one that is left where the steps have ended."""
     nodes, count = out.curves.shape[0] - 1, state.w.size
     for sample in range(first, out.t.size):
@@ -141,7 +153,7 @@ def record_rest(first: int, state: State, base: float, d: PointTangents, out: Sa
 
 @inner
 def mend_kink(
-    scene: Scene, body: Body, knot: int, jump: float, d: PointTangents, out: Samples
+    scene: Scene, body: Body, knot: int, jump: float, d: PointTangents, out: LoggedSamples
 ) -> None:
     """Dashpots feel the mean rate where the prescribed motion has a kink of `jump`."""
     flow = 0.0
@@ -170,7 +182,7 @@ def fly_on(
     now: float,
     done: int,
     d: PointTangents,
-    out: Samples,
+    out: LoggedSamples,
     w_end: Array,
 ) -> None:
     """Fill the samples after contact, which ended now with the base stress falling at `fall`.

@@ -45,7 +45,13 @@ from foamfit.solve.implicit.control import (
     error_of,
     raise_floor,
 )
-from foamfit.solve.implicit.recording import fly_on, mend_kink, record_rest, record_step
+from foamfit.solve.implicit.recording import (
+    LoggedSamples,
+    fly_on,
+    mend_kink,
+    record_rest,
+    record_step,
+)
 from foamfit.solve.implicit.vibration import (
     Unresolved,
     contact_time,
@@ -64,7 +70,6 @@ from foamfit.solve.scene import (
     STRESS,
     TOO_MANY_STEPS,
     VISCOUS,
-    Samples,
     Scene,
     SceneTuple,
     before_contact,
@@ -208,7 +213,7 @@ def _drive(
     fresh: bool,
     now: float,
     d: PointTangents,
-    out: Samples,
+    out: LoggedSamples,
 ) -> tuple[float, float, float]:
     """Prescribe motion or stress from sample `knot` on, which may be reached just now (`fresh`).
 
@@ -331,7 +336,7 @@ def _follow(
     r: Unresolved,
     control: Control,
     d: PointTangents,
-    samples: Samples,
+    samples: LoggedSamples,
     start: Array,
     tally: Branches,
 ) -> tuple[int, float, int, int]:
@@ -466,7 +471,7 @@ def integrate_implicit(
     memory = np.zeros(1, CONTROL)  # used again below: it would be freed after its last use
     memory[0].worst = 1.0
     outcome, end, steps, switches = _follow(
-        scene, limits, body, state, at, out, r, memory[0], d, Samples(t, curves, slopes, log),
+        scene, limits, body, state, at, out, r, memory[0], d, LoggedSamples(t, curves, slopes, log),
         start, tally,
     )  # fmt: skip
     lost = memory[0].damped
