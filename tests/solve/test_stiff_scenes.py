@@ -4,13 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-
-import foamfit as ff
-from foamfit.solve.implicit import collocation, steps
-from foamfit.solve.plan import NO_DIRECTIONS, NO_SLOPES, RADAU, TAYLOR, Motion, plan
-from foamfit.solve.scene import DONE
-from reference import Bistable, Chain, Impact, Linear, energy_balance
-from test_simulate import (
+from test_simulation import (
     AREA,
     BASE_2,
     BASE_3,
@@ -29,6 +23,12 @@ from test_simulate import (
     damped,
     history,
 )
+
+import foamfit as ff
+from foamfit.solve.implicit import collocation, steps
+from foamfit.solve.plan import NO_DIRECTIONS, NO_SLOPES, RADAU, TAYLOR, Motion, plan
+from foamfit.solve.scene import DONE
+from reference import Bistable, Chain, Impact, Linear, energy_balance
 
 PAIRS = {"model-3": (BASE_3, TOP_3, THREE, FOAM_1), "foam-2": (BASE_2, TOP_2, TWO, FOAM_2)}
 

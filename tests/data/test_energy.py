@@ -13,7 +13,7 @@ from foamfit.data.describe import describe
 from foamfit.data.energy import audit, largest_motion
 from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
 
-DATA = Path(os.environ.get("FOAMFIT_DATA", Path(__file__).parents[2] / "shared" / "data"))
+DATA = Path(os.environ.get("FOAMFIT_DATA", Path(__file__).parents[3] / "shared" / "data"))
 SPECIMEN = Specimen(height=1e-3, area=2e-5)
 MASS, VELOCITY, REBOUND, STIFFNESS = 7e-3, 1.75, 1.05, 5e4
 

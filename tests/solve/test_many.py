@@ -5,6 +5,7 @@ import itertools
 
 import numpy as np
 import pytest
+from test_simulation import AREA, MODEL_1, built
 
 import foamfit as ff
 from foamfit.solve import many
@@ -13,7 +14,6 @@ from foamfit.solve.plan import AGGREGATE, TAYLOR, plan
 from foamfit.solve.simulation import Response
 from foamfit.springs import kernels
 from reference import Bistable, Chain, Impact, Linear, energy_balance
-from test_simulate import AREA, MODEL_1, built
 
 TIME = np.linspace(-0.05e-3, 0.9e-3, 301)
 HEIGHT = 1.19e-3

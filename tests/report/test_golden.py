@@ -27,7 +27,7 @@ from foamfit.report.comparison_text import comparison_text
 from foamfit.report.summary import summary_text
 from foamfit.results import Check, Fit, Ladder, Rung
 
-GOLDEN = Path(__file__).parent / "golden"
+GOLDEN = Path(__file__).parents[1] / "golden"
 RENEW = "FOAMFIT_RENEW_GOLDEN"
 TEST = "experiments/foam-1/model-1-1.75mps-reconstruction.csv"
 

@@ -462,14 +462,14 @@ def test_the_command_writes_to_auto(loop_file, tmp_path):
     done = run("fit", loop_file, "--model", "auto", "--starts", 4)
     assert done.exit_code == 0, done.output
     assert "chosen of 1 model tried: bistable: its residuals are structureless" in done.stdout
-    assert "no richer rung was tried" in done.stdout
+    assert "no richer model was tried" in done.stdout
     folder = tmp_path / "fits" / "loop" / "auto"
     content = json.loads((folder / "fit.json").read_text())
     assert content["model"] == "bistable"
     assert [rung["chosen"] for rung in content["ladder"]["rungs"]] == [True]
     assert (folder / "ladder.csv").is_file()
     page = (folder / "report.html").read_text()
-    assert "The first rung bistable is the simplest that holds" in page
+    assert "bistable was chosen of 1 model: it is the simplest" in page
 
 
 def test_the_command_refuses_parameters_of_one_model(loop_file, tmp_path):

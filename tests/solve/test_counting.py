@@ -23,7 +23,7 @@ from foamfit.one_model import Options, identify, judge
 from foamfit.solve.plan import CLOSED_FORM, SECOND_ORDER, Plan
 from foamfit.trust.intervals import Choice
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).parents[1]  # counted.py lies beside the folders
 DRIVES = ("impact", "stress", "displacement")
 CLOSED = [
     f"{chain}, {drive}"
