@@ -20,15 +20,14 @@ ZETA = "ζ = η/(2 H √(ρ k_c)) with ρ = m/(A H), m, A and H of the paper's s
 
 def comparison_text(comparison: Comparison) -> str:
     """Return a comparison as aligned text, at most 100 columns wide, no newline at the end."""
-    reference = "published" if comparison.with_published else "reference"
-    parts = ["\n".join(_pair_lines(pair, reference)) for pair in comparison.pairs]
+    reference, last = "reference", "The deviation is in standard errors (s.e.) of both fits."
     if comparison.with_published:
-        parts.append(
+        reference = "published"
+        last = (
             "Published numbers carry no uncertainty and are taken as exact; s.e. = standard errors."
         )
-    else:
-        parts.append("The deviation is in standard errors (s.e.) of both fits.")
-    return "\n\n".join(parts)
+    parts = ["\n".join(_pair_lines(pair, reference)) for pair in comparison.pairs]
+    return "\n\n".join([*parts, last])
 
 
 def _pair_lines(pair: Pair, reference: str) -> Iterator[str]:
@@ -46,17 +45,14 @@ def _pair_lines(pair: Pair, reference: str) -> Iterator[str]:
     lines += [f"{', '.join(labels)}: {remark}." for remark, labels in apart.items()]
     if any(row.name == "ζ" for row in pair.rows):
         lines.append(f"{ZETA}.{_damping_ratio(pair)}")
-    if lines:
-        yield ""
-    for line in lines:
-        yield from wrapped(line)
+    yield from ["", *(part for line in lines for part in wrapped(line))] if lines else []
 
 
 def _damping_ratio(pair: Pair) -> str:
     """Say whether the paper's damping ratio follows from its table."""
-    item = published.get(pair.reference.removeprefix("published "))
-    ratio = None if item is None else item.damping_ratio_by_formula()
-    if item is None or ratio is None or item.damping_ratio is None:
+    item = published[pair.reference.removeprefix("published ")]
+    ratio = item.damping_ratio_by_formula()
+    if ratio is None or item.damping_ratio is None:
         return ""
     agrees = math.isclose(ratio, item.damping_ratio, rel_tol=2e-3)
     rest = "as the paper says" if agrees else f"where the paper says {item.damping_ratio:g}"
