@@ -34,7 +34,7 @@ from foamfit.trust.identifiability import Insight
 from foamfit.trust.intervals import Intervals
 from reference import reference_impact
 
-STRIKER = Striker(mass=7e-3, velocity=1.75)
+IMPACT = Impact(mass=7e-3, velocity=1.75)
 SLOW = EXPERIMENTS / "foam-1" / "model-1-1.75mps-reconstruction.csv"
 AGREED = ((1.0, 5), (4.0, 2))
 
@@ -88,8 +88,8 @@ def test_the_closing_velocity_brings_the_energy_of_the_way_to_c1(name: str) -> N
     s = ff.published[name].bistable
     rise = s.eps_hat_c - s.eps_a
     work = s.k0 * (-s.eps_a - math.log1p(-s.eps_a)) + s.sigma_a * rise + 0.5 * s.kh_plus * rise**2
-    direct = math.sqrt(2.0 * AREA * HEIGHT * work / STRIKER.mass)
-    found = planning.closing_velocity(Chain([s], [HEIGHT], AREA), STRIKER, 1)
+    direct = math.sqrt(2.0 * AREA * HEIGHT * work / IMPACT.mass)
+    found = planning.closing_velocity(Chain([s], [HEIGHT], AREA), IMPACT, 1)
     assert found == pytest.approx(direct, rel=3e-5)
     assert found == pytest.approx(1.911, abs=6e-4)
 
@@ -97,20 +97,20 @@ def test_the_closing_velocity_brings_the_energy_of_the_way_to_c1(name: str) -> N
 def test_the_closing_velocity_of_a_chain_by_independent_integration() -> None:
     item = ff.published["foam-1/model-3"]
     chain = Chain(item.chain.springs, item.chain.heights, item.chain.area, [0.0, 0.0])
-    found = planning.closing_velocity(chain, STRIKER, 2)
+    found = planning.closing_velocity(chain, IMPACT, 2)
     assert found == pytest.approx(1.923, abs=6e-4)
     time = np.linspace(0.0, 1.2e-3, 7)
     for factor, closed in ((0.999, False), (1.001, True)):
-        run = reference_impact(chain, Impact(STRIKER.mass, factor * found), time, rtol=1e-9)
+        run = reference_impact(chain, Impact(IMPACT.mass, factor * found), time, rtol=1e-9)
         assert any(branch == "c" for _, _, branch in run.switches) == closed
 
 
 def test_dampers_raise_the_closing_velocity_and_a_wall_has_none() -> None:
     spring = ff.published["foam-1/model-1"].bistable
     damped = Chain([spring], [HEIGHT], AREA, site_damping=200.0)
-    assert planning.closing_velocity(damped, STRIKER, 1) > 1.95
+    assert planning.closing_velocity(damped, IMPACT, 1) > 1.95
     stiff = Chain([replace(spring, k0=1e14, kc=1e15, kh_plus=1e14)], [HEIGHT], AREA)
-    assert planning.closing_velocity(stiff, STRIKER, 1) is None
+    assert planning.closing_velocity(stiff, IMPACT, 1) is None
 
 
 # ---------------------------------------------------------------- expected errors
