@@ -108,21 +108,11 @@ class _Value:
 
 
 def compare(results: Sequence[Result], published: str | None = None) -> Comparison:
-    """Put fits beside what was published, or beside each other.
+    """Put fits, result folders or what `load_result` gives beside what was published.
 
-    Parameters
-    ----------
-    results : sequence of Fit, path or mapping
-        Fits, result folders, or what `load_result` gives.
-    published : str, optional
-        A published set to put all of them beside. Without it, each result goes beside the set that
-        its test names, for example "foam-1/model-3"; where a test names none, the results are put
-        beside the first of them.
-
-    Raises
-    ------
-    InputError
-        If a result cannot be read, the set is unknown, or there is nothing to compare with.
+    Without `published`, each goes beside the set that its test names, for example "foam-1/model-3";
+    where a test names none, all are put beside the first of them. InputError if a result cannot be
+    read, the set is unknown, or there is nothing to compare with.
     """
     names = ", ".join(published_sets)
     if published is not None and published not in published_sets:

@@ -34,20 +34,19 @@ def plot_comparison(comparison: Comparison, path: str | Path | None = None) -> F
     for pair in comparison.pairs:
         groups.setdefault(pair.reference, []).append(pair)
     columns = min(len(groups), 2)
-    rows = [list(groups.items())[i : i + columns] for i in range(0, len(groups), columns)]
-    lines = [max(_comparison_lines(pairs) for _, pairs in row) for row in rows]
-    with drawing(7.0, 0.5 + sum(0.6 + 0.12 * n for n in lines)) as figure:
-        grid = figure.add_gridspec(len(rows), columns, height_ratios=[n + 2 for n in lines])
-        for i, row in enumerate(rows):
-            for j, (reference, pairs) in enumerate(row):
-                ax = figure.add_subplot(grid[i, j])
-                _draw_comparison(ax, pairs)
-                title = textwrap.fill(f"beside {reference}", 58 if columns == 2 else 110)
-                ax.set_title(
-                    title, loc="left", fontsize=7.5, pad=4, weight="bold", parse_math=False
-                )
-                if i == len(rows) - 1 or len(rows[i + 1]) <= j:
-                    ax.set_xlabel("deviation (standard errors)")
+    lines = [max(len(_shown(pairs)), 1) * (len(_lanes(pairs)) + 1) for pairs in groups.values()]
+    rows = [max(lines[i : i + columns]) for i in range(0, len(lines), columns)]
+    with drawing(7.0, 0.5 + sum(0.6 + 0.12 * n for n in rows)) as figure:
+        ratios = [n + 2 for n in rows]
+        axes = figure.subplots(len(rows), columns, squeeze=False, height_ratios=ratios).ravel()
+        for ax in axes[len(groups) :]:
+            ax.remove()
+        for ax, (reference, pairs) in zip(axes, groups.items(), strict=False):
+            _draw_comparison(ax, pairs)
+            title = textwrap.fill(f"beside {reference}", 58 if columns == 2 else 110)
+            ax.set_title(title, loc="left", fontsize=7.5, pad=4, weight="bold", parse_math=False)
+        for ax in figure.axes[-columns:]:  # the lowest ones
+            ax.set_xlabel("deviation (standard errors)")
         _name_results(figure, list(groups.values()))
     return save(figure, path)
 
@@ -60,16 +59,12 @@ def _shown(pairs: list[Pair]) -> list[str]:
     """Return the parameters of which some result has something to show, in their order."""
     rows = [row for pair in pairs for row in pair.rows]
     there = {row.label for row in rows if _is_shown(row)}
-    return list(dict.fromkeys(row.label for row in rows if row.label in there))
+    return [label for label in dict.fromkeys(row.label for row in rows) if label in there]
 
 
 def _lanes(pairs: list[Pair]) -> list[int]:
     """Return the places of the results that have anything to show: each gets a lane."""
     return [k for k, pair in enumerate(pairs) if any(map(_is_shown, pair.rows))]
-
-
-def _comparison_lines(pairs: list[Pair]) -> int:
-    return max(len(_shown(pairs)), 1) * (len(_lanes(pairs)) + 1)
 
 
 def _draw_comparison(ax: Axes, pairs: list[Pair]) -> None:

@@ -91,13 +91,7 @@ def _with_error(value: float | None, stderr: float | None) -> str:
 
 
 def write_csv(comparison: Comparison, path: str | Path) -> None:
-    """Write a comparison as a table, one parameter of one result per line.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
-    """
+    """Write a comparison as a table, one parameter of one result per line."""
     head = (
         "test", "model", "drive", "reference", "spring", "parameter", "unit", "value", "stderr",
         "state", "reference_value", "reference_stderr", "percent", "standard_errors", "remark",

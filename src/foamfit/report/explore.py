@@ -11,7 +11,6 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from foamfit import api
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError
@@ -73,19 +72,15 @@ def plot_loop(measurement: Measurement, values: Mapping[str, float]) -> Figure:
 
 
 class Turner:
-    """Sliders for the seven parameters (moduli in MPa) and their picture: display `panel`.
+    """Sliders for the seven parameters (moduli in MPa) and their picture: display `panel`."""
 
-    They start at `start`, by default at a rough guess from the test.
-    """
-
-    def __init__(self, measurement: Measurement, start: BistableSpring | None = None) -> None:
+    def __init__(self, measurement: Measurement) -> None:
         import ipywidgets as widgets
 
         self.measurement = measurement
-        at = {n: getattr(start, n) for n in UNITS} if start else rough_guess(measurement)
         self.sliders: dict[str, Any] = {}
-        for name, unit in UNITS.items():
-            value = at[name] / unit
+        for name, start in rough_guess(measurement).items():
+            value = start / (unit := UNITS[name])
             low, high = sorted((0.0, 4.0 * value or -0.1))
             self.sliders[name] = widgets.FloatSlider(
                 value, min=low, max=high, step=(high - low) / 4000, readout_format=".4g",
@@ -111,15 +106,3 @@ class Turner:
 
     def _draw(self) -> None:
         self.image.value = image(plot_loop(self.measurement, self.values), "png", 100)
-
-    def fit(self) -> api.FitResult:
-        """Fit the spring, without a dashpot, from where the sliders stand; move them to the fit."""
-        from foamfit.fitting.problem import make_params
-
-        params, start = make_params(self.measurement, "bistable"), BistableSpring(**self.values)
-        for name in UNITS:
-            params[f"s1_{name}"].value = getattr(start, name)
-        params["s1_eta"].set(value=0.0, vary=False)
-        result = api.fit(self.measurement, model="bistable", params=params)
-        self.set({name: result.params[f"s1_{name}"].value for name in UNITS})
-        return result
