@@ -212,10 +212,23 @@ def _fixes(
     return fixed
 
 
-def _hold_and_vary(
-    params: lmfit.Parameters, model: str, fix: dict[str, float], vary: tuple[str, ...]
-) -> None:
-    """Do what --fix and --vary say to the parameters of a model."""
+def _params(
+    measurement: Measurement, model: str, drive: str | None, time_shift: bool,
+    fix: dict[str, float], vary: tuple[str, ...],
+) -> lmfit.Parameters | None:  # fmt: skip
+    """Return the parameters of a model as --fix and --vary want them; None for auto."""
+    from foamfit.fitting.curves import check_time_shift, choose_drive
+    from foamfit.fitting.problem import make_params
+
+    if time_shift:
+        check_time_shift(measurement, drive or choose_drive(measurement))
+    if model == "auto":
+        if fix or vary:
+            raise InputError(
+                "--fix and --vary belong to one model; name it instead of --model auto"
+            )
+        return None
+    params = make_params(measurement, model, drive, time_shift=time_shift)
     for name in (*fix, *vary):
         if name not in params:
             raise InputError(
@@ -235,6 +248,7 @@ def _hold_and_vary(
         params[name].set(value=value, vary=False, min=-math.inf, max=math.inf)
     for name in vary:
         params[name].set(vary=True)
+    return params
 
 
 def _interval_method(profile: bool, bootstrap: int | None, mcmc: int | None) -> str:
@@ -245,27 +259,6 @@ def _interval_method(profile: bool, bootstrap: int | None, mcmc: int | None) -> 
         names = " and ".join(f"--{name}" for name in ways)
         raise InputError(f"{names} exclude each other; choose one way to make the intervals")
     return ways[0] if ways else "auto"
-
-
-def _params(
-    measurement: Measurement, model: str, drive: str | None, time_shift: bool,
-    fix: dict[str, float], vary: tuple[str, ...],
-) -> lmfit.Parameters | None:  # fmt: skip
-    """Return the parameters of a model as --fix and --vary want them; None for auto."""
-    from foamfit.fitting.curves import check_time_shift, choose_drive
-    from foamfit.fitting.problem import make_params
-
-    if time_shift:
-        check_time_shift(measurement, drive or choose_drive(measurement))
-    if model == "auto":
-        if fix or vary:
-            raise InputError(
-                "--fix and --vary belong to one model; name it instead of --model auto"
-            )
-        return None
-    params = make_params(measurement, model, drive, time_shift=time_shift)
-    _hold_and_vary(params, model, fix, vary)
-    return params
 
 
 @main.command()

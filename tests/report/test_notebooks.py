@@ -1,4 +1,4 @@
-"""The notebooks run, and are stored as they should be; their sliders do what they say."""
+"""The notebooks run, and are stored as they should be; what their sliders draw is right."""
 
 import json
 from dataclasses import replace
@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import foamfit as ff
-from conftest import EXPERIMENTS, ROOT, synthetic_impact, synthetic_loop
+from conftest import ROOT, synthetic_impact, synthetic_loop
 from foamfit.data.measurement import Measurement, Specimen
-from foamfit.report.explore import POINTS, Turner, plot_loop, rough_guess
+from foamfit.report.explore import POINTS, plot_loop, rough_guess
 from foamfit.report.explore import UNITS as NAMES
 
 NOTEBOOKS = ROOT / "notebooks"
@@ -18,7 +18,6 @@ LISTED = (
     "fitted_against_published.ipynb",
     "turn_the_parameters.ipynb",
 )
-REAL = EXPERIMENTS / "foam-1" / "model-2-2.0mps-reconstruction.csv"
 
 
 # ------------------------------------------------------------------------------- the notebooks
@@ -57,7 +56,8 @@ def test_notebook_runs_quietly_from_the_root(name, folder, tmp_path, monkeypatch
     )
     client.execute()
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", ())]
-    assert outputs
+    assert any("application/vnd.jupyter.widget-view+json" in o.get("data", {}) for o in outputs)
+    assert any("image/png" in output.get("data", {}) for output in outputs)
     assert not [output for output in outputs if output.get("name") == "stderr"]
     assert sorted(folder.iterdir()) == before
 
@@ -132,33 +132,3 @@ def test_loop_needs_stress_and_displacement():
     bare = Measurement("bare", None, "", None, np.zeros(3), None, Specimen(1e-3, 1e-5))
     with pytest.raises(ff.InputError, match="bare: a loop needs a force or stress column, and a"):
         plot_loop(bare, {})
-
-
-# ----------------------------------------------------------------------------------- the sliders
-
-
-@pytest.fixture
-def turner():
-    return Turner(ff.read_test(REAL))
-
-
-def test_moving_a_slider_redraws(turner):
-    picture = turner.image.value
-    assert bytes(picture).startswith(b"\x89PNG")
-    turner.sliders["eps_a"].value *= 1.5
-    assert turner.image.value != picture
-    assert turner.values["eps_a"] == turner.sliders["eps_a"].value
-
-
-def test_sliders_that_are_set_to_a_spring_draw_it(turner):
-    spring = ff.published["foam-1/model-2"].bistable
-    turner.set({name: getattr(spring, name) for name in NAMES})
-    assert turner.values == pytest.approx({name: getattr(spring, name) for name in NAMES})
-    told = texts(drawn(turner.values, turner.measurement))
-    assert float(told.split("misfit ")[1].split("%")[0]) < 4.0
-
-
-def test_sliders_widen_for_a_value_beyond_their_ends(turner):
-    turner.set({"k0": 9e9, "dsigma": -1e5})
-    assert turner.values["k0"] == pytest.approx(9e9)
-    assert turner.values["dsigma"] == pytest.approx(-1e5)

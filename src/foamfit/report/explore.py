@@ -1,11 +1,10 @@
-"""One bistable spring turned by hand over a measured loop, with the sliders of a notebook."""
+"""One bistable spring over a measured loop: what the sliders of a notebook draw."""
 
 from __future__ import annotations
 
 import math
 import textwrap
 from collections.abc import Mapping
-from typing import Any
 
 import matplotlib
 import numpy as np
@@ -14,11 +13,11 @@ from matplotlib.figure import Figure
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError
-from foamfit.report.figures import GREY, STYLE, VERMILION, image
+from foamfit.report.figures import GREY, STYLE, VERMILION
 from foamfit.springs.spring import BistableSpring
 
 MPA = 1e6
-# Of each parameter in the order of the loop: the unit of its slider.
+# Of each parameter in the order of the loop: the unit in which it reads well.
 UNITS = {
     "k0": MPA, "eps_a": 1.0, "kh_plus": MPA, "dsigma": MPA, "kc": MPA, "eps_c": 1.0, "kh_minus": MPA
 }  # fmt: skip
@@ -69,40 +68,3 @@ def plot_loop(measurement: Measurement, values: Mapping[str, float]) -> Figure:
             told = textwrap.fill(str(error), 70)
         ax.text(0.02, 0.97, told, transform=ax.transAxes, va="top", weight="bold")
     return figure
-
-
-class Turner:
-    """Sliders for the seven parameters (moduli in MPa) and their picture: display `panel`."""
-
-    def __init__(self, measurement: Measurement) -> None:
-        import ipywidgets as widgets
-
-        self.measurement = measurement
-        self.sliders: dict[str, Any] = {}
-        for name, start in rough_guess(measurement).items():
-            value = start / (unit := UNITS[name])
-            low, high = sorted((0.0, 4.0 * value or -0.1))
-            self.sliders[name] = widgets.FloatSlider(
-                value, min=low, max=high, step=(high - low) / 4000, readout_format=".4g",
-                description=name if unit == 1.0 else f"{name} (MPa)",
-                style={"description_width": "105px"},
-            )  # fmt: skip
-            self.sliders[name].observe(lambda _: self._draw(), names="value")
-        self.image = widgets.Image(format="png")
-        self.panel = widgets.HBox([widgets.VBox([*self.sliders.values()]), self.image])
-        self._draw()
-
-    @property
-    def values(self) -> dict[str, float]:
-        """What the sliders say, in SI."""
-        return {name: slider.value * UNITS[name] for name, slider in self.sliders.items()}
-
-    def set(self, values: Mapping[str, float]) -> None:
-        """Move sliders to values in SI, beyond their ends where need be."""
-        for name, value in values.items():
-            slider, new = self.sliders[name], value / UNITS[name]
-            slider.min, slider.max = min(slider.min, new), max(slider.max, new)
-            slider.value = new
-
-    def _draw(self) -> None:
-        self.image.value = image(plot_loop(self.measurement, self.values), "png", 100)

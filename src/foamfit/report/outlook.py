@@ -21,6 +21,7 @@ from foamfit.fitting.branches import visited
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.search import Tracker, search
 from foamfit.report.folder import load_result
+from foamfit.report.sides import published_side
 from foamfit.results import ParameterEstimate
 from foamfit.solve.simulation import Response, simulate
 from foamfit.springs import kernels
@@ -28,7 +29,6 @@ from foamfit.springs.chain import Chain, Impact
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import split_name, unit_of
 from foamfit.springs.published import published
-from foamfit.springs.spring import BistableSpring
 from foamfit.trust import covariance
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import state_of
@@ -120,18 +120,14 @@ def published_values(problem: Problem, name: str) -> tuple[Array, str]:
     if name not in published:
         known = ", ".join(published)
         raise InputError(f"there is no published set '{name}'; there are {known}")
-    item, values = published[name], problem.vector()
-    if [kind == "bistable" for kind in problem.model.kinds] != [
-        isinstance(spring, BistableSpring) for spring in item.chain.springs
-    ]:
+    item, side, values = published[name], published_side(name), problem.vector()
+    if [k == "bistable" for k in problem.model.kinds] != [k == "bistable" for k in side.kinds]:
         raise InputError(f"{name} is a {item.model}, not a {problem.model.name}; give --model")
     for full in problem.model.names:
-        spring, short = split_name(full)
+        short = split_name(full)[1]
+        new = 0.0 if short == "eta" else side.estimates[full].value
         if short == "height":
-            share = item.chain.heights[spring] / item.chain.height
-            new = share * problem.measurement.specimen.height
-        else:
-            new = 0.0 if short == "eta" else getattr(item.chain.springs[spring], short)
+            new = new / item.chain.height * problem.measurement.specimen.height
         if problem.params[full].vary or short == "eta":
             values[problem.model.index[full]] = new
     return problem.space().complete(values), f"published {name}, without its numerical damping"

@@ -43,16 +43,12 @@ def outlook_text(outlook: Outlook) -> str:
 
 def _larger_residuals(outlook: Outlook) -> Iterator[str]:
     """Warn where the start values leave more than the noise: then the errors are too small."""
-    objective, at = outlook.problem.objective, 0
-    residual = objective.differences(outlook.values)
-    for (name, level), size in zip(outlook.noise.items(), objective.sizes, strict=True):
-        rms = float(np.sqrt(np.mean(residual[at : at + size] ** 2)))
-        rms *= objective.scale[name] / objective.weights[name] ** 0.5
-        at += size
-        if rms > ESTIMATED * level.sigma:
+    objective = outlook.problem.objective
+    for name, rms in objective.rms(objective.differences(outlook.values)).items():
+        if (times := rms / outlook.noise[name].sigma) > ESTIMATED:
             yield (
-                f"The start values leave {significant(rms / level.sigma)} times the noise of "
-                f"{_spoken(name)}, so the errors to expect are larger than those below."
+                f"The start values leave {significant(times)} times the noise of {_spoken(name)}, "
+                "so the errors to expect are larger than those below."
             )
 
 
@@ -72,16 +68,15 @@ def _closing_sentences(outlook: Outlook) -> Iterator[str]:
             closing = f"from {found:.4g} m/s on"
         last = "c" if "c" in seen else seen[-1]
         does = "closes its loop" if "e" in seen else f"turns back on branch {last}"
-        guess = ", ".join(
+        sentence = f"{at} spring {name[1:]} {does}; the loop closes {closing}"
+        lost = ", ".join(
             parameter
             for parameter, item in planned.estimates.items()
             if "reached" in item.why and parameter.startswith(f"{name}_")
         )
-        if guess and outlook.source.startswith(GUESSED) and "e" not in seen:
-            guess = f", which is a guess: this test does not determine {guess}"
-        else:
-            guess = ""
-        yield f"{at} spring {name[1:]} {does}; the loop closes {closing}{guess}."
+        if lost and outlook.source.startswith(GUESSED) and "e" not in seen:
+            sentence += f", which is a guess: this test does not determine {lost}"
+        yield f"{sentence}."
 
 
 def _needed(outlook: Outlook, spring: int) -> tuple[float, float]:
