@@ -400,14 +400,10 @@ def _progress(quiet: bool) -> Iterator[Callable[[float, str], None]]:
         yield lambda fraction, what: None
         return
     with click.progressbar(length=1000, label="fit", file=sys.stderr, show_eta=False) as bar:
-        done = 0
 
         def progress(fraction: float, what: str) -> None:
-            nonlocal done
-            now = round(1000 * fraction)
             bar.label = f"fit: {what:<10}"
-            bar.update(now - done)
-            done = now
+            bar.update(round(1000 * fraction) - bar.pos)
 
         yield progress
 

@@ -1,8 +1,7 @@
 """Fitted parameters beside the published ones, or beside those of another fit.
 
 Everything is shown as the paper's tables show it: stiffness of branch a in MPa, the other slopes as
-ratios to it, the stress drop as a ratio to σ_a. Where the difference of two numbers would mean
-nothing, there is a sentence instead of a percentage.
+ratios to it, the stress drop as a ratio to σ_a.
 """
 
 from __future__ import annotations
@@ -171,23 +170,18 @@ def _total(*parts: Any) -> Any:
     return sum(parts)
 
 
-_K0 = _Quantity("k0", "MPa", ("k0",), lambda k0: k0 / MPA)
-_H = _Quantity("h", "mm", ("height",), lambda h: h / MM)
 _ETA = _Quantity("η", "Pa·s", ("eta",), _total)
-TABLES = {
-    "bistable": (
-        _K0,
-        _Quantity("Δσ/σ_a", "", ("dsigma", "k0", "eps_a"), _drop),
-        _ETA,
-        _Quantity("ε_a", "", ("eps_a",), _total),
-        _Quantity("ε_c", "", ("eps_c",), _total),
-        _H,
-        _Quantity("k_h+/k0", "", ("kh_plus", "k0"), _ratio),
-        _Quantity("k_h−/k0", "", ("kh_minus", "k0"), _ratio),
-        _Quantity("k_c/k0", "", ("kc", "k0"), _ratio),
-    ),
-    "linear": (_K0, _ETA, _H),
-}
+TABLE = (  # of a linear spring, those whose parameters it has
+    _Quantity("k0", "MPa", ("k0",), lambda k0: k0 / MPA),
+    _Quantity("Δσ/σ_a", "", ("dsigma", "k0", "eps_a"), _drop),
+    _ETA,
+    _Quantity("ε_a", "", ("eps_a",), _total),
+    _Quantity("ε_c", "", ("eps_c",), _total),
+    _Quantity("h", "mm", ("height",), lambda h: h / MM),
+    _Quantity("k_h+/k0", "", ("kh_plus", "k0"), _ratio),
+    _Quantity("k_h−/k0", "", ("kh_minus", "k0"), _ratio),
+    _Quantity("k_c/k0", "", ("kc", "k0"), _ratio),
+)
 
 
 def _evaluate(side: Side, names: Sequence[str], formula: Callable[..., Any]) -> _Value | None:
@@ -289,7 +283,7 @@ def _spring_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
     chain = len(side.kinds) > 1
     for i, kind in enumerate(side.kinds, start=1):
         alike = i <= len(other.kinds) and _family(other.kinds[i - 1]) == _family(kind)
-        for quantity in TABLES[_family(kind)]:
+        for quantity in TABLE:
             eta = quantity is _ETA
             if eta and not chain:
                 continue  # of one spring, it stands with the onsite damper

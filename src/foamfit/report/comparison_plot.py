@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from foamfit.report.comparison import Comparison, Pair, Row
 from foamfit.report.figures import BLUE, GREY, VERMILION, drawing, save, say_nothing_there
+from foamfit.text import signed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -114,14 +115,11 @@ def _draw_comparison(ax: Axes, pairs: list[Pair]) -> None:
 def _name_results(figure: Figure, groups: list[list[Pair]]) -> None:
     """Say once what the colours mean: the drives, where these are the same in every panel."""
     drives = [[f"{pair.drive} drive" for pair in pairs] for pairs in groups]
-    longest = max(drives, key=len)
-    alike = all(names == longest[: len(names)] for names in drives)
-    if alike and len(set(longest)) == len(longest):
-        names = longest
-    elif len(groups) == 1:
+    names = max(drives, key=len)
+    if len(groups) == 1 and len(set(names)) < len(names):
         names = [f"{s.test}: {s.model}, {s.drive} drive" for s in groups[0]]
-    else:
-        names = [f"result {k + 1}" for k in range(len(longest))]
+    elif len(set(names)) < len(names) or any(d != names[: len(d)] for d in drives):
+        names = [f"result {k + 1}" for k in range(len(names))]
     drawn = {k for pairs in groups for k in _lanes(pairs)}
     for k, name in enumerate(names):
         color, mark = MARKS[k % len(MARKS)]
@@ -145,6 +143,4 @@ def _percent(row: Row) -> str:
     spread = 100.0 * math.hypot(row.stderr or 0.0, row.reference_stderr or 0.0)
     spread /= abs(row.reference)
     places = 0 if spread >= 10.0 else 1 if spread >= 1.0 else 2
-    shown = f"{row.percent:+.{places}f}"
-    shown = shown[1:] if float(shown) == 0.0 else shown.replace("-", "−")
-    return f"{shown} ± {spread:.{places}f} %"
+    return f"{signed(row.percent, places)} ± {spread:.{places}f} %"

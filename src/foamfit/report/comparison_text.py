@@ -13,7 +13,7 @@ from foamfit.report.comparison import Comparison, Pair, Row
 from foamfit.report.readable import readable
 from foamfit.results import ParameterEstimate
 from foamfit.springs.published import published
-from foamfit.text import aligned, significant, wrapped
+from foamfit.text import aligned, signed, significant, wrapped
 
 ZETA = "ζ = η/(2 H √(ρ k_c)) with ρ = m/(A H), m, A and H of the paper's striker and specimen"
 
@@ -61,22 +61,13 @@ def _damping_ratio(pair: Pair) -> str:
 
 def _cells(row: Row) -> tuple[str, ...]:
     off = "not compared" if row.remark and row.reference is not None else None
-    return (
-        row.label,
-        row.unit or "–",
-        _with_error(row.value, row.stderr),
-        _with_error(row.reference, row.reference_stderr),
-        off or _signed(row.percent, " %"),
-        _signed(row.standard_errors, " s.e."),
-        row.state,
-    )
+    values = _with_error(row.value, row.stderr), _with_error(row.reference, row.reference_stderr)
+    deviation = off or _signed(row.percent, " %"), _signed(row.standard_errors, " s.e.")
+    return (row.label, row.unit or "–", *values, *deviation, row.state)
 
 
 def _signed(value: float | None, unit: str) -> str:
-    if value is None:
-        return ""
-    shown = f"{value:+.{0 if abs(value) >= 99.5 else 1}f}"
-    return (shown[1:] if float(shown) == 0.0 else shown.replace("-", "−")) + unit
+    return "" if value is None else signed(value, 0 if abs(value) >= 99.5 else 1) + unit
 
 
 def _with_error(value: float | None, stderr: float | None) -> str:

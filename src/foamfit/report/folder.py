@@ -61,15 +61,11 @@ def check_target(folder: str | Path) -> None:
             _check_replaceable(folder, place)
         elif os.path.lexists(place):
             raise InputError(f"{folder} is a file; choose a new or an empty folder")
-        there = next(path for path in place.parents if path.exists())
-        if not there.is_dir():
-            raise InputError(
-                f"{folder} cannot be written: {there} is a file; choose another folder"
-            )
-        if not os.access(there, os.W_OK | os.X_OK):
-            raise InputError(
-                f"{folder} cannot be written: Permission denied in {there}; choose another folder"
-            )
+        for there in (place, next(path for path in place.parents if path.exists())):
+            if there.exists() and not there.is_dir():
+                raise NotADirectoryError(0, f"{there} is a file")
+            if there.exists() and not os.access(there, os.W_OK | os.X_OK):
+                raise PermissionError(0, f"Permission denied in {there}")
     except (OSError, RuntimeError) as error:  # also a link to itself
         raise InputError(
             f"{folder} cannot be written: {reason(error)}; choose another folder"
@@ -80,8 +76,6 @@ def _check_replaceable(folder: Path, place: Path) -> None:
     """Refuse a folder that is there, at `place`, and must not or cannot be replaced."""
     if place.is_mount():
         raise InputError(f"{folder} is a mount point and cannot be replaced; name a folder in it")
-    if not os.access(place, os.W_OK | os.X_OK):
-        raise InputError(f"{folder} cannot be written: Permission denied; choose another folder")
     there = sorted(place.iterdir())
     if there and not _is_of_fit(place / "fit.json"):
         raise InputError(

@@ -178,7 +178,10 @@ def simulated_test(like: Measurement, chain: Chain, drive: Impact) -> Measuremen
     Noise that is not stated becomes 1 % of the range of its curve.
     """
     count = SAMPLES if like.time is None else like.time.size
-    time = np.linspace(0.0, _duration(chain, drive), count)
+    *_, last = _runs(chain, drive)
+    if last.contact_end is None:
+        raise SimulationError("the striker does not come back; check its mass and the damping")
+    time = np.linspace(0.0, last.contact_end, count)
     response = simulate(chain, drive, time)
     stress, motion = response.base_stress, response.displacement[-1]
     noise = Noise(
@@ -201,14 +204,6 @@ def _runs(chain: Chain, drive: Impact) -> Iterator[Response]:
         if response.contact_end is not None:
             return
         end *= 2.0
-
-
-def _duration(chain: Chain, drive: Impact) -> float:
-    """Duration of the contact of an impact, s."""
-    *_, last = _runs(chain, drive)
-    if last.contact_end is None:
-        raise SimulationError("the striker does not come back; check its mass and the damping")
-    return last.contact_end
 
 
 # ---------------------------------------------------------------- the questions

@@ -99,20 +99,18 @@ def plot_response(response: Response, path: str | Path | None = None) -> Figure:
         for i, node in enumerate(nodes[:-1]):
             axes[1].plot(time / ft, node / fw, color=str(shades[i]), lw=1.0, label=f"node {i + 1}")
         axes[1].plot(time / ft, nodes[-1] / fw, label="top", **last)
-        end = np.inf if response.contact_end is None else response.contact_end
-        loop = time <= end  # then the striker flies
+        end = response.contact_end
+        loop = time <= (np.inf if end is None else end)  # then the striker flies
         axes[2].plot(response.strain[loop], stress[loop] / fs, **last)
-        base = f"base stress ({s_unit})"
-        axes[0].set(xlabel=f"time ({t_unit})", ylabel=base)
-        axes[1].set(xlabel=f"time ({t_unit})", ylabel=f"displacement ({w_unit})")
-        axes[2].set(xlabel="overall strain (–)", ylabel=base)
-        for ax in axes:
-            ax.margins(0.05, 0.11)
-        if response.contact_end is not None:
+        x, base = f"time ({t_unit})", f"base stress ({s_unit})"
+        axes[0].set(xlabel=x, ylabel=base, xmargin=0.05, ymargin=0.11)
+        axes[1].set(xlabel=x, ylabel=f"displacement ({w_unit})", xmargin=0.05, ymargin=0.11)
+        axes[2].set(xlabel="overall strain (–)", ylabel=base, xmargin=0.05, ymargin=0.11)
+        if end is not None:
             for ax in axes[:2]:
-                ax.axvline(response.contact_end / ft, color=GREY, lw=0.6, ls=(0, (2, 2)))
+                ax.axvline(end / ft, color=GREY, lw=0.6, ls=(0, (2, 2)))
             axes[0].annotate(
-                "end of contact", (response.contact_end / ft, 1.0), (-3, -3),
+                "end of contact", (end / ft, 1.0), (-3, -3),
                 xycoords=("data", "axes fraction"), textcoords="offset points",
                 ha="right", va="top", rotation=90, color=GREY, fontsize=6.5,
             )  # fmt: skip
@@ -290,8 +288,7 @@ def _free_offset(
 ) -> tuple[float, float]:
     """Return where a name stands beside its anchor: on no other name, on little of the curves.
 
-    All in typographic points; `avoid` has a row for each sample of the curves, and the box of the
-    name (left, low, right, high) is added to `taken`.
+    All in typographic points; the box of the name (left, low, right, high) is added to `taken`.
     """
     x, y = wanted
     size, best, found = np.array([4.2 * len(name), 9.0]), math.inf, (wanted, np.zeros(4))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 from foamfit import text
 from foamfit.results import ParameterEstimate
@@ -73,14 +72,10 @@ def readable(name: str, p: ParameterEstimate) -> Readable:
     return Readable(name, _symbol(name), shown, stderr, interval, unit, p.state, p.why, method)
 
 
-def number(value: Any) -> str:
-    """Return anything as text; a number with four digits, an integer with all of its own."""
+def number(value: float | None) -> str:
+    """Return a number with four digits, an integer with all of its own, None as a dash."""
     if value is None:
         return "–"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, list | tuple):
-        return ", ".join(number(item) for item in value)
     return text.number(value) if isinstance(value, float) else str(value)
 
 
