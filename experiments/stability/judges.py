@@ -405,7 +405,7 @@ def _balance(
     return Balance(float(np.abs(brought - kinetic - work - heat).max()) / scale, impulse)
 
 
-# ------------------------------------------------------------------------------------------ ringing
+# ---------------------------------------------------------------------------------------- vibration
 
 
 def ripple_of(scene: Scene, answer: ff.Response | Motion, rtol: float) -> float | None:

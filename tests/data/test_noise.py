@@ -79,8 +79,8 @@ def test_spikes_and_ringing_are_no_noise():
     values = signal("stress", n) + 0.01 * rng.standard_normal(n)
     values[rng.choice(n, 10, replace=False)] += 0.3
     assert residual_noise(values)[0] == pytest.approx(0.01, rel=0.15)
-    ringing = values + 0.1 * np.sin(2 * np.pi * np.arange(n) / 60)
-    assert residual_noise(ringing)[0] == pytest.approx(0.01, rel=0.15)
+    vibration = values + 0.1 * np.sin(2 * np.pi * np.arange(n) / 60)
+    assert residual_noise(vibration)[0] == pytest.approx(0.01, rel=0.15)
 
 
 @pytest.mark.parametrize("step", [0.002, 0.02])

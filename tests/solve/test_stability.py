@@ -60,8 +60,8 @@ def judge(point: Point, answer: ff.Response) -> None:
 
 def cheap(point: Point) -> bool:
     """Leave to the study what takes a second or more."""
-    ringing = (point.mass > 0.0 and point.springs > 1) or point.top_mass > 0.0
-    return point.springs <= (1 if ringing else 8) and point.samples <= 300
+    vibration = (point.mass > 0.0 and point.springs > 1) or point.top_mass > 0.0
+    return point.springs <= (1 if vibration else 8) and point.samples <= 300
 
 
 # ------------------------------------------------------------------------------------- the scenes
@@ -124,7 +124,7 @@ def test_vibrations_that_cannot_be_followed_are_refused_by_size() -> None:
     with pytest.raises(ff.SimulationError, match="ask for no smaller rtol") as refusal:
         simulation._verified(few, rows, np.array(chain.heights), 1e-9)
     assert f"{motion.unresolved:.1g}" in str(refusal.value)
-    massless = ff.Chain(chain.springs, chain.heights, chain.area)  # without any ringing
+    massless = ff.Chain(chain.springs, chain.heights, chain.area)  # without any vibration
     want = ff.simulate(massless, drive, time, rtol=1e-9)
     assert judges.difference(motion, want) <= motion.unresolved
 

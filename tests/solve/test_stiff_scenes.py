@@ -109,8 +109,8 @@ def test_against_reference(name: str, drive: str, rtol: float, bar: float) -> No
     assert len(got.switches) >= len(want.switches) - (want.contact_end is not None)
     if want.contact_end is not None:
         assert got.contact_end == pytest.approx(want.contact_end, rel=bar)
-    ringing = (", mass" in name and "dashpot" not in name) or "own mass" in name
-    assert got.steps < (8000 if ringing and rtol < 1e-6 else 3000)
+    vibration = (", mass" in name and "dashpot" not in name) or "own mass" in name
+    assert got.steps < (8000 if vibration and rtol < 1e-6 else 3000)
 
 
 @pytest.mark.parametrize("name", PAIRS)

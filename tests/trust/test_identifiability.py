@@ -367,7 +367,7 @@ def test_the_standard_error_goes_with_an_interval_that_is_not_local() -> None:
 
 
 def test_a_profile_much_narrower_than_the_local_interval_is_not_taken() -> None:
-    """Refits that stall in a long valley make it so."""
+    """Refits that stall where the cost is flat make it so."""
     local = concluded().parameters["s1_k0"]
     half = (local.ci95[1] - local.ci95[0]) / 2
     ends = {"s1_k0": (local.value - 0.1 * half, local.value)}

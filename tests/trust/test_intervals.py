@@ -256,7 +256,7 @@ def test_the_ends_of_a_profile_satisfy_the_cut_by_an_independent_refit(impact):
         assert rise == pytest.approx(found.cut, rel=0.06)
 
 
-def test_a_profile_goes_on_beyond_a_valley_that_is_as_good():
+def test_a_profile_goes_on_beyond_a_minimum_that_is_as_good():
     """A cost of two minima: x² (x-3)² seen by its residual x (x-3), flat noise elsewhere."""
     rng = np.random.default_rng(0)
     noise = rng.standard_normal(400)
@@ -299,7 +299,7 @@ def test_what_one_profile_meets_counts_for_the_others():
     """Two minima a low barrier apart: a = 0, b = 0 and a = 1, b = 3.
 
     With a held b does not move, since a - (3 - 2u) u², u = b/3, has no slope there: the profile of
-    a alone stays in the first valley. That of b crosses the barrier and meets the second.
+    a alone stays in the first minimum. That of b crosses the barrier and meets the second.
     """
     noise = np.random.default_rng(1).standard_normal(400)
     noise[:2] = 0.0
