@@ -73,7 +73,7 @@ def test_slow_noise_is_not_taken_for_signal(n, phi, off):
     assert np.median(found[:, 1]) == pytest.approx(phi, abs=0.1)
 
 
-def test_spikes_and_ringing_are_no_noise():
+def test_spikes_and_vibration_are_no_noise():
     rng = np.random.default_rng(2)
     n = 1000
     values = signal("stress", n) + 0.01 * rng.standard_normal(n)

@@ -99,7 +99,7 @@ def test_literal_reading_with_other_drives(
         assert claims.displacement_error(drive, mass, damper) == pytest.approx(error, abs=0.3)
 
 
-def test_ringing_closes_a_loop_that_the_drive_does_not() -> None:
+def test_vibration_closes_a_loop_that_the_drive_does_not() -> None:
     drive = claims.drive_of_impact(velocity=1.9)
     exact, vibration = (claims.driven(drive, mass, 0.0) for mass in (0.0, claims.OWN_MASS))
     on_c = claims.BRANCH_NAMES.index("c")

@@ -189,7 +189,7 @@ def test_light_masses_tend_to_none(name: str, mass: float) -> None:
 
 
 @pytest.mark.parametrize("mass", [1e-14, 1e-12, 1e-10])
-def test_the_ringing_that_steps_pass_over_is_owned_up_to(mass: float) -> None:
+def test_the_vibration_that_steps_pass_over_is_owned_up_to(mass: float) -> None:
     """Steps of 100 radians: against the closed form of a mass between two springs on branch a."""
     chain, blow = struck("foam-2", mass=mass)
     below, above = (s.k0 / h for s, h in zip(chain.springs, chain.heights, strict=True))
@@ -206,7 +206,7 @@ def test_the_ringing_that_steps_pass_over_is_owned_up_to(mass: float) -> None:
 
 
 @pytest.mark.parametrize("eta", [0.0, 1e-3])
-def test_ringing_that_is_lost_is_refused_or_followed(eta: float) -> None:
+def test_vibration_that_is_lost_is_refused_or_followed(eta: float) -> None:
     chain, blow = struck("foam-2", eta, 1e-11)
     time = np.linspace(0.0, 6e-5, 41)
     want = run(chain, blow, 1e-10, implicit=False, time=time)
