@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from foamfit.data.measurement import MIN_ROWS, Array, NoiseLevel, Record, Striker, interior_node
+from foamfit.arrays import Array
+from foamfit.data.measurement import MIN_ROWS, NoiseLevel, Record, Striker, interior_node
 from foamfit.data.noise import noise_level
 from foamfit.data.rest import (
     ERRORS,
@@ -32,12 +33,11 @@ Levels = dict[str, NoiseLevel]
 
 @dataclass(frozen=True)
 class Start:
-    """Where contact starts: at a time of the file (None: at its first sample), at which height.
+    """Where contact starts: at a time of the file (None: at its first sample).
 
-    `zero` is the displacement there, and `zero_from` says what shows it. `free` says that nothing
-    pressed on the specimen before, so that the samples before it show the offset of the sensor.
-    `at_zero` says that the first sample lies so far behind the file's time zero as the striker has
-    gone by then: contact starts at that zero.
+    `zero` is the displacement there, and `zero_from` says what shows it. With `free` nothing
+    pressed on the specimen before, so that the samples before it show the sensor's offset. With
+    `at_zero` contact starts at the file's time zero, before its first sample.
     """
 
     how: str
@@ -73,8 +73,8 @@ def find_start(record: Record, levels: Levels, striker: Striker | None) -> Start
     """Find where contact starts, which motion and stress decide together.
 
     A motion that passes its own zero, or leaves a rest, starts contact there, unless the stress has
-    risen before; a stress that leaves a rest starts it where the motion has gone on meanwhile, as
-    that of a striker on its way. Where no rest is shown, contact starts at the first sample.
+    risen before; a stress that leaves a rest starts it while the motion goes on. Where no rest is
+    shown, contact starts at the first sample.
     """
     time, w, stress = record.instants, record.displacement, record.stress
     impact, drift = striker is not None, 0.01 * float(stress.max())
@@ -84,8 +84,8 @@ def find_start(record: Record, levels: Levels, striker: Striker | None) -> Start
         return Start("at the first sample") if at is None else Start(by_the_stress, at, free=True)
     noise, top = levels["displacement"], int(np.argmax(w))
     first, balance = _first_levels(time, w, stress, top, noise)
-    surely = min(first, balance, key=lambda level: level.sureness) if impact else first
-    away = surely.sureness > _ELSEWHERE
+    surely = min(first, balance, key=lambda level: level.significance) if impact else first
+    away = surely.significance > _ELSEWHERE
     elsewhere = away and abs(first.value) > 0.02 * (w[top] - first.value)
     # Where the motion of a striker starts at its zero, no stress that rises is taken for a rest.
     drift = np.inf if elsewhere else 0.0 if impact else drift
@@ -100,8 +100,11 @@ def find_start(record: Record, levels: Levels, striker: Striker | None) -> Start
     unloaded = stress[near].mean() < 0.2 * stress.max()
     unloaded &= not _loaded(record, time[crossing], levels)
     if below and unloaded and (by_stress is None or abs(w[onset]) < 0.3 * w[top]):
-        at = _time_of_passage(time, w, crossing, near)
-        return Start("where the displacement passes zero", at)
+        level, speed = line_at(time[near], w[near], time[crossing])
+        at = time[crossing] - level / speed if speed > 0 else time[crossing]
+        at = float(np.clip(at, time[near][0], time[near][-1]))
+        own = abs(at) < 0.05 * (time[crossing] - time[crossing - 1])  # the file's own time zero
+        return Start("where the displacement passes zero", 0.0 if own else at)
     up_to = slice(top + 1)
     by_motion = leave_rest(time[up_to], w[up_to], noise, _STILL_STRIKER if impact else STILL)
     approach = w[onset] - first.value if by_stress is not None else 0.0
@@ -109,22 +112,22 @@ def find_start(record: Record, levels: Levels, striker: Striker | None) -> Start
     small = approach < (0.3 if impact else 0.1) * travel
     if by_motion is not None and small and not _loaded(record, by_motion, levels):
         rest = resting_level(w[time < by_motion], noise)
-        told = rest.told(noise, "median of") + " at rest before contact"
-        return Start("where the displacement leaves its rest", by_motion, rest.value, True, told)
+        source = rest.source(noise, "median of") + " at rest before contact"
+        return Start("where the displacement leaves its rest", by_motion, rest.value, True, source)
     if by_stress is not None and approach > (0.02 if elsewhere else 0.1) * travel:
         reach = max(5, min(onset, (top - onset) // 24))
         near = slice(max(0, onset - reach), onset + reach)
         zero = level_on_line(time[near], w[near], by_stress, noise)
-        told = zero.told(noise, "line through") + " around it, the stress being at rest before"
-        return Start(by_the_stress, by_stress, zero.value, True, told)
+        source = zero.source(noise, "line through") + " around it, the stress being at rest before"
+        return Start(by_the_stress, by_stress, zero.value, True, source)
     gone = time[0] * (striker.velocity or 0.0) if striker is not None else 0.0
-    if surely.sureness > ERRORS and 0.7 < first.value / max(gone, 1e-300) < 1.1:
+    if surely.significance > ERRORS and 0.7 < first.value / max(gone, 1e-300) < 1.1:
         return Start("before the first sample", at_zero=True)
     under_load = stress[:3].mean() > 0.05 * stress.max() and 0 < first.value < travel
     if under_load or not elsewhere:
         return Start("at the first sample")
-    told = first.told(noise, "line through") + " from the first on; the file's zero lies elsewhere"
-    return Start("at the first sample", zero=first.value, zero_from=told)
+    source = first.source(noise, "line through") + " from the first on; the file's zero lies"
+    return Start("at the first sample", zero=first.value, zero_from=f"{source} elsewhere")
 
 
 def _first_levels(
@@ -138,26 +141,16 @@ def _first_levels(
     return by_line, level_by_balance(time[loading], w[loading], stress[loading])
 
 
-def _time_of_passage(time: Array, w: Array, crossing: int, near: slice) -> float:
-    """Time at which a motion passes zero, by the line through the samples around."""
-    level, speed = line_at(time[near], w[near], time[crossing])
-    at = time[crossing] - level / speed if speed > 0 else time[crossing]
-    at = float(np.clip(at, time[near][0], time[near][-1]))
-    own = abs(at) < 0.05 * (time[crossing] - time[crossing - 1])
-    return 0.0 if own else at  # the file's own time zero
-
-
 def _loaded(record: Record, at: float, levels: Levels) -> bool:
     """Whether the stress has plainly risen before a time."""
     return slopes(record.instants, record.stress, at, levels["stress"]).lower > STILL
 
 
 def _passage(time: Array, w: Array, top: int, noise: NoiseLevel) -> tuple[int, slice]:
-    """Sample at which a motion passes zero on its way up, and the samples around it.
+    """Sample at which the moving mean of a rising motion passes zero, and the samples around it.
 
-    A mean over a fiftieth of the rise keeps noise from passing first. The samples around are as
-    many as bring the scatter of their line to a thousandth of the rise, but within a twelfth of the
-    rise on either side, where the motion is still straight.
+    They bring the scatter of their line to a thousandth of the rise, but lie within a twelfth of
+    the rise on either side, where the motion is still straight.
     """
     if w[top] <= 0:
         return 0, slice(0, 5)
@@ -175,8 +168,8 @@ def zero_interior(
 ) -> tuple[Record, list[str]]:
     """Take from each interior displacement its value where contact starts in `first`.
 
-    That is the median of its rest before contact; without a rest it is where a line through the
-    first samples starts, unless this is zero within their noise.
+    That is the median of its rest before contact, or else where a line through the first samples
+    starts, unless this is zero within their noise.
     """
     before, notes = start.rest(first), []
     for name, values in first.curves().items():
@@ -185,18 +178,18 @@ def zero_interior(
         noise = levels[name]
         if before >= MIN_ROWS:
             zero = resting_level(values[:before], noise)
-            told = zero.told(noise, "median of") + " before contact"
+            source = zero.source(noise, "median of") + " before contact"
         else:
             early = slice(before, before + max(LEAST_REST, int(np.argmax(values)) // 12))
             at = start.zero_time(first)
             zero = level_on_line(first.instants[early], values[early], at, noise)
-            told = zero.told(noise, "line through") + " from there on"
+            source = zero.source(noise, "line through") + " from there on"
             if abs(zero.value) < max(_ELSEWHERE * zero.error, 2e-3 * np.ptp(values)):
                 continue
         record = record.changed(name, record.curves()[name] - zero.value)
         if abs(zero.value) > 1e-3 * np.ptp(values):
             size = engineering(zero.value, "m")
-            notes.append(f"{name} at contact, {size}, is taken off ({told}).")
+            notes.append(f"{name} at contact, {size}, is taken off ({source}).")
     return record, notes
 
 
@@ -226,10 +219,9 @@ def remove_offset(record: Record, n: int, noise: NoiseLevel) -> tuple[Record, li
 def contact_end(stress: Array, noise: NoiseLevel) -> tuple[int, bool]:
     """Index after the last sample of the contact with the highest stress, and if it was reached.
 
-    The end is the last return to zero: a mean over as many samples as bring the noise to half a
-    percent of the peak, but no more than follow the form of the pulse, keeps noise from ending it
-    early. A stress that soon rises again has not ended, nor one whose mean over the next quarter of
-    the time since the peak is not zero within its error.
+    The end is the last return to zero of a moving mean, whose noise is half a percent of the peak
+    if the pulse is long enough. A stress that soon rises again has not ended, nor one whose mean
+    over the next quarter of the time since the peak is not zero within its error.
     """
     top = int(np.argmax(stress))
     peak = float(stress[top])
@@ -279,11 +271,10 @@ def cut_to_contact(
     at = "" if record.time is None else f", {engineering(zero_time, 's')} in the file"
     notes.insert(0, f"Contact starts {start.how}{at}{cut if end - first < len(record) else ''}.")
     if start.zero != 0:
-        size, told = engineering(start.zero, "m"), f" ({start.zero_from})" * bool(start.zero_from)
-        notes.append(f"The displacement there, {size}, is taken off{told}.")
-    record = replace(
-        record,
-        time=None if record.time is None else record.time - zero_time,
-        displacement=None if w is None else w - start.zero,
-    )
+        size, source = engineering(start.zero, "m"), f" ({start.zero_from})"
+        notes.append(f"The displacement there, {size}, is taken off{source}.")
+    if record.time is not None:
+        record = replace(record, time=record.time - zero_time)
+    if w is not None:
+        record = replace(record, displacement=w - start.zero)
     return record.between(first, end, "before contact starts", "after contact ends"), notes

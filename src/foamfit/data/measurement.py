@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from foamfit.arrays import Array
+
 MIN_ROWS = 10  # samples of a test
 
 # Where a motion comes from; the second is no measurement of its own.
@@ -288,10 +289,8 @@ class Measurement:
     @property
     def rows(self) -> RowCount:
         """Rows of the file, used and not used; without a file all samples are used."""
-        if self.count is not None:
-            return self.count
         n = max((values.size for values in self.channels().values()), default=0)
-        return RowCount(n, n)
+        return self.count or RowCount(n, n)
 
     def channels(self) -> dict[str, Array]:
         """Stress, displacement and displacements of masses inside, as far as they are there."""

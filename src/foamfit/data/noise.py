@@ -11,7 +11,8 @@ from functools import cache
 
 import numpy as np
 
-from foamfit.data.measurement import Array, Measurement, NoiseLevel
+from foamfit.arrays import Array
+from foamfit.data.measurement import Measurement, NoiseLevel
 
 # Widths of the local cubics (samples); the widest may cover a twelfth of the record.
 _WIDTHS = (5, 7, 11, 17, 25, 37, 55, 83, 125)
@@ -55,11 +56,10 @@ def quantum(values: Array) -> float:
 def residual_noise(values: Array) -> tuple[float, float]:
     """Noise of a sampled signal from what local cubics leave of it.
 
-    Cubics over 5, 7, 11, … samples take off the signal; of the variance of what is left each shows
-    a known share, which depends on the correlation of the noise: for an autocorrelation φ^k it is
-    c_0 + 2 Σ c_k φ^k, with c the autocorrelation of the filter. If the three narrowest widths agree
-    with white noise, their variance is the answer. Else σ and φ are those that explain all widths
-    best. Switches and spikes are cut from the residuals at three deviations.
+    Cubics over 5, 7, 11, … samples take off the signal; each leaves a known share of the variance
+    of noise with the autocorrelation φ^k: c_0 + 2 Σ c_k φ^k, with c the autocorrelation of the
+    filter. If the three narrowest agree with white noise, their variance is the answer, else σ and
+    φ explain all widths best. Switches and spikes are cut from the residuals at three deviations.
 
     Returns
     -------
@@ -78,11 +78,9 @@ def residual_noise(values: Array) -> tuple[float, float]:
     variance = np.array([robust_variance(np.convolve(values, w, "valid")) for w, _ in filters])
     if variance.min() <= 0.0:
         return digital, 0.0
-    powers = _CORRELATIONS[:, None, None] ** np.arange(1, max(widths))[None, None, :]
-    shares = np.array(
-        [c[0] + 2.0 * (powers[:, 0, : c.size - 1] @ c[1:]) for _, c in filters]
-    ).T  # (correlations, widths)
-    off = np.log(variance) - np.log(shares)
+    powers = _CORRELATIONS[:, None] ** np.arange(1, max(widths))
+    shares = np.array([c[0] + 2.0 * (powers[:, : c.size - 1] @ c[1:]) for _, c in filters])
+    off = np.log(variance) - np.log(shares.T)  # (correlations, widths)
     narrow = off[:, :3]
     phi = _CORRELATIONS[int(np.argmin(np.var(narrow, axis=1)))]
     # The scatter of φ over records of white noise is about 1.5/√n.
@@ -101,10 +99,7 @@ def residual_noise(values: Array) -> tuple[float, float]:
 
 
 def noise_level(values: Array) -> float:
-    """Estimate the standard deviation of the noise of a smooth signal from its second differences.
-
-    It is quick and takes part of the signal for noise where that is sampled coarsely.
-    """
+    """Noise of a finely sampled signal, a standard deviation, from its second differences."""
     if len(values) < 4:
         return 0.0
     return float(1.4826 * np.median(np.abs(np.diff(values, 2))) / np.sqrt(6))
@@ -121,19 +116,18 @@ def correlation_time(phi: float) -> float:
     return (1.0 + phi) / (1.0 - phi)
 
 
-def estimated_noise(values: Array) -> NoiseLevel:
+def estimated_noise(values: Array, what: str = "samples") -> NoiseLevel:
     """Noise of a channel by `residual_noise`."""
     sigma, phi = residual_noise(values)
-    how = f"estimated from what local cubics leave of {values.size} samples"
+    how = f"estimated from what local cubics leave of {values.size} {what}"
     return NoiseLevel(sigma, False, how, correlation_time(phi))
 
 
 def noise_at_rest(rest: Array, during: NoiseLevel, block: int) -> NoiseLevel | None:
     """Noise of a channel from its samples before contact, about their line; None for no noise.
 
-    During contact `block` samples are averaged. What the signal itself shows there, `during`, is
-    the answer where it contradicts: a sensor may be quieter at rest, and a motion may start before
-    the stress.
+    During contact `block` samples are averaged. Where the noise that the signal shows there,
+    `during`, contradicts, it is the answer.
     """
     n = len(rest)
     x = np.arange(n, dtype=np.float64)
@@ -161,10 +155,7 @@ def averaged(level: NoiseLevel, block: int) -> NoiseLevel:
 
 
 def with_noise(measurement: Measurement) -> Measurement:
-    """Complete the noise of a test: what is neither stated nor known is estimated from the samples.
-
-    A test whose channels all have their noise is returned as it is.
-    """
+    """Estimate the noise of the channels that have none; a test that has all stays as it is."""
     noise, curves = measurement.noise, measurement.channels()
     missing = {c: estimated_noise(v) for c, v in curves.items() if noise.of(c) is None}
     if not missing:

@@ -5,11 +5,12 @@ A newcomer may skip this module.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from foamfit.data.measurement import MIN_ROWS, Array, NoiseLevel
+from foamfit.arrays import Array
+from foamfit.data.measurement import MIN_ROWS, NoiseLevel
 from foamfit.data.noise import correlation_time, lag_one, noise_level
 
 # A rest has as many independent samples, and the slope of a signal on it is less than this share of
@@ -47,31 +48,27 @@ def leave_rest(
 ) -> float | None:
     """Time at which a signal leaves its rest, or None if none is shown before it rises.
 
-    Where a rise seems to start, the samples before it must be at rest: their slope is less than a
-    share `still` of the slope that follows, and they do not surely rise by more than `drift`. If
-    they do, the kink was one in a rise, and the part before it is looked at in the same way.
+    Before it the slope is less than a share `still` of the slope that follows, and the signal does
+    not significantly change by more than `drift`. A kink within a rise is passed over for an
+    earlier one.
     """
-    end = len(time)
-    while True:
-        at = _kink(time[:end], values[:end], noise)
-        if at is None:
-            return None
-        before = slopes(time[:end], values[:end], at, noise)
-        if before.upper < still and before.drift <= drift:
-            return at
-        rows = int(np.searchsorted(time, at))
-        if not MIN_ROWS <= rows < end:
-            return None
-        end = rows
+    at = _kink(time, values, noise)
+    if at is None:
+        return None
+    before = slopes(time, values, at, noise)
+    if before.upper < still and before.drift <= drift:
+        return at
+    rows = int(np.searchsorted(time, at))
+    if not MIN_ROWS <= rows < len(time):
+        return None
+    return leave_rest(time[:rows], values[:rows], noise, still, drift)
 
 
-@dataclass(frozen=True)
-class Slopes:
+class Slopes(NamedTuple):
     """Slope of a signal before a time over its mean slope after it, up to 15 % of the peak.
 
-    The bounds are three standard errors away, and infinite where the samples before, or the rise
-    after, are too few or too noisy to tell. `upper` is that of the slope's size: a signal that
-    falls does not rest either. `drift` is how much the signal changes at least before that time.
+    The bounds are three standard errors away, infinite where samples are too few or too noisy;
+    `upper` is that of the slope's size. `drift` is the least change of the signal before that time.
     """
 
     lower: float = -np.inf
@@ -105,8 +102,8 @@ def slopes(time: Array, values: Array, at: float, noise: NoiseLevel) -> Slopes:
 def _kink(time: Array, values: Array, noise: NoiseLevel) -> float | None:
     """Time at which a signal seems to start to rise, None if it may do so from its first sample.
 
-    A rest followed by a straight or else a quadratic rise is fitted by least squares to the samples
-    up to 15 % of the peak, so that the time is finer than the sampling.
+    A rest followed by a straight or a quadratic rise is fitted to the samples up to 15 % of the
+    peak by least squares.
     """
     high, low = _rise(values, 0.15), _rise(values, 0.05)
     first = max(0, high - 4 * max(high - low, 3) - 8)
@@ -148,22 +145,21 @@ def _rise_misfit(t: Array, y: Array, starts: Array, power: int) -> Array:
     return misfit
 
 
-@dataclass(frozen=True)
-class Level:
-    """Where a signal is at one time: by how many samples, and how sure that is."""
+class Level(NamedTuple):
+    """Value of a signal at one time, its standard error, and from how many samples it is."""
 
     value: float
     error: float
     samples: int
 
-    def told(self, noise: NoiseLevel, shape: str) -> str:
-        """Say its size against the noise, and what it was read off."""
+    def source(self, noise: NoiseLevel, shape: str) -> str:
+        """Say its size over that of the noise, and what it was read off."""
         size = abs(self.value) / noise.sigma if noise.sigma > 0 else np.inf
         ratio = f"{size:.{0 if size >= 10 else 1}f} noise standard deviations; "
         return f"{ratio if np.isfinite(size) else ''}{shape} {self.samples} samples"
 
     @property
-    def sureness(self) -> float:
+    def significance(self) -> float:
         """Size over standard error."""
         if self.error > 0:
             return abs(self.value) / self.error
@@ -189,15 +185,14 @@ def level_on_line(time: Array, values: Array, at: float, noise: NoiseLevel) -> L
 
 
 def level_by_balance(time: Array, w: Array, stress: Array) -> Level:
-    """Level of the motion at the first sample, by the striker's balance of motion.
+    """Level of a motion at its first sample, by the striker's balance of momentum.
 
-    w = w0 + v t - c ∬σ with free w0, v and c is fitted by least squares. What it leaves is the
-    noise, as slow as it may be, or what contradicts it, so that the error holds either.
+    w = w0 + v t - c ∬σ is fitted by least squares; the error is that of its correlated residuals.
     """
+    from scipy.integrate import cumulative_trapezoid
+
     t = time - time[0]
-    dt = np.diff(t, prepend=0.0)
-    slowed = np.cumsum(dt * (stress - 0.5 * np.diff(stress, prepend=stress[0])))
-    braked = np.cumsum(dt * (slowed - 0.5 * np.diff(slowed, prepend=0.0)))
+    braked = cumulative_trapezoid(cumulative_trapezoid(stress, t, initial=0), t, initial=0)
     columns = np.column_stack([np.ones(t.size), t, braked])
     columns /= np.sqrt((columns**2).sum(axis=0))
     inverse = np.linalg.pinv(columns)
