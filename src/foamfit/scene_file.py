@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import math
 from collections.abc import Callable
@@ -11,8 +10,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from foamfit.arrays import Array
 from foamfit.data.csv_file import read_history
-from foamfit.data.measurement import Array
 from foamfit.data.toml_file import check_keys, load_toml
 from foamfit.data.units import parse_quantity
 from foamfit.errors import InputError
@@ -174,7 +173,5 @@ def write_response(response: Response, path: Path) -> None:
     header = ["time (s)", "base stress (Pa)", "strain", *(f"displacement_{i} (m)" for i in nodes)]
     columns = [response.time, response.base_stress, response.strain, *response.displacement]
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(zip(*(column.tolist() for column in columns), strict=True))
+    np.savetxt(text, np.transpose(columns), "%s", ",", header=",".join(header), comments="")
     write_file(path, text.getvalue().encode())

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from foamfit.arrays import Array
 from foamfit.data.columns import (
     assign_columns,
     columns_note,
@@ -25,7 +26,6 @@ from foamfit.data.csv_table import Table, find_table, read_numbers, read_text
 from foamfit.data.headers import CHANNELS, example
 from foamfit.data.measurement import (
     MIN_ROWS,
-    Array,
     Dropped,
     Measurement,
     Record,
@@ -35,6 +35,7 @@ from foamfit.data.measurement import (
     interior_node,
 )
 from foamfit.data.noise import with_noise
+from foamfit.data.outliers import fresh_samples
 from foamfit.data.prepare import condition
 from foamfit.data.toml_file import Column, Settings, read_settings
 from foamfit.errors import InputError
@@ -70,7 +71,7 @@ def read_test(path: str | Path, specimen: str | Path | None = None) -> Measureme
     columns = assign_columns(table, settings.columns, toml)
     record, notes = _record(table, columns, settings)
     try:
-        conditioned = condition(
+        test = condition(
             record,
             settings.specimen,
             striker=settings.striker,
@@ -79,25 +80,10 @@ def read_test(path: str | Path, specimen: str | Path | None = None) -> Measureme
         )
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    _check_noise(toml, settings, conditioned.record)
-    measurement = Measurement(
-        name=settings.name,
-        path=path,
-        data_sha256=text.sha256,
-        time=conditioned.record.time,
-        stress=conditioned.record.stress,
-        displacement=conditioned.record.displacement,
-        specimen=settings.specimen,
-        striker=settings.striker,
-        noise=replace(settings.noise, estimated=conditioned.noise),
-        motion=conditioned.motion,
-        notes=(*notes, *conditioned.notes),
-        interior=conditioned.record.interior,
-        outliers=conditioned.outliers,
-        contact=conditioned.contact,
-        count=conditioned.count,
-    )
-    return with_noise(measurement)
+    _check_noise(toml, settings, test)
+    test = replace(test, name=settings.name, path=path, data_sha256=text.sha256)
+    noise = replace(settings.noise, estimated=test.noise.estimated)
+    return with_noise(replace(test, noise=noise, notes=(*notes, *test.notes)))
 
 
 def read_history(path: Path, channel: str) -> tuple[Array, Array]:
@@ -139,8 +125,8 @@ def _record(
     if count < MIN_ROWS:
         raise InputError(f"{table.path}: has fewer than {MIN_ROWS} rows; a test needs more.")
     for channel, values in numbers.items():
+        name = headers[needed[channel]].text
         if np.ptp(values) == 0:
-            name = headers[needed[channel]].text
             raise InputError(f"{table.path}: column {name!r} is constant; a {channel} must vary.")
         numbers[channel] = values * factors[channel]
     notes = [columns_note(table, needed, settings), *_announced(table, count)]
@@ -190,8 +176,7 @@ def _announced(table: Table, count: int) -> list[str]:
     for row, line in enumerate(head, 1):
         match = re.match(rb"\W*(?:number of )?samples\W+(\d+)", line, re.IGNORECASE)
         if match and int(match[1]) != count:
-            told = f"row {row} announces {int(match[1])} samples, but the table has {count}"
-            return [f"Check: {told}."]
+            return [f"Check: row {row} announces {int(match[1])} samples, the table has {count}."]
     return []
 
 
@@ -200,12 +185,10 @@ def _averaged(
 ) -> tuple[dict[str, Array], NDArray[np.int64]]:
     """Average neighbouring rows with the same time stamp; each is counted with its reason."""
     time = numbers["time"]
-    fresh = np.append(True, np.diff(time) != 0.0)
-    again = rows[~fresh]
+    starts, counts = fresh_samples(time)
+    again = np.delete(rows, starts)
     if not again.size:
         return numbers, rows
-    starts = np.flatnonzero(fresh)
-    counts = np.diff(np.append(starts, len(time)))
     dropped.append(Dropped.of(again, "the time stamp of the row before, averaged with it"))
     notes.append(
         f"Check: {again.size} of {len(time)} rows have the time stamp of the row before, the first "
@@ -239,25 +222,25 @@ def _one_of(
     if two is None:
         return one
     if one is None:
-        notes.append(
-            f"The {first} is the {second} {'over' if first == 'stress' else 'times'} {by}."
-        )
+        operation = "over" if first == "stress" else "times"
+        notes.append(f"The {first} is the {second} {operation} {by}.")
         return two / ratio
     slope = float(np.dot(two, one) / np.dot(one, one)) / ratio
     if abs(slope - 1) > 0.03:
-        agree = f"the {second} is {slope:.3g} times what it gives with {by} of the specimen"
-        notes.append(f"Check: the {first} is used, but {agree}; they are inconsistent.")
+        notes.append(
+            f"Check: the {first} is used, but the {second} is {slope:.3g} times what it gives with "
+            f"{by} of the specimen; they are inconsistent."
+        )
     else:
         notes.append(f"The {first} is used rather than the {second}, and they agree.")
     return one
 
 
-def _check_noise(toml: Path, settings: Settings, record: Record) -> None:
+def _check_noise(toml: Path, settings: Settings, test: Measurement) -> None:
     """Refuse a stated noise that is larger than all that was measured."""
     for channel, unit in (("stress", "Pa"), ("displacement", "m")):
-        values, sigma = record.channel(channel), getattr(settings.noise, channel)
-        if values is not None and sigma is not None and sigma > np.ptp(values):
-            size = float(np.ptp(values))
+        size, sigma = float(np.ptp(test.channels()[channel])), getattr(settings.noise, channel)
+        if sigma is not None and sigma > size:
             raise InputError(
                 f"{toml}: [noise] {channel} = {engineering(sigma, unit)} is "
                 f"{percent(sigma / size, 3)} of the range of the measured {channel}, "

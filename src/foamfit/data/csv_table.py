@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from foamfit.arrays import Array
 from foamfit.data.headers import CHANNELS, Header, parse_header
-from foamfit.data.measurement import MIN_ROWS, Array
+from foamfit.data.measurement import MIN_ROWS
 from foamfit.data.toml_file import LONGEST
 from foamfit.data.units import is_unit
 from foamfit.errors import InputError
