@@ -60,10 +60,9 @@ def run(record, **window):
 
 def error_of_motion(conditioned):
     """RMS error of displacement along the contact, as a share of its peak."""
-    record = conditioned
-    truth = pulse(record.time)[1]
-    inside = record.time <= DURATION
-    return np.sqrt(np.mean((record.displacement - truth)[inside] ** 2)) / truth.max()
+    truth = pulse(conditioned.time)[1]
+    inside = conditioned.time <= DURATION
+    return np.sqrt(np.mean((conditioned.displacement - truth)[inside] ** 2)) / truth.max()
 
 
 # Where contact starts.
@@ -86,12 +85,11 @@ def test_a_file_that_starts_in_contact_keeps_its_time_zero(n, noise, w):
 )
 def test_contact_is_found_after_a_pretrigger(noise, w):
     conditioned = run(impact(before=0.4, after=0.4, noise=noise, offset=0.03, origin=5e-3, w=w))
-    record = conditioned
-    assert 0 <= record.time[0] < 0.012 * DURATION
-    assert record.time[-1] == pytest.approx(DURATION, rel=0.05)
+    assert 0 <= conditioned.time[0] < 0.012 * DURATION
+    assert conditioned.time[-1] == pytest.approx(DURATION, rel=0.05)
     assert error_of_motion(conditioned) < 0.015
     # the sensor's offset is gone
-    assert record.stress[-3:].mean() == pytest.approx(0, abs=0.02 * PEAK)
+    assert conditioned.stress[-3:].mean() == pytest.approx(0, abs=0.02 * PEAK)
     assert any("offset" in note for note in conditioned.notes)
     assert any("are cut" in note for note in conditioned.notes)
 
@@ -316,11 +314,10 @@ def followed(record, share=0.4, zero=3e-3, noise=0.0):
 )
 def test_a_mass_inside_goes_through_the_same_steps(before, n, noise):
     conditioned = run(followed(impact(n, before=before, after=0.3), noise=noise))
-    record = conditioned
-    assert record.interior[1].shape == record.time.shape
-    truth = 0.4 * pulse(np.minimum(record.time, DURATION))[1]
-    inside = record.time <= DURATION
-    away = np.abs(np.mean(record.interior[1] - truth, where=inside)) / truth.max()
+    assert conditioned.interior[1].shape == conditioned.time.shape
+    truth = 0.4 * pulse(np.minimum(conditioned.time, DURATION))[1]
+    inside = conditioned.time <= DURATION
+    away = np.abs(np.mean(conditioned.interior[1] - truth, where=inside)) / truth.max()
     assert away < 2e-3  # its own zero, 3 mm by the file, is gone
     assert any("displacement_1 at contact, 3 mm, is taken off" in n for n in conditioned.notes)
 
@@ -375,12 +372,11 @@ def cycles(n=3, hold=50):
 @pytest.mark.parametrize("cycle", [1, 2, 3])
 def test_one_cycle_of_a_slow_test_is_kept(cycle):
     conditioned = condition(cycles(), SPECIMEN, window=Window(cycle=cycle))
-    record = conditioned
-    assert 440 <= len(record) <= 510
-    assert record.time[0] == pytest.approx(0, abs=0.011)
+    assert 440 <= len(conditioned.stress) <= 510
+    assert conditioned.time[0] == pytest.approx(0, abs=0.011)
     # the zero is that of the first contact, in every cycle
-    assert record.displacement.max() == pytest.approx(1e-3, rel=1e-3)
-    assert record.displacement[-1] == pytest.approx(2e-5, abs=6e-6)
+    assert conditioned.displacement.max() == pytest.approx(1e-3, rel=1e-3)
+    assert conditioned.displacement[-1] == pytest.approx(2e-5, abs=6e-6)
     assert any(f"Cycle {cycle} of 3" in note for note in conditioned.notes)
 
 

@@ -9,31 +9,17 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.arrays import Array
-from foamfit.data.columns import (
-    assign_columns,
-    columns_note,
-    needed_columns,
-    si_factor,
-    sign_advice,
-)
+from foamfit.data.columns import assign_columns, needed_columns, read_note, si_factor, sign_advice
 from foamfit.data.csv_table import Table, find_table, read_numbers, read_text
 from foamfit.data.headers import CHANNELS, example
-from foamfit.data.measurement import (
-    MIN_ROWS,
-    Dropped,
-    Measurement,
-    Record,
-    Specimen,
-    Striker,
-    interior_channel,
-    interior_node,
-)
+from foamfit.data.measurement import MIN_ROWS, Dropped, Measurement, Record, Striker, interior_node
 from foamfit.data.noise import with_noise
 from foamfit.data.outliers import fresh_samples
 from foamfit.data.prepare import condition
@@ -76,7 +62,7 @@ def read_test(path: str | Path, specimen: str | Path | None = None) -> Measureme
             settings.specimen,
             striker=settings.striker,
             window=settings.window,
-            advice=sign_advice(table, columns, settings),
+            advice=partial(sign_advice, table, columns, settings),
         )
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
@@ -87,15 +73,7 @@ def read_test(path: str | Path, specimen: str | Path | None = None) -> Measureme
 
 
 def read_history(path: Path, channel: str) -> tuple[Array, Array]:
-    """Read time and one other channel of a table, both in SI, as they stand there.
-
-    A column without a unit is in SI.
-
-    Raises
-    ------
-    InputError
-        Where the file cannot be used.
-    """
+    """Read time and one other channel of a table in SI; a column without a unit is in SI."""
     wanted = f"a CSV with the columns 'time (ms)' and '{example(channel)}'"
     table = find_table(read_text(path, wanted), set())
     found = assign_columns(table, {}, None)
@@ -129,7 +107,7 @@ def _record(
         if np.ptp(values) == 0:
             raise InputError(f"{table.path}: column {name!r} is constant; a {channel} must vary.")
         numbers[channel] = values * factors[channel]
-    notes = [columns_note(table, needed, settings), *_announced(table, count)]
+    notes = [read_note(table, needed, settings), *_announced(table, count)]
     rows, dropped = table.row_numbers(count), list[Dropped]()
     if empty.size:
         dropped.append(Dropped.of(empty, "no cell of it holds anything"))
@@ -137,33 +115,27 @@ def _record(
         if settings.duplicates == "average":
             numbers, rows = _averaged(numbers, rows, dropped, notes)
         _check_time(table, numbers["time"], headers[needed["time"]].text, rows)
-    record = _to_record(numbers, settings.specimen, settings.striker or Striker(), notes)
+    record = _to_record(numbers, settings, notes)
     return replace(record, numbers=rows, dropped=tuple(dropped)), tuple(notes)
 
 
-def _to_record(
-    numbers: dict[str, Array], specimen: Specimen, striker: Striker, notes: list[str]
-) -> Record:
+def _to_record(numbers: dict[str, Array], settings: Settings, notes: list[str]) -> Record:
     """Derive stress and displacement from the channels, in SI, that stand for them."""
+    specimen, mass = settings.specimen, (settings.striker or Striker()).mass
     stress = _one_of(numbers, "stress", "force", specimen.area, "the area", notes)
     displacement = _one_of(numbers, "displacement", "strain", 1 / specimen.height, "height", notes)
     acceleration = numbers.get("acceleration")
-    if stress is None:  # needed_columns has seen to it that these are there
-        assert striker.mass is not None
+    if stress is None:
+        assert mass is not None  # see needed_columns
         assert acceleration is not None
-        stress, acceleration = acceleration * striker.mass / specimen.area, None
+        stress, acceleration = acceleration * mass / specimen.area, None
         notes.append("The force is the striker's mass times its acceleration.")
     inside = {}
     for channel, values in numbers.items():
-        node = interior_node(channel)
-        if node is None:
-            continue
-        if displacement is not None and np.allclose(
-            values, displacement, rtol=0.0, atol=1e-9 * float(np.ptp(displacement))
-        ):
-            name = interior_channel(node)
-            notes.append(f"{name} is the displacement of the top; it is left out.")
-        else:
+        node, top = interior_node(channel), displacement
+        if node and top is not None and np.allclose(values, top, 0.0, 1e-9 * np.ptp(top)):
+            notes.append(f"{channel} is the displacement of the top; it is left out.")
+        elif node:
             inside[node] = values
     return Record(
         numbers.get("time"), stress, displacement, numbers.get("velocity"), acceleration, inside

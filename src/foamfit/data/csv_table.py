@@ -129,12 +129,10 @@ def find_table(text: Text, names: set[str]) -> Table:
             f"{path}: rows {above[0]} to {above[-1]} hold numbers above the header in row {i + 1}; "
             "a file must hold one table with one header."
         )
-    for k, cell in enumerate(grid[i], 1):
-        if len(cell) > LONGEST:
-            raise InputError(
-                f"{path}: row {i + 1}: the name of column {k} has {len(cell)} characters; "
-                f"it must have {LONGEST} at most."
-            )
+    for k, n in enumerate(map(len, grid[i]), 1):
+        if n > LONGEST:
+            many = f"row {i + 1}: the name of column {k} has {n} characters"
+            raise InputError(f"{path}: {many}; it must have {LONGEST} at most.")
     first, texts = _unit_row(grid, i)
     headers = tuple(map(parse_header, texts))
     body = [cells for cells in grid[first:] if any(c.strip() for c in cells)]
@@ -207,7 +205,7 @@ def _decimal_sign(path: Path, body: list[list[str]], width: int, separator: str)
             f"{path}: {commas[0]!r} may have a decimal comma or a separator of thousands; "
             "write the numbers with a decimal point and without separators."
         )
-    points = sum(1 for v in values if "." in v and _is_number(v))
+    points = sum("." in v and _is_number(v) for v in values)
     return "," if len(commas) > points else "."
 
 
@@ -230,10 +228,7 @@ def read_numbers(
 ) -> tuple[dict[str, Array], NDArray[np.int64]]:
     """Read columns as they stand in the file, and the numbers of rows that are left out as empty.
 
-    Raises
-    ------
-    InputError
-        Naming the first cell that is no number.
+    InputError names the first cell that is no number.
     """
     empty = np.zeros(0, dtype=np.int64)
     try:
@@ -280,15 +275,11 @@ def _refuse_cells(table: Table, columns: dict[str, int]) -> None:
     for row, cells in table.rows():
         where = f"{table.path}: row {row}"
         if tuple(cell.strip() for cell in cells) == table.header_cells:
-            raise InputError(
-                f"{where} repeats the header of row {table.header_row}; a file must hold one table "
-                "with one header."
-            )
+            again = f"repeats the header of row {table.header_row}"
+            raise InputError(f"{where} {again}; a file must hold one table with one header.")
         if any(cell.strip() for cell in cells[count:]):
-            raise InputError(
-                f"{where} has {len(cells)} cells, but the header has {count}; every row must have "
-                "as many as the header."
-            )
+            many = f"has {len(cells)} cells, but the header has {count}"
+            raise InputError(f"{where} {many}; every row must have as many as the header.")
         for k in columns.values():
             cell = cells[k].strip() if k < len(cells) else ""
             wrong = _wrong(cell, table.decimal)
@@ -301,12 +292,10 @@ def _wrong(cell: str, decimal: str) -> str:
     if not cell:
         return "empty; every sample must have a number there"
     if decimal == "," and "." in cell and _is_number(cell):
-        same = "all must have the same decimal sign"
-        return f"{cell!r}, but other numbers have a decimal comma; {same}"
+        return f"{cell!r}, but others have a decimal comma; all must have the same decimal sign"
     text = cell.replace(",", ".") if decimal == "," else cell
     if not _NUMBER.fullmatch(text):
-        # Digits in groups?
-        plain = re.sub(r"(?<=\d)[_' ,\u2009\u202f](?=\d{3})", "", cell)
+        plain = re.sub(r"(?<=\d)[_' ,\u2009\u202f](?=\d{3})", "", cell)  # digits in groups
         hint = f" without separators, {plain}" if plain != cell and _is_number(plain) else ""
         shown = repr(cell if len(cell) <= LONGEST else cell[:LONGEST] + " …")
         return f"{shown}; it must be a number{hint}"

@@ -61,13 +61,8 @@ def residual_noise(values: Array) -> tuple[float, float]:
     filter. If the three narrowest agree with white noise, their variance is the answer, else σ and
     φ explain all widths best. Switches and spikes are cut from the residuals at three deviations.
 
-    Returns
-    -------
-    sigma : float
-        Standard deviation; at least that of the digitiser's step q, q/√12.
-    phi : float
-        Autocorrelation from one sample to the next; 0 for white noise, and where a vibration or a
-        noise slower than the signal hides it.
+    Returns σ, at least that of the digitiser's step q, q/√12, and φ, 0 for white noise and where a
+    vibration or a noise slower than the signal hides it.
     """
     n = values.size
     digital = quantum(values) / np.sqrt(12.0)

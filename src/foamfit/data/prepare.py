@@ -6,7 +6,7 @@ thing that it changed or left out.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable
 
 import numpy as np
 
@@ -51,7 +51,7 @@ def condition(
     *,
     striker: Striker | None = None,
     window: Window | None = None,
-    advice: Mapping[str, str] | None = None,
+    advice: Callable[[str], str] | None = None,
 ) -> Measurement:
     """Turn all samples of a file into one loading and unloading, a test without a name.
 
@@ -70,7 +70,7 @@ def condition(
     record = done(cut_to_window(record, window))
     record = done(mark_clipped(bridge_outliers(record)))
     spoilt = {name: int(np.count_nonzero(excess)) for name, excess in record.excess.items()}
-    check_signs(record, advice or {})
+    check_signs(record, advice)
     held = noise_of_held(record)
     record = done(fill_staircase(record))
     if impact and window.cycle != 1:
@@ -136,8 +136,8 @@ def cut_to_window(record: Record, window: Window) -> tuple[Record, list[str]]:
     return record, [note]
 
 
-def check_signs(record: Record, advice: Mapping[str, str]) -> None:
-    """Refuse a channel that is negative in compression; `advice` says what to write, by channel."""
+def check_signs(record: Record, advice: Callable[[str], str] | None) -> None:
+    """Refuse a channel that is negative in compression; `advice` says what would be right."""
     stress, peak = record.stress, int(np.argmax(record.stress))
     first, lowest = float(np.median(stress[:5])), stress.min()
     negative = first - lowest > 2 * max(stress[peak] - first, 0) and abs(lowest) > stress[peak]
@@ -152,8 +152,8 @@ def check_signs(record: Record, advice: Mapping[str, str]) -> None:
     elif record.displacement is None and velocity is not None:
         wrong += ["velocity"] if velocity[0] < velocity[-1] else []
     if wrong:
-        told = f"{wrong[0]} is negative in compression; give it scale = -1 in [columns]"
-        raise InputError(f"the {advice.get(wrong[0], told)}.")
+        plain = f"{wrong[0]} is negative in compression; give it scale = -1 in [columns]"
+        raise InputError(f"the {advice(wrong[0]) if advice else plain}.")
 
 
 def integrate_motion(record: Record, specimen: Specimen, striker: Striker) -> tuple[Record, str]:

@@ -18,12 +18,11 @@ _QUANTITY = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*)")
 def _registry() -> Any:
     import pint
 
+    make = functools.partial(pint.UnitRegistry, autoconvert_offset_to_baseunit=True)
     try:  # parsing pint's definitions takes longer than most fits: it keeps them in a cache
-        registry: Any = pint.UnitRegistry(
-            autoconvert_offset_to_baseunit=True, cache_folder=":auto:"
-        )
+        registry: Any = make(cache_folder=":auto:")
     except OSError:
-        registry = pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
+        registry = make()
     registry.define("microstrain = 1e-6 = ustrain")
     return registry
 
