@@ -144,7 +144,7 @@ def _to_record(numbers: dict[str, Array], settings: Settings, notes: list[str]) 
 
 def _announced(table: Table, count: int) -> list[str]:
     """Compare with the number of samples that an instrument's header announces."""
-    head = table.text.raw.split(b"\n", table.first_row)[: table.first_row]
+    head = table.raw.split(b"\n", table.first_row)[: table.first_row]
     for row, line in enumerate(head, 1):
         match = re.match(rb"\W*(?:number of )?samples\W+(\d+)", line, re.IGNORECASE)
         if match and int(match[1]) != count:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from foamfit.arrays import Array
 from foamfit.data.headers import CHANNELS, Header, parse_header
 from foamfit.data.measurement import MIN_ROWS
-from foamfit.data.toml_file import LONGEST
+from foamfit.data.toml_file import LONGEST, read_bytes
 from foamfit.data.units import is_unit
 from foamfit.errors import InputError
 
@@ -43,10 +43,9 @@ class Text:
 
 
 @dataclass(frozen=True)
-class Table:
-    """Where the numbers of a file are, before they are read."""
+class Table(Text):
+    """The text of a file, and where its numbers are, before they are read."""
 
-    text: Text
     separator: str
     decimal: str
     header_row: int
@@ -55,26 +54,21 @@ class Table:
     headers: tuple[Header, ...]
 
     @property
-    def path(self) -> Path:
-        """The file."""
-        return self.text.path
-
-    @property
     def listed(self) -> str:
         """The headers, in quotation marks."""
         return ", ".join(repr(h.text) for h in self.headers if h.text)
 
     def rows(self) -> Iterator[tuple[int, list[str]]]:
         """Yield (row number in the file, cells) of the rows that are not blank."""
-        raw, encoding = self.text.raw, self.text.encoding
-        lines = io.TextIOWrapper(io.BytesIO(raw), encoding, errors="replace", newline="")
+        file = io.BytesIO(self.raw)
+        lines = io.TextIOWrapper(file, self.encoding, errors="replace", newline="")
         for number, cells in _cells(self.path, lines, self.separator):
             if number > self.first_row and any(cell.strip() for cell in cells):
                 yield number, cells
 
     def body(self) -> bytes:
         """Return the rows below the header."""
-        return self.text.raw.split(b"\n", self.first_row)[-1] if self.first_row else self.text.raw
+        return self.raw.split(b"\n", self.first_row)[-1] if self.first_row else self.raw
 
     def row_numbers(self, count: int) -> NDArray[np.int64]:
         """Return the row numbers in the file of its `count` samples."""
@@ -93,14 +87,7 @@ class Table:
 
 def read_text(path: Path, wanted: str) -> Text:
     """Read a file as text; `wanted` says what the path must be."""
-    try:
-        raw = path.read_bytes()
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; give {wanted}.") from None
-    except IsADirectoryError:
-        raise InputError(f"{path}: is a directory; give {wanted}.") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
+    raw = read_bytes(path, f"give {wanted}")
     sha256 = hashlib.sha256(raw).hexdigest()
     if not raw.strip():
         raise InputError(f"{path}: the file is empty; it must hold a header and rows of numbers.")
@@ -139,8 +126,8 @@ def find_table(text: Text, names: set[str]) -> Table:
     if not body:
         raise InputError(f"{path}: has a header in row {i + 1} but no rows of numbers below it.")
     decimal = _decimal_sign(path, body, len(texts), separator)
-    cells = tuple(cell.strip() for cell in grid[i])
-    return Table(text, separator, decimal, i + 1, cells, first, headers)
+    cells, whole = tuple(cell.strip() for cell in grid[i]), (path, text.raw, text.encoding)
+    return Table(*whole, text.sha256, separator, decimal, i + 1, cells, first, headers)
 
 
 def _cells(path: Path, lines: Iterable[str], separator: str) -> Iterator[tuple[int, list[str]]]:
@@ -261,7 +248,7 @@ def _frame(table: Table, columns: dict[str, int], body: bytes) -> pd.DataFrame:
         io.BytesIO(header + b"\n" + body),
         sep=table.separator,
         decimal=table.decimal,
-        encoding=table.text.encoding,
+        encoding=table.encoding,
         usecols=[*kinds, str(excess)],
         dtype=kinds | {str(excess): "str"},
         na_filter=False,

@@ -11,15 +11,15 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from foamfit.arrays import Array
+from foamfit.data.contact import line_at
 from foamfit.data.measurement import INTEGRATED, Measurement, Striker
 from foamfit.data.noise import noise_level
-from foamfit.data.rest import line_at
 from foamfit.text import engineering, percent
 
 
 @dataclass(frozen=True)
 class EnergyAudit:
-    """The energy and momentum of one test; None where the test does not say enough.
+    """The energy and momentum of one test; None where the test lacks what it takes.
 
     Attributes
     ----------

@@ -14,6 +14,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement, NoiseLevel
 
+MIN_REST = 20  # samples that show their own noise
 # Widths of the local cubics (samples); the widest may cover a twelfth of the record.
 _WIDTHS = (5, 7, 11, 17, 25, 37, 55, 83, 125)
 _SHARE = 12
@@ -118,26 +119,31 @@ def estimated_noise(values: Array, what: str = "samples") -> NoiseLevel:
     return NoiseLevel(sigma, False, how, correlation_time(phi))
 
 
-def noise_at_rest(rest: Array, during: NoiseLevel, block: int) -> NoiseLevel | None:
-    """Noise of a channel from its samples before contact, about their line; None for no noise.
+def noise_before_contact(
+    rest: dict[str, Array], curves: dict[str, Array], block: int
+) -> dict[str, NoiseLevel]:
+    """Noise of channels from their samples before contact, about their line, if they are twenty.
 
-    During contact `block` samples are averaged. Where the noise that the signal shows there,
-    `during`, contradicts, it is the answer.
+    The `curves` during contact are means of `block` samples; where the noise that they show
+    contradicts, it is the answer.
     """
-    n = len(rest)
-    x = np.arange(n, dtype=np.float64)
-    off = rest - np.polyval(np.polyfit(x, rest, 1), x)
-    sigma, phi = float(np.sqrt(off @ off / (n - 2))), lag_one(off)
-    if sigma == 0.0:
-        return None
-    time = correlation_time(phi) if 2 / np.sqrt(n) < phi < 1 else 1.0
-    how = f"estimated from {n} samples before contact"
-    level = averaged(NoiseLevel(sigma, False, how, time), block)
-    if 0.5 < level.sigma / max(during.sigma, 1e-300) < 4.0:
-        return level
-    word = "quieter" if level.sigma < during.sigma else "less quiet"
-    how = f"{during.how}, the {n} before contact being {word}"
-    return replace(during, how=how) if during.sigma > 0.0 else None
+    found = dict[str, NoiseLevel]()
+    for name, values in rest.items():
+        n, x = len(values), np.arange(len(values), dtype=np.float64)
+        if n < MIN_REST:
+            continue
+        off = values - np.polyval(np.polyfit(x, values, 1), x)
+        sigma, phi = float(np.sqrt(off @ off / (n - 2))), lag_one(off)
+        time = correlation_time(phi) if 2 / np.sqrt(n) < phi < 1 else 1.0
+        how = f"estimated from {n} samples before contact"
+        level = averaged(NoiseLevel(sigma, False, how, time), block)
+        during = estimated_noise(curves[name])
+        if 0.5 < level.sigma / max(during.sigma, 1e-300) < 4.0:
+            found[name] = level
+        elif min(sigma, during.sigma) > 0.0:
+            word = "quieter" if level.sigma < during.sigma else "less quiet"
+            found[name] = replace(during, how=f"{during.how}, the {n} before contact being {word}")
+    return found
 
 
 def averaged(level: NoiseLevel, block: int) -> NoiseLevel:

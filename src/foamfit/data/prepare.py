@@ -7,11 +7,12 @@ thing that it changed or left out.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.data.contact import Start, cut_to_contact, find_start, remove_offset, zero_interior
+from foamfit.data.contact import cut_to_contact, find_start, remove_offset, smooth, zero_interior
 from foamfit.data.cycles import inner_reversals, select_cycle
 from foamfit.data.measurement import (
     INTEGRATED,
@@ -20,7 +21,6 @@ from foamfit.data.measurement import (
     Dropped,
     Measurement,
     Noise,
-    NoiseLevel,
     Outliers,
     Record,
     RowCount,
@@ -29,7 +29,7 @@ from foamfit.data.measurement import (
     Window,
     interior_channel,
 )
-from foamfit.data.noise import averaged, estimated_noise, noise_at_rest, noise_level
+from foamfit.data.noise import averaged, estimated_noise, noise_before_contact, noise_level
 from foamfit.data.outliers import (
     bridge_outliers,
     fill_staircase,
@@ -38,7 +38,6 @@ from foamfit.data.outliers import (
     outlier_note,
     outliers_of_blocks,
 )
-from foamfit.data.rest import MIN_REST, line_at, smooth
 from foamfit.errors import InputError
 from foamfit.text import engineering, percent
 
@@ -85,8 +84,8 @@ def condition(
     if not impact:
         record = done(select_cycle(record, window.cycle))
     if window.cycle > 1:  # a later cycle keeps the zero of the first, when the foam was fresh
-        how, resting = f"with cycle {window.cycle}", 0
-        start = Start(how, zero=start.zero, zero_from=start.zero_from)
+        start = replace(start, how=f"with cycle {window.cycle}", time=None, at_zero=False)
+        resting = 0
     record = done(cut_to_contact(record, start, impact, levels["stress"]))
     record, motion = integrate_motion(record, specimen, striker or Striker())
     if motion != MEASURED:
@@ -94,7 +93,8 @@ def condition(
     notes += checks(record, specimen, striker or Striker(), motion)
     whole, record = record, done(thin(record))
     block = -(-len(whole) // len(record))
-    noise = noise_before_contact(first.rows(slice(resting)), record, block)
+    before = {name: values[:resting] for name, values in first.curves().items()}
+    noise = noise_before_contact(before, record.curves(), block)
     noise |= {name: averaged(level, block) for name, level in held.items()}
     outliers = outliers_of_blocks(whole, block)
     timed = record.time is not None
@@ -214,7 +214,7 @@ def checks(record: Record, specimen: Specimen, striker: Striker, motion: str) ->
         early = displacement <= 0.15 * displacement.max()
         early[int(np.argmax(displacement)) :] = False
         if early.sum() >= 3:
-            speed = line_at(record.time[early], displacement[early], 0.0)[1]
+            speed = float(np.polyfit(record.time[early], displacement[early], 1)[0])
             if abs(speed / striker.velocity - 1) > 0.1:
                 notes.append(
                     f"Check: the displacement starts at {speed:.3g} m/s, but the striker's velocity"
@@ -256,18 +256,6 @@ def thin(record: Record) -> tuple[Record, list[str]]:
     for name, values in record.curves().items():
         thinned = thinned.changed(name, np.add.reduceat(values, edges) / counts)
     return thinned, [f"{n} samples are averaged in {len(edges)} blocks of {size}."]
-
-
-def noise_before_contact(rest: Record, record: Record, block: int) -> dict[str, NoiseLevel]:
-    """Estimate the noise of each channel from the samples before contact, if they are twenty."""
-    if len(rest) < MIN_REST:
-        return {}
-    curves = record.curves()
-    found = {
-        name: noise_at_rest(values, estimated_noise(curves[name]), block)
-        for name, values in rest.curves().items()
-    }
-    return {name: level for name, level in found.items() if level is not None}
 
 
 def count_rows(record: Record, outliers: dict[str, Outliers], block: int) -> RowCount:

@@ -69,24 +69,30 @@ class Settings:
     duplicates: str = "average"
 
 
-def load_toml(path: Path, otherwise: str) -> dict[str, Any]:
-    """Load a TOML file; `otherwise` says what it is needed for where there is none."""
+def read_bytes(path: Path, otherwise: str, most: int = -1) -> bytes:
+    """Read a file, its first bytes if `most` are given; `otherwise` says what would be right."""
     try:
         with path.open("rb") as file:
-            raw = file.read(_LARGEST + 1)
-        if len(raw) > _LARGEST:
-            size = path.stat().st_size
-            raise InputError(f"{path}: has {size} characters; a TOML must have {_LARGEST} at most.")
+            return file.read(most)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; {otherwise}.") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); {otherwise}.") from None
+
+
+def load_toml(path: Path, otherwise: str) -> dict[str, Any]:
+    """Load a TOML file; `otherwise` says what it is needed for where there is none."""
+    raw = read_bytes(path, otherwise, _LARGEST + 1)
+    if len(raw) > _LARGEST:
+        size = path.stat().st_size
+        raise InputError(f"{path}: has {size} characters; a TOML must have {_LARGEST} at most.")
+    try:
         text = raw.decode("utf-8-sig")
         if _DOTTED.search(text):  # tomllib takes a time that grows with the square of their number
             raise RecursionError
         return tomllib.loads(text)
     except RecursionError:
         raise InputError(f"{path}: is nested too deeply; write a TOML of few levels.") from None
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; {otherwise}.") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give a TOML file.") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: is no UTF-8 text; a TOML file must be.") from None
     except tomllib.TOMLDecodeError as error:
