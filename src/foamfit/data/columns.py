@@ -43,9 +43,9 @@ def assign_columns(table: Table, given: dict[str, Column], toml: Path | None) ->
         if len(best) > 1:
             both = " and ".join(repr(table.headers[k].text) for k in best)
             entry = f'{channel} = {{ column = "{table.headers[best[0]].text}" }}'
+            more = f", or write {entry} in [columns] of {toml.name}" if toml else ""
             raise InputError(
-                f"{table.path}: columns {both} could both be the {channel}; keep one"
-                + (f", or write {entry} in [columns] of {toml.name}." if toml else ".")
+                f"{table.path}: columns {both} could both be the {channel}; keep one{more}."
             )
         if best and not (ranks[best[0]] == WEAK and strained):
             found[channel] = best[0]

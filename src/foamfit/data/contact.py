@@ -64,11 +64,10 @@ class Start:
 
 
 def find_start(record: Record, levels: Levels, striker: Striker | None) -> Start:
-    """Find where contact starts, which motion and stress decide together.
+    """Find where contact starts: where the motion passes its own zero or leaves a rest.
 
-    A motion that passes its own zero, or leaves a rest, starts contact there, unless the stress has
-    risen before; a stress that leaves a rest starts it while the motion goes on. Where no rest is
-    shown, contact starts at the first sample.
+    If the stress has risen before, it is where the stress leaves its rest; without any rest it is
+    the first sample.
     """
     time, w, stress = record.instants, record.displacement, record.stress
     impact, drift = striker is not None, 0.01 * float(stress.max())
@@ -78,8 +77,8 @@ def find_start(record: Record, levels: Levels, striker: Striker | None) -> Start
         return Start("at the first sample") if at is None else Start(by_the_stress, at, free=True)
     noise, top = levels["displacement"], int(np.argmax(w))
     first, balance = _first_levels(time, w, stress, top, noise)
-    surely = min(first, balance, key=lambda level: level.significance) if impact else first
-    away = surely.significance > _ELSEWHERE
+    origin = min(first, balance, key=lambda level: level.significance) if impact else first
+    away = origin.significance > _ELSEWHERE
     elsewhere = away and abs(first.value) > 0.02 * (w[top] - first.value)
     # Where the motion of a striker starts at its zero, no stress that rises is taken for a rest.
     drift = np.inf if elsewhere else 0.0 if impact else drift
@@ -90,13 +89,9 @@ def find_start(record: Record, levels: Levels, striker: Striker | None) -> Start
     onset = 0 if by_stress is None else int(np.searchsorted(time, by_stress))
     travel = float(w[top] - w[onset])
     crossing, near = _passage(time, w, top, noise)
-    below = crossing > 1 and away and surely.value < -1e-4 * travel
-
-    def loaded(at: float) -> bool:
-        """Whether the stress has plainly risen before a time."""
-        return slopes(time, stress, at, levels["stress"]).lower > STILL
-
-    unloaded = stress[near].mean() < 0.2 * stress.max() and not loaded(time[crossing])
+    below = crossing > 1 and away and origin.value < -1e-4 * travel
+    unloaded = stress[near].mean() < 0.2 * stress.max()
+    unloaded &= not _loaded(record, time[crossing], levels)
     if below and unloaded and (by_stress is None or abs(w[onset]) < 0.3 * w[top]):
         level, speed = line_at(time[near], w[near], time[crossing])
         at = time[crossing] - level / speed if speed > 0 else time[crossing]
@@ -108,7 +103,7 @@ def find_start(record: Record, levels: Levels, striker: Striker | None) -> Start
     approach = w[onset] - first.value if by_stress is not None else 0.0
     # A striker's motion starts at contact, if tracked so; a machine's may start above the specimen.
     small = approach < (0.3 if impact else 0.1) * travel
-    if by_motion is not None and small and not loaded(by_motion):
+    if by_motion is not None and small and not _loaded(record, by_motion, levels):
         rest = resting_level(w[time < by_motion], noise)
         source = rest.source(noise, "median of") + " at rest before contact"
         return Start("where the displacement leaves its rest", by_motion, rest.value, True, source)
@@ -119,13 +114,18 @@ def find_start(record: Record, levels: Levels, striker: Striker | None) -> Start
         source = zero.source(noise, "line through") + " around it, the stress being at rest before"
         return Start(by_the_stress, by_stress, zero.value, True, source)
     gone = time[0] * (striker.velocity or 0.0) if striker is not None else 0.0
-    if surely.significance > ERRORS and 0.7 < first.value / max(gone, 1e-300) < 1.1:
+    if origin.significance > ERRORS and 0.7 < first.value / max(gone, 1e-300) < 1.1:
         return Start("before the first sample", at_zero=True)
     under_load = stress[:3].mean() > 0.05 * stress.max() and 0 < first.value < travel
     if under_load or not elsewhere:
         return Start("at the first sample")
     source = first.source(noise, "line through") + " from the first on; the file's zero lies"
     return Start("at the first sample", zero=first.value, zero_from=f"{source} elsewhere")
+
+
+def _loaded(record: Record, at: float, levels: Levels) -> bool:
+    """Whether the stress has significantly risen before a time."""
+    return slopes(record.instants, record.stress, at, levels["stress"]).lower > STILL
 
 
 def _first_levels(
@@ -193,8 +193,8 @@ def remove_offset(record: Record, n: int, noise: NoiseLevel) -> tuple[Record, li
     rest = record.stress[:n]
     offset, scatter = float(np.median(rest)), float(rest.std())
     rise = line_at(np.arange(n, dtype=np.float64), rest, 0.0)[1] * n
-    doubt = 4 * noise_level(rest) * np.sqrt(12 * noise.time / n)
-    if abs(rise) > max(0.01 * record.stress.max(), doubt):
+    uncertainty = 4 * noise_level(rest) * np.sqrt(12 * noise.time / n)
+    if abs(rise) > max(0.01 * record.stress.max(), uncertainty):
         told = f"by {engineering(rise, 'Pa')} in the {n} samples before contact"
         return record, [f"The stress drifts {told}, so no offset is taken off."]
     ratio = f", {abs(offset) / scatter:.2g} times that" if scatter > 0 else ""
@@ -342,12 +342,12 @@ def slopes(time: Array, values: Array, at: float, noise: NoiseLevel) -> Slopes:
         scatter = max(scatter, noise.sigma)
     error = ERRORS * scatter * np.sqrt(noise.time / float(t @ t))
     top = values[high : high + 3]
-    doubt = ERRORS * noise.sigma * np.sqrt(1.0 / len(top) + noise.time / n)
+    uncertainty = ERRORS * noise.sigma * np.sqrt(1.0 / len(top) + noise.time / n)
     rise, lasts = float(top.mean() - rest.mean()), float(time[high] - at)
     drift = max(0.0, abs(slope) - error) * float(np.ptp(t))
-    if rise <= doubt:
+    if rise <= uncertainty:
         return Slopes(drift=drift)
-    upper = (abs(slope) + error) * lasts / (rise - doubt)
+    upper = (abs(slope) + error) * lasts / (rise - uncertainty)
     return Slopes((slope - error) * lasts / rise, upper, drift)
 
 
@@ -365,7 +365,7 @@ def _kink(time: Array, values: Array, noise: NoiseLevel) -> float | None:
         return None
     starts = np.linspace(t[0], t[-2], 400)
     straight, curved = _rise_misfit(t, y, starts, 1), _rise_misfit(t, y, starts, 2)
-    # The curve must fit clearly better: where noise hides the shape, the line is the safer guess.
+    # The curve must fit significantly better than the line.
     variance = min(noise.sigma**2, min(straight.min(), curved.min()) / len(t))
     slow = 9 * noise.time * variance  # three standard errors of noise with its correlation
     less = max(9 / len(t) * straight.min(), slow)
@@ -382,8 +382,8 @@ def _kink(time: Array, values: Array, noise: NoiseLevel) -> float | None:
             return None
         if (time[high] - starts[best]) * 2 > starts[best] - t[0]:
             rise = line_at(t[rest], y[rest], 0.0)[1] * np.ptp(t[rest])
-            doubt = 4 * noise_level(values) * np.sqrt(12 / rest.sum())
-            if abs(rise) > max(doubt, 2e-3 * np.ptp(values)):
+            uncertainty = 4 * noise_level(values) * np.sqrt(12 / rest.sum())
+            if abs(rise) > max(uncertainty, 2e-3 * np.ptp(values)):
                 return None
     return float(starts[best])
 

@@ -1,7 +1,6 @@
-"""A test file and its TOML become a `Measurement`: column names end here, SI begins.
+"""A test file and its TOML become a `Measurement` in SI.
 
-A file holds one table, one row per sample. Its separator, its decimal sign and the row that names
-the columns are found from the first lines; the unit of a channel stands in its header, in a row of
+A file holds one table, one row per sample; the unit of a channel is in its header, in a row of
 units beneath it, or in the ``[columns]`` table of the TOML.
 """
 
@@ -180,10 +179,8 @@ def _check_time(table: Table, time: Array, name: str, rows: NDArray[np.int64]) -
         if time[i] == time[i - 1]:
             more = ' (in a test, [data] duplicates = "average" averages rows with the same stamp)'
             wrong = "repeats"
-        raise InputError(
-            f"{table.path}: row {rows[i]}, column {name!r}: time {wrong}; it must increase from "
-            f"row to row{more}."
-        )
+        where = f"{table.path}: row {rows[i]}, column {name!r}"
+        raise InputError(f"{where}: time {wrong}; it must increase from row to row{more}.")
 
 
 def _one_of(
@@ -199,10 +196,8 @@ def _one_of(
         return two / ratio
     slope = float(np.dot(two, one) / np.dot(one, one)) / ratio
     if abs(slope - 1) > 0.03:
-        notes.append(
-            f"Check: the {first} is used, but the {second} is {slope:.3g} times what it gives with "
-            f"{by} of the specimen; they are inconsistent."
-        )
+        agree = f"{slope:.3g} times what it gives with {by} of the specimen; they are inconsistent"
+        notes.append(f"Check: the {first} is used, but the {second} is {agree}.")
     else:
         notes.append(f"The {first} is used rather than the {second}, and they agree.")
     return one

@@ -112,10 +112,8 @@ def find_table(text: Text, names: set[str]) -> Table:
     separator, grid, i = _header_row(path, head, names)
     above = [k for k, cells in enumerate(grid[:i], 1) if _holds_numbers(cells)]
     if len(above) >= MIN_ROWS:
-        raise InputError(
-            f"{path}: rows {above[0]} to {above[-1]} hold numbers above the header in row {i + 1}; "
-            "a file must hold one table with one header."
-        )
+        where = f"rows {above[0]} to {above[-1]} hold numbers above the header in row {i + 1}"
+        raise InputError(f"{path}: {where}; a file must hold one table with one header.")
     for k, n in enumerate(map(len, grid[i]), 1):
         if n > LONGEST:
             many = f"row {i + 1}: the name of column {k} has {n} characters"
@@ -137,10 +135,8 @@ def _cells(path: Path, lines: Iterable[str], separator: str) -> Iterator[tuple[i
         for cells in reader:
             yield reader.line_num, cells
     except csv.Error:
-        raise InputError(
-            f"{path}: row {reader.line_num} has a cell of more than {csv.field_size_limit()} "
-            "characters; the file must be a text table (CSV)."
-        ) from None
+        cell = f"row {reader.line_num} has a cell of more than {csv.field_size_limit()} characters"
+        raise InputError(f"{path}: {cell}; the file must be a text table (CSV).") from None
 
 
 def _header_row(path: Path, lines: list[str], names: set[str]) -> tuple[str, list[list[str]], int]:

@@ -9,12 +9,8 @@ from foamfit.data.measurement import Measurement, Specimen, Striker, interior_no
 from foamfit.text import engineering, labelled, percent
 
 
-def describe(measurement: Measurement, audit: EnergyAudit) -> str:
-    """Write what was read of a test, what was done to it, and its balance of energy and momentum.
-
-    The text has about thirty aligned lines, without a newline at its end.
-    """
-    test = measurement
+def describe(test: Measurement, audit: EnergyAudit) -> str:
+    """Write what was read of a test, what was done to it, and its energy and momentum."""
     lines = [
         ("test", [test.name]),
         ("file", [str(test.path or "none")]),

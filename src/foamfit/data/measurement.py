@@ -54,8 +54,8 @@ class Striker:
 class NoiseLevel:
     """The noise of one channel: one standard deviation, Pa or m.
 
-    It is `given` by the test, or else estimated from the data; `how` says so ("estimated from 40
-    samples before contact"). `time` is its autocorrelation time, in samples (1: white).
+    It is `given` by the test, or else estimated from the data, and `how` says from what. `time` is
+    its autocorrelation time, in samples (1: white).
     """
 
     sigma: float
@@ -90,9 +90,8 @@ class Outliers:
     """Samples of a channel that are not fitted: spikes, short gaps, and a clipped top.
 
     `left_out` marks these samples, shape (n,); at spikes and gaps the channel holds a straight
-    line. What the file has there is `values` (k,), Pa or m, `at` (k,) times in s, or samples where
-    the test has no time. `clipped_at` is the value at which the sensor or its amplifier clips the
-    channel, Pa.
+    line. The file has the `values` (k,), Pa or m, `at` times (k,), s, or samples where the test has
+    no time. At `clipped_at`, Pa, the sensor or its amplifier clips the channel.
     """
 
     left_out: NDArray[np.bool_]
@@ -103,10 +102,9 @@ class Outliers:
 
 @dataclass(frozen=True)
 class Dropped:
-    """Rows of a file that are not used, for one reason, which follows "not used: ".
+    """Rows of a file that are not used, for one reason; rows that are used may lie between.
 
     `first` and `last` are lines of the file as an editor counts them, from 1 and with the header.
-    Rows that are used may lie between.
     """
 
     rows: int
@@ -147,10 +145,10 @@ class RowCount:
 
 @dataclass(frozen=True)
 class Window:
-    """The part of a file to look at: times in s as the file counts them, and which cycle."""
+    """The part of a file to use: times in s as the file counts them, and which cycle."""
 
-    start: float | None = None
-    end: float | None = None
+    start: float = -np.inf
+    end: float = np.inf
     cycle: int = 1
 
 

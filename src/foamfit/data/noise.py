@@ -1,7 +1,6 @@
-"""The noise of a channel, from its own samples.
+"""The noise of a channel, from its own samples: each is judged by its neighbours, not by a model.
 
-Nothing here knows the model: a sample is judged by its neighbours alone, so that no switch of a
-spring and no vibration is taken for noise where it is sampled well enough to be seen.
+No switch of a spring and no vibration is taken for noise where it is sampled finely.
 """
 
 from __future__ import annotations
@@ -18,8 +17,8 @@ MIN_REST = 20  # samples that show their own noise
 # Widths of the local cubics (samples); the widest may cover a twelfth of the record.
 _WIDTHS = (5, 7, 11, 17, 25, 37, 55, 83, 125)
 _SHARE = 12
-# Autocorrelations from one sample to the next that are tried, and the largest that is believed: a
-# slower noise cannot be told from the signal.
+# Autocorrelations from one sample to the next that are tried, and the largest that is accepted: a
+# slower noise cannot be distinguished from the signal.
 _CORRELATIONS = np.linspace(0.0, 0.98, 99)
 _SLOWEST = 0.95
 # Scatter of the logarithms of the variances up to which they are those of one noise.

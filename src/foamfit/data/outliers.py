@@ -1,6 +1,6 @@
 """Samples that are no measurements: spikes, short gaps, a clipped force, and values that are held.
 
-A sample is judged by its neighbours alone; nothing here knows the model.
+A sample is judged by its neighbours, not by a model.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def find_outliers(values: Array, time: Array | None = None) -> NDArray[np.bool_]
     at = np.arange(n, dtype=np.float64) if time is None or even else time
     cubics = _cubics(at, even)
     wrong = _gaps(values, at)
-    for _ in range(4):  # what a big spike hides
+    for _ in range(4):  # beside a large spike a small one is found later
         smooth = _bridged(values, wrong, at)
         if is_staircase(smooth):
             break

@@ -54,10 +54,9 @@ def condition(
 ) -> Measurement:
     """Turn all samples of a file into one loading and unloading, a test without a name.
 
-    With a striker and a time the record is an impact, else a slow test whose displacement is
-    driven. `window` is the part to use, and `advice` says how to turn a channel round; see
-    `check_signs`. At most 1500 samples are left; time and displacement are zero where contact
-    starts. The noise is estimated where samples before contact, or held samples, show it.
+    With a striker and a time it is an impact, else a slow test whose displacement is driven; for
+    `advice` see `check_signs`. At most 1500 samples are left; time and displacement are zero where
+    contact starts. The noise is estimated where samples before contact, or held ones, show it.
     """
     window, notes = window or Window(), list[str]()
     impact = striker is not None and record.time is not None
@@ -97,8 +96,8 @@ def condition(
     noise = noise_before_contact(before, record.curves(), block)
     noise |= {name: averaged(level, block) for name, level in held.items()}
     outliers = outliers_of_blocks(whole, block)
-    timed = record.time is not None
-    notes += [outlier_note(name, n, outliers.get(name), timed) for name, n in spoilt.items()]
+    for name, n in spoilt.items():
+        notes.append(outlier_note(name, n, outliers.get(name), record.time is not None))
     channels = record.time, record.stress, record.displacement
     return Measurement(
         *("", None, "", *channels, specimen, striker),  # no name and no file
@@ -114,13 +113,11 @@ def condition(
 
 def cut_to_window(record: Record, window: Window) -> tuple[Record, list[str]]:
     """Keep what lies between the window's start and end, as the file counts time."""
-    if window.start is None and window.end is None:
+    if (window.start, window.end) == (-np.inf, np.inf):
         return record, []
     if record.time is None:
         raise InputError("[window] start and end need a time column; the file has none.")
-    start = -np.inf if window.start is None else window.start
-    end = np.inf if window.end is None else window.end
-    inside = (record.time >= start) & (record.time <= end)
+    inside = (record.time >= window.start) & (record.time <= window.end)
     kept = int(inside.sum())
     if kept < MIN_ROWS:
         first, last = (engineering(float(t), "s") for t in record.time[[0, -1]])
@@ -229,17 +226,13 @@ def checks(record: Record, specimen: Specimen, striker: Striker, motion: str) ->
 def _stress_notes(stress: Array) -> list[str]:
     """Say where a stress does not start or end at zero."""
     peak, width, notes = float(stress.max()), max(1, len(stress) // 100), []
-    share = stress[:3].mean() / peak
-    if share > 0.05:
-        notes.append(
-            f"Check: the record starts under load, at {percent(share)} of the peak stress."
-        )
-    lowest = float(smooth(stress, width)[int(np.argmax(stress)) :].min())
+    first, lowest = stress[:3].mean(), float(smooth(stress, width)[np.argmax(stress) :].min())
+    if first > 0.05 * peak:
+        load = f"at {percent(first / peak)} of the peak stress"
+        notes.append(f"Check: the record starts under load, {load}.")
     if lowest < -max(0.002 * peak, 4 * noise_level(stress) / np.sqrt(width)):
-        notes.append(
-            f"The stress goes down to {engineering(lowest, 'Pa')} after the peak (adhesion, drift "
-            "or vibration); it is kept."
-        )
+        after = f"{engineering(lowest, 'Pa')} after the peak (adhesion, drift or vibration)"
+        notes.append(f"The stress goes down to {after}; it is kept.")
     return notes
 
 

@@ -44,10 +44,7 @@ _SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
 
 @dataclass(frozen=True)
 class Column:
-    """What [columns] says of one channel: its column, and the unit and scale of its numbers.
-
-    A column that `counts_down` is a gap or a position that gets smaller in compression.
-    """
+    """What [columns] says of one channel; one that `counts_down` gets smaller in compression."""
 
     column: str
     unit: str | None = None

@@ -70,10 +70,7 @@ def split_quantity(text: str) -> tuple[float, str] | None:
 
 
 def parse_quantity(value: object, si: str, where: str, example: str) -> float:
-    """Read a quantity such as "1.19 mm" in the unit `si`, "" for none.
-
-    A refusal names `where` it stands, file and key, and gives an `example`.
-    """
+    """Read a quantity such as "1.19 mm" in the unit `si`; `where` and `example` are for errors."""
     parts = split_quantity(value) if isinstance(value, str) else None
     if parts is None:
         raise InputError(f'{where} = {value!r} is no quantity; give it like "{example}".')
