@@ -100,7 +100,7 @@ def _spikes(
 ) -> NDArray[np.bool_]:
     """Samples that the cubic through their eight neighbours does not expect; see `_cubics`."""
     out = np.zeros(values.size, dtype=bool)
-    residual = np.sum(weights * _windows(values).T, axis=0)
+    residual = np.einsum("sw,ws->w", weights, _windows(values))
     off = np.abs(residual) / own
     usual = np.sqrt(robust_variance(residual / np.sqrt(own)) / own)
     far = np.flatnonzero(off > np.maximum(_OFF * usual, least))
@@ -135,7 +135,8 @@ def _cubics(time: Array, even: bool) -> tuple[Array, Array]:
     step = np.diff(time)
     pause = _windows(step, _WIDTH - 1).max(axis=1) > _PAUSE * float(np.median(step))
     unjudged = pause | (weights[_HALF] < _OPEN)
-    return np.where(unjudged, 0.0, weights), np.where(unjudged, 1.0, weights[_HALF])
+    own = np.where(unjudged, 1.0, weights[_HALF])
+    return np.where(unjudged, 0.0, weights) if unjudged.any() else weights, own
 
 
 def _windows(values: Array, width: int = _WIDTH) -> Array:
