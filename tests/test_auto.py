@@ -237,19 +237,35 @@ def test_a_linear_spring_in_series_adds_combinations_and_no_evidence():
 # --------------------------------------------------------------- which models
 
 
-def test_only_models_that_the_test_allows_are_tried():
+def test_only_models_that_the_test_allows_are_tried(monkeypatch):
+    tried = []
+
+    def identify(_, model, *__):
+        tried.append(model)
+        raise ff.SimulationError("not now")
+
+    def models(test):
+        """Models that are tried, each once, and which are left out and why."""
+        tried.clear()
+        with pytest.raises(ff.SimulationError) as caught:
+            ff.fit(test, model="auto")
+        told = str(caught.value).split("no rung could be tried: ")[1].split("; ")
+        return list(dict.fromkeys(tried)), [why for why in told if not why.endswith("not now")]
+
+    monkeypatch.setattr(one_model, "identify", identify)
+    monkeypatch.setattr(auto, "WITHOUT_EVIDENCE", len(auto.LADDER) + 1)
     _, test = synthetic_impact()
-    assert auto._models(test) == (list(auto.LADDER), [])
+    assert models(test) == (list(auto.LADDER), [])
     given = replace(test, specimen=replace(test.specimen, heights=(0.6e-3, 0.59e-3)))
-    models, skipped = auto._models(given)
-    assert models == ["bistable", "linear+bistable", "bistable+bistable"]
+    allowed, skipped = models(given)
+    assert allowed == ["bistable", "linear+bistable", "bistable+bistable"]
     assert skipped == ["linear+bistable+bistable: [specimen] heights are those of 2 springs"]
-    followed = replace(test, interior={1: test.displacement * 0.4})
-    models, skipped = auto._models(followed)
-    assert models == list(auto.LADDER[1:])
+    allowed, skipped = models(replace(test, interior={1: test.displacement * 0.4}))
+    assert allowed == list(auto.LADDER[1:])
+    assert len(skipped) == 1
     assert "motion was measured" in skipped[0]
     with pytest.raises(ff.InputError, match="no model of the ladder"):
-        auto._models(replace(test, interior={5: test.displacement}))
+        ff.fit(replace(test, interior={5: test.displacement}), model="auto")
 
 
 def test_a_drive_without_dampers_has_one_rung_for_each_model():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import lmfit
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -327,13 +328,12 @@ def test_the_figure_of_a_stopped_fit_says_so():
 
 
 def test_a_stopped_fit_is_never_ok(monkeypatch):
-    from foamfit import one_model
     from foamfit.fitting.search import SearchStoppedError
 
-    def stop(*_: object) -> None:
+    def stop(*_: object, **__: object) -> None:
         raise SearchStoppedError
 
-    monkeypatch.setattr(one_model, "_refine", stop)
+    monkeypatch.setattr(lmfit, "minimize", stop)  # the refinement
     result = ff.fit(synthetic_impact()[1], starts=4)
     assert result.stopped == "the time limit"
     assert result.status == "warnings"

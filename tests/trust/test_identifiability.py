@@ -27,8 +27,9 @@ from foamfit.report.identifiability_plots import (
 from foamfit.report.page import render_report
 from foamfit.report.summary import summary_text
 from foamfit.springs.chain import Chain, Impact
+from foamfit.trust import checklist
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.checklist import Check, _by_reason, status_of
+from foamfit.trust.checklist import Check, status_of
 from foamfit.trust.conclude import conclude
 from foamfit.trust.identifiability import Insight
 from foamfit.trust.intervals import Intervals
@@ -379,12 +380,16 @@ def test_a_profile_much_narrower_than_the_local_interval_is_not_taken() -> None:
     assert "was not taken" in found.why
 
 
-def test_many_reasons_are_left_to_the_table() -> None:
-    few = [("s1_k0", "one"), ("s1_kc", "one"), ("s1_eta", "two")]
-    assert _by_reason(few) == "s1_k0, s1_kc (one); s1_eta (two)"
-    many = _by_reason([(f"s{i}_k0", f"reason {i}") for i in range(1, 6)])
-    assert many.startswith("s1_k0, s2_k0, s3_k0, s4_k0, s5_k0 (")
-    assert "reason 1" not in many
+def test_many_reasons_are_left_to_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    slow = synthetic_impact(velocity=1.0, samples=201)[1]
+    assert concluded(slow).warnings[0] == (
+        "Not determined: s1_kc (branch c of spring 1 was never reached); "
+        "s1_dsigma, s1_eps_c, s1_kh_minus (branch e of spring 1 was never reached)."
+    )
+    monkeypatch.setattr(checklist, "REASONS", 1)
+    assert concluded(slow).warnings[0] == (
+        "Not determined: s1_kc, s1_dsigma, s1_eps_c, s1_kh_minus (see why of each in the report)."
+    )
 
 
 def test_parameters_that_are_not_determined_count_as_varied() -> None:

@@ -626,10 +626,14 @@ def test_what_is_within_rounding_of_its_limit_is_at_it(impact, monkeypatch):
     assert "lies at its limit 0" in item.why
     assert item.ci95[1] == 0.0
     values[at] = -0.0
-    assert str(one_model._on_limits(BestPoint(problem, values), np.inf).values[at]) == "0.0"
+    found = Found(problem, Tracker(problem.objective, best_values=values), AGREED)
+    result, _ = judge(found, Choice("local"), lambda _: None)
+    assert str(result.parameters["s1_dsigma"].value) == "0.0"
     # What would cost something stays where it is.
     monkeypatch.setattr(one_model, "AT_LIMIT", 1.0)
-    assert one_model._on_limits(impact, impact.cost) is impact
+    tracker = Tracker(problem.objective, best_values=impact.values, best_cost=impact.cost)
+    _, best = judge(Found(problem, tracker, AGREED), Choice("local"), lambda _: None)
+    np.testing.assert_array_equal(best.values, impact.values)
 
 
 def test_a_profile_that_its_limit_cuts_is_not_called_narrow(impact):
