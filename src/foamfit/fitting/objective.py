@@ -47,26 +47,16 @@ MAX_STEPS = 20_000
 
 @dataclass(frozen=True, eq=False)
 class Simulated:
-    """The curves of one set of parameters; None where the drive prescribes or the test lacks them.
+    """The curves of one set of parameters and the run itself.
 
-    `stress_strain` is the stress (Pa) along the measured displacement. `motion` is the run itself.
-    `interior` holds the displacements (m) of the masses inside that the test has too, `slopes` the
+    `curves` are by their names in `Objective.curves`, absent where the drive prescribes or the test
+    lacks them; stress_strain is the stress (Pa) along the measured displacement. `slopes` are the
     derivatives (p, n) of the curves by the parameters that were asked for; None where none were.
     """
 
-    stress_time: Array | None
-    displacement_time: Array | None
-    stress_strain: Array | None
+    curves: dict[str, Array]
     motion: Motion
-    interior: dict[str, Array] = field(default_factory=dict)
     slopes: dict[str, Array] | None = None
-
-    def curve(self, name: str) -> Array | None:
-        """Return a curve by its name in `Objective.curves`."""
-        if name not in CURVES:
-            return self.interior.get(name)
-        values: Array | None = getattr(self, name)
-        return values
 
 
 @dataclass(eq=False)
@@ -105,7 +95,12 @@ class Objective:
         self._check_weights()
         self._dashpots = np.array([name.endswith("eta") for name in self.model.names])
         self._dashpots[-1] = False  # the onsite damper is none of a spring
-        self.time = self._time()
+        time = self.measurement.time
+        # Of the samples, s; their number where the test has no time.
+        self.time = np.arange(self._stress.size, dtype=float) if time is None else time
+        self._absent = {"stress": ["stress_time"], "displacement": ["displacement_time"]}.get(
+            self.drive, []
+        ) + (["stress_time"] if time is None else [])
         loading = self._loading()
         self._plans = {damped: self._scene(loading, damped=damped) for damped in (False, True)}
         self._along: dict[bool, Plan] = {}
@@ -113,11 +108,8 @@ class Objective:
             along = DisplacementDrive(self.measurement.displacement)
             self._along = {damped: self._scene(along, damped=damped) for damped in (False, True)}
         self.measured = self._measured()
-        self.counted = tuple(
-            name
-            for name in self.curves
-            if self.weights[name] > 0 and self.measured[name] is not None
-        )
+        there = [name for name in self.curves if self.measured[name] is not None]
+        self.counted = tuple(name for name in there if self.weights[name] > 0)
         self._inside = any(name in self.interior for name in self.counted)
         if not self.counted:
             raise InputError(
@@ -146,12 +138,6 @@ class Objective:
                     f"{', '.join(self.curves)} a weight of zero or more"
                 )
         self.weights = dict.fromkeys(self.curves, 0.0) | self.weights
-
-    def _time(self) -> Array:
-        """Time of the samples, s; their number where the test has no time."""
-        time = self.measurement.time
-        stress = self._stress
-        return np.arange(stress.size, dtype=float) if time is None else time
 
     @property
     def _stress(self) -> Array:
@@ -192,17 +178,14 @@ class Objective:
 
     def _measured(self) -> dict[str, Array | None]:
         """Measured curves that the drive leaves free."""
-        motion = self.measurement.displacement
-        inside = self.measurement.interior
-        return {
-            "stress_time": None if self.drive == "stress" else self._timed(self._stress),
-            "displacement_time": None if self.drive == "displacement" else motion,
+        motion, inside = self.measurement.displacement, self.measurement.interior
+        measured = {
+            "stress_time": self._stress,
+            "displacement_time": motion,
             "stress_strain": None if motion is None else self._stress,
             **{name: inside[node] for name, node in self.interior.items()},
         }
-
-    def _timed(self, values: Array) -> Array | None:
-        return None if self.measurement.time is None else values
+        return measured | dict.fromkeys(self._absent)
 
     def _curve(self, name: str) -> Array:
         curve = self.measured[name]
@@ -217,10 +200,6 @@ class Objective:
     def channel(self, name: str) -> str:
         """Channel of the test that a curve is compared with."""
         return name.removesuffix("_time") if name.startswith("displacement") else "stress"
-
-    def measured_size(self, name: str) -> int:
-        """Samples of a curve, outliers and all."""
-        return self._curve(name).size
 
     def noise(self, name: str) -> NoiseLevel:
         """Noise of a curve, stated or estimated."""
@@ -288,23 +267,21 @@ class Objective:
         if along is None and self._along and (everything or "stress_strain" in self.counted):
             plan = self._along[damped]
             along = plan.run(rows, heights, self.rtol, everything=False, directions=wanted)
-        slopes: dict[str, Array] | None = None
-        if run.slopes is not None and (along is None or along.slopes is not None):
-            moved, pressed = run.slopes
-            slopes = {"stress_time": pressed, "displacement_time": moved[:, -1]}
-            slopes |= {name: moved[:, node - 1] for name, node in inside.items()}
-            if along is not None and along.slopes is not None:
-                slopes["stress_strain"] = along.slopes.base_stress
-            for slope in slopes.values():
-                slope[places == values.size - 1] /= height  # site_eta acts through η_site/H
-        return Simulated(
-            stress_time=None if self.drive == "stress" else self._timed(run.base_stress),
-            displacement_time=None if self.drive == "displacement" else run.displacement[-1],
-            stress_strain=None if along is None else along.base_stress,
-            motion=run,
-            interior={name: run.displacement[node - 1] for name, node in inside.items()},
-            slopes=slopes,
-        )
+        curves = {"stress_time": run.base_stress, "displacement_time": run.displacement[-1]}
+        curves |= {name: run.displacement[node - 1] for name, node in inside.items()}
+        if along is not None:
+            curves["stress_strain"] = along.base_stress
+        curves = {name: curve for name, curve in curves.items() if name not in self._absent}
+        if run.slopes is None or (along is not None and along.slopes is None):
+            return Simulated(curves, run)
+        moved, pressed = run.slopes
+        slopes = {"stress_time": pressed, "displacement_time": moved[:, -1]}
+        slopes |= {name: moved[:, node - 1] for name, node in inside.items()}
+        if along is not None and along.slopes is not None:
+            slopes["stress_strain"] = along.slopes.base_stress
+        for slope in slopes.values():
+            slope[places == values.size - 1] /= height  # site_eta acts through η_site/H
+        return Simulated(curves, run, slopes)
 
     def shifted(
         self, curves: Simulated, late: float, by_shift: NDArray[np.bool_] = NOWHERE == 0
@@ -314,11 +291,10 @@ class Objective:
         Slopes are shifted with their curves. Where `by_shift` (n_places,) marks one by the shift
         itself, that is a difference over one sample: no simulation is in it.
         """
-        there = {name: curve for name in self.curves if (curve := curves.curve(name)) is not None}
-        slopes: dict[str, Array] | None = None
+        there, slopes = curves.curves, curves.slopes
         if by_shift.size:
             step = float(np.median(np.diff(self.time)))
-            own = curves.slopes or {name: np.empty((0, self.time.size)) for name in there}
+            own = slopes or {name: np.empty((0, self.time.size)) for name in there}
             slopes = {}
             for name in there.keys() & own.keys():
                 out = np.empty((by_shift.size, self.time.size))
@@ -329,14 +305,7 @@ class Objective:
                 slopes[name] = out
         if late != 0.0:
             there = {name: self._shift(name, curve, late) for name, curve in there.items()}
-        return replace(
-            curves,
-            stress_time=there.get("stress_time"),
-            displacement_time=there.get("displacement_time"),
-            stress_strain=there.get("stress_strain"),
-            interior={name: there[name] for name in curves.interior},
-            slopes=slopes,
-        )
+        return replace(curves, curves=there, slopes=slopes)
 
     def _shift(self, name: str, curve: Array, late: float, speed: float | None = None) -> Array:
         """One curve, or its derivative, seen by channels of which the motion is late (s).
@@ -385,12 +354,10 @@ class Objective:
 
     def compare(self, curves: Simulated) -> Array:
         """Residuals of simulated curves before the loss gives way to large ones, (n_data,)."""
-        parts = []
-        for name in self.counted:
-            simulated = curves.curve(name)
-            assert simulated is not None  # a curve is counted only if the drive leaves it free
-            difference = simulated - self._curve(name)
-            parts.append(difference[self._kept[name]] * self._factor(name))
+        parts = [
+            (curves.curves[name] - self._curve(name))[self._kept[name]] * self._factor(name)
+            for name in self.counted
+        ]
         # A stress near the pole of branch c is as bad as none.
         return np.asarray(np.clip(np.concatenate(parts), -self.penalty, self.penalty))
 
@@ -424,7 +391,7 @@ class Objective:
 
     def kept(self, name: str) -> NDArray[np.intp]:
         """Samples of a curve that stand in the residual, in their order: all but outliers."""
-        return np.arange(self.measured_size(name))[self._kept[name]]
+        return np.arange(self.time.size)[self._kept[name]]
 
     def rms(self, residual: Array) -> dict[str, float]:
         """RMS of each counted curve in its unit, from residuals before the loss."""
@@ -446,7 +413,7 @@ class Objective:
 
     def off(self, curves: Simulated, name: str) -> float | None:
         """RMS of simulated minus measured over the measured range of one curve, if it is there."""
-        measured, simulated = self.measured[name], curves.curve(name)
+        measured, simulated = self.measured[name], curves.curves.get(name)
         if measured is None or simulated is None:
             return None
         miss = (simulated - measured)[self._kept[name]]

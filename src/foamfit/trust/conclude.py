@@ -65,11 +65,11 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
             time=measurement.time,
             measured_stress=measurement.stress,
             measured_displacement=measurement.displacement,
-            stress=simulated.stress_time,
-            displacement=simulated.displacement_time,
-            stress_along=simulated.stress_strain,
+            stress=simulated.curves.get("stress_time"),
+            displacement=simulated.curves.get("displacement_time"),
+            stress_along=simulated.curves.get("stress_strain"),
             interior={
-                node: (measurement.interior[node], simulated.interior[name])
+                node: (measurement.interior[node], simulated.curves[name])
                 for name, node in objective.interior.items()
             },
         ),
@@ -132,70 +132,54 @@ def _noise_notes(objective: Objective) -> list[str]:
     return told
 
 
-def _notes(best: BestPoint) -> tuple[str, ...]:
+def _notes(best: BestPoint) -> list[str]:
     """What was left out of the model, and what it would change."""
     problem, simulated = best.problem, best.simulated
     objective, specimen = problem.objective, problem.measurement.specimen
-    unused = problem.notes + _along_integrated(problem, simulated)
-    if len(problem.model.kinds) == 1 and problem.measurement.interior:
-        names = ", ".join(map(interior_channel, sorted(problem.measurement.interior)))
-        unused += (f"A single spring has no mass inside, so {names} is left out.",)
-    if objective.drive == "stress":
-        return (
-            *unused,
-            "The driving stress is smoothed by a parabola over a twenty-fifth of the samples.",
+    single = len(problem.model.kinds) == 1
+    told = [*problem.notes]
+    unseen = [name for name in MOTION_CURVES if name not in objective.counted]
+    off = [(name.replace("_", "-"), objective.off(simulated, name)) for name in unseen]
+    there = [f"the {name} curve is {share:.1%} of its range off" for name, share in off if share]
+    if problem.measurement.motion == INTEGRATED and there:
+        told.append(
+            "The motion was integrated from the force, so it is no second measurement and has no "
+            f"misfit; against it {' and '.join(there)}."
         )
-    if len(problem.model.kinds) == 1 or objective.drive != "impact" or objective.interior_mass:
-        return unused
+    if single and problem.measurement.interior:
+        names = ", ".join(map(interior_channel, sorted(problem.measurement.interior)))
+        told.append(f"A single spring has no mass inside, so {names} is left out.")
+    if objective.drive == "stress":
+        told.append(
+            "The driving stress is smoothed by a parabola over a twenty-fifth of the samples."
+        )
+    if single or objective.drive != "impact" or objective.interior_mass:
+        return told
     left_out = "The interior masses are left out"
     if specimen.mass is None:
-        return (
-            *unused,
-            f"{left_out}; with [specimen] mass foamfit could say what they would change.",
-        )
-    heavy = replace(objective, interior_mass=True)
+        return [
+            *told, f"{left_out}; with [specimen] mass foamfit could say what they would change."
+        ]  # fmt: skip
     try:
-        other = heavy.simulate(best.values)
+        other = replace(objective, interior_mass=True).simulate(best.values).curves
     except SimulationError as error:
-        return (*unused, f"{left_out}; with them the simulation ends: {error}.")
+        return [*told, f"{left_out}; with them the simulation ends: {error}."]
+    spoken = {"stress_time": "the base stress", "displacement_time": "the displacement"}
     changes = [
-        f"{name} by {_share(one, two)}"
-        for name, one, two in (
-            ("the base stress", simulated.stress_time, other.stress_time),
-            ("the displacement", simulated.displacement_time, other.displacement_time),
-            *((c.removesuffix("_time"), w, other.curve(c)) for c, w in simulated.interior.items()),
-        )
-        if one is not None and two is not None
+        f"{spoken.get(name, name.removesuffix('_time'))} by {_share(curve, other[name])}"
+        for name, curve in simulated.curves.items()
+        if name != "stress_strain" and name in other
     ]
-    return (
-        *unused,
+    return [
+        *told,
         f"{left_out}; the specimen's {specimen.mass * 1e6:.3g} mg between the springs would change "
         f"{' and '.join(changes)} (RMS over range).",
-    )
+    ]
 
 
 def _share(one: Array, two: Array) -> str:
     off = float(np.sqrt(np.mean((one - two) ** 2)) / np.ptp(one))
     return "less than 0.01 %" if off < 1e-4 else percent(off)
-
-
-def _along_integrated(problem: Problem, simulated: Simulated) -> tuple[str, ...]:
-    """How far the fit is from a motion that was integrated from the force it is fitted to."""
-    objective = problem.objective
-    names = [name for name in MOTION_CURVES if name not in objective.counted]
-    if problem.measurement.motion != INTEGRATED or not names:
-        return ()
-    off = [
-        f"the {name.replace('_', '-')} curve is {share:.1%} of its range off"
-        for name in names
-        if (share := objective.off(simulated, name)) is not None
-    ]
-    if not off:
-        return ()
-    return (
-        "The motion was integrated from the force, so it is no second measurement and has no "
-        f"misfit; against it {' and '.join(off)}.",
-    )
 
 
 def _estimates(
@@ -320,7 +304,7 @@ def _statistics(best: BestPoint, record: SearchRecord) -> dict[str, float | int 
     return {
         "n_data": n,
         "n_effective": best.spread.effective if best.names else None,
-        "n_left_out": sum(objective.measured_size(name) for name in objective.counted) - n,
+        "n_left_out": len(objective.counted) * objective.time.size - n,
         "n_vary": n_vary,
         "chisqr": chisqr,
         "redchi": chisqr / max(n - n_vary, 1),
