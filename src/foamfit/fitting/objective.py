@@ -108,26 +108,19 @@ class Objective:
             along = DisplacementDrive(self.measurement.displacement)
             self._along = {damped: self._scene(along, damped=damped) for damped in (False, True)}
         self.measured = self._measured()
-        there = [name for name in self.curves if self.measured[name] is not None]
-        self.counted = tuple(name for name in there if self.weights[name] > 0)
+        self.counted = tuple(name for name in self.measured if self.weights[name] > 0)
         self._inside = any(name in self.interior for name in self.counted)
         if not self.counted:
             raise InputError(
                 f"{self.measurement.name}: no curve is left to fit; give one that the "
                 f"{self.drive} drive has a weight above zero"
             )
-        self.scale = {name: self._scale(name) for name in self.curves}
-        self._kept = {name: self._fitted(name) for name in self.curves}
-        self.sizes = tuple(self._curve(name)[self._kept[name]].size for name in self.counted)
+        self.scale = {name: self._scale(name) for name in self.measured}
+        self._kept = {name: self._fitted(name) for name in self.measured}
+        self.sizes = tuple(self.kept(name).size for name in self.counted)
         self.n_data = sum(self.sizes)
         # Worse per sample than any curve that stays within ten ranges.
-        self.penalty = max(
-            PENALTY
-            * self.weights[name] ** 0.5
-            * float(np.ptp(self._curve(name)))
-            / self.scale[name]
-            for name in self.counted
-        )
+        self.penalty = max(PENALTY * self.span(name) for name in self.counted)
 
     def _check_weights(self) -> None:
         for name, weight in self.weights.items():
@@ -176,21 +169,15 @@ class Objective:
         chain = Chain(springs, heights, specimen.area, masses)
         return make_plan(chain, loading, self.time, dashpots=damped, max_steps=MAX_STEPS)
 
-    def _measured(self) -> dict[str, Array | None]:
+    def _measured(self) -> dict[str, Array]:
         """Measured curves that the drive leaves free."""
-        motion, inside = self.measurement.displacement, self.measurement.interior
-        measured = {
-            "stress_time": self._stress,
-            "displacement_time": motion,
-            "stress_strain": None if motion is None else self._stress,
-            **{name: inside[node] for name, node in self.interior.items()},
-        }
-        return measured | dict.fromkeys(self._absent)
-
-    def _curve(self, name: str) -> Array:
-        curve = self.measured[name]
-        assert curve is not None
-        return curve
+        measured = {"stress_time": self._stress}
+        if self.measurement.displacement is not None:
+            measured["displacement_time"] = self.measurement.displacement
+            measured["stress_strain"] = self._stress
+        inside = self.measurement.interior
+        measured |= {name: inside[node] for name, node in self.interior.items()}
+        return {name: curve for name, curve in measured.items() if name not in self._absent}
 
     @property
     def nuisance(self) -> tuple[str, ...]:
@@ -209,11 +196,9 @@ class Objective:
 
     def _scale(self, name: str) -> float:
         """One standard deviation of a curve's noise; an estimated one not below MODEL_ERROR."""
-        curve = self.measured[name]
-        if curve is None:
-            return 1.0
         level = self.noise(name)
-        return level.sigma if level.given else max(level.sigma, MODEL_ERROR * float(np.ptp(curve)))
+        least = MODEL_ERROR * float(np.ptp(self.measured[name]))
+        return level.sigma if level.given else max(level.sigma, least)
 
     def _fitted(self, name: str) -> slice | NDArray[np.bool_]:
         """Samples of a curve that count: all but the outliers of its channel."""
@@ -355,15 +340,19 @@ class Objective:
     def compare(self, curves: Simulated) -> Array:
         """Residuals of simulated curves before the loss gives way to large ones, (n_data,)."""
         parts = [
-            (curves.curves[name] - self._curve(name))[self._kept[name]] * self._factor(name)
+            (curves.curves[name] - self.measured[name])[self._kept[name]] * self.factor(name)
             for name in self.counted
         ]
         # A stress near the pole of branch c is as bad as none.
         return np.asarray(np.clip(np.concatenate(parts), -self.penalty, self.penalty))
 
-    def _factor(self, name: str) -> float:
-        """What makes a curve's difference a residual."""
+    def factor(self, name: str) -> float:
+        """Residual of a curve that is off by one SI unit."""
         return float(self.weights[name] ** 0.5 / self.scale[name])
+
+    def span(self, name: str) -> float:
+        """Measured range of a curve, in the unit of its residual."""
+        return float(np.ptp(self.measured[name])) * self.factor(name)
 
     def jacobian(self, values: Array, places: NDArray[np.int64]) -> Array:
         """Derivative of the residual by the parameters at `places`, (n_data, n_places), SI.
@@ -377,7 +366,7 @@ class Objective:
         if curves.slopes is None:  # none were asked for
             return np.zeros((self.n_data, 0))
         parts = [
-            curves.slopes[name][:, self._kept[name]] * self._factor(name) for name in self.counted
+            curves.slopes[name][:, self._kept[name]] * self.factor(name) for name in self.counted
         ]
         slopes = np.concatenate(parts, axis=1).T
         residual = self.compare(curves)
@@ -397,7 +386,7 @@ class Objective:
         """RMS of each counted curve in its unit, from residuals before the loss."""
         parts = np.split(residual, np.cumsum(self.sizes)[:-1])
         return {
-            name: float(np.sqrt(np.mean(part**2))) / self._factor(name)
+            name: float(np.sqrt(np.mean(part**2))) / self.factor(name)
             for name, part in zip(self.counted, parts, strict=True)
         }
 
@@ -413,7 +402,7 @@ class Objective:
 
     def off(self, curves: Simulated, name: str) -> float | None:
         """RMS of simulated minus measured over the measured range of one curve, if it is there."""
-        measured, simulated = self.measured[name], curves.curves.get(name)
+        measured, simulated = self.measured.get(name), curves.curves.get(name)
         if measured is None or simulated is None:
             return None
         miss = (simulated - measured)[self._kept[name]]

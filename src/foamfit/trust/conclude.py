@@ -205,11 +205,11 @@ def _estimates(
 
 def _left_over(best: BestPoint) -> dict[str, float]:
     """One standard deviation of what is left of each curve, SI, its correlation counted."""
-    objective, out = best.problem.objective, {}
-    for name, process in zip(objective.counted, best.spread.noise, strict=True):
-        spread = math.sqrt(max(process.variance * process.tau, 1e-300))
-        out[name] = spread * objective.scale[name] / objective.weights[name] ** 0.5
-    return out
+    objective = best.problem.objective
+    return {
+        name: math.sqrt(max(process.variance * process.tau, 1e-300)) / objective.factor(name)
+        for name, process in zip(objective.counted, best.spread.noise, strict=True)
+    }
 
 
 def _varied(

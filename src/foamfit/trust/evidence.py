@@ -57,13 +57,7 @@ class Tried:
     @cached_property
     def spans(self) -> tuple[float, ...]:
         """Measured range of each curve, in the unit of its residual."""
-        objective, out = self.best.problem.objective, []
-        for name in self.counted:
-            measured = objective.measured[name]
-            assert measured is not None
-            weight, scale = objective.weights[name] ** 0.5, objective.scale[name]
-            out.append(weight * float(np.ptp(measured)) / scale)
-        return tuple(out)
+        return tuple(self.best.problem.objective.span(name) for name in self.counted)
 
     @property
     def places(self) -> list[NDArray[np.str_]]:
@@ -121,6 +115,11 @@ class Tried:
     def structureless(self) -> bool:
         """Whether nothing but noise is left."""
         return self.chisqr <= self.floor or min(self.runs_p, self.neighbours_p) >= LEVEL
+
+    @property
+    def varied(self) -> int:
+        """How many parameters vary."""
+        return sum(item.vary for item in self.result.parameters.values())
 
     def states(self, state: str) -> tuple[str, ...]:
         """Names of the parameters in a state."""

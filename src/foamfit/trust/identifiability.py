@@ -209,9 +209,8 @@ def look(best: BestPoint, noise: Mapping[str, float]) -> Insight:
     scaled = np.zeros((len(objective.counted) * n, len(best.names)))
     for c, curve in enumerate(objective.counted):
         kept = objective.kept(curve)
-        weighed = objective.weights[curve] ** 0.5 / objective.scale[curve]
         rows = best.jacobian[at : at + kept.size] * best.sizes
-        scaled[c * n + kept] = rows / (weighed * noise[curve])
+        scaled[c * n + kept] = rows / (objective.factor(curve) * noise[curve])
         at += kept.size
     return Insight(
         names=best.names,

@@ -138,8 +138,7 @@ def _by_profiles(
     parameter held end in the nearest of several shallow minima; those with another one held have
     been led through the next.
     """
-    objective = tracker.objective
-    allowed = objective.evaluations + budget
+    allowed = tracker.objective.evaluations + budget
     tracings: dict[str, Tracing] = {}
     wanted, better = list(names), None
     for name in (*names, *best.known):
@@ -149,30 +148,24 @@ def _by_profiles(
             if not _outside(best, name, met):
                 continue
             wanted.append(name)
-        if objective.evaluations >= allowed and not begun:
+        if tracker.objective.evaluations >= allowed and not begun:
             continue
         tracing = tracings.setdefault(name, Tracing(best, name, tracker))
         tracing.follow(met if begun else [*minima, *met])
         better = tracing.better
         if better is not None or tracing.stopped:
             break
-    profiles = [tracing.profile for tracing in tracings.values()]
-    whole = {p.name: p for p in profiles if p.complete}
-    left = tuple(name for name in wanted if name not in whole)
+    profiles = tuple(tracing.profile for tracing in tracings.values())
+    ends = {p.name: p.ci95 for p in profiles if p.complete}
+    left = tuple(name for name in wanted if name not in ends)
     warnings = tuple(
-        f"The profiles were stopped by {p.stopped}: {len(whole)} of {len(wanted)} were done, and "
+        f"The profiles were stopped by {p.stopped}: {len(ends)} of {len(wanted)} were done, and "
         f"the intervals of {', '.join(left)} are local."
         for p in profiles
         if p.stopped
     )
-    return Intervals(
-        ends={name: p.ci95 for name, p in whole.items()},
-        methods=dict.fromkeys(whole, "profile likelihood"),
-        profiles=tuple(profiles),
-        doubtful=left,
-        warnings=warnings,
-        better=better,
-    )
+    methods = dict.fromkeys(ends, "profile likelihood")
+    return Intervals(ends, methods, profiles, left, warnings=warnings, better=better)
 
 
 def _met(best: BestPoint, name: str, tracings: Sequence[Tracing]) -> list[Array]:
