@@ -84,18 +84,8 @@ def climb(
 ) -> Fit:
     """Fit ever richer models until one holds; this is `foamfit.fit` with model="auto".
 
-    The time limit is that of all rungs together. The time limit and Ctrl-C keep what is done. Rungs
-    have local intervals; those that were asked for are made of the chosen one.
-
-    Returns
-    -------
-    Fit
-        That of the chosen rung, with its `ladder`.
-
-    Raises
-    ------
-    InputError, SimulationError
-        As `foamfit.fit`, if not one rung could be tried.
+    The time limit is that of all rungs together; it and Ctrl-C keep what is done. Rungs have local
+    intervals; those that were asked for are made of the chosen one.
     """
     state = _Climb(measurement, options, progress)
     models, skipped = _models(measurement)
@@ -304,9 +294,8 @@ def _why(i: int, best: int, tried: Sequence[Tried], found: Sequence[Criteria]) -
     """Why a rung was chosen or not."""
     if i == best:
         reason = "its residuals are structureless" if tried[i].structureless else "best supported"
-        if best == len(tried) - 1:
-            return f"{reason}, and no richer model was tried"
-        return f"{reason}, and no richer model lowers AICc and BIC by {MARGIN:g}"
+        richer = f"lowers AICc and BIC by {MARGIN:g}" if i < len(tried) - 1 else "was tried"
+        return f"{reason}, and no richer model {richer}"
     bic, aicc = found[i].bic - found[best].bic, found[i].aicc - found[best].aicc
     told = f"BIC {signed(bic)}, AICc {signed(aicc)}"
     return told if i < best else f"richer without evidence: {told}"
@@ -319,23 +308,16 @@ def signed(value: float) -> str:
     return f"{value:+.1f}".replace("-", "−")
 
 
-def p_value(p: float) -> str:
-    """Write a p-value, with a sign: "= 0.43", "< 1e-6"."""
-    return "< 1e-6" if p < 1e-6 else f"= {p:.2g}"
-
-
 def _choice_sentences(
     tried: Sequence[Tried], found: Sequence[Criteria], best: int, ended: str
 ) -> list[str]:
     """What was chosen, and what each criterion alone would choose."""
     one = tried[best]
-    reason = "the evidence supports it best"
-    if one.structureless:
-        reason = "it is the simplest whose residuals are structureless"
+    simplest = "it is the simplest whose residuals are structureless"
+    reason = simplest if one.structureless else "the evidence supports it best"
     said = [
-        f"{one.name} was chosen of {counted(len(tried), 'model')}: {reason} (runs test p "
-        f"{p_value(one.runs_p)}, neighbours test p {p_value(one.neighbours_p)}). No more models "
-        f"were tried because {ended}."
+        f"{one.name} was chosen of {counted(len(tried), 'model')}: {reason}. No more models were "
+        f"tried because {ended}."
     ]
     if found[best].rank < one.varied:
         said.append(
@@ -368,10 +350,8 @@ def _structure_left(tried: Sequence[Tried], best: int) -> str:
     worst = int(np.argmin([min(runs_test(part), neighbours_test(part)) for part in one.curves]))
     found = find_structure(one.curves[worst], one.places[worst])
     size, noise = found.size / one.spans[worst], found.noise / one.spans[worst]
-    runs, near = (max(p) for p in zip(*((r.runs_p, r.neighbours_p) for r in tried), strict=True))
     told = (
-        f"No model reaches the noise (at best runs test p {p_value(runs)}, neighbours test p "
-        f"{p_value(near)}): the residuals of {one.counted[worst]} have a structure of "
+        f"No model reaches the noise: the residuals of {one.counted[worst]} have a structure of "
         f"{percent(size)} of the range (noise {percent(noise)}), {percent(found.share)} of it on "
         f"{found.place}."
     )

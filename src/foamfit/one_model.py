@@ -27,7 +27,6 @@ from foamfit.fitting.search import (
     what_stopped,
 )
 from foamfit.results import Fit
-from foamfit.springs.model import Model
 from foamfit.springs.parameters import split_name
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
@@ -138,15 +137,7 @@ def identify(
     options: Options,
     progress: Progress,
 ) -> Found:
-    """Search and refine; see `foamfit.fit` for the arguments.
-
-    Raises
-    ------
-    InputError
-        If the test cannot feed the drive or a parameter is unknown; the message names it.
-    SimulationError
-        If nothing that was tried could be simulated.
-    """
+    """Search and refine; see `foamfit.fit` for the arguments and the errors."""
     began = time.perf_counter()
     problem = options.problem(measurement, model, params)
     starts = STARTS * len(problem.model.kinds) if options.starts is None else options.starts
@@ -210,20 +201,12 @@ def _assess(
 
 
 def _search(
-    problem: Problem,
-    tracker: Tracker,
-    record: SearchRecord,
-    progress: Progress,
+    problem: Problem, tracker: Tracker, record: SearchRecord, progress: Progress
 ) -> SearchRecord:
     """Search, then refine by lmfit; returns the record with its costs and what stopped it."""
+    rng = np.random.default_rng(record.seed)
     try:
-        costs = search(
-            tracker,
-            problem.space(),
-            starts=record.starts,
-            rng=np.random.default_rng(record.seed),
-            progress=progress,
-        )
+        costs = search(tracker, problem.space(), starts=record.starts, rng=rng, progress=progress)
         record = replace(record, costs=tuple(costs))
         progress(0.95, "refinement")
         _refine(problem, tracker)
@@ -249,7 +232,11 @@ def _refine(problem: Problem, tracker: Tracker) -> None:
         params[name].vary = False
     if not names:
         return
-    _move_inside(params, names)
+    for name in names:  # least_squares wants its start off the bounds
+        parameter = params[name]
+        if math.isfinite(span := parameter.max - parameter.min):
+            low, high = parameter.min + 1e-9 * span, parameter.max - 1e-9 * span
+            parameter.value = min(max(parameter.value, low), high)
 
     def residual(p: lmfit.Parameters) -> Array:
         return tracker.residual(problem.vector(p))
@@ -265,22 +252,10 @@ def _refine(problem: Problem, tracker: Tracker) -> None:
         )  # fmt: skip
 
 
-def _move_inside(params: lmfit.Parameters, names: tuple[str, ...]) -> None:
-    """Move values off their bounds by a hair, where least_squares wants its start."""
-    for name in names:
-        parameter = params[name]
-        span = parameter.max - parameter.min
-        if math.isfinite(span):
-            margin = 1e-9 * span
-            parameter.value = min(
-                max(parameter.value, parameter.min + margin), parameter.max - margin
-            )
-
-
 def _on_limits(best: BestPoint, cost: float) -> BestPoint:
     """Put parameters that are within rounding of a limit on it, if `cost` hardly rises.
 
-    The refinement stays off the limits by a hair (`_move_inside`).
+    The refinement stays off the limits by a hair (`_refine`).
     """
     problem, space = best.problem, best.problem.space()
     values = best.values + 0.0  # no -0
@@ -303,16 +278,6 @@ def _on_limits(best: BestPoint, cost: float) -> BestPoint:
         return best
 
 
-def _moved(model: Model, values: Array, sources: Mapping[int, int]) -> Array:
-    """Put other springs in some places of a chain: {place: spring}, 0 at the base."""
-    moved = values.copy()
-    for name in model.names:
-        place, short = split_name(name)
-        if place in sources:
-            moved[model.index[name]] = values[model.index[f"s{sources[place] + 1}_{short}"]]
-    return moved
-
-
 def _ordered(problem: Problem, values: Array) -> Array:
     """Order springs that can be exchanged by their σ_a, the softest at the base.
 
@@ -322,28 +287,25 @@ def _ordered(problem: Problem, values: Array) -> Array:
     """
     model = problem.model
     bistable = [i for i, kind in enumerate(model.kinds) if kind == "bistable"]
-    if len(bistable) < 2:
+    held = [split_name(name) for name in model.names if not problem.params[name].vary]
+    if any(spring in bistable and short not in ("eta", "height") for spring, short in held):
         return values
-    held = {name for name in model.names if not problem.params[name].vary}
-    if any(
-        split_name(name)[0] in bistable for name in held if not name.endswith(("eta", "height"))
-    ):
-        return values
-
-    def onset(spring: int) -> float:
-        k0, eps_a = (values[model.index[f"s{spring + 1}_{short}"]] for short in ("k0", "eps_a"))
-        return float(k0 * eps_a / (1.0 - eps_a))
-
-    counted = problem.objective.counted
-    nodes = [node for name, node in problem.objective.interior.items() if name in counted]
+    nodes = [
+        n for name, n in problem.objective.interior.items() if name in problem.objective.counted
+    ]
 
     def order(spring: int) -> tuple[int, float]:
-        return sum(node <= spring for node in nodes), onset(spring)
+        k0, eps_a = (values[model.index[f"s{spring + 1}_{short}"]] for short in ("k0", "eps_a"))
+        return sum(node <= spring for node in nodes), float(k0 * eps_a / (1.0 - eps_a))
 
     ranked = sorted(bistable, key=order)
     if ranked == bistable:
         return values
-    moved = _moved(model, values, dict(zip(bistable, ranked, strict=True)))
+    moved, sources = values.copy(), dict(zip(bistable, ranked, strict=True))
+    for name in model.names:
+        place, short = split_name(name)
+        if place in sources:
+            moved[model.index[name]] = values[model.index[f"s{sources[place] + 1}_{short}"]]
     before, after = (problem.objective.residual(v) for v in (values, moved))
     same = np.allclose(before, after, rtol=0.0, atol=1e-9 * max(float(np.max(np.abs(before))), 1.0))
     return moved if same else values

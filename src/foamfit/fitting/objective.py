@@ -295,10 +295,10 @@ class Objective:
     def _shift(self, name: str, curve: Array, late: float, speed: float | None = None) -> Array:
         """One curve, or its derivative, seen by channels of which the motion is late (s).
 
-        Where the clock is that of the force, the motion is seen later; where it is that of the
-        motion (time zero is read off it, or it drives), the force is seen earlier. Before contact
-        the striker comes at its velocity, or at `speed` (m/s), and nothing bears stress; a
-        displacement that was set to zero where the stress starts is so here.
+        By the clock of the force the motion is seen later; by that of the motion (time zero is read
+        off it, or it drives) the force is seen earlier. Before contact the striker comes at its
+        velocity, or at `speed` (m/s), and nothing bears stress; a displacement that was set to zero
+        where the stress starts is so here.
         """
         impact, contact = self.drive == "impact", self.measurement.contact
         by_motion = self.drive == "displacement" or (impact and contact == "motion")

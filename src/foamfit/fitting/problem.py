@@ -39,7 +39,7 @@ def make_params(
     model : str or Model
         For example "linear+bistable".
     drive : str, optional
-        "impact", "stress" or "displacement"; see `fitting.objective.choose_drive`.
+        "impact", "stress" or "displacement"; see `fitting.curves.choose_drive`.
     time_shift : bool
         Whether the time by which the motion channel is late is a parameter too.
 

@@ -105,9 +105,8 @@ def _noise_notes(objective: Objective) -> list[str]:
     """What the noise is, what the residuals are counted in, and which samples are left out."""
     measurement = objective.measurement
     told = [f"Noise of {sentence}" for sentence in noise_sentences(measurement)]
-    floored = [
-        name for name in objective.counted if objective.scale[name] > objective.noise(name).sigma
-    ]
+    counted = objective.counted
+    floored = [name for name in counted if objective.scale[name] > objective.noise(name).sigma]
     if floored:
         told.append(
             f"{', '.join(floored)}: residuals count in units of {MODEL_ERROR:.1%} of the range, "
@@ -120,10 +119,7 @@ def _noise_notes(objective: Objective) -> list[str]:
         if outliers.at.size:
             told.append(f"{outliers.at.size} outliers of the {channel} are not fitted.")
     if objective.time_shift and objective.drive != "impact":
-        told.append(
-            "time_shift: a foam whose stress relaxes leads its strain, and looks as if the "
-            "motion were late."
-        )
+        told.append("time_shift: a foam whose stress relaxes looks as if its motion were late.")
     if objective.loss != "linear":
         told.append(
             f"The loss is {objective.loss}: residuals past {LOSSES[objective.loss]:g} of their "
@@ -220,11 +216,11 @@ def _varied(
     value, unit = float(best.values[best.index[name]]), unit_of(name)
     stderr, half = float(best.spread.stderr[column]), float(best.halves[column])
     local = (value - half, value + half)
-    ends = _ordered_with(value, intervals.ends.get(name, local))
-    made, by_local = (
-        min(pair[1], high) - max(pair[0], low)  # within the limits, which cut both
-        for pair in (ends, local)
-    )
+    # Percentiles of refits, or of a chain, may all lie to one side of the best point.
+    given = (*intervals.ends.get(name, local), value)
+    ends = min(given), max(given)
+    # Within the limits, which cut both.
+    made, by_local = (min(pair[1], high) - max(pair[0], low) for pair in (ends, local))
     ratio = made / by_local if by_local > 0.0 else math.nan
     method = intervals.methods.get(name, "local covariance")
     # refits that stall in a long minimum make a profile narrow: the wider interval is taken
@@ -247,31 +243,17 @@ def _varied(
     return ParameterEstimate(value, stderr, ci95, unit, True, state, why, method)
 
 
-def _ordered_with(value: float, ends: tuple[float, float]) -> tuple[float, float]:
-    """Ends of an interval in their order, moved out where they do not hold the value.
-
-    Percentiles of refits, or of a chain, may all lie to one side of the best point.
-    """
-    return min(*ends, value), max(*ends, value)
-
-
 def state_of(
-    name: str,
-    value: float,
-    ends: tuple[float, float],
-    insight: Insight,
+    name: str, value: float, ends: tuple[float, float], insight: Insight,
     limits: tuple[float, float],
-) -> tuple[str, str]:
+) -> tuple[str, str]:  # fmt: skip
     """State of a parameter that varies and whose branch is reached, and the reason in one sentence.
 
     `ends` are those of its 95 % interval, not cut at its `limits`; NaN or infinite where the data
     fix only a combination.
     """
-    size, short, unit = (
-        float(insight.sizes[insight.names.index(name)]),
-        split_name(name)[1],
-        unit_of(name),
-    )
+    size, short = float(insight.sizes[insight.names.index(name)]), split_name(name)[1]
+    unit = unit_of(name)
     half = 0.5 * (ends[1] - ends[0])
     half = half if math.isfinite(half) else math.nan
     state, why = covariance.state(value, half, size, *limits, scale_in_words(name, value, size))
@@ -321,19 +303,15 @@ def _statistics(best: BestPoint, record: SearchRecord) -> dict[str, float | int 
 
 def _switches(problem: Problem, simulated: Simulated) -> tuple[Switch, ...]:
     """Place the switches of the fitted response on its curves."""
-    measurement, motion = problem.measurement, simulated.motion
-    clock = problem.objective.time
-    top, stress = motion.displacement[-1], motion.base_stress
-    out = []
-    for when, spring, left, entered, _ in motion.switches:
-        out.append(
-            Switch(
-                spring=int(spring) + 1,
-                source=kernels.BRANCH_NAMES[int(left)],
-                target=kernels.BRANCH_NAMES[int(entered)],
-                time=None if measurement.time is None else float(when),
-                displacement=float(np.interp(when, clock, top)),
-                stress=float(np.interp(when, clock, stress)),
-            )
+    motion, clock = simulated.motion, problem.objective.time
+    return tuple(
+        Switch(
+            spring=int(spring) + 1,
+            source=kernels.BRANCH_NAMES[int(left)],
+            target=kernels.BRANCH_NAMES[int(entered)],
+            time=None if problem.measurement.time is None else float(when),
+            displacement=float(np.interp(when, clock, motion.displacement[-1])),
+            stress=float(np.interp(when, clock, motion.base_stress)),
         )
-    return tuple(out)
+        for when, spring, left, entered, _ in motion.switches
+    )

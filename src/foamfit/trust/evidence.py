@@ -88,8 +88,7 @@ class Tried:
     @property
     def floor(self) -> float:
         """Chi-square of the simulation's own error."""
-        pairs = zip(self.sizes, self.spans, strict=True)
-        return sum(size * (EXACT * span) ** 2 for size, span in pairs)
+        return sum(n * (EXACT * span) ** 2 for n, span in zip(self.sizes, self.spans, strict=True))
 
     @property
     def chisqr(self) -> float:
@@ -151,8 +150,7 @@ def reference_of(tried: Sequence[Tried]) -> Tried:
 
 def effective_samples(reference: Tried) -> float:
     """Effective samples n/τ of all curves."""
-    pairs = zip(reference.sizes, reference.taus, strict=True)
-    return float(sum(size / tau for size, tau in pairs))
+    return float(sum(n / tau for n, tau in zip(reference.sizes, reference.taus, strict=True)))
 
 
 def effective_parameters(grams: Array, reference: Tried) -> int:
@@ -186,7 +184,6 @@ def choose(tried: Sequence[Tried]) -> tuple[int, list[Criteria]]:
     reference = reference_of(tried)
     found = [criteria(one, reference) for one in tried]
     best = 0
-    for i in range(1, len(tried)):
-        if found[i].beats(found[best]):
-            best = i
+    for i, one in enumerate(found):
+        best = i if one.beats(found[best]) else best
     return best, found

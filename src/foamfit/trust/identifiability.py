@@ -94,18 +94,12 @@ class Insight:
         return np.asarray(self.scaled[at * n : (at + 1) * n, self.names.index(name)])
 
     def shares(self) -> tuple[tuple[tuple[str, str], ...], Array]:
-        """Say which part of which curve fixes which parameter.
+        """Parts (curve, branches), and the share of each in the information on a parameter.
 
         The information on a parameter, all others free, is the square of what is left of its column
         of sensitivities once the other columns are taken out of it (Frisch and Waugh 1933,
-        Econometrica 1, 387); being a sum over samples it is shared out among them.
-
-        Returns
-        -------
-        parts : tuple of (curve, branches)
-            In the order of curves and of first visits.
-        shares : (k, n_parts) array
-            Each row adds up to one; NaN for a parameter that the curves do not tell.
+        Econometrica 1, 387); being a sum over samples it is shared out among them. Each row of the
+        shares (k, n_parts) adds up to one; NaN for a parameter that the curves do not tell.
         """
         n, columns, parts = self.clock.size, [], []
         labels = np.full(n, "", object)

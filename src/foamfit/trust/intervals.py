@@ -19,7 +19,7 @@ from foamfit.errors import InputError
 from foamfit.fitting.search import Tracker
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.profile import PLACED, Profile, Tracing, departures
-from foamfit.trust.resample import block_length, bootstrap, check_emcee, mcmc, walkers
+from foamfit.trust.resample import bootstrap, check_emcee, mcmc, walkers
 
 # The default profiles a parameter if the root of the cost departs from a straight line by this
 # share at the end of its local interval.
@@ -92,10 +92,7 @@ def assess(
         return Intervals()
     tracker, known = Tracker(best.problem.objective, deadline, best_cost=best.cost), best.known
     if not known:
-        what = {"mcmc": "a Markov chain", "bootstrap": "a bootstrap"}.get(choice.method, "profiles")
-        none = (
-            f"The test determines no parameter, so {what} would make no interval and was not run."
-        )
+        none = "The test determines no parameter, so no intervals were made."
         return Intervals(warnings=() if choice.method == "auto" else (none,))
     if choice.method == "bootstrap":
         return _by_bootstrap(best, choice, tracker, announce)
@@ -124,19 +121,13 @@ def _elsewhere(best: BestPoint, minima: Sequence[Array], tracker: Tracker) -> ND
 
 
 def _by_profiles(
-    best: BestPoint,
-    names: Sequence[str],
-    minima: Sequence[Array],
-    tracker: Tracker,
-    budget: float,
+    best: BestPoint, names: Sequence[str], minima: Sequence[Array], tracker: Tracker, budget: float
 ) -> Intervals:
     """Profiles of some parameters, until they are done, a better point is met or all ends.
 
-    A point within the cut that the profile of one parameter has met is evidence for the others too:
-    their intervals must hold it. So each profile goes on beyond what the others have met, and a
-    parameter that these put outside of its local interval is profiled as well. Refits with one
-    parameter held end in the nearest of several shallow minima; those with another one held have
-    been led through the next.
+    The intervals of all parameters must hold a point within the cut that the profile of one has
+    met: each profile goes on beyond what the others have met, and a parameter that these put
+    outside of its local interval is profiled as well.
     """
     allowed = tracker.objective.evaluations + budget
     tracings: dict[str, Tracing] = {}
@@ -190,12 +181,7 @@ def _by_bootstrap(
 ) -> Intervals:
     announce(_cost_told(best, "block bootstrap", choice.draws))
     drawn = bootstrap(best, choice.draws, choice.seed, tracker)
-    sizes = best.problem.objective.sizes
-    lengths = [block_length(p, n) for p, n in zip(best.spread.noise, sizes, strict=True)]
-    note = (
-        f"Block bootstrap: {len(drawn.values)} of {choice.draws} refits, blocks of "
-        f"{' and '.join(map(str, lengths))} samples."
-    )
+    note = f"Block bootstrap: {len(drawn.values)} of {choice.draws} refits."
     if drawn.stopped:
         note += f" It was stopped by {drawn.stopped}."
     if len(drawn.values) < ENOUGH_DRAWS:
@@ -210,11 +196,11 @@ def _by_mcmc(best: BestPoint, choice: Choice, tracker: Tracker, announce: Announ
     note = chain.sentence()
     if len(chain.samples) < ENOUGH_DRAWS:
         return Intervals(warnings=(note + " The intervals are local.",))
-    lost = [name for name in best.names if name not in best.known]
+    lost = ", ".join(name for name in best.names if name not in best.known)
     if lost:
         note += (
-            f" The test does not determine {', '.join(lost)}: the chain samples them with a flat "
-            "prior within their limits, and they have no interval."
+            f" The test does not determine {lost}: the chain samples them with a flat prior within "
+            "their limits, and they have no interval."
         )
     fine = chain.converged and chain.stopped is None
     return _percentiles(best, chain.samples, "MCMC", note, fine)

@@ -115,13 +115,12 @@ class MarkovChain:
 
     def sentence(self) -> str:
         """What the autocorrelation says of the chain."""
-        length = self.steps - self.burn_in
-        word = "enough" if self.converged else "too short: at least 50 are needed"
+        times = (self.steps - self.burn_in) / self.autocorrelation
+        enough = "enough" if self.converged else "too short: at least 50 are needed"
         return (
             f"Markov chain of {self.walkers} walkers and {self.steps} steps, the first "
-            f"{self.burn_in} left out: {length / self.autocorrelation:.0f} autocorrelation times "
-            f"of the slowest parameter, which is {word}."
-            + (f" It was stopped by {self.stopped}." if self.stopped else "")
+            f"{self.burn_in} left out: {times:.0f} autocorrelation times of the slowest parameter, "
+            f"which is {enough}." + (f" It was stopped by {self.stopped}." if self.stopped else "")
         )
 
 
@@ -191,12 +190,9 @@ def mcmc(best: BestPoint, steps: int, seed: int, tracker: Tracker | None = None)
 
 
 def _begin(
-    best: BestPoint,
-    refit: Refit,
-    log_probability: Callable[[Array], float],
-    count: int,
+    best: BestPoint, refit: Refit, log_probability: Callable[[Array], float], count: int,
     rng: np.random.Generator,
-) -> Array | None:
+) -> Array | None:  # fmt: skip
     """Points about the best one at which walkers begin, scaled, (count, k); None if there are none.
 
     Half a standard error away along what the test fixes, no more than `FARTHEST` along the rest.
