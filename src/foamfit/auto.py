@@ -1,10 +1,8 @@
 """The simplest model that follows the curves, and the evidence for each that was tried.
 
-A ladder of models is fitted from the simplest up, each without damping and then with it. What is
-compared are AICc and BIC with the effective number of samples and the effective number of
-parameters, so that neither correlated residuals nor combinations that the curves do not fix count
-as evidence. It ends where the residuals are structureless, or where two models in a row bring no
-evidence.
+A ladder of models is fitted from the simplest up, each without damping and then with it, and
+compared by AICc and BIC with the effective numbers of samples and of parameters. It ends where the
+residuals are structureless, or where two models in a row bring no evidence.
 """
 
 from __future__ import annotations
@@ -27,14 +25,7 @@ from foamfit.results import Fit, Ladder, Rung, rung_name
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import split_name
 from foamfit.text import counted, percent
-from foamfit.trust.evidence import (
-    MARGIN,
-    Criteria,
-    Tried,
-    choose,
-    effective_samples,
-    reference_of,
-)
+from foamfit.trust.evidence import MARGIN, Criteria, Tried, choose, effective_samples, reference_of
 from foamfit.trust.intervals import Announce, Choice
 from foamfit.trust.residual_tests import BENT, find_structure, neighbours_test, runs_test
 
@@ -76,10 +67,10 @@ def _carry(params: lmfit.Parameters, model: Model, below: Fit | None) -> None:
             params[name].value = params[name].min if short == "height" else 0.1 * params[name].max
 
 
-# ---------------------------------------------------------------- the climb
+# ---------------------------------------------------------------- the comparison
 
 
-def climb(
+def compare_models(
     measurement: Measurement, options: Options, progress: Progress, announce: Announce
 ) -> Fit:
     """Fit ever richer models until one holds; this is `foamfit.fit` with model="auto".
@@ -87,7 +78,7 @@ def climb(
     The time limit is that of all rungs together; it and Ctrl-C keep what is done. Rungs have local
     intervals; those that were asked for are made of the chosen one.
     """
-    state = _Climb(measurement, options, progress)
+    state = _Comparison(measurement, options, progress)
     models, skipped = _models(measurement)
     tried: list[Tried] = []
     ended, stopped, idle = "the top of the ladder was reached", None, 0
@@ -132,8 +123,8 @@ def _has_evidence(tried: Sequence[Tried], below: int) -> bool:
 
 
 @dataclass(eq=False)
-class _Climb:
-    """What every rung is fitted with, and what stopped the climb."""
+class _Comparison:
+    """What every rung is fitted with, and what stopped the comparison."""
 
     measurement: Measurement
     options: Options
@@ -142,11 +133,11 @@ class _Climb:
     fits: list[Found] = field(default_factory=list)  # of what was tried, in its order
 
     def __post_init__(self) -> None:
-        """Choose the drive, and start the clock."""
+        """Choose the drive and begin."""
         self.began, limit = time.perf_counter(), self.options.max_time
         self.deadline = None if limit is None else time.monotonic() + limit
-        drive = self.options.drive or choose_drive(self.measurement)
-        self.options = replace(self.options, drive=drive)
+        if self.options.drive is None:
+            self.options = replace(self.options, drive=choose_drive(self.measurement))
 
     def family(
         self, model: str, models: Sequence[str], tried: list[Tried], skipped: list[str]
@@ -208,8 +199,7 @@ class _Climb:
 def _models(measurement: Measurement) -> tuple[list[str], list[str]]:
     """Models that a test allows, and which are left out and why.
 
-    Heights that imaging gave are those of so many springs and no other number; a mass inside that
-    was followed is data that every rung must have.
+    They have as many springs as heights were given, or one, and every mass that was followed.
     """
     heights, inside = measurement.specimen.heights, max(measurement.interior, default=0)
     models, skipped = [], []
@@ -356,8 +346,5 @@ def _structure_left(tried: Sequence[Tried], best: int) -> str:
         f"{found.place}."
     )
     if found.bent > BENT and found.straight:
-        told += (
-            f" A parabola describes {percent(found.bent)} of it: the measured branch is curved "
-            "where the law is a straight line."
-        )
+        told += " The measured branch is curved where the law is a straight line."
     return told

@@ -120,10 +120,7 @@ class Found:
     record: SearchRecord
 
     def best(self) -> BestPoint:
-        """The best point, its springs in order and its parameters on the limits that they reach.
-
-        Within rounding of a limit, rounding would decide the ends of the intervals.
-        """
+        """The best point, its springs in order, what is within rounding of a limit on it."""
         values = self.tracker.best_values
         assert values is not None  # checked by identify
         best = BestPoint(self.problem, _ordered(self.problem, values))
@@ -131,12 +128,9 @@ class Found:
 
 
 def identify(
-    measurement: Measurement,
-    model: str,
-    params: lmfit.Parameters | None,
-    options: Options,
+    measurement: Measurement, model: str, params: lmfit.Parameters | None, options: Options,
     progress: Progress,
-) -> Found:
+) -> Found:  # fmt: skip
     """Search and refine; see `foamfit.fit` for the arguments and the errors."""
     began = time.perf_counter()
     problem = options.problem(measurement, model, params)
@@ -255,7 +249,7 @@ def _refine(problem: Problem, tracker: Tracker) -> None:
 def _on_limits(best: BestPoint, cost: float) -> BestPoint:
     """Put parameters that are within rounding of a limit on it, if `cost` hardly rises.
 
-    The refinement stays off the limits by a hair (`_refine`).
+    The refinement ends slightly off the limits (`_refine`).
     """
     problem, space = best.problem, best.problem.space()
     values = best.values + 0.0  # no -0

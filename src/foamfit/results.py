@@ -140,7 +140,7 @@ class Ladder:
     rungs: tuple[Rung, ...]  # From the simplest up
     n_eff: float  # Effective samples that AICc and BIC use
     noise_from: str  # The rung of the least chi-square: its residuals are taken for the noise
-    ended: str  # Why the climb ended
+    ended: str  # Why the comparison ended
     stopped: str | None  # "the time limit" or "Ctrl-C" if that ended it
     skipped: tuple[str, ...]  # Rungs that could not be tried, and why
     sentences: tuple[str, ...]  # What the comparison says
@@ -197,20 +197,11 @@ class Fit:
     @property
     def bistable_springs(self) -> dict[str, BistableSpring]:
         """The bistable springs of the chain by their prefix, "s1" at the base."""
-        return {
-            f"s{i}": spring
-            for i, spring in enumerate(self.chain.springs, start=1)
-            if isinstance(spring, BistableSpring)
-        }
+        springs = enumerate(self.chain.springs, start=1)
+        return {f"s{i}": one for i, one in springs if isinstance(one, BistableSpring)}
 
     def to_json_dict(self) -> dict[str, Any]:
-        """Return the content of ``fit.json``: SI, plain types, null for what is not there.
-
-        Returns
-        -------
-        dict
-            Serialisable with ``allow_nan=False``; a number that is not finite becomes None.
-        """
+        """Return the content of ``fit.json``: SI, plain types, null for what is not there."""
         content: dict[str, Any] = plain(
             {
                 "schema": SCHEMA,

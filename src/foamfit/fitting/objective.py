@@ -233,7 +233,7 @@ class Objective:
         self.failures += other.failures
 
     def _springs(self, values: Array, everything: bool, places: NDArray[np.int64]) -> Simulated:
-        """Simulate the parameters of the model, on one clock; see `simulate`."""
+        """Simulate the parameters of the model, without a time shift; see `simulate`."""
         height = self.measurement.specimen.height
         rows = self.model.rows(values)
         heights = np.ascontiguousarray(self.model.heights(values, height))
@@ -295,10 +295,10 @@ class Objective:
     def _shift(self, name: str, curve: Array, late: float, speed: float | None = None) -> Array:
         """One curve, or its derivative, seen by channels of which the motion is late (s).
 
-        By the clock of the force the motion is seen later; by that of the motion (time zero is read
-        off it, or it drives) the force is seen earlier. Before contact the striker comes at its
-        velocity, or at `speed` (m/s), and nothing bears stress; a displacement that was set to zero
-        where the stress starts is so here.
+        Where time is that of the force the motion is seen later; where it is that of the motion
+        (time zero is read off it, or it drives) the force is seen earlier. Before contact the
+        striker comes at its velocity, or at `speed` (m/s), and no stress acts; a displacement that
+        was set to zero where the stress starts is so here.
         """
         impact, contact = self.drive == "impact", self.measurement.contact
         by_motion = self.drive == "displacement" or (impact and contact == "motion")

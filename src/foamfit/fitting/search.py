@@ -1,8 +1,7 @@
 """The search: start values read from the curve, and descents from the best of many.
 
-It moves in the box of `fitting.box`, so that no start needs luck and no step can leave
-what the law admits. It first fits the loop (stress along the measured motion, closed form, cheap)
-and only then the curves of the drive itself.
+It moves in the box of `fitting.box`, so that no step leaves what the law admits. It first fits the
+loop (stress along the measured motion, closed form, cheap), then the curves of the drive itself.
 """
 
 from __future__ import annotations
@@ -81,12 +80,6 @@ class Tracker:
         if self.deadline is not None and time.monotonic() > self.deadline:
             raise SearchStoppedError
         return residual
-
-    def slopes(self, space: Space, point: Array) -> Array:
-        """Derivative of the residual by the coordinates of a point, (n_data, n_free)."""
-        values = space.decode(point)
-        moves = space.slopes(point, values)
-        return self.objective.jacobian_along(values, moves)
 
     def consider(self, values: Array, shift: Array | float = 0.0) -> Array:
         """Residual of the objective, whatever the time; with a shift, that of other data."""
@@ -181,8 +174,7 @@ def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> l
     """Vectors of parameters read off the measured loop, from a Latin hypercube of marks.
 
     Linear springs take a share of the largest displacement; each bistable spring is then read off
-    what is left with marks of its own. Springs in series that each follow the loop follow it
-    together.
+    what is left, with marks of its own.
     """
     assert loop.displacement is not None
     assert loop.stress is not None
@@ -236,9 +228,13 @@ def descend(
     tracker: Tracker, space: Space, start: Array, iterations: int, enough: float = 1e-5
 ) -> tuple[float, Array]:
     """Levenberg-Marquardt descent inside the box; returns (cost, coordinates) of its end."""
+
+    def jacobian(point: Array) -> Array:
+        values = space.decode(point)
+        return tracker.objective.jacobian_along(values, space.slopes(point, values))
+
     end = levenberg.descend(
-        lambda point: tracker.residual(space.decode(point)),
-        lambda point: tracker.slopes(space, point),
+        lambda point: tracker.residual(space.decode(point)), jacobian,
         start, space.box, iterations, enough=enough,
     )  # fmt: skip
     return end.cost, end.point
@@ -247,8 +243,7 @@ def descend(
 def rank(tracker: Tracker, space: Space, points: list[Array]) -> list[tuple[float, Array]]:
     """Points of the box with their costs, cheapest first."""
     residuals = [tracker.residual(space.decode(point)) for point in points]
-    costs = [float(residual @ residual) for residual in residuals]
-    return sorted(zip(costs, points, strict=True), key=_cost)
+    return sorted(((float(r @ r), p) for r, p in zip(residuals, points, strict=True)), key=_cost)
 
 
 def spread_out(space: Space, points: list[Array], count: int) -> list[Array]:
@@ -295,8 +290,8 @@ def search(
     counts: dict[int, int] = {}
     if tracker.objective.measurement.displacement is not None:
         found = distinct(_search_loop(tracker, space, points, starts, rng, progress))
-        counts = {id(point): count for count, point in found}
         points = [point for _, point in found]
+        counts = {id(point): count for count, point in found}
     ranked = rank(tracker, space, points)
     if tracker.objective.interior_mass:
         progress(0.7, "vibration")
@@ -352,8 +347,8 @@ def _search_loop(
 def _scan_vibration(tracker: Tracker, space: Space, start: Array) -> list[tuple[float, Array]]:
     """Fits of the massless chain for each stiffness of a linear spring, ranked with its masses.
 
-    An interior mass vibrates on a stiff linear spring, and the cost has a minimum for every cycle
-    that the simulated vibration gains on the measured one: no descent crosses from one to the next.
+    The cost has a minimum for every cycle that the vibration of an interior mass on a stiff spring
+    gains on the measured one: no descent crosses from one to the next.
     """
     objective = replace(tracker.objective, interior_mass=False)
     massless = Tracker(objective, tracker.deadline)

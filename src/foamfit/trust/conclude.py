@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -90,11 +90,7 @@ def _noise(best: BestPoint) -> dict[str, dict[str, Any]]:
     objective, found = best.problem.objective, {}
     for name, rms in objective.rms(best.residual).items():
         level = objective.noise(name)
-        found[name] = {
-            "sigma": level.sigma,
-            "given": level.given,
-            "how": level.how,
-            "time": level.time,
+        found[name] = asdict(level) | {
             "scale": objective.scale[name],
             "residual_over_noise": rms / level.sigma if level.sigma > 0.0 else None,
         }

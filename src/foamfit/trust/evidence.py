@@ -139,11 +139,10 @@ class Criteria:
 
 
 def reference_of(tried: Sequence[Tried]) -> Tried:
-    """The rung whose residuals are taken for the noise: that of the least chi-square.
+    """The rung of the least chi-square: its residuals are taken for the noise of all.
 
-    One measure for all, as the variance inflation of the global model in QAICc (Burnham & Anderson
-    2002, Model Selection and Multimodel Inference, section 2.5): what a simpler rung leaves over is
-    not noise, and criteria with samples counted differently cannot be compared.
+    As the variance inflation of the global model in QAICc (Burnham & Anderson 2002, Model Selection
+    and Multimodel Inference, section 2.5): what a simpler rung leaves over is not noise.
     """
     return min(tried, key=lambda one: one.chisqr)
 

@@ -118,11 +118,7 @@ class Insight:
     # ------------------------------------------------------------ in words
 
     def weakest(self) -> tuple[float, dict[str, float]]:
-        """Standard error along the weakest direction (relative), and its largest parts.
-
-        The direction is the right singular vector of the smallest singular value of `scaled`; its
-        parts are over the largest of them, which is 1.
-        """
+        """Relative standard error along the weakest direction, and its parts over the largest."""
         errors, vt = self._directions
         direction = vt[-1] / vt[-1][np.argmax(np.abs(vt[-1]))]
         order = np.argsort(-np.abs(direction), kind="stable")
@@ -153,9 +149,9 @@ class Insight:
     def combination(self, name: str, loose: float) -> str:
         """Say what the data fix instead of a parameter; "" if it is loose by itself.
 
-        Directions whose relative standard error is larger than `loose` are taken for free. If one
-        combination of the parameters that can move together is fixed, it is given as a product of
-        powers, good to first order; else those parameters that compensate a change of it.
+        Directions of a relative standard error above `loose` are taken for free. One combination
+        that is fixed is given as a product of powers, good to first order; else those parameters
+        that compensate a change of it.
         """
         errors, vt = self._directions
         free, me = vt[errors > loose], self.names.index(name)

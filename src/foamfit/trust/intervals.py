@@ -34,9 +34,7 @@ Announce = Callable[[str], None]
 class Choice:
     """Which intervals are wanted."""
 
-    # "auto" (profiles of those parameters along which the cost is no parabola, local covariance for
-    # the others), "local", "profile", "bootstrap" or "mcmc".
-    method: str = "auto"
+    method: str = "auto"  # One of `METHODS`; see `foamfit.fit`
     draws: int = 0  # Refits of the bootstrap, or steps of the Markov chain
     seed: int = 0  # Source of all chance
 
@@ -60,17 +58,15 @@ class Choice:
 class Intervals:
     """The 95 % intervals of a fit, and how they were made."""
 
-    # Ends of the intervals that are not those of the local covariance.
+    # Ends of the intervals that are not those of the local covariance, and how each was made.
     ends: dict[str, tuple[float, float]] = field(default_factory=dict)
-    methods: dict[str, str] = field(default_factory=dict)  # How each of these was made
+    methods: dict[str, str] = field(default_factory=dict)
     profiles: tuple[Profile, ...] = ()  # All profiles that were followed, whole or not
     # Parameters along which the cost is no parabola and whose interval is local all the same.
     doubtful: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()  # One sentence each
-    # Why they are not, or hardly, what was asked for; one sentence each.
-    warnings: tuple[str, ...] = ()
-    # (n,): A point with a lower cost that was met: the fit should go on from there.
-    better: Array | None = None
+    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  # Why they are not, or hardly, what was asked for
+    better: Array | None = None  # A point of lower cost: the fit should go on from there
 
 
 def assess(

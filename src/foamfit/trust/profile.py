@@ -247,10 +247,10 @@ class Tracing:
 def departures(best: BestPoint) -> Array:
     """How far the cost is from a parabola at either end of each local interval, (k, 2).
 
-    One evaluation each: the parameter is put at the end of its interval (nearer if nothing can be
-    simulated there), the others follow their correlation, and what they could still gain is read
-    off the local slopes. Given is the root of the rise over what a parabola has, less one; zero
-    where a limit is next to the best point, infinite where nothing can be simulated.
+    The parameter is put at the end of its interval (nearer if nothing can be simulated there), the
+    others follow their correlation, and what they could still gain is read off the local slopes.
+    Given is the root of the rise over what a parabola has, less one; zero where a limit is next to
+    the best point, infinite where nothing can be simulated.
     """
     refit = Refit(best, Tracker(best.problem.objective))
     start = refit.start()

@@ -37,9 +37,8 @@ def block_length(process: NoiseProcess, n: int) -> int:
 def _scaled_residual(residual: Array, process: NoiseProcess, like: Array, length: int) -> Array:
     """Residual of one curve for circular blocks of it (Politis & Romano 1992).
 
-    Residuals are smaller than the noise was, and blocks break correlation at their ends: a factor
-    corrects both, such that sums over the curve vary as those of its noise, which was read off
-    `like`.
+    A factor corrects that residuals are smaller than the noise was, which was read off `like`, and
+    that blocks break correlation at their ends: sums over the curve vary as those of its noise.
     """
     lags = process.autocovariance(length) / process.variance
     within = 1.0 + 2.0 * float((1.0 - np.arange(1, length) / length) @ lags[1:])
