@@ -247,10 +247,7 @@ def _refine(problem: Problem, tracker: Tracker) -> None:
 
 
 def _on_limits(best: BestPoint, cost: float) -> BestPoint:
-    """Put parameters that are within rounding of a limit on it, if `cost` hardly rises.
-
-    The refinement ends slightly off the limits (`_refine`).
-    """
+    """Put parameters that are within rounding of a limit on it, if `cost` hardly rises."""
     problem, space = best.problem, best.problem.space()
     values = best.values + 0.0  # no -0
     if np.any(np.signbit(best.values) & (values == 0.0)):
