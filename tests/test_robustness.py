@@ -250,8 +250,8 @@ def test_the_curves_of_a_shifted_test_are_those_that_it_shows(contact):
     curves = one.simulate(np.array([*spring.seven, 0.0, 0.0, late]))
     inside = (test.time > 2 * late) & (test.time < test.time[-1] - 2 * late)
     for simulated, measured in (
-        (curves.stress_time, test.stress),
-        (curves.displacement_time, test.displacement),
+        (curves.curves["stress_time"], test.stress),
+        (curves.curves["displacement_time"], test.displacement),
     ):
         off = np.abs(simulated - measured)[inside] / np.ptp(measured)
         assert off.max() < 1e-9

@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from numbers import Integral, Real
+from typing import TypedDict
 
 import lmfit
 import numpy as np
@@ -26,7 +27,6 @@ from foamfit.fitting.search import (
     what_stopped,
 )
 from foamfit.results import Fit
-from foamfit.springs.model import Model
 from foamfit.springs.parameters import split_name
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
@@ -42,6 +42,21 @@ DRAWS = {"bootstrap": 500, "mcmc": 2000}
 # Evaluations that the default spends on profiles, over those of the search; and how often it goes
 # on from a better point that a profile has met.
 PROFILE_SHARE, IMPROVEMENTS = 0.5, 3
+
+
+class Keywords(TypedDict, total=False):
+    """The options of a fit as keyword arguments of `foamfit.fit`: the fields of `Options`."""
+
+    drive: str | None
+    seed: int
+    starts: int | None
+    max_time: float | None
+    weights: Mapping[str, float] | None
+    interior_mass: bool
+    time_shift: bool
+    loss: str
+    intervals: str
+    draws: int | None
 
 
 @dataclass(frozen=True)
@@ -105,28 +120,18 @@ class Found:
     record: SearchRecord
 
     def best(self) -> BestPoint:
-        """The best point, its springs in order."""
+        """The best point, its springs in order, what is within rounding of a limit on it."""
         values = self.tracker.best_values
         assert values is not None  # checked by identify
-        return BestPoint(self.problem, _ordered(self.problem, values))
+        best = BestPoint(self.problem, _ordered(self.problem, values))
+        return _on_limits(best, self.tracker.best_cost)
 
 
 def identify(
-    measurement: Measurement,
-    model: str,
-    params: lmfit.Parameters | None,
-    options: Options,
+    measurement: Measurement, model: str, params: lmfit.Parameters | None, options: Options,
     progress: Progress,
-) -> Found:
-    """Search and refine; see `foamfit.fit` for the arguments.
-
-    Raises
-    ------
-    InputError
-        If the test cannot feed the drive or a parameter is unknown; the message names it.
-    SimulationError
-        If nothing that was tried could be simulated.
-    """
+) -> Found:  # fmt: skip
+    """Search and refine; see `foamfit.fit` for the arguments and the errors."""
     began = time.perf_counter()
     problem = options.problem(measurement, model, params)
     starts = STARTS * len(problem.model.kinds) if options.starts is None else options.starts
@@ -158,7 +163,6 @@ def _finish(
     found: Found, best: BestPoint, record: SearchRecord, intervals: Intervals
 ) -> tuple[Fit, BestPoint]:
     """Write the point into the parameters, and conclude."""
-    best = _on_limits(best, found.tracker.best_cost)
     found.problem.put(best.values)
     return conclude(best, record, intervals), best
 
@@ -191,20 +195,12 @@ def _assess(
 
 
 def _search(
-    problem: Problem,
-    tracker: Tracker,
-    record: SearchRecord,
-    progress: Progress,
+    problem: Problem, tracker: Tracker, record: SearchRecord, progress: Progress
 ) -> SearchRecord:
     """Search, then refine by lmfit; returns the record with its costs and what stopped it."""
+    rng = np.random.default_rng(record.seed)
     try:
-        costs = search(
-            tracker,
-            problem.space(),
-            starts=record.starts,
-            rng=np.random.default_rng(record.seed),
-            progress=progress,
-        )
+        costs = search(tracker, problem.space(), starts=record.starts, rng=rng, progress=progress)
         record = replace(record, costs=tuple(costs))
         progress(0.95, "refinement")
         _refine(problem, tracker)
@@ -230,7 +226,11 @@ def _refine(problem: Problem, tracker: Tracker) -> None:
         params[name].vary = False
     if not names:
         return
-    _move_inside(params, names)
+    for name in names:  # least_squares wants its start off the bounds
+        parameter = params[name]
+        if math.isfinite(span := parameter.max - parameter.min):
+            low, high = parameter.min + 1e-9 * span, parameter.max - 1e-9 * span
+            parameter.value = min(max(parameter.value, low), high)
 
     def residual(p: lmfit.Parameters) -> Array:
         return tracker.residual(problem.vector(p))
@@ -246,23 +246,8 @@ def _refine(problem: Problem, tracker: Tracker) -> None:
         )  # fmt: skip
 
 
-def _move_inside(params: lmfit.Parameters, names: tuple[str, ...]) -> None:
-    """Move values off their bounds by a hair, where least_squares wants its start."""
-    for name in names:
-        parameter = params[name]
-        span = parameter.max - parameter.min
-        if math.isfinite(span):
-            margin = 1e-9 * span
-            parameter.value = min(
-                max(parameter.value, parameter.min + margin), parameter.max - margin
-            )
-
-
 def _on_limits(best: BestPoint, cost: float) -> BestPoint:
-    """Put parameters that are within rounding of a limit on it, if `cost` hardly rises.
-
-    The refinement stays off the limits by a hair (`_move_inside`).
-    """
+    """Put parameters that are within rounding of a limit on it, if `cost` hardly rises."""
     problem, space = best.problem, best.problem.space()
     values = best.values + 0.0  # no -0
     if np.any(np.signbit(best.values) & (values == 0.0)):
@@ -284,16 +269,6 @@ def _on_limits(best: BestPoint, cost: float) -> BestPoint:
         return best
 
 
-def _moved(model: Model, values: Array, sources: Mapping[int, int]) -> Array:
-    """Put other springs in some places of a chain: {place: spring}, 0 at the base."""
-    moved = values.copy()
-    for name in model.names:
-        place, short = split_name(name)
-        if place in sources:
-            moved[model.index[name]] = values[model.index[f"s{sources[place] + 1}_{short}"]]
-    return moved
-
-
 def _ordered(problem: Problem, values: Array) -> Array:
     """Order springs that can be exchanged by their σ_a, the softest at the base.
 
@@ -303,28 +278,25 @@ def _ordered(problem: Problem, values: Array) -> Array:
     """
     model = problem.model
     bistable = [i for i, kind in enumerate(model.kinds) if kind == "bistable"]
-    if len(bistable) < 2:
+    held = [split_name(name) for name in model.names if not problem.params[name].vary]
+    if any(spring in bistable and short not in ("eta", "height") for spring, short in held):
         return values
-    held = {name for name in model.names if not problem.params[name].vary}
-    if any(
-        split_name(name)[0] in bistable for name in held if not name.endswith(("eta", "height"))
-    ):
-        return values
-
-    def onset(spring: int) -> float:
-        k0, eps_a = (values[model.index[f"s{spring + 1}_{short}"]] for short in ("k0", "eps_a"))
-        return float(k0 * eps_a / (1.0 - eps_a))
-
-    counted = problem.objective.counted
-    nodes = [node for name, node in problem.objective.interior.items() if name in counted]
+    nodes = [
+        n for name, n in problem.objective.interior.items() if name in problem.objective.counted
+    ]
 
     def order(spring: int) -> tuple[int, float]:
-        return sum(node <= spring for node in nodes), onset(spring)
+        k0, eps_a = (values[model.index[f"s{spring + 1}_{short}"]] for short in ("k0", "eps_a"))
+        return sum(node <= spring for node in nodes), float(k0 * eps_a / (1.0 - eps_a))
 
     ranked = sorted(bistable, key=order)
     if ranked == bistable:
         return values
-    moved = _moved(model, values, dict(zip(bistable, ranked, strict=True)))
+    moved, sources = values.copy(), dict(zip(bistable, ranked, strict=True))
+    for name in model.names:
+        place, short = split_name(name)
+        if place in sources:
+            moved[model.index[name]] = values[model.index[f"s{sources[place] + 1}_{short}"]]
     before, after = (problem.objective.residual(v) for v in (values, moved))
     same = np.allclose(before, after, rtol=0.0, atol=1e-9 * max(float(np.max(np.abs(before))), 1.0))
     return moved if same else values

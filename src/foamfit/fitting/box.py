@@ -123,12 +123,12 @@ class Space:
     @cached_property
     def coordinates(self) -> list[tuple[int, str, int]]:
         """Place, short name, place of the spring's first parameter; what others need is first."""
-        out = []
-        for name in sorted(self.free, key=lambda name: list(BOX).index(split_name(name)[1])):
+        out, shorts = [], list(BOX)
+        for name in sorted(self.free, key=lambda name: shorts.index(split_name(name)[1])):
             spring, short = split_name(name)
             first = self.model.index[f"s{spring + 1}_k0"] if spring >= 0 else -1
-            place = self.model.index.get(name, len(self.model.names))  # the nuisance stands last
-            out.append((place, short, first))
+            # The nuisance stands last.
+            out.append((self.model.index.get(name, len(self.model.names)), short, first))
         return out
 
     @cached_property
@@ -138,11 +138,10 @@ class Space:
         return pairs[:, 0], pairs[:, 1]
 
     def _unit(self, short: str) -> float:
-        if short == "height":
-            return self.scales.height
-        if short == "time_shift":
-            return LARGEST_SHIFT * self.scales.duration
-        return self.scales.eta if short == "eta" else self.scales.slope
+        scales = self.scales
+        others = {"height": scales.height, "eta": scales.eta}
+        others["time_shift"] = LARGEST_SHIFT * scales.duration
+        return others.get(short, scales.slope)
 
     def encode(self, values: Array) -> Array:
         """Coordinates of a vector of parameters, moved into the box."""
@@ -198,11 +197,9 @@ class Space:
                 moves[i] = (1.0 - point[j]) * moves[first + 3]
                 moves[i, j] = LAST_STRAIN - values[first + 3]
             elif short == "dsigma":
-                v = 1.0 - values[first + 3]
-                rise = (
-                    values[first + 3] / v * moves[first]
-                    + values[first] / (v * v) * moves[first + 3]
-                )
+                eps_a = values[first + 3]
+                rise = eps_a / (1.0 - eps_a) * moves[first]
+                rise += values[first] / (1.0 - eps_a) ** 2 * moves[first + 3]
                 moves[i] = -point[j] * rise
                 moves[i, j] = -_stress_at_a1(values, first)
             else:
