@@ -29,7 +29,6 @@ from foamfit.solve.polynomial import (
     fill_values,
     first_crossing,
     order_for,
-    value_and_slope,
     value_at,
 )
 from foamfit.solve.scene import (
@@ -60,21 +59,15 @@ from foamfit.springs.kernels import (
     first_branch,
     inner,
     maker,
-    strains_on,
     stress_interval,
 )
 from foamfit.springs.law import BISTABLE, UNILATERAL
 
-# A step of Newton's method so small, in distances to the nearest pole, is the last: what it leaves
-# is about its square.
-NEAR = 3e-8
 # Degree of the polynomial of the elongation, and how far from its anchor it is used, in distances
 # to the nearest pole: what it leaves out is below 0.125**17 < 1e-15 of the elongation.
 DEGREE, REACH = 16, 0.125
 # Springs whose switching stresses differ by less than this share switch together.
 CLOSE = 1e-13
-# Past so many times the least slope, and so many anchors, no room is left on a curved branch.
-FAR, MOST_ANCHORS = 1e30, 1000
 # Orders by which the time of the next event is guessed.
 GUESS = 3
 # Columns of `Group.law` and of `Group.place`.
@@ -101,18 +94,6 @@ class Group(NamedTuple):
     lower: Array
     sum: Array
     place: Array
-
-
-class Runs(NamedTuple):
-    """Histories to fill: stress (n,), strains and branches (springs or 0, n).
-
-    `since` (springs,) is the sample from which each spring has been on its branch.
-    """
-
-    sigma: Array
-    eps: Array
-    history: Branches
-    since: Branches
 
 
 class Step(NamedTuple):
@@ -451,85 +432,3 @@ def integrate_aggregate(
                 _anchor(group, stress, side > 0)
                 effort[0] += 1
     return TOO_MANY_STEPS, begin, max_steps, switches
-
-
-# ---------------------------------------------------------------- a known elongation
-
-
-@inner
-def _stress_at(group: Group, elongation: float, guess: float) -> tuple[float, float]:
-    """Stress at an elongation within the reach of the sum, by Newton's method, and its slope."""
-    unit, slope = group.place[UNIT], 1.0
-    x = (guess - group.place[ANCHOR]) / unit
-    for _ in range(50):
-        value, slope = value_and_slope(group.sum, DEGREE, x)
-        step = (elongation - value) / slope
-        x += step
-        if abs(step) < NEAR:
-            break
-    return group.place[ANCHOR] + unit * x, unit / slope
-
-
-@inner
-def _write(group: Group, i: int, first: int, last: int, runs: Runs) -> None:
-    """Write strains and branch of a spring over the samples that it was on it, if wanted."""
-    if runs.eps.shape[0] == 0:
-        return
-    strains_on(group.rows[i], group.branches[i], runs.sigma[first:last], runs.eps[i, first:last])
-    runs.history[i, first:last] = group.branches[i]
-
-
-@inner
-def _pass(group: Group, stress: float, rising: bool, j: int, runs: Runs) -> None:
-    """Change the branches of all springs that leave theirs at this stress, before sample j."""
-    tree = group.upper if rising else group.lower
-    met = (stress if rising else -stress) + CLOSE * abs(stress)
-    while tree[1] <= met:
-        i = _winner(tree)
-        _write(group, i, runs.since[i], j, runs)
-        runs.since[i] = j
-        _swap(group, i, above(group.branches[i]) if rising else below(group.branches[i]))
-
-
-@compiled
-def equilibrium_along(
-    rows: Array, heights: Array, top: Array, sigma: Array, eps: Array, history: Branches
-) -> bool:
-    """Springs in series, as `holds` wants them, along a history of the top's displacement (m).
-
-    Fills the common stress (n,), the strains and the branches (springs or 0, n), as does
-    `springs.kernels.equilibrium_along`, which goes through all springs at every trial. False, and
-    nothing of use filled, where the sum does not reach: past all room on a curved branch, or under
-    a tension beyond the least slope, which a spring on a straight branch may bear.
-    """
-    count, group = heights.size, _make_group(rows, heights)
-    runs = Runs(sigma, eps, history, np.zeros(count, np.int64))
-    _begin(group)
-    stress, place, slope, end, edge = 0.0, 0.0, 0.0, 0.0, 0.0
-    rose, stale = True, True
-    for j in range(top.size):
-        rising, there = top[j] >= place, False
-        stale, rose = stale or rising != rose, rising
-        for _ in range(4 * count + MOST_ANCHORS):
-            anchor, reach = group.place[ANCHOR], REACH * group.place[UNIT]
-            if stale:
-                end = min(group.upper[1], anchor + reach)
-                if not rising:
-                    end = max(-group.lower[1], anchor - reach)
-                edge = value_at(group.sum, DEGREE, (end - anchor) / group.place[UNIT])
-            there = top[j] <= edge if rising else top[j] >= edge
-            stale = not there
-            if there or not abs(end) < FAR * group.place[LEAST]:
-                break
-            stress = end
-            _pass(group, stress, rising, j, runs)
-            if abs(stress - anchor) >= reach * (1.0 - 1e-12):
-                _anchor(group, stress, rising)
-        if not there:
-            return False
-        guess = stress + slope * (top[j] - place)
-        stress, slope = _stress_at(group, top[j], min(guess, end) if rising else max(guess, end))
-        sigma[j], place = stress, top[j]
-    for i in range(count):
-        _write(group, i, runs.since[i], top.size, runs)
-    return True

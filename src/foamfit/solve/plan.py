@@ -41,9 +41,8 @@ OF_MASSES, OF_IMPACT, ALONG_DRIVE = 1e-4, 1e-3, 1e-4
 OF_MASSES_IMPLICIT, IMPLICIT, AS_ONE = 3e-2, 3e-4, 1e-4
 # Truncation of implicit steps that rounding leaves room for.
 LEAST_IMPLICIT = 1e-14
-# From so many springs on, those that carry one stress count as one: in an impact, and where their
-# elongation is prescribed.
-LEAST_AGGREGATE, LEAST_ELONGATED = 9, 3
+# From so many springs on, those that carry one stress in an impact count as one.
+LEAST_AGGREGATE = 9
 # Switches that are kept, of springs that do not count as one.
 LOGGED = 1024
 
@@ -240,10 +239,6 @@ class Plan(NamedTuple):
             stress, history = kernels.stress_along(rows[0], strain)
             return stress, strain[None, :], history[None, :]
         stress = np.empty(n)
-        if count >= LEAST_ELONGATED and many.holds(rows):
-            strain, branches = _new_history(count if wanted else 0, n)
-            if many.equilibrium_along(rows, heights, self.values, stress, strain, branches):
-                return stress, strain, branches
         strain, branches = _new_history(count, n)
         kernels.equilibrium_along(rows, heights, self.values, stress, strain, branches)
         miss = np.abs(heights @ strain - self.values).max()
