@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
 from foamfit.solve import cache, many
 from foamfit.solve import scene as scenes
@@ -21,7 +22,6 @@ from foamfit.springs.parameters import OWN_ETA, OWN_HEIGHT
 from foamfit.springs.sensitivities import equilibrium_tangents
 from foamfit.springs.spring import as_samples
 
-Array = NDArray[np.float64]
 Directions = NDArray[np.int64]
 
 CLOSED_FORM, FIRST_ORDER, SECOND_ORDER = "closed form", "first order", "second order"
@@ -161,7 +161,9 @@ class Plan(NamedTuple):
         slopes = np.empty((p, *curves.shape)) if p else NO_SLOPES
         bounces = self.plain and not drag and self.implicit is None
         stiff = not bounces and self._is_stiff(self.given(rows, heights, drag))
-        if p == 0 and not stiff and len(heights) >= LEAST_AGGREGATE and self._is_one(rows):
+        one = self.speed > 0.0 and self.top == scenes.FREE and len(self.ends) == 1
+        one = one and p == 0 and not stiff and len(heights) >= LEAST_AGGREGATE
+        if one and many.holds(rows):
             return self._aggregate(self.given(rows, heights, drag), rtol, curves)
         start = _AT_REST if self.top in _RESTING else self._start(rows, heights, directions)
         log = np.empty((LOGGED, 5)) if everything else NO_SWITCHES
@@ -178,7 +180,7 @@ class Plan(NamedTuple):
         margin = OF_MASSES_IMPLICIT if len(self.ends) > 1 else IMPLICIT
         cache.announce(steps.integrate_implicit, "the solver of stiff scenes")
         *ending, lost = steps.integrate_implicit(
-            self.given(rows, heights, drag), max(margin * rtol, LEAST_IMPLICIT), rtol,
+            self.given(rows, heights, drag), max(margin * rtol, LEAST_IMPLICIT),
             self.max_steps, directions, start, curves, slopes, log, np.zeros(2, np.int64),
         )  # fmt: skip
         return _motion(RADAU, ending, curves, slopes, log, lost)
@@ -197,7 +199,7 @@ class Plan(NamedTuple):
         moved, wanted = self.top == scenes.MOTION, everything or len(directions) > 0
         if moved:
             top = np.array(self.values)
-            stress, strain, branches = self._stretched(rows, heights, wanted)
+            stress, strain, branches = self._stretched(rows, heights)
             fine = True
         else:
             stress, top = np.array(self.values), np.empty(self.time.size)
@@ -229,10 +231,8 @@ class Plan(NamedTuple):
         switches = _switches(self.time, strain, branches)
         return Motion(nodes, stress, math.nan, switches, 0, CLOSED_FORM, slopes)
 
-    def _stretched(
-        self, rows: Array, heights: Array, wanted: bool
-    ) -> tuple[Array, Array, NDArray[np.int64]]:
-        """Stress, strains and branches (the last two if `wanted`) under a known motion."""
+    def _stretched(self, rows: Array, heights: Array) -> tuple[Array, Array, NDArray[np.int64]]:
+        """Stress, strains and branches under a known motion."""
         count, n = len(heights), self.time.size
         if count == 1:
             strain = self.values / heights
@@ -287,15 +287,6 @@ class Plan(NamedTuple):
             start[1 + own, first:] = longer / heights
         return start
 
-    def _is_one(self, rows: Array) -> bool:
-        """Tell whether an impact acts on springs so many and so plain that they count as one."""
-        return (
-            len(self.ends) == 1
-            and self.top == scenes.FREE
-            and self.speed > 0.0
-            and bool(many.holds(rows))
-        )
-
     def fastest_rates(self, rows: Array, heights: Array) -> tuple[float, float]:
         """Vibration and relaxation (radians) that explicit steps would have to go through."""
         return vibration.fastest_rates(self.given(rows, heights))
@@ -304,8 +295,6 @@ class Plan(NamedTuple):
         """Tell whether explicit steps would have to follow what is long over."""
         if self.implicit is not None:
             return self.implicit
-        if self.speed > 0.0 and vibration.stops_the_striker(given):
-            return True
         swings, decays = vibration.fastest_rates(given)
         return bool(swings > MOST_VIBRATION or decays > MOST_RELAXATION)
 

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
 from foamfit.solve.plan import (
     AGGREGATE,
@@ -28,8 +29,6 @@ from foamfit.springs.chain import Chain, Drive, check_scene
 from foamfit.springs.law import BISTABLE
 from foamfit.springs.parameters import DRAG, KINDS, OWN_HEIGHT, direction
 from foamfit.springs.spring import as_number
-
-Array = NDArray[np.float64]
 
 _UNRESOLVED = (
     "masses vibrate too fast to be followed, by up to {size:.1g} of the range: ask for no smaller "
@@ -92,11 +91,7 @@ class Response:
 
 
 def _verified(
-    scene: Plan,
-    rows: Array,
-    heights: Array,
-    rtol: float,
-    directions: Directions = NO_DIRECTIONS,
+    scene: Plan, rows: Array, heights: Array, rtol: float, directions: Directions = NO_DIRECTIONS
 ) -> Motion:
     """Run a scene; where masses make its errors grow, follow it again by shorter steps and compare.
 
@@ -106,15 +101,18 @@ def _verified(
         If the scene has no answer within `rtol`; the message says why.
     """
     motion = scene.run(rows, heights, rtol, directions=directions)
-    inside = len(scene.ends) > 2 or _damped_below_a_mass(scene, rows)
+    inside = len(scene.ends) > 2
+    if len(scene.ends) == 2:  # dashpots at the base feel how fast the mass above moves
+        inside = bool((rows[: scene.ends[0], kernels.ETA] > 0.0).any())
     many = _many(scene, motion, FEW_STEPS) or inside or motion.method == RADAU
     if scene.speed > 0.0 and not many and not _hard(scene, rows, heights):
         return motion
     motion = _resolved(scene, rows, heights, rtol, directions, motion)
     lost = motion.unresolved
-    if lost > 0.7 * rtol:  # the comparison below leaves 0.3
+    if (
+        lost > 0.7 * rtol
+    ):  # the comparison below leaves 0.3; an explicit step goes through 3 radians
         scene = scene._replace(implicit=False)
-        # an explicit step goes through two or three radians
         if max(scene.fastest_rates(rows, heights)) / 3.0 > MOST_WORK / len(heights):
             raise SimulationError(_UNRESOLVED.format(size=lost))
         motion = _followed(scene, rows, heights, rtol, directions, lost)
@@ -188,11 +186,6 @@ def _many(scene: Plan, motion: Motion, few: int) -> bool:
     return (motion.steps > few or shaken) and motion.method != AGGREGATE
 
 
-def _damped_below_a_mass(scene: Plan, rows: Array) -> bool:
-    """Whether dashpots at the base feel how fast a mass inside moves."""
-    return len(scene.ends) > 1 and bool((rows[: scene.ends[0], kernels.ETA] > 0.0).any())
-
-
 def _difference(one: Array, other: Array) -> float:
     """Largest difference of two motions over the range of the first, rest included."""
     span = max(float(one.max()), 0.0) - min(float(one.min()), 0.0)
@@ -225,9 +218,7 @@ def _distance_at_peak(
         return _distance_to_pole(rows, heights, motion.displacement[:, peak : peak + 1])
     distance = _distance_to_pole(rows, heights, motion.displacement)
     bistable = rows[:, kernels.KIND] == BISTABLE
-    if scene.speed == 0.0 or not bistable.any():
-        return distance
-    if not _hard(scene, rows, heights):
+    if scene.speed == 0.0 or not bistable.any() or not _hard(scene, rows, heights):
         return distance
     low, high = 0.0, float(scene.time[-1])
     for _ in range(12):
