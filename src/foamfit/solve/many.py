@@ -70,16 +70,15 @@ DEGREE, REACH = 16, 0.125
 CLOSE = 1e-13
 # Orders by which the time of the next event is guessed.
 GUESS = 3
-# Columns of `Group.law` and of `Group.place`.
-CURVED, SLOPE, ORIGIN, OFFSET, N_LAW = range(5)
+# Columns of `Group.place`.
 ANCHOR, UNIT, LEAST, N_PLACE = range(4)
 
 
 class Group(NamedTuple):
     """Springs in series under one stress, on the branches that they are on.
 
-    `rows` (springs, columns), `heights` (springs,) in m, `branches` (springs,); `law` (springs,
-    N_LAW) the shapes of the branches. `upper` and `lower` hold in their second halves the stresses
+    `rows` (springs, columns), `heights` (springs,) in m, `branches` (springs,).
+    `upper` and `lower` hold in their second halves the stresses
     at which each spring leaves its branch upwards and, negative, downwards; every entry before is
     the lesser of its two children, so that the first is the next to be met. `sum` (DEGREE + 1,) is
     the elongation as a polynomial of (S - anchor)/unit, with both, Pa, in `place`, and the least
@@ -89,7 +88,6 @@ class Group(NamedTuple):
     rows: Array
     heights: Array
     branches: Branches
-    law: Array
     upper: Array
     lower: Array
     sum: Array
@@ -146,10 +144,7 @@ def _winner(tree: Array) -> int:
 @inner
 def _enter(group: Group, i: int, branch: int) -> None:
     """Put a spring on a branch."""
-    curved, slope, origin, offset = branch_shape(group.rows[i], branch)
     group.branches[i] = branch
-    group.law[i, CURVED] = 1.0 if curved else 0.0
-    group.law[i, SLOPE], group.law[i, ORIGIN], group.law[i, OFFSET] = slope, origin, offset
     low, high = stress_interval(group.rows[i], branch)
     _put(group.upper, i, high)
     _put(group.lower, i, -low)
@@ -161,9 +156,9 @@ def _add(group: Group, i: int, share: float) -> None:
 
     On a curved branch ε = x0 + 1 - k/(k + S), a geometric series.
     """
-    k, x0, s0 = group.law[i, SLOPE], group.law[i, ORIGIN], group.law[i, OFFSET]
+    curved, k, x0, s0 = branch_shape(group.rows[i], group.branches[i])
     anchor, unit, height = group.place[ANCHOR], group.place[UNIT], share * group.heights[i]
-    if group.law[i, CURVED] == 0.0:
+    if not curved:
         group.sum[0] += height * (x0 + (anchor - s0) / k)
         group.sum[1] += height * unit / k
         return
@@ -188,32 +183,16 @@ def _anchor(group: Group, stress: float, rising: bool) -> None:
         _add(group, i, 1.0)
 
 
-@inner
-def _swap(group: Group, i: int, branch: int) -> None:
-    """Put a spring on another branch, and its elongation there in the place of that before."""
-    _add(group, i, -1.0)
-    _enter(group, i, branch)
-    _add(group, i, 1.0)
-
-
 @maker
 def _make_group(rows: Array, heights: Array) -> Group:
-    """Make room for springs as one; `_begin` fills it."""
+    """Springs as one, all on their first branches, free of stress."""
     count, leaves = heights.size, 1
     while leaves < count:
         leaves *= 2
-    return Group(
-        rows, heights, np.zeros(count, np.int64), np.zeros((count, N_LAW)),
-        np.empty(2 * leaves), np.empty(2 * leaves), np.zeros(DEGREE + 1), np.zeros(N_PLACE),
+    group = Group(
+        rows, heights, np.zeros(count, np.int64), np.full(2 * leaves, math.inf),
+        np.full(2 * leaves, math.inf), np.zeros(DEGREE + 1), np.zeros(N_PLACE),
     )  # fmt: skip
-
-
-@inner
-def _begin(group: Group) -> None:
-    """Put all springs on their first branches, free of stress."""
-    rows = group.rows
-    for at in range(group.upper.size):
-        group.upper[at] = group.lower[at] = math.inf
     least = math.inf
     for i in range(rows.shape[0]):
         _enter(group, i, first_branch(rows[i]))
@@ -221,16 +200,15 @@ def _begin(group: Group) -> None:
         if rows[i, KIND] == BISTABLE:
             least = min(least, rows[i, KC])
     group.place[LEAST] = least
-    _anchor(group, 0.0, least > 0.0)
+    _anchor(group, 0.0, least > 0.0)  # not the literal, which is a type
+    return group
 
 
 @inner
 def _strain(group: Group, i: int, stress: float) -> float:
     """Strain of a spring on its branch."""
-    k, x0 = group.law[i, SLOPE], group.law[i, ORIGIN]
-    if group.law[i, CURVED] == 0.0:
-        return x0 + (stress - group.law[i, OFFSET]) / k
-    return x0 + stress / (k + stress)
+    curved, k, x0, s0 = branch_shape(group.rows[i], group.branches[i])
+    return x0 + (stress / (k + stress) if curved else (stress - s0) / k)
 
 
 @inner
@@ -246,7 +224,9 @@ def _switch(
         entered = above(left) if rising else below(left)
         strain = _strain(group, i, stress)
         switches = log_switch(log, switches, now, i, left, entered, strain)
-        _swap(group, i, entered)
+        _add(group, i, -1.0)
+        _enter(group, i, entered)
+        _add(group, i, 1.0)
     return switches
 
 
@@ -278,16 +258,6 @@ def _next_order(group: Group, now: Step, n: int, mass: float, drag: float) -> No
 
 
 @inner
-def _start(group: Group, now: Step) -> None:
-    """Find order 0: the displacement, from the stress."""
-    step = (now.s[0] - group.place[ANCHOR]) / group.place[UNIT]
-    now.shifted[DEGREE] = group.sum[DEGREE]
-    for m in range(DEGREE - 1, -1, -1):
-        now.shifted[m] = group.sum[m] + step * now.shifted[m + 1]
-    now.w[0] = now.shifted[0]
-
-
-@inner
 def _longest(c: Array, n: int, limit: float, span: float) -> float:
     """Step within `span` at which the terms n - 1 and n of a series are below a limit."""
     for m in (n - 1, n):
@@ -312,7 +282,11 @@ def _expand(
 
     The first orders tell about when the next event comes; the step is a little longer than that.
     """
-    _start(group, now)
+    step = (now.s[0] - group.place[ANCHOR]) / group.place[UNIT]
+    now.shifted[DEGREE] = group.sum[DEGREE]
+    for m in range(DEGREE - 1, -1, -1):
+        now.shifted[m] = group.sum[m] + step * now.shifted[m + 1]
+    now.w[0] = now.shifted[0]
     most = now.s.size - 1
     n = min(GUESS, most)
     for m in range(1, n + 1):
@@ -330,7 +304,7 @@ def _expand(
 @inner
 def _sample(
     group: Group, now: Step, order: int, t: Array, first: int, last: int, begin: float,
-    curves: Array,
+    curves: Array
 ) -> None:  # fmt: skip
     """Write base stress and displacements at the samples first … last-1 of a step."""
     if first == last:
@@ -386,7 +360,6 @@ def integrate_aggregate(
         np.zeros(order + 1), np.zeros(order + 1), np.zeros(order + 1),
         np.zeros((order + 1, order + 1)), np.zeros(DEGREE + 1),
     )  # fmt: skip
-    _begin(group)
     s_scale, w_scale = _scales(group, mass, drag, speed)
     effort[0] += 1
     done = before_contact(curves, t, speed)

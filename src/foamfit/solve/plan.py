@@ -300,12 +300,7 @@ class Plan(NamedTuple):
 
 
 def _motion(
-    method: str,
-    ending: Sequence[Any],
-    curves: Array,
-    slopes: Array,
-    log: Array,
-    unresolved: float = 0.0,
+    method: str, ending: Sequence[Any], curves: Array, slopes: Array, log: Array, lost: float = 0.0
 ) -> Motion:
     """Gather what an integrator found, or say why it found nothing."""
     outcome, time, steps, switches = ending
@@ -313,7 +308,7 @@ def _motion(
         raise SimulationError(_OUTCOMES[outcome].format(steps=steps, time=time))
     slope = None if slopes is NO_SLOPES else Slopes(slopes[:, 1:], slopes[:, 0])
     seen = log if log is NO_SWITCHES else log[:switches]
-    return Motion(curves[1:], curves[0], time, seen, steps, method, slope, unresolved)
+    return Motion(curves[1:], curves[0], time, seen, steps, method, slope, lost)
 
 
 def _new_history(count: int, n: int) -> tuple[Array, NDArray[np.int64]]:
@@ -335,20 +330,14 @@ def _time(t: ArrayLike) -> Array:
     if time.ndim != 1 or time.size == 0:
         raise InputError("t must be a one-dimensional array with at least one sample")
     at = kernels.fault(time)
-    if at >= 0 and not math.isfinite(time[at]):
-        raise InputError(f"t must be finite; sample {at} is not")
     if at >= 0:
-        raise InputError(f"t must increase; sample {at} is not later than the one before it")
+        what = "later than the one before it" if math.isfinite(time[at]) else "finite"
+        raise InputError(f"t must be finite and increase; sample {at} is not {what}")
     return time
 
 
 def plan(
-    chain: Chain,
-    drive: Drive,
-    t: ArrayLike,
-    *,
-    dashpots: bool = False,
-    max_steps: int = MAX_STEPS,
+    chain: Chain, drive: Drive, t: ArrayLike, *, dashpots: bool = False, max_steps: int = MAX_STEPS
 ) -> Plan:
     """Find what a scene needs: the nodes that have a state, and the least solver.
 

@@ -107,7 +107,6 @@ def _verified(
     many = _many(scene, motion, FEW_STEPS) or inside or motion.method == RADAU
     if scene.speed > 0.0 and not many and not _hard(scene, rows, heights):
         return motion
-    motion = _resolved(scene, rows, heights, rtol, directions, motion)
     lost = motion.unresolved
     if (
         lost > 0.7 * rtol
@@ -146,26 +145,6 @@ def _verified(
         f"{miss:.1g} of the range; ask for a larger rtol, give the springs heavier dashpots, or "
         "leave the masses out"
     )
-
-
-def _resolved(
-    scene: Plan, rows: Array, heights: Array, rtol: float, directions: Directions, motion: Motion
-) -> Motion:
-    """Take shorter implicit steps where these follow the vibrations that longer ones have lost.
-
-    What many damped masses have lost together is overestimated: shorter steps may show that.
-    """
-    by_implicit = scene._replace(implicit=True)
-    for factor in (1e-2, 1e-4):
-        if motion.unresolved <= 0.7 * rtol or rtol * factor < 1e-14:
-            break
-        try:
-            finer = by_implicit.run(rows, heights, rtol * factor, directions=directions)
-        except SimulationError:
-            break
-        if finer.unresolved <= 0.7 * rtol:
-            return finer
-    return motion
 
 
 def _followed(

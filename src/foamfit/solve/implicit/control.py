@@ -32,18 +32,15 @@ AGAIN, FREELY, ARRIVED, AT_ONCE = range(4)
 class Limits(NamedTuple):
     """What does not change in a run besides the scene.
 
-    `tol` is the truncation of a step relative to the motion so far, `duration` that of the motion
-    (s), `short` the length under which steps are short. `base_weight` weighs the truncation of the
-    base stress relative to what is left of it, vibrations (groups, 3) are those of each mass
-    (`vibration.fastest_of_masses`).
+    `tol` is the truncation of a step relative to the motion so far, `short` the length (s) under
+    which steps are short. `base_weight` weighs the truncation of the base stress relative to what
+    is left of it.
     """
 
     tol: float
     max_steps: int
-    duration: float
     short: float
     base_weight: float
-    vibrations: Array
 
 
 class Control:
@@ -142,7 +139,7 @@ def error_of(
 
 @inner
 def allowed_length(
-    limits: Limits, c: Control, now: float, span: float, error: float, rounded: bool
+    limits: Limits, rates: Array, c: Control, now: float, span: float, error: float, rounded: bool
 ) -> float:
     """Length at which to take a step whose truncation is `error`: its own where that may pass.
 
@@ -157,7 +154,7 @@ def allowed_length(
         return max(span * min(max(factor, 0.1), 0.9), floor)
     if excess <= 1.0:
         c.damping = 0.0
-    elif is_unresolved(limits.vibrations, span) and error > c.damping:
+    elif is_unresolved(rates, span) and error > c.damping:
         c.damped += error - c.damping
         c.damping = error
     c.proposed = max(span * min(max(factor, 0.2), 5.0), c.floor)

@@ -27,13 +27,7 @@ from foamfit.springs.parameters import OWN_ETA, OWN_HEIGHT
 
 @inner
 def _record(
-    now: float,
-    span: float,
-    first: int,
-    done: int,
-    state: State,
-    curves: Polynomials,
-    out: Samples,
+    now: float, span: float, first: int, done: int, state: State, curves: Polynomials, out: Samples
 ) -> None:
     """Write the samples first … done-1, which a step contains."""
     nodes, count = out.curves.shape[0] - 1, state.w.size

@@ -53,7 +53,6 @@ from foamfit.solve.implicit.recording import (
 from foamfit.solve.implicit.vibration import (
     Unresolved,
     contact_time,
-    fastest_of_masses,
     is_overdamped,
     remember,
 )
@@ -123,6 +122,7 @@ def _step(
     state: State,
     at: Points,
     out: Polynomials,
+    rates: Array,
     control: Control,
     start: Start,
     span: float,
@@ -151,7 +151,7 @@ def _step(
             if first_error == math.inf:
                 first, first_error = span, error
             rounded = span <= 1e-6 * first and error > 0.3 * first_error
-            allowed = allowed_length(limits, control, now, span, error, rounded)
+            allowed = allowed_length(limits, rates, control, now, span, error, rounded)
             if allowed < span:
                 longest = span = allowed
                 continue
@@ -359,14 +359,10 @@ def _follow(
         if horizon <= now:  # a single sample, or the last one
             record_rest(done, state, base, d, samples)
             return DONE, math.nan, step, switches
-        span = horizon - now
-        if control.proposed > 0.0:
-            span = min(span, control.proposed)
-        elif struck:
-            span = min(span, 0.02 * limits.duration)
+        span = min(horizon - now, control.proposed)
         begin = Start(now, base, pressed, push, push_rate)
         outcome, span, arrived, target, side = _step(
-            scene, limits, body, state, at, out, control, begin, span, tally
+            scene, limits, body, state, at, out, r.rates, control, begin, span, tally
         )
         if outcome != DONE:
             return outcome, now, step, switches
@@ -436,10 +432,8 @@ def integrate_implicit(
     if struck:
         duration = min(duration, 5.0 * contact_time(scene))
     weight = min(1.0, tol / SMALL_BASE_ERROR) if is_overdamped(scene) else 0.0
-    limits = Limits(
-        tol, max_steps, duration, SHORT * duration * (tol / 3e-8) ** (1.0 / 6.0),
-        weight, fastest_of_masses(scene),
-    )  # fmt: skip
+    short = SHORT * duration * (tol / 3e-8) ** (1.0 / 6.0)
+    limits = Limits(tol, max_steps, short, weight)
     body = Body(rows, heights, areal, scene.drag, count - 1 if top == MOTION else count)
     at, d = make_points(count), make_tangents(count, directions)
     shape = (count, STAGES + 1)
@@ -453,7 +447,7 @@ def integrate_implicit(
     moving = np.zeros((4, count))
     state = State(moving[0], moving[1], moving[2], moving[3], np.empty(count, np.int64))
     memory = np.zeros(1, CONTROL)  # used again below: it would be freed after its last use
-    memory[0].worst = 1.0
+    memory[0].worst, memory[0].proposed = 1.0, 0.02 * duration if struck else math.inf
     outcome, end, steps, switches = _follow(
         scene, limits, body, state, at, out, r, memory[0], d, Samples(t, curves, slopes), log,
         start, tally,

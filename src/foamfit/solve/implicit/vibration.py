@@ -11,20 +11,16 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
-
 from foamfit.solve.implicit.collocation import COEFFICIENTS, STAGES, Points, State
 from foamfit.solve.scene import FREE, STRESS, VISCOUS, Scene, SceneTuple
 from foamfit.springs.kernels import (
     ETA,
     K0,
     KC,
-    KH_MINUS,
     KH_PLUS,
     Array,
     compiled,
     inner,
-    maker,
     slope_on,
 )
 
@@ -36,8 +32,8 @@ OVERDAMPED = 1e3
 class Unresolved(NamedTuple):
     """Vibrations that steps did not resolve, per mass (groups,): see `remember`.
 
-    worst (2,) is the largest motion and stress that they had at a sample; rates (groups, 3) and
-    slopes (springs,) are scratch.
+    worst (2,) is the largest motion and stress that they had at a sample; rates (groups, 3) are
+    those of the last step (`_fill_rates`), slopes (springs,) is scratch.
     """
 
     alive: Array
@@ -156,17 +152,6 @@ def _fill_rates(scene: Scene, slopes: Array, rates: Array) -> None:
             rates[g - 1, 1] = 0.5 * hold / mass
             rates[g - 1, 2] = max(below_stiff, stiff)
         below_stiff, below_damp = stiff, damp
-
-
-@maker
-def fastest_of_masses(scene: Scene) -> Array:
-    """Rates (masses, 3), as `_fill_rates` has them, with every spring on its steepest branch."""
-    rates, slopes = np.zeros((scene.ends.size, 3)), np.empty(scene.heights.size)
-    for i in range(slopes.size):
-        row = scene.rows[i]
-        slopes[i] = max(max(row[K0], row[KC]), max(row[KH_PLUS], row[KH_MINUS]))
-    _fill_rates(scene, slopes, rates)
-    return rates
 
 
 @inner
