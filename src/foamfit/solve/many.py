@@ -9,7 +9,7 @@ analytic as far as the nearest pole of a curved branch (-k). Its Taylor polynomi
 stress stands for all springs: a spring that switches takes its terms out and puts others in, which
 costs the same in a chain of ten springs and of a thousand. The whole sum is made anew only where
 the stress nears the end of the polynomial's reach. The next spring to switch is found in a
-tournament of the switching stresses. So a run costs little more than in proportion to its springs,
+binary tree of the switching stresses. So a run costs little more than in proportion to its springs,
 where following every spring through every step costs their number squared.
 
 In time a step is a Taylor series again, with powers of the series of S put into the polynomial.
@@ -77,12 +77,11 @@ ANCHOR, UNIT, LEAST, N_PLACE = range(4)
 class Group(NamedTuple):
     """Springs in series under one stress, on the branches that they are on.
 
-    `rows` (springs, columns), `heights` (springs,) in m, `branches` (springs,).
-    `upper` and `lower` hold in their second halves the stresses
-    at which each spring leaves its branch upwards and, negative, downwards; every entry before is
-    the lesser of its two children, so that the first is the next to be met. `sum` (DEGREE + 1,) is
-    the elongation as a polynomial of (S - anchor)/unit, with both, Pa, in `place`, and the least
-    first slope of a branch.
+    `rows` (springs, columns), `heights` (springs,) in m, `branches` (springs,). `upper` and `lower`
+    hold in their second halves the stresses at which each spring leaves its branch upwards and,
+    negative, downwards; every entry before is the lesser of its two children, so that the first is
+    the next to be reached. `sum` (DEGREE + 1,) is the elongation as a polynomial of
+    (S - anchor)/unit, with both, Pa, in `place`, and the least first slope of a branch.
     """
 
     rows: Array
@@ -110,7 +109,7 @@ class Step(NamedTuple):
 
 @compiled
 def holds(rows: Array) -> bool:
-    """Tell whether every spring has one strain at each stress on its branch, and no dashpot."""
+    """Whether every spring has one strain at each stress on its branch, and no dashpot."""
     for i in range(rows.shape[0]):
         if rows[i, ETA] > 0.0 or rows[i, KIND] == UNILATERAL:
             return False
@@ -123,8 +122,8 @@ def holds(rows: Array) -> bool:
 
 
 @inner
-def _put(tree: Array, i: int, value: float) -> None:
-    """Set an entry of a tournament."""
+def _set(tree: Array, i: int, value: float) -> None:
+    """Set a leaf of a tree in which every node is the lesser of its children."""
     at = tree.size // 2 + i
     tree[at] = value
     while at > 1:
@@ -133,8 +132,8 @@ def _put(tree: Array, i: int, value: float) -> None:
 
 
 @inner
-def _winner(tree: Array) -> int:
-    """Which entry of a tournament is the least."""
+def _least(tree: Array) -> int:
+    """Which leaf of a tree is the least."""
     at = 1
     while at < tree.size // 2:
         at = 2 * at if tree[2 * at] == tree[at] else 2 * at + 1
@@ -146,8 +145,8 @@ def _enter(group: Group, i: int, branch: int) -> None:
     """Put a spring on a branch."""
     group.branches[i] = branch
     low, high = stress_interval(group.rows[i], branch)
-    _put(group.upper, i, high)
-    _put(group.lower, i, -low)
+    _set(group.upper, i, high)
+    _set(group.lower, i, -low)
 
 
 @inner
@@ -219,7 +218,7 @@ def _switch(
     tree = group.upper if rising else group.lower
     met = (stress if rising else -stress) + CLOSE * abs(stress)
     while tree[1] <= met:
-        i = _winner(tree)
+        i = _least(tree)
         left = group.branches[i]
         entered = above(left) if rising else below(left)
         strain = _strain(group, i, stress)
@@ -280,7 +279,7 @@ def _expand(
 ) -> tuple[int, float]:
     """Expand a step until its terms fall below the limits: orders found, and the longest step.
 
-    The first orders tell about when the next event comes; the step is a little longer than that.
+    The first orders estimate the next event; the step is a little longer than that.
     """
     step = (now.s[0] - group.place[ANCHOR]) / group.place[UNIT]
     now.shifted[DEGREE] = group.sum[DEGREE]

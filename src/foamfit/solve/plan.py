@@ -39,7 +39,7 @@ MOST_WORK, MOST_EXPLICIT_WORK, MOST_SAMPLED = 1_500_000, 500_000, 10_000_000
 # and without; of springs that count as one, whose errors add up.
 OF_MASSES, OF_IMPACT, ALONG_DRIVE = 1e-4, 1e-3, 1e-4
 OF_MASSES_IMPLICIT, IMPLICIT, AS_ONE = 3e-2, 3e-4, 1e-4
-# Truncation of implicit steps that rounding leaves room for.
+# Least truncation of implicit steps: less is rounding.
 LEAST_IMPLICIT = 1e-14
 # From so many springs on, those that carry one stress in an impact count as one.
 LEAST_AGGREGATE = 9
@@ -65,7 +65,7 @@ _NOTHING = np.zeros(1)
 # Tops under which springs start from rest, and what they start from.
 _RESTING, _AT_REST = (scenes.FREE, scenes.VISCOUS), np.zeros((1, 0))
 # Outcomes of explicit steps after which implicit ones are tried.
-_WRONG_TOOL = (scenes.TOO_MANY_STEPS, scenes.STEP_UNDERFLOW)
+_STIFF = (scenes.TOO_MANY_STEPS, scenes.STEP_UNDERFLOW)
 NO_SLOPES = np.empty((0, 0, 0))
 
 
@@ -175,7 +175,7 @@ class Plan(NamedTuple):
                 self.values, self.speed, time, self.margin * rtol, most, directions, start, curves,
                 slopes, log,
             )  # fmt: skip
-            if self.implicit is False or ending[0] not in _WRONG_TOOL:
+            if self.implicit is False or ending[0] not in _STIFF:
                 return _motion(TAYLOR, ending, curves, slopes, log)
         margin = OF_MASSES_IMPLICIT if len(self.ends) > 1 else IMPLICIT
         cache.announce(steps.integrate_implicit, "the solver of stiff scenes")
@@ -292,11 +292,11 @@ class Plan(NamedTuple):
         return vibration.fastest_rates(self.given(rows, heights))
 
     def _is_stiff(self, given: scenes.SceneTuple) -> bool:
-        """Tell whether explicit steps would have to follow what is long over."""
+        """Whether explicit steps would have to follow rates that have long died out."""
         if self.implicit is not None:
             return self.implicit
-        swings, decays = vibration.fastest_rates(given)
-        return bool(swings > MOST_VIBRATION or decays > MOST_RELAXATION)
+        vibrates, relaxes = vibration.fastest_rates(given)
+        return bool(vibrates > MOST_VIBRATION or relaxes > MOST_RELAXATION)
 
 
 def _motion(

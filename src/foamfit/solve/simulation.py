@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -102,16 +103,21 @@ def _verified(
     """
     motion = scene.run(rows, heights, rtol, directions=directions)
     inside = len(scene.ends) > 2
-    if len(scene.ends) == 2:  # dashpots at the base feel how fast the mass above moves
+    if len(scene.ends) == 2:  # the base stress depends on the velocity of the mass above
         inside = bool((rows[: scene.ends[0], kernels.ETA] > 0.0).any())
     many = _many(scene, motion, FEW_STEPS) or inside or motion.method == RADAU
     if scene.speed > 0.0 and not many and not _hard(scene, rows, heights):
         return motion
+    for factor in (1e-2, 1e-4):  # shorter implicit steps may follow what longer ones have lost
+        if motion.unresolved > 0.7 * rtol and rtol * factor >= 1e-14:
+            with suppress(SimulationError):
+                finer = scene._replace(implicit=True).run(
+                    rows, heights, rtol * factor, directions=directions
+                )
+                motion = finer if finer.unresolved <= 0.7 * rtol else motion
     lost = motion.unresolved
-    if (
-        lost > 0.7 * rtol
-    ):  # the comparison below leaves 0.3; an explicit step goes through 3 radians
-        scene = scene._replace(implicit=False)
+    if lost > 0.7 * rtol:  # the comparison below leaves 0.3
+        scene = scene._replace(implicit=False)  # its steps go through some 3 radians each
         if max(scene.fastest_rates(rows, heights)) / 3.0 > MOST_WORK / len(heights):
             raise SimulationError(_UNRESOLVED.format(size=lost))
         motion = _followed(scene, rows, heights, rtol, directions, lost)
@@ -124,7 +130,7 @@ def _verified(
     forced = 0 if scene.speed > 0.0 else scene.time.size
     many = _many(scene, motion, FEW_STEPS + 2 * forced) or inside or distance < CLOSE
     many = many and scene.solver == SECOND_ORDER
-    if not (many or motion.method == RADAU) or rtol < 1e-12:  # no finer run could tell
+    if not (many or motion.method == RADAU) or rtol < 1e-12:  # a finer run is rounding
         return motion
     miss = math.inf
     for factor in (1e-2, 1e-4, 1e-6):
@@ -161,8 +167,8 @@ def _followed(
 
 def _many(scene: Plan, motion: Motion, few: int) -> bool:
     """Whether a motion took many steps (those of springs under one stress are but switches)."""
-    shaken = len(scene.ends) > 1 and len(motion.switches) > FEW_SWITCHES
-    return (motion.steps > few or shaken) and motion.method != AGGREGATE
+    vibrates = len(scene.ends) > 1 and len(motion.switches) > FEW_SWITCHES
+    return (motion.steps > few or vibrates) and motion.method != AGGREGATE
 
 
 def _difference(one: Array, other: Array) -> float:
@@ -179,9 +185,9 @@ def _distance_to_pole(rows: Array, heights: Array, displacement: Array) -> float
 
 
 def _hard(scene: Plan, rows: Array, heights: Array) -> bool:
-    """Whether a blow may bring a spring close to the end of its branch c."""
-    brought = 0.5 * float(scene.mass[-1]) * scene.speed**2
-    return brought >= 6.0 * float(heights.dot(rows[:, kernels.KC]))
+    """Whether an impact may bring a spring close to the end of its branch c."""
+    energy = 0.5 * float(scene.mass[-1]) * scene.speed**2
+    return energy >= 6.0 * float(heights.dot(rows[:, kernels.KC]))
 
 
 def _distance_at_peak(
@@ -189,7 +195,7 @@ def _distance_at_peak(
 ) -> float:
     """Least distance, at the peak of an impact, of a spring from the end of its branch.
 
-    The peak of a hard blow is so short that no sample need lie in it: it is closed in on. In
+    The peak of a fast impact is so short that no sample need lie in it: it is bracketed. In
     equilibrium all springs are longest together.
     """
     if scene.solver == CLOSED_FORM:

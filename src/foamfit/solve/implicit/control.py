@@ -143,7 +143,7 @@ def allowed_length(
 ) -> float:
     """Length at which to take a step whose truncation is `error`: its own where that may pass.
 
-    Where the error is one of rounding, or the layer thinner than the clock can tell, it has to.
+    It may also where the error is one of rounding, or the step as short as times can resolve.
     """
     excess = error / limits.tol
     if not math.isfinite(excess):

@@ -44,7 +44,7 @@ def _through(values: Array, at: float) -> float:
     """Value at a place of a step of the polynomial through the values at its points.
 
     Where nothing has inertia or a dashpot, the derivatives by a dashpot jump at switches and kinks:
-    the polynomial of a step asks nothing of its start.
+    this polynomial does not pass through the start of the step.
     """
     total = 0.0
     for k in range(STAGES - 1, -1, -1):

@@ -2,7 +2,7 @@
 
 Light masses and heavy or very light dashpots make rates that explicit steps must follow. The steps
 of `implicit.collocation` (Radau IIA, order 9) need not: the method is L-stable, what relaxes or
-vibrates too fast to be followed dies out (and `implicit.vibration` tells how much that was).
+vibrates too fast to be followed dies out (and `implicit.vibration` estimates how much that was).
 
 No branch changes inside a step. A switch, or the end of contact, is the first crossing of the
 polynomial; the step is then taken again, shorter, until it ends there. Derivatives by parameters

@@ -1,7 +1,7 @@
 """How fast a chain vibrates and relaxes, and what of it implicit steps do not resolve.
 
 Explicit steps must follow every rate; implicit ones damp out what is too fast for them. What they
-damp out is estimated here, so that an answer can say what it lacks.
+damp out is estimated here, so that a response can be refused where that exceeds its tolerance.
 """
 
 # mypy: disallow-untyped-decorators=False, warn-return-any=False
@@ -55,7 +55,7 @@ def contact_time(scene: Scene) -> float:
 
 @inner
 def is_overdamped(scene: Scene) -> bool:
-    """Tell whether dashpots stop a striker long before the springs throw it back.
+    """Whether dashpots stop a striker long before the springs throw it back.
 
     With the rates a = k/c of creep and b = c/m of stopping, contact ends where the base stress has
     fallen to (a/b)² of its peak: explicit steps, whose error is relative to the peak, lose it.
@@ -156,7 +156,7 @@ def _fill_rates(scene: Scene, slopes: Array, rates: Array) -> None:
 
 @inner
 def is_unresolved(rates: Array, span: float) -> bool:
-    """Tell whether a mass vibrates too fast for a step and goes on vibrating after it."""
+    """Whether a mass vibrates too fast for a step and goes on vibrating after it."""
     for g in range(rates.shape[0]):
         own, fade = rates[g, 0], rates[g, 1]
         if own * span > 0.5 and fade < own and fade * span < 20.0:
