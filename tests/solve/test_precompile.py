@@ -50,7 +50,7 @@ def test_a_fit_calls_what_was_compiled_and_nothing_else() -> None:
     assert taylor.integrate.signatures == [precompile._calls()[taylor.integrate]]
     for function in (
         kernels.fill_rows, kernels.stress_along, kernels.fault, kernels.total,
-        sensitivities.equilibrium_tangents, vibration.fastest_rates, vibration.stops_the_striker,
+        sensitivities.equilibrium_tangents, vibration.fastest_rates,
     ):  # fmt: skip
         assert len(function.signatures) == 1, function.py_func.__name__
 

@@ -381,7 +381,7 @@ def test_cost_of_a_long_chain_is_linear(kind: str) -> None:
         rows = np.array([spring.row for spring in built(chain).springs])
         tally, curves = np.zeros(2, np.int64), np.empty((2, TIME.size))
         outcome, end, taken, switches, _ = steps.integrate_implicit(
-            scene.given(rows, np.array(chain.heights)), 3e-8, 1e-6, 10_000, NO_DIRECTIONS,
+            scene.given(rows, np.array(chain.heights)), 3e-8, 10_000, NO_DIRECTIONS,
             np.zeros((1, 0)), curves, NO_SLOPES, np.empty((4, 5)), tally,
         )  # fmt: skip
         stress = curves[0]

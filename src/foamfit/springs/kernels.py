@@ -14,9 +14,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from foamfit.arrays import Array as Array
 from foamfit.springs.law import BISTABLE, LINEAR, UNILATERAL, admissible, derived_points
 
-Array = NDArray[np.float64]
 Row = Array
 Branches = NDArray[np.int64]
 

@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
 from foamfit.springs.law import BISTABLE, LINEAR, UNILATERAL, derived_points
 
 if TYPE_CHECKING:
     from foamfit.springs.kernels import Row
-
-Array = NDArray[np.float64]
 
 
 def _require(holds: bool, name: str, value: float, wanted: str) -> None:
