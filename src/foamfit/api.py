@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
+from typing import Unpack
 
 import lmfit
 
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError
-from foamfit.one_model import Options, Progress, identify, judge
+from foamfit.one_model import Keywords, Options, Progress, identify, judge
 from foamfit.report.folder import save_result
 from foamfit.results import Fit
 from foamfit.trust.intervals import Announce
@@ -27,19 +27,10 @@ def fit(
     measurement: Measurement,
     *,
     model: str = "bistable",
-    drive: str | None = None,
-    seed: int = 0,
-    starts: int | None = None,
-    max_time: float | None = None,
     params: lmfit.Parameters | None = None,
-    weights: Mapping[str, float] | None = None,
-    interior_mass: bool = False,
-    time_shift: bool = False,
-    loss: str = "linear",
-    intervals: str = "auto",
-    draws: int | None = None,
     progress: Progress | None = None,
     tell: Announce | None = None,
+    **options: Unpack[Keywords],
 ) -> FitResult:
     """Identify the parameters of a chain of springs from a test.
 
@@ -50,6 +41,12 @@ def fit(
     model : str
         Springs from the base up, joined by "+"; "auto" takes the simplest that holds, see
         `foamfit.auto.climb`.
+    params : lmfit.Parameters, optional
+        Values, bounds, fixed values and expressions; see `make_params`.
+    progress : callable, optional
+        Told the fraction done and what is going on.
+    tell : callable, optional
+        Called with the expected run time of the intervals before it is spent.
     drive : str, optional
         "impact", "stress" or "displacement"; by default what the test allows, in this order:
         impact, displacement.
@@ -59,8 +56,6 @@ def fit(
         Descents of the search; by default 16 for each spring.
     max_time : float, optional
         Seconds after which the best point so far is the result.
-    params : lmfit.Parameters, optional
-        Values, bounds, fixed values and expressions; see `make_params`.
     weights : mapping, optional
         Weight of each curve; see `fitting.objective.default_weights`.
     interior_mass : bool
@@ -77,10 +72,6 @@ def fit(
         along which the cost is no parabola), "local", "profile", "bootstrap" or "mcmc".
     draws : int, optional
         Refits of the bootstrap (by default 500) or steps of the Markov chain (2000).
-    progress : callable, optional
-        Told the fraction done and what is going on.
-    tell : callable, optional
-        Called with the expected run time of the intervals before it is spent.
 
     Returns
     -------
@@ -89,6 +80,8 @@ def fit(
 
     Raises
     ------
+    TypeError
+        If there is no option of that name.
     InputError
         If the test cannot feed the drive or a parameter is unknown; the message names it.
     SimulationError
@@ -100,26 +93,15 @@ def fit(
         )
     if params is not None and not isinstance(params, lmfit.Parameters):
         raise InputError("params must be lmfit.Parameters, as foamfit.make_params returns them")
-    options = Options(
-        drive=drive,
-        seed=seed,
-        starts=starts,
-        max_time=max_time,
-        weights=weights,
-        interior_mass=interior_mass,
-        time_shift=time_shift,
-        loss=loss,
-        intervals=intervals,
-        draws=draws,
-    )
+    chosen = Options(**options)
     progress, tell = progress or (lambda *_: None), tell or (lambda _: None)
     if model == "auto":
         if params is not None:
             raise InputError("params belong to one model; name it instead of 'auto'")
         from foamfit.auto import climb  # the one fit that has rungs
 
-        found = climb(measurement, options, progress, tell)
+        found = climb(measurement, chosen, progress, tell)
     else:
-        searched = identify(measurement, model, params, options, progress)
-        found, _ = judge(searched, options.choice, tell)
+        searched = identify(measurement, model, params, chosen, progress)
+        found, _ = judge(searched, chosen.choice, tell)
     return FitResult(**vars(found))

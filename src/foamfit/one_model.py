@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from numbers import Integral, Real
+from typing import TypedDict
 
 import lmfit
 import numpy as np
@@ -42,6 +43,21 @@ DRAWS = {"bootstrap": 500, "mcmc": 2000}
 # Evaluations that the default spends on profiles, over those of the search; and how often it goes
 # on from a better point that a profile has met.
 PROFILE_SHARE, IMPROVEMENTS = 0.5, 3
+
+
+class Keywords(TypedDict, total=False):
+    """The options of a fit as keyword arguments of `foamfit.fit`: the fields of `Options`."""
+
+    drive: str | None
+    seed: int
+    starts: int | None
+    max_time: float | None
+    weights: Mapping[str, float] | None
+    interior_mass: bool
+    time_shift: bool
+    loss: str
+    intervals: str
+    draws: int | None
 
 
 @dataclass(frozen=True)
@@ -105,10 +121,14 @@ class Found:
     record: SearchRecord
 
     def best(self) -> BestPoint:
-        """The best point, its springs in order."""
+        """The best point, its springs in order and its parameters on the limits that they reach.
+
+        Within rounding of a limit, rounding would decide the ends of the intervals.
+        """
         values = self.tracker.best_values
         assert values is not None  # checked by identify
-        return BestPoint(self.problem, _ordered(self.problem, values))
+        best = BestPoint(self.problem, _ordered(self.problem, values))
+        return _on_limits(best, self.tracker.best_cost)
 
 
 def identify(
@@ -158,7 +178,6 @@ def _finish(
     found: Found, best: BestPoint, record: SearchRecord, intervals: Intervals
 ) -> tuple[Fit, BestPoint]:
     """Write the point into the parameters, and conclude."""
-    best = _on_limits(best, found.tracker.best_cost)
     found.problem.put(best.values)
     return conclude(best, record, intervals), best
 

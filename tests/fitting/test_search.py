@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from typing import get_type_hints
 
 import lmfit
 import numpy as np
@@ -14,6 +15,7 @@ from conftest import DATA, needs_data, synthetic_impact, synthetic_loop
 from foamfit.data.measurement import Measurement, Noise, Specimen
 from foamfit.fitting import search
 from foamfit.fitting.problem import make_params
+from foamfit.one_model import Keywords, Options
 
 NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
 
@@ -161,6 +163,18 @@ def test_without_stated_noise_the_errors_come_from_the_residuals():
 def test_wrong_calls_are_refused(options, message):
     with pytest.raises(ff.InputError, match=message):
         ff.fit(synthetic_loop()[1], **options)
+
+
+def test_an_unknown_option_is_a_type_error_that_names_it():
+    with pytest.raises(TypeError, match="unexpected keyword argument 'start'"):
+        ff.fit(synthetic_loop()[1], start=3)
+
+
+def test_keywords_and_options_are_one_list_and_all_are_documented():
+    fields = get_type_hints(Options)
+    assert get_type_hints(Keywords) == fields
+    for name in fields:
+        assert re.search(rf"^    {name} : ", ff.fit.__doc__, re.MULTILINE), name
 
 
 def test_a_path_is_no_measurement():

@@ -22,6 +22,7 @@ import foamfit as ff
 from conftest import EXPERIMENTS, synthetic_impact
 from foamfit import one_model
 from foamfit.cli import main
+from foamfit.data.measurement import Measurement, Specimen, Striker
 from foamfit.errors import InputError
 from foamfit.fitting.losses import soften
 from foamfit.fitting.problem import Problem, make_problem
@@ -632,6 +633,20 @@ def test_what_is_within_rounding_of_its_limit_is_at_it(impact, monkeypatch):
     assert one_model._on_limits(impact, impact.cost) is impact
 
 
+def test_intervals_are_made_with_the_parameters_on_their_limits(impact, monkeypatch):
+    problem, at = impact.problem, impact.index["s1_dsigma"]
+    values = impact.values.copy()
+    values[at] = -3e-15
+    seen = []
+    monkeypatch.setattr(
+        one_model, "assess", lambda best, *_, **__: seen.append(best) or intervals.Intervals()
+    )
+    found = Found(problem, Tracker(problem.objective, best_values=values), AGREED)
+    _, best = judge(found, Choice("profile"), lambda _: None)
+    assert [one.values[at] for one in seen] == [0.0]
+    assert best is seen[0]
+
+
 def test_a_profile_that_its_limit_cuts_is_not_called_narrow(impact):
     values = impact.values.copy()
     values[impact.index["s1_dsigma"]] = 0.0
@@ -643,6 +658,32 @@ def test_a_profile_that_its_limit_cuts_is_not_called_narrow(impact):
     assert item.ci95_method == PROFILE
     assert item.ci95 == pytest.approx((-0.9 * half, 0.0))
     assert item.stderr == pytest.approx(around.spread.stderr[column])
+
+
+def test_the_ends_of_a_profile_do_not_depend_on_rounding():
+    """Two springs, whose parameters the curves fix in combinations only: the cost is flat."""
+    rng, time = np.random.default_rng(4), np.linspace(0.0, 8e-4, 301)
+    foam = ff.BistableSpring(2.0510e6, 60.822e6, -0.39005e6, 0.34889, 0.62232, 6.7937e6, 1.1061e6)
+    chain = ff.Chain([ff.LinearSpring(60e6), foam], [0.7e-3, 0.49e-3], 2e-5)
+    run = ff.simulate(chain, ff.Impact(7e-3, 2.3), time)
+    stress, motion = (
+        curve + 0.01 * np.ptp(curve) * rng.standard_normal(time.size)
+        for curve in (run.base_stress, run.displacement[-1])
+    )
+    specimen, striker = Specimen(height=1.19e-3, area=2e-5), Striker(mass=7e-3, velocity=2.3)
+    measurement = Measurement(
+        name="two", path="", data_sha256="", specimen=specimen, striker=striker, time=time,
+        stress=stress, displacement=motion,
+    )  # fmt: skip
+    problem = make_problem(measurement, "linear+bistable", "impact", None, None, False)
+    best = np.array([38.871e6, 0.0, 3.56346e6, 89.8142e6, -270282.0, 0.214886, 0.399398, 10.6933e6,
+                     1.68852e6, 0.0, 0.424033e-3, 0.765967e-3, 0.229676])  # fmt: skip
+    ends = []
+    for seed in range(3):
+        rounding = 1e-12 * seed * np.random.default_rng(seed).standard_normal(best.size)
+        here = BestPoint(problem, best * (1.0 + rounding))
+        ends.append(profile(here, "s2_kh_plus").ci95)
+    assert np.ptp(ends, axis=0) == pytest.approx(0.0, abs=1e-6 * np.ptp(ends[0]))
 
 
 # ---------------------------------------------------------------- coverage
@@ -668,8 +709,7 @@ def test_nine_of_ten_intervals_hold():
         tracker = Tracker(problem.objective)
         names = problem.free()
         around = BestPoint(problem, truth, names)
-        refit = Refit(around, tracker)
-        best = refit.run(refit.start(), np.ones(len(names), dtype=bool), steps=40)
+        best = Refit(around, tracker).run(truth)
         around = BestPoint(problem, best.point, names)
         found = assess(around, Choice())
         for i, name in enumerate(names):

@@ -303,11 +303,12 @@ def descend(
     tracker: Tracker, space: Space, start: Array, iterations: int, enough: float = 1e-5
 ) -> tuple[float, Array]:
     """Levenberg-Marquardt descent inside the box; returns (cost, coordinates) of its end."""
-    return levenberg.descend(
+    end = levenberg.descend(
         lambda point: tracker.residual(space.decode(point)),
         lambda point: tracker.slopes(space, point),
-        start, space.box, iterations, enough,
+        start, space.box, iterations, enough=enough,
     )  # fmt: skip
+    return end.cost, end.point
 
 
 def rank(tracker: Tracker, space: Space, points: list[Array]) -> list[tuple[float, Array]]:

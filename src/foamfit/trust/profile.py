@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.arrays import Array
-from foamfit.fitting.levenberg import Iterate
+from foamfit.fitting.levenberg import Iterate, damped_step
 from foamfit.fitting.search import STOPPING, Tracker, what_stopped
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.refit import Refit
@@ -88,7 +88,6 @@ class _Side:
         self.unit = float(best.spread.inflation[self.column])
         self.quantile = float(best.quantiles[self.column])
         self.half = self.quantile * float(best.spread.stderr[self.column])
-        self.others = np.arange(len(best.names)) != self.column
         self.refits = [self.refit.start()]
         low, high = best.limits(self.name)
         self.limit = low if self.sign < 0 else high
@@ -119,11 +118,8 @@ class _Side:
             edge = self.value(self.refits[-1]) if self.is_open else self.bound
             if self.better or self.sign * (value - edge) <= reach:
                 break
-            residual = self.refit.residual(point)
-            if residual is None:
-                continue
-            found = self.refit.run(self.refit.fresh(point, residual), self.others)
-            if self.rise(found) < self.quantile**2:
+            found = self.refit.run(point, (self.column, value))
+            if found is not None and self.rise(found) < self.quantile**2:
                 # Refits farther out are of another minimum, or have stalled.
                 inside = [at for at in self.refits if self.sign * (self.value(at) - value) < 0.0]
                 self.refits = [*inside, found]
@@ -174,16 +170,14 @@ class _Side:
 
         The others follow to first order; where that cannot be simulated they stay.
         """
-        shift = np.zeros(self.others.size)
+        shift = np.zeros(len(self.best.names))
         shift[self.column] = (value - self.value(near)) / self.best.sizes[self.column]
-        ahead = replace(near, residual=near.residual + near.jacobian @ shift)
-        for step in (shift + self.refit.step(ahead, self.others, 1e-9), shift):
-            point = self.refit.moved(near, step)
-            point[self.place] = value
-            residual = self.refit.residual(point)
-            if residual is not None:
-                start = near.updated(point, residual, self.refit.taken(near, point))
-                return self.refit.run(start, self.others)
+        ahead = near.residual + near.jacobian @ shift
+        held = np.arange(shift.size) == self.column
+        for step in (shift + damped_step(ahead, near.jacobian, 1e-9, held), shift):
+            found = self.refit.run(self.refit.moved(near, step), (self.column, value))
+            if found is not None:
+                return found
         return None
 
     def _bracket(self) -> tuple[Iterate, Iterate | None]:

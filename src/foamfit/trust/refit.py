@@ -1,29 +1,29 @@
-"""Least squares close to the best point with some parameters held."""
+"""Least squares close to the best point, with one parameter held or none."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from foamfit.arrays import Array
-from foamfit.fitting.levenberg import Iterate, damped_step, descend_updated
+from foamfit.fitting.levenberg import Iterate, descend
 from foamfit.fitting.losses import soften, softness
 from foamfit.fitting.search import Tracker
 from foamfit.trust.best_point import BestPoint
 
-# How often a refit gets a new Jacobian before it is taken as it is.
-RENEWALS = 2
 # Largest drop of the stress from A1 to C2 over the stress at A1.
 LAST_DROP = 0.999
+# A refit ends where the expected gain of the cost is below this share of the 95 % cut, or after so
+# many steps. Refits that end earlier depend on where they began, and so on rounding.
+ENOUGH, STEPS = 1e-6, 40
 
 
 @dataclass(eq=False)
 class Refit:
-    """Least squares close to the best point, with some parameters held."""
+    """Least squares close to the best point."""
 
-    best: BestPoint  # Where to start
+    best: BestPoint
     tracker: Tracker  # Simulates, counts and ends all at its deadline
     # (n_data,): Taken off the residual, before the loss: data that differ from those that were
     # fitted.
@@ -39,66 +39,64 @@ class Refit:
             ([index[own + "k0"], index[own + "eps_a"]], index[own + "dsigma"])
             for own in (name.removesuffix("dsigma") for name in best.names if "_dsigma" in name)
         ]
-        # Of the cost: less than this is no gain.
         cuts = best.quantiles**2 * best.spread.inflation  # NaN where the test says nothing
-        self.enough = 1e-3 * float(min(cuts[np.isfinite(cuts)], default=1.0))
+        self.enough = ENOUGH * float(min(cuts[np.isfinite(cuts)], default=1.0))
 
     def start(self) -> Iterate:
         """The best point itself."""
-        return self._softened(self.best.values, self.best.residual - self.shift, self.best.jacobian)
+        differences = self.best.residual - self.shift
+        soft = soften(differences, self.best.problem.objective.loss)
+        return Iterate(self.best.values, soft, self._jacobian(differences, self.best.jacobian))
 
-    def _softened(self, point: Array, differences: Array, jacobian: Array) -> Iterate:
-        """An iterate under the loss."""
-        loss = self.best.problem.objective.loss
-        slopes = softness(differences, loss)[:, None] * jacobian * self.best.sizes
-        return Iterate(point, soften(differences, loss), slopes)
+    def _jacobian(self, differences: Array, slopes: Array) -> Array:
+        """Derivative of the softened residual by the scaled parameters."""
+        soft = softness(differences, self.best.problem.objective.loss)
+        return np.asarray(soft[:, None] * slopes * self.best.sizes)
 
     def residual(self, point: Array) -> Array | None:
         """Residual of a point that can be simulated, else None."""
-        objective = self.tracker.objective
-        failures = objective.failures
+        failures = self.tracker.objective.failures
         residual = self.tracker.residual(point, self.shift)
-        return residual if objective.failures == failures else None
+        return residual if self.tracker.objective.failures == failures else None
 
-    def fresh(self, point: Array, residual: Array) -> Iterate:
-        """An iterate with a Jacobian of its own."""
-        problem, names = self.best.problem, self.best.names
-        jacobian = problem.linear.slopes(point, names)
-        if problem.objective.loss == "linear":
-            return Iterate(point, residual, jacobian * self.best.sizes)
-        return self._softened(point, problem.objective.differences(point) - self.shift, jacobian)
-
-    def moved(self, at: Iterate, step: Array) -> Array:
-        """Point that is off an iterate by a scaled step, within the limits."""
-        point = at.point.copy()
-        there = point[self.places] + step * self.best.sizes
-        point[self.places] = np.clip(there, self.low, self.high)
+    def point(self, scaled: Array, low: Array, high: Array) -> Array:
+        """Vector of all parameters from the scaled ones, moved between these limits (SI)."""
+        point = self.best.values.copy()
+        point[self.places] = np.clip(scaled * self.best.sizes, low, high)
         for sigma_a, drop in self.drops:  # no spring's stress at C2 falls below zero
             k0, eps_a = point[sigma_a]
             point[drop] = max(point[drop], -LAST_DROP * k0 * eps_a / (1.0 - eps_a))
         return self.complete(point)
 
-    def taken(self, at: Iterate, point: Array) -> Array:
-        """Scaled step from an iterate to a point."""
-        return np.asarray((point - at.point)[self.places] / self.best.sizes)
+    def moved(self, at: Iterate, step: Array) -> Array:
+        """Point that is off an iterate by a scaled step, within the limits."""
+        return self.point(at.point[self.places] / self.best.sizes + step, self.low, self.high)
 
-    def step(self, at: Iterate, free: NDArray[np.bool_], damping: float) -> Array:
-        """Scaled step of the free parameters."""
-        return damped_step(at, at.point[self.places], self.low, self.high, damping, free)
+    def run(self, start: Array, hold: tuple[int, float] | None = None) -> Iterate | None:
+        """Descend from a point, one parameter (its column) held at a value or none.
 
-    def _move(self, at: Iterate, step: Array) -> tuple[Array, Array]:
-        point = self.moved(at, step)
-        return point, self.taken(at, point)
+        Returns None if the start cannot be simulated.
+        """
+        problem, names, sizes = self.best.problem, self.best.names, self.best.sizes
+        low, high = self.low.copy(), self.high.copy()
+        if hold is not None:
+            low[hold[0]] = high[hold[0]] = hold[1]
 
-    def run(self, at: Iterate, free: NDArray[np.bool_], *, steps: int = 12) -> Iterate:
-        """Descend with these parameters free."""
-        for renewal in range(RENEWALS + 1):
-            at, settled, poor = descend_updated(
-                self.residual, lambda here, damping: self.step(here, free, damping), self._move,
-                at, steps, self.enough,
-            )  # fmt: skip
-            if settled and (renewal or not poor):
-                break
-            if renewal < RENEWALS:
-                at = self.fresh(at.point, at.residual)
-        return at
+        def point(scaled: Array) -> Array:
+            return self.point(scaled, low, high)
+
+        def jacobian(scaled: Array) -> Array:
+            slopes = problem.linear.slopes(point(scaled), names)
+            if problem.objective.loss == "linear":
+                return slopes * sizes
+            differences = problem.objective.differences(point(scaled)) - self.shift
+            return self._jacobian(differences, slopes)
+
+        scaled = np.clip(start[self.places], low, high) / sizes
+        if self.residual(point(scaled)) is None:
+            return None
+        end = descend(
+            lambda scaled: self.tracker.residual(point(scaled), self.shift), jacobian,
+            scaled, (low / sizes, high / sizes), STEPS, least=self.enough, damping=1e-6,
+        )  # fmt: skip
+        return replace(end, point=point(end.point))

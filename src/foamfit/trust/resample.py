@@ -81,7 +81,6 @@ def bootstrap(best: BestPoint, draws: int, seed: int, tracker: Tracker | None = 
     objective = best.problem.objective
     tracker = Tracker(objective) if tracker is None else tracker
     rng = np.random.default_rng([seed, 1])
-    free = np.ones(len(best.names), dtype=bool)
     ends = np.cumsum(objective.sizes)[:-1]
     _, pseudo = m_estimate(best.residual, objective.sizes, objective.loss)
     pairs = zip(np.split(best.residual, ends), np.split(pseudo, ends), strict=True)
@@ -95,7 +94,9 @@ def bootstrap(best: BestPoint, draws: int, seed: int, tracker: Tracker | None = 
         for _ in range(draws):
             noise = np.concatenate([block.draw(rng) for block in blocks])
             refit = Refit(best, tracker, best.residual - noise)
-            out.append(refit.run(refit.start(), free).point[refit.places])
+            end = refit.run(best.values)
+            assert end is not None  # the best point can be simulated
+            out.append(end.point[refit.places])
     except STOPPING as error:
         stopped = what_stopped(error)
     return Refits(np.array(out).reshape(-1, len(best.names)), stopped)
