@@ -259,6 +259,7 @@ class _FitOptions:
     vary: tuple[str, ...]
     interior_mass: bool
     time_shift: bool
+    relaxation: int
     loss: str
     profile: bool
     bootstrap: int | None
@@ -272,7 +273,10 @@ class _FitOptions:
         if len(given) > 1:
             names = " and ".join(f"--{name}" for name in given)
             raise InputError(f"{names} exclude each other; choose one way to make the intervals")
-        taken = ("drive", "seed", "starts", "max_time", "interior_mass", "time_shift", "loss")
+        taken = (
+            "drive", "seed", "starts", "max_time", "interior_mass", "time_shift", "relaxation",
+            "loss",
+        )  # fmt: skip
         way = {"intervals": given[0], "draws": methods[given[0]]} if given else {}
         return {name: getattr(self, name) for name in taken} | way
 
@@ -289,7 +293,9 @@ class _FitOptions:
                     "--fix and --vary belong to one model; name it instead of --model auto"
                 )
             return None
-        params = make_params(measurement, model, self.drive, time_shift=self.time_shift)
+        params = make_params(
+            measurement, model, self.drive, time_shift=self.time_shift, relaxation=self.relaxation
+        )
         _hold_and_vary(params, model, self.fix, self.vary)
         return params
 
@@ -315,6 +321,10 @@ class _FitOptions:
 @click.option("--vary", multiple=True, metavar="NAME", help="Vary one that is held by default.")
 @click.option("--interior-mass", is_flag=True, help="Put the specimen's mass between the springs.")
 @click.option("--time-shift", is_flag=True, help="Fit how late the motion is against the force.")
+@click.option(
+    "--relaxation", type=click.IntRange(min=0), default=0, show_default=True, metavar="N",
+    help="Relaxation terms of every bistable and microscale spring.",
+)  # fmt: skip
 @click.option(
     "--loss", type=click.Choice(["linear", "soft_l1", "huber", "cauchy"]), default="linear",
     show_default=True, help="All but linear weigh large residuals less.",
@@ -342,6 +352,7 @@ def fit(
     Examples:
         foamfit fit TEST.csv
         foamfit fit TEST.csv --model auto
+        foamfit fit TEST.csv --model microscale --relaxation 1
         foamfit fit TEST.csv --drive displacement --out results/today
         foamfit fit TEST.csv --model linear+bistable --fix s1_k0=60e6
     """

@@ -28,7 +28,7 @@ from foamfit.fitting.search import (
 )
 from foamfit.results import Fit
 from foamfit.springs.model import Model
-from foamfit.springs.parameters import split_name
+from foamfit.springs.parameters import HYSTERETIC, split_name
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
 from foamfit.trust.covariance import AT_LIMIT
@@ -55,6 +55,7 @@ class Keywords(TypedDict, total=False):
     weights: Mapping[str, float] | None
     interior_mass: bool
     time_shift: bool
+    relaxation: int
     loss: str
     intervals: str
     draws: int | None
@@ -74,6 +75,7 @@ class Options:
     weights: Mapping[str, float] | None = None
     interior_mass: bool = False
     time_shift: bool = False
+    relaxation: int = 0
     loss: str = "linear"
     intervals: str = "auto"
     draws: int | None = None
@@ -108,7 +110,7 @@ class Options:
         """Make the problem of one model ready."""
         return make_problem(
             measurement, model, self.drive, params, self.weights, self.interior_mass,
-            time_shift=self.time_shift, loss=self.loss,
+            time_shift=self.time_shift, loss=self.loss, relaxation=self.relaxation,
         )  # fmt: skip
 
 
@@ -314,23 +316,31 @@ def _moved(model: Model, values: Array, sources: Mapping[int, int]) -> Array:
 
 
 def _ordered(problem: Problem, values: Array) -> Array:
-    """Order springs that can be exchanged by their σ_a, the softest at the base.
+    """Order springs that can be exchanged by where they start to snap, the softest at the base.
 
     Two springs can be exchanged if they are of one kind and the curves stay the same, so never
     across a mass inside whose displacement is counted; the foam of the paper buckles first at its
     base.
     """
+    for kind in HYSTERETIC:
+        values = _ordered_of_kind(problem, values, kind)
+    return values
+
+
+def _ordered_of_kind(problem: Problem, values: Array, kind: str) -> Array:
+    """Order the springs of one kind; see `_ordered`."""
     model = problem.model
-    bistable = [i for i, kind in enumerate(model.kinds) if kind == "bistable"]
-    if len(bistable) < 2:
-        return values
+    own = [i for i, other in enumerate(model.kinds) if other == kind]
     held = {name for name in model.names if not problem.params[name].vary}
-    if any(
-        split_name(name)[0] in bistable for name in held if not name.endswith(("eta", "height"))
+    if len(own) < 2 or any(
+        split_name(name)[0] in own for name in held if not name.endswith(("eta", "height"))
     ):
         return values
 
     def onset(spring: int) -> float:
+        """σ_a, or the median snap-through stress, Pa."""
+        if kind == "microscale":
+            return float(values[model.index[f"s{spring + 1}_sigma_plus"]])
         k0, eps_a = (values[model.index[f"s{spring + 1}_{short}"]] for short in ("k0", "eps_a"))
         return float(k0 * eps_a / (1.0 - eps_a))
 
@@ -340,10 +350,10 @@ def _ordered(problem: Problem, values: Array) -> Array:
     def order(spring: int) -> tuple[int, float]:
         return sum(node <= spring for node in nodes), onset(spring)
 
-    ranked = sorted(bistable, key=order)
-    if ranked == bistable:
+    ranked = sorted(own, key=order)
+    if ranked == own:
         return values
-    moved = _moved(model, values, dict(zip(bistable, ranked, strict=True)))
+    moved = _moved(model, values, dict(zip(own, ranked, strict=True)))
     before, after = (problem.objective.residual(v) for v in (values, moved))
     same = np.allclose(before, after, rtol=0.0, atol=1e-9 * max(float(np.max(np.abs(before))), 1.0))
     return moved if same else values

@@ -163,7 +163,8 @@ class Space:
     def coordinates(self) -> list[tuple[int, str, int]]:
         """Place, short name, place of the spring's first parameter; what others need is first."""
         out = []
-        for name in sorted(self.free, key=lambda name: list(BOX).index(family(split_name(name)[1]))):
+        order = list(BOX)
+        for name in sorted(self.free, key=lambda name: order.index(family(split_name(name)[1]))):
             spring, short = split_name(name)
             first = self.model.index[f"s{spring + 1}_k0"] if spring >= 0 else -1
             place = self.model.index.get(name, len(self.model.names))  # the nuisance stands last

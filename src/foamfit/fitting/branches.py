@@ -40,7 +40,8 @@ def unreached(problem: Problem, simulated: Simulated) -> dict[str, str]:
 
 def _states(problem: Problem, simulated: Simulated) -> list[tuple[int, dict[int, str]]]:
     """Samples from which on the hysteretic springs (0 at the base) are on these branches."""
-    state = {i: "a" for i, kind in enumerate(problem.model.kinds) if kind in HYSTERETIC}
+    kinds = problem.model.kinds
+    state = {i: "a" for i, kind in enumerate(kinds) if kind in HYSTERETIC}
     out = [(0, dict(state))]
     for when, spring, _, entered, _ in simulated.motion.switches:
         if int(spring) in state:
@@ -53,7 +54,7 @@ def _states(problem: Problem, simulated: Simulated) -> list[tuple[int, dict[int,
 class Section:
     """Samples `start` to `stop` (excluded) in which no spring changes its branch.
 
-    `branches` names those of the hysteretic springs from the base up, joined by a dot: "d" or "a·c".
+    `branches` names those of the hysteretic springs from the base up, joined by a dot: "d", "a·c".
     """
 
     branches: str

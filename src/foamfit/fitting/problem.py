@@ -25,6 +25,7 @@ def make_params(
     drive: str | None = None,
     *,
     time_shift: bool = False,
+    relaxation: int = 0,
 ) -> lmfit.Parameters:
     """Parameters of a model for a test, with bounds from its scales; change them, then `fit`.
 
@@ -42,13 +43,15 @@ def make_params(
         "impact", "stress" or "displacement"; see `fitting.objective.choose_drive`.
     time_shift : bool
         Whether the time by which the motion channel is late is a parameter too.
+    relaxation : int
+        Relaxation terms of every hysteretic spring of a model that is given by its name.
 
     Returns
     -------
     lmfit.Parameters
         Values in SI, named s1_k0 … site_eta.
     """
-    model = Model.parse(model) if isinstance(model, str) else model
+    model = Model.parse(model, relaxation) if isinstance(model, str) else model
     drive = choose_drive(measurement) if drive is None else drive
     scales = Scales.of(measurement)
     stress, slope = scales.stress, scales.slope
@@ -258,12 +261,13 @@ def make_problem(
     *,
     time_shift: bool = False,
     loss: str = "linear",
+    relaxation: int = 0,
 ) -> Problem:
     """Make a problem ready; see `foamfit.fit` for the arguments.
 
     Raises InputError if the test cannot feed the drive or a parameter is unknown, by its name.
     """
-    model = Model.parse(model_name)
+    model = Model.parse(model_name, relaxation)
     drive = choose_drive(measurement) if drive is None else drive
     count = len(model.kinds)
     check_interior(measurement, count)

@@ -34,15 +34,27 @@ UNITS = {
     "g": "",
     "tau": "s",
 }
-# The branches of which a test must have reached one for the parameter to leave a trace in it.
+# By kind of spring, the branches of which a test must have reached one for the parameter to leave a
+# trace in it.
 BRANCHES = {
-    "k0": "a",
-    "eps_a": "d",
-    "kh_plus": "d",
-    "kc": "c",
-    "eps_c": "e",
-    "dsigma": "e",
-    "kh_minus": "e",
+    "bistable": {
+        "k0": "a",
+        "eps_a": "d",
+        "kh_plus": "d",
+        "kc": "c",
+        "eps_c": "e",
+        "dsigma": "e",
+        "kh_minus": "e",
+    },
+    "microscale": {
+        "k0": "a",
+        "sigma_plus": "snap-through",
+        "spread_plus": "snap-through",
+        "kc": "snap-through",
+        "eps_star": "snap-through",
+        "sigma_minus": "snap-back",
+        "spread_minus": "snap-back",
+    },
 }
 
 
