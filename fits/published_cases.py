@@ -50,7 +50,7 @@ from the published parameters in the impact drive with 1 % noise on both channel
 (`experiments/reconstruct.py`). So the published parameters are the truth here, and a deviation is
 an error of the identification.
 
-{verdict}
+{finding}
 
 In the stress drive the measured stress is the input, and its noise would be taken for stress that
 acted: where the foam is soft, on branch e above all, the fitted slope would come out too steep. The
@@ -80,7 +80,7 @@ def fit(case: str, drive: str) -> Path:
     return folder
 
 
-def verdict(comparison: Comparison) -> str:
+def finding(comparison: Comparison) -> str:
     """Say how many parameters were recovered, and name those that were not."""
     missed, lost, compared = [], [], 0
     for section in comparison.pairs:
@@ -125,8 +125,8 @@ def main() -> None:
         folders = list(pool.map(fit, *zip(*RUNS, strict=True)))
     comparison = compare(folders)
     text = comparison_text(comparison)
-    summary = f"{verdict(comparison)}\n\n{in_parts(folders)}"
-    page = PAGE.format(verdict=summary, text=text)
+    summary = f"{finding(comparison)}\n\n{in_parts(folders)}"
+    page = PAGE.format(finding=summary, text=text)
     (HERE / "comparison.md").write_text(page, encoding="utf-8")
     plot_comparison(comparison, HERE / "comparison.png")
     print(text, summary, sep="\n\n")

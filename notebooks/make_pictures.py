@@ -14,7 +14,7 @@ import foamfit as ff
 from foamfit.api import FitResult
 from foamfit.report.comparison import compare
 from foamfit.report.comparison_plot import plot_comparison
-from foamfit.report.explore import loop_of, plot_loop, rough_guess, turn
+from foamfit.report.explore import plot_loop, rough_guess
 from foamfit.report.plots import plot_fit
 
 HERE = Path(__file__).parent
@@ -44,7 +44,7 @@ def main() -> None:
     PICTURES.mkdir(exist_ok=True)
     test = read("model-2")
     comparison = compare([fit_with_site_damper(case) for case in CASES])
-    picture = plot_loop(test, turn(*loop_of(test), rough_guess(test)))
+    picture = plot_loop(test, rough_guess(test))
     for name, figure in (
         ("fit_a_new_test", plot_fit(ff.fit(test, seed=0))),
         ("fitted_against_published", plot_comparison(comparison)),

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ import pytest
 
 import foamfit as ff
 from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
+from foamfit.report import folder as result_folder
 from foamfit.solve import cache, precompile
 
 ROOT = Path(__file__).parent.parent
@@ -47,6 +49,14 @@ def compiled() -> Iterator[None]:
         compile_rest()
     with subprocess.Popen([sys.executable, "-c", STIFF]):
         yield
+
+
+def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a result folder be written with pictures of a few bytes and an empty page."""
+    monkeypatch.setattr(result_folder, "plot_fit", lambda _: None)
+    monkeypatch.setattr(result_folder, "laid_out", lambda _: nullcontext())
+    monkeypatch.setattr(result_folder, "image", lambda *_: b"\x89PNG" + bytes(20))
+    monkeypatch.setattr(result_folder, "render_report", lambda *_, **__: "")
 
 
 @functools.cache

@@ -190,7 +190,9 @@ def slopes(held: tuple[str, ...], way: str) -> dict[str, Any]:
         if way == "fit":
             columns = problem.slopes(values, problem.free())
         elif way == "search":
-            columns = tracker.slopes(space, space.encode(values))
+            point = space.encode(values)
+            there = space.decode(point)
+            columns = problem.objective.jacobian_along(there, space.slopes(point, there))
         else:
             columns = tracker.residual(values)[:, None][:, :0]
     finally:

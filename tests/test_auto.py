@@ -79,7 +79,7 @@ def test_the_neighbours_test_holds_its_level_and_sees_a_short_wave():
 
 
 def tried(residual, columns):
-    """A rung of one curve, as far as the evidence looks at it."""
+    """A model of one curve, as far as the evidence looks at it."""
     return SimpleNamespace(
         residual=residual,
         sizes=(residual.size,),
@@ -96,10 +96,10 @@ def test_combinations_are_not_counted_as_parameters():
     noise = tried(rng.standard_normal(600), np.ones((600, 1)))
     apart = np.column_stack([np.ones_like(x), x, x**2])
     same = np.column_stack([apart, apart[:, 0] - apart[:, 1]])
-    faint = np.column_stack([apart, 0.01 * x**3])  # its interval is ±13
+    vague = np.column_stack([apart, 0.01 * x**3])  # its interval is ±13
     counted = [
         evidence.effective_parameters(np.array([columns.T @ columns]), noise)
-        for columns in (apart, same, faint)
+        for columns in (apart, same, vague)
     ]
     assert counted == [3, 3, 3]
 
@@ -207,7 +207,7 @@ def test_a_clear_structure_is_found(name):
 
 
 def test_two_bistable_springs_are_told_from_fewer(monkeypatch):
-    """With all starts, which two springs need; for time, without the rung of a linear spring."""
+    """With all starts, which two springs need; for time, without the model of a linear spring."""
     monkeypatch.setattr(auto, "LADDER", ("bistable", *auto.LADDER[2:]))
     test = impact([SOFT, STIFF], HALVES, velocity=4.5)
     result = ff.fit(test, model="auto")
@@ -234,22 +234,38 @@ def test_a_linear_spring_in_series_adds_combinations_and_no_evidence():
     assert found[1].rank < 9
 
 
-# ---------------------------------------------------------------- which rungs
+# --------------------------------------------------------------- which models
 
 
-def test_only_models_that_the_test_allows_are_tried():
+def test_only_models_that_the_test_allows_are_tried(monkeypatch):
+    tried = []
+
+    def identify(_, model, *__):
+        tried.append(model)
+        raise ff.SimulationError("not now")
+
+    def models(test):
+        """Models that are tried, each once, and which are left out and why."""
+        tried.clear()
+        with pytest.raises(ff.SimulationError) as caught:
+            ff.fit(test, model="auto")
+        told = str(caught.value).split("no rung could be tried: ")[1].split("; ")
+        return list(dict.fromkeys(tried)), [why for why in told if not why.endswith("not now")]
+
+    monkeypatch.setattr(one_model, "identify", identify)
+    monkeypatch.setattr(auto, "WITHOUT_EVIDENCE", len(auto.LADDER) + 1)
     _, test = synthetic_impact()
-    assert auto._models(test) == (list(auto.LADDER), [])
+    assert models(test) == (list(auto.LADDER), [])
     given = replace(test, specimen=replace(test.specimen, heights=(0.6e-3, 0.59e-3)))
-    models, skipped = auto._models(given)
-    assert models == ["bistable", "linear+bistable", "bistable+bistable"]
+    allowed, skipped = models(given)
+    assert allowed == ["bistable", "linear+bistable", "bistable+bistable"]
     assert skipped == ["linear+bistable+bistable: [specimen] heights are those of 2 springs"]
-    followed = replace(test, interior={1: test.displacement * 0.4})
-    models, skipped = auto._models(followed)
-    assert models == list(auto.LADDER[1:])
+    allowed, skipped = models(replace(test, interior={1: test.displacement * 0.4}))
+    assert allowed == list(auto.LADDER[1:])
+    assert len(skipped) == 1
     assert "motion was measured" in skipped[0]
     with pytest.raises(ff.InputError, match="no model of the ladder"):
-        auto._models(replace(test, interior={5: test.displacement}))
+        ff.fit(replace(test, interior={5: test.displacement}), model="auto")
 
 
 def test_a_drive_without_dampers_has_one_rung_for_each_model():
@@ -260,7 +276,7 @@ def test_a_drive_without_dampers_has_one_rung_for_each_model():
 
 
 def test_only_the_chosen_rung_gets_the_intervals_that_were_asked_for(monkeypatch):
-    """Rungs are weighed with local ones; options reach every rung."""
+    """Models are compared with local ones; options reach every model."""
     given = []
     original = one_model.judge
 
@@ -299,7 +315,7 @@ def test_outliers_leave_the_ladder_standing():
 
 @pytest.fixture(scope="module")
 def wavy():
-    """A loop that no rung follows: a wave of 5 % lies on it."""
+    """A loop that no model follows: a wave of 5 % lies on it."""
     _, loop = synthetic_loop()
     wave = 0.05 * np.ptp(loop.stress) * np.sin(np.linspace(0, 60, loop.stress.size))
     return replace(loop, stress=loop.stress + wave, name="synthetic loop with a wave")
@@ -328,7 +344,7 @@ def test_an_interrupted_ladder_keeps_what_is_done(wavy, monkeypatch):
 
 
 def test_the_time_limit_is_shared_over_the_rungs(wavy, monkeypatch):
-    """A clock that gains a second with each look: what is left for a rung shrinks."""
+    """A timer that gains a second with each look: what is left for a model shrinks."""
     now = itertools.count(0.0, 1.0)
     monkeypatch.setattr(auto.time, "monotonic", lambda: next(now))
     given = []
@@ -375,7 +391,7 @@ def test_a_rung_that_cannot_be_simulated_is_left_out(wavy, monkeypatch):
 
 @pytest.fixture(scope="module")
 def climbed(wavy):
-    """Two rungs, neither of which reaches the noise."""
+    """Two models, neither of which reaches the noise."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(auto, "LADDER", auto.LADDER[:2])
         return ff.fit(wavy, model="auto", starts=4)
@@ -390,7 +406,7 @@ def test_what_remains_is_said(climbed):
 
 
 def test_undetermined_parameters_of_the_chosen_model_are_named(climbed):
-    """A loop that never closes leaves branches c and e out of every rung."""
+    """A loop that never closes leaves branches c and e out of every model."""
     _, test = synthetic_impact(velocity=1.75)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(auto, "LADDER", auto.LADDER[:1])

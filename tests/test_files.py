@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import re
 import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -19,8 +19,7 @@ import fabricated
 import foamfit.report.figures
 import foamfit.report.folder
 import foamfit.results
-from conftest import EXPERIMENTS
-from foamfit import files
+from conftest import EXPERIMENTS, without_pictures
 from foamfit.api import FitResult
 from foamfit.cli import main
 from foamfit.errors import InputError
@@ -37,14 +36,10 @@ posix = pytest.mark.skipif(os.name != "posix", reason="signals and permissions o
 @pytest.fixture(autouse=True)
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty working directory, and results of one file that need no time."""
-    monkeypatch.setattr(foamfit.report.folder, "_write", write_json)
+    without_pictures(monkeypatch)
     monkeypatch.setattr(foamfit.report.figures, "image", lambda *_: b"\x89PNG" + bytes(20))
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-def write_json(result: FitResult, folder: Path) -> None:
-    (folder / "fit.json").write_text(json.dumps(result.to_json_dict()))
 
 
 def names(folder: Path) -> list[str]:
@@ -59,12 +54,13 @@ def gone() -> int:
 
 
 def left_behind(path: Path, ending: str, process: int) -> Path:
-    """What a process with this number has left beside a path."""
-    ours = files._beside(path, ending).name
-    token = "0" * 8
-    named = ours.replace(f".{os.getpid()}.{files._TOKEN}", f".{process}.{token}")
-    assert named != ours
-    return path.with_name(named)
+    """What a process with this number has left beside a path, named as this one names it."""
+    with suppress(InterruptedError), replacing(path.parent / "apart" / path.name) as fresh:
+        raise InterruptedError
+    named, found = re.subn(rf"\.{os.getpid()}\.\w{{8}}", f".{process}.{8 * '0'}", fresh.name)
+    assert found == 1
+    assert named.endswith(".new")
+    return path.with_name(named.removesuffix("new") + ending)
 
 
 # ---------------------------------------------------------------- whose folder it is
@@ -106,11 +102,10 @@ def test_what_is_put_into_the_folder_while_it_is_written_stays(
 ) -> None:
     folder = fabricated.result(seed=1).save("r")
 
-    def late(result: FitResult, folder: Path) -> None:
-        write_json(result, folder)
+    def late(_: object) -> None:
         (here / "r" / "notes.txt").write_text("x")
 
-    monkeypatch.setattr(foamfit.report.folder, "_write", late)
+    monkeypatch.setattr(foamfit.report.folder, "plot_fit", late)
     with pytest.raises(InputError, match=r"notes\.txt"):
         fabricated.result(seed=2).save("r")
     assert load_result(folder)["seed"] == 1
@@ -243,7 +238,7 @@ def test_what_a_killed_process_left_is_swept_and_nothing_else(here: Path) -> Non
         left_behind(here / "another", "new", gone()),
         here / ".r.notes.new",
         here / ".r.abcdef123456.new",
-        here / dead.name.replace(files._host(), "another-machine"),
+        here / re.sub(r"^\.r\.[\w-]+", ".r.another-machine", dead.name),
     ]
     for folder in (dead, *others):
         folder.mkdir()
@@ -268,7 +263,7 @@ def test_an_older_result_that_a_killed_process_put_aside_comes_back(
     def fail(*_: object, **__: object) -> None:
         raise RuntimeError
 
-    monkeypatch.setattr(foamfit.report.folder, "_write", fail)
+    monkeypatch.setattr(foamfit.report.folder, "plot_fit", fail)
     with pytest.raises(RuntimeError):
         fabricated.result(seed=2).save("r")
     assert load_result("r")["seed"] == 1

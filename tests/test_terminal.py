@@ -22,9 +22,8 @@ import foamfit.report.figures
 import foamfit.report.folder
 import foamfit.report.page
 import foamfit.results
-from conftest import EXPERIMENTS
+from conftest import EXPERIMENTS, without_pictures
 from foamfit import api, terminal
-from foamfit.api import FitResult
 from foamfit.cli import main
 from foamfit.errors import InputError
 from foamfit.terminal import ending_cleanly, printable, without_ctrl_c
@@ -46,16 +45,12 @@ def run(*args: object, encoding: str = "utf-8") -> Result:
     return CliRunner(charset=encoding).invoke(main, [str(arg) for arg in args])
 
 
-def write_json(result: FitResult, folder: Path) -> None:
-    (folder / "fit.json").write_text(json.dumps(result.to_json_dict()))
-
-
 def quick(monkeypatch: pytest.MonkeyPatch, *, light: bool = True, **changed: object) -> None:
-    """Let the fit be there at once, and its folder hold its fit.json alone."""
+    """Let the fit be there at once, and its folder hold no pictures if `light`."""
     made = fabricated.result(**changed)
     monkeypatch.setattr(api, "fit", lambda *_, **__: made)
     if light:
-        monkeypatch.setattr(foamfit.report.folder, "_write", write_json)
+        without_pictures(monkeypatch)
 
 
 # ---------------------------------------------------------------- encodings

@@ -13,6 +13,7 @@ from foamfit.text import (
     listed,
     number,
     percent,
+    signed,
     significant,
     wrapped,
 )
@@ -48,6 +49,11 @@ def test_numbers() -> None:
     ]
     assert [percent(v) for v in (1.384, 0.0023, 0.05)] == ["140 %", "0.23 %", "5 %"]
     assert percent(1e-9) == "less than 0.001 %"
+
+
+def test_differences_have_a_sign() -> None:
+    assert [signed(x, 1) for x in (1.23, -0.31, 0.04, -0.04)] == ["+1.2", "−0.3", "0.0", "0.0"]
+    assert signed(-140.2, 0) == "−140"
 
 
 def test_words() -> None:

@@ -109,7 +109,7 @@ class Piece(NamedTuple):
     low: float
     high: float
     since: float  # time from the turning point to `low`, s
-    clock: Array  # Chebyshev coefficients of the time from `low`
+    elapsed: Array  # Chebyshev coefficients of the time from `low`
     springs: Frozen
 
 
@@ -131,10 +131,10 @@ def _way(series: Series, most: float, rising: bool, areal: float) -> tuple[list[
             c = springs.compliance(inside.ravel()).reshape(inside.shape)
             along = x**2 * ((2.0 * _R * inside * c) @ _W)
         speed = np.sqrt(2.0 / areal * (energy + along))
-        clock = chebyshev.chebint(_FIT @ (2.0 * x * soft / speed), lbnd=-1.0) * half
-        out.append(Piece(low, high, since, clock, springs))
+        elapsed = chebyshev.chebint(_FIT @ (2.0 * x * soft / speed), lbnd=-1.0) * half
+        out.append(Piece(low, high, since, elapsed, springs))
         energy += chebyshev.chebval(1.0, work)
-        since += chebyshev.chebval(1.0, clock)
+        since += chebyshev.chebval(1.0, elapsed)
     return out, since, np.sqrt(2.0 / areal * energy)
 
 
@@ -183,7 +183,7 @@ def _x_at(piece: Piece, apart: float) -> float:
 
     def late(x: float) -> float:
         scaled = 2.0 * (x - piece.low) / (piece.high - piece.low) - 1.0
-        return float(piece.since + chebyshev.chebval(scaled, piece.clock) - apart)
+        return float(piece.since + chebyshev.chebval(scaled, piece.elapsed) - apart)
 
     if late(piece.low) >= 0.0:  # the ends miss `apart` by rounding
         return piece.low

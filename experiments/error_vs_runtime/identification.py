@@ -1,8 +1,8 @@
 """Misfit reached against seconds: the project's own search and eight methods of lmfit.
 
 Every method minimises the same residual (`fitting.objective.Objective`) of the same problems and
-is stopped by the same clock. What is recorded is the lowest cost so far against the processor time
-of the one thread that runs, which on an idle machine is the time on the clock. A local method
+is stopped after the same time. What is recorded is the lowest cost so far against the processor
+time of the one thread that runs, which on an idle machine is the elapsed time. A local method
 starts at a random point of the search's box (`fitting.search.box_starts`, drawn from the seed) and
 starts again from the next one until the time is up; a global method that ends does so too; and so
 does `foamfit.fit`, with another seed. A run also ends once its cost is within 0.1 % of the best
@@ -31,7 +31,7 @@ import os
 import sys
 
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[_name] = "1"  # one thread for all, so that processor time is the time on the clock
+    os.environ[_name] = "1"  # one thread for all, so that processor time is elapsed time
 
 import argparse
 import platform

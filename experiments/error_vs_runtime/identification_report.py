@@ -185,7 +185,7 @@ def draw_profiles(ends: pd.DataFrame, setup: Setup, path: Path) -> None:
 def draw_curves(runs: pd.DataFrame, coordinates: str, setup: Setup, path: Path) -> None:
     """Misfit over the best known against seconds: median and quartiles over the seeds."""
     count = len(setup.known)
-    clock = np.geomspace(0.01, setup.budget_s, 200)
+    elapsed = np.geomspace(0.01, setup.budget_s, 200)
     among = runs[runs["coordinates"].isin(("own", coordinates))]
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(7.0, 1.7 * count + 0.9), layout="constrained")
@@ -195,8 +195,10 @@ def draw_curves(runs: pd.DataFrame, coordinates: str, setup: Setup, path: Path) 
                 for name in (*methods, OWN):
                     chosen = among[(among["problem"] == key) & (among["method"] == name)]
                     if len(chosen):
-                        _band(axes, clock, chosen, setup.known[key], name)
-                axes.set(xscale="log", yscale="log", xlim=(clock[0], clock[-1]), ylim=(0.9, 300.0))
+                        _band(axes, elapsed, chosen, setup.known[key], name)
+                axes.set(
+                    xscale="log", yscale="log", xlim=(elapsed[0], elapsed[-1]), ylim=(0.9, 300.0)
+                )
                 axes.axhline(1.0, color="0.75", linewidth=0.8, zorder=0)
                 _grid(axes)
                 if key == list(setup.known)[-1]:
@@ -210,20 +212,20 @@ def draw_curves(runs: pd.DataFrame, coordinates: str, setup: Setup, path: Path) 
         figure.savefig(path, dpi=200)
 
 
-def _band(axes: Axes, clock: Array, runs: pd.DataFrame, known: float, name: str) -> None:
+def _band(axes: Axes, elapsed: Array, runs: pd.DataFrame, known: float, name: str) -> None:
     """Draw one method: what each seed had reached at each second, as median and quartiles."""
     reached = []
     for _, run in runs.groupby("seed", sort=False):
-        at = np.searchsorted(run["seconds"].to_numpy(), clock, side="right") - 1
+        at = np.searchsorted(run["seconds"].to_numpy(), elapsed, side="right") - 1
         misfit = np.sqrt(run["cost"].to_numpy() / known)
         reached.append(np.where(at >= 0, misfit[at], np.inf))
     low, middle, high = np.quantile(reached, (0.25, 0.5, 0.75), axis=0, method="inverted_cdf")
     there = np.isfinite(high)  # from when on three quarters of the seeds have anything
     line = _line(name)
     axes.fill_between(
-        clock, low, high, where=list(there), color=line["color"], alpha=0.15, linewidth=0
+        elapsed, low, high, where=list(there), color=line["color"], alpha=0.15, linewidth=0
     )
-    axes.plot(clock, middle, **line)
+    axes.plot(elapsed, middle, **line)
 
 
 def _line(name: str) -> dict[str, Any]:
@@ -250,11 +252,11 @@ PAGE = """\
 
 Made by `python experiments/error_vs_runtime/identification.py`; `--redraw` draws the recorded runs
 again. {seeds} seeds for each of {problems} problems; a run takes at most {budget:g} s on one
-thread, in seconds of processor time (on an idle machine those of the clock).
+thread, in seconds of processor time (on an idle machine, of elapsed time).
 
 Machine: {machine}.
 
-Everyone minimises the same residual, is stopped by the same clock, and starts again when it ends
+Everyone minimises the same residual, is stopped after the same time, and starts again when it ends
 early: a method of lmfit from the next random point of the seed, `foamfit.fit` with another seed.
 `foamfit.fit` first descends on the measured loop, which is another residual; until that is done it
 has nothing to show here. A global method may need more time than this; `--budget` gives it.

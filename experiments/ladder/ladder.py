@@ -7,7 +7,7 @@ simulation alone and before it is climbed, if
 
 - every bistable spring goes through branches a, d, c and e;
 - with damping, dashpots dissipate at least 5 % of the striker's energy;
-- every rung below the true one, fitted to the curves without noise, keeps a misfit (RMS over both
+- every simpler model, fitted to the curves without noise, keeps a misfit (RMS over both
   curves) of at least half the noise, so that chi-square is at least a quarter above the floor.
 
 Where FOAMFIT_DATA names the measurements of others (see experiments/real_foams.py), the ladder also
@@ -127,22 +127,22 @@ def random_test(
     drive = ff.Impact(MASS, velocity)
     long = ff.simulate(chain, drive, np.linspace(0, 20 * HEIGHT / velocity, 8001))
     end = long.contact_end or long.time[-1]
-    clock = np.linspace(0, 1.05 * end, SAMPLES)
-    run = ff.simulate(chain, drive, clock)
+    times = np.linspace(0, 1.05 * end, SAMPLES)
+    run = ff.simulate(chain, drive, times)
     entered = {(int(row[1]), int(row[3])) for row in run.switches}
     closed = all({(i, 1), (i, 2), (i, 3)} <= entered for i in loops)  # branches d, c, e
     # Over the area, η ẇ²/H is dissipated, in the dashpot of one spring as in the onsite damper.
-    speed = np.gradient(run.displacement[-1], clock)
+    speed = np.gradient(run.displacement[-1], times)
     rate = (site + (springs[0].eta if len(springs) == 1 else 0.0)) / HEIGHT * speed**2
-    contact = clock <= end
-    spent = float(np.trapezoid(rate[contact], clock[contact])) * AREA
+    contact = times <= end
+    spent = float(np.trapezoid(rate[contact], times[contact])) * AREA
     noise = rng.uniform(0.005, 0.01)
     curves = run.base_stress, run.displacement[-1]
     clean = Measurement(
         name=f"synthetic impact on {name_of(model, damped)}",
         path=None,
         data_sha256="",
-        time=clock,
+        time=times,
         stress=curves[0],
         displacement=curves[1],
         specimen=Specimen(HEIGHT, AREA),
@@ -155,13 +155,13 @@ def random_test(
 
 
 def simpler(model: str, damped: bool) -> list[tuple[str, bool]]:
-    """Rungs below one."""
-    rungs = [(name, with_) for name in LADDER for with_ in (False, True)]
-    return rungs[: rungs.index((model, damped))]
+    """Models of the ladder that are simpler than one."""
+    ladder = [(name, with_) for name in LADDER for with_ in (False, True)]
+    return ladder[: ladder.index((model, damped))]
 
 
 def best_simpler_misfit(clean: Measurement, model: str, damped: bool) -> float:
-    """Least RMS misfit, over both curves, of the rungs below on the curves without noise."""
+    """Least RMS misfit, over both curves, of the simpler models on the curves without noise."""
     least = np.inf
     for name, with_ in simpler(model, damped):
         params = make_params(clean, name)
@@ -207,7 +207,7 @@ def study(wanted: int, seed: int, path: Path) -> None:
                     "found": chosen.name == name_of(model, damped),
                     "runs p": chosen.runs_p,
                     "lag p": chosen.neighbours_p,
-                    "rungs": len(result.ladder.rungs),
+                    "models tried": len(result.ladder.rungs),
                     "not determined": len(chosen.not_determined),
                     "seconds": time.perf_counter() - began,
                     "ended": result.ladder.ended,
@@ -221,7 +221,7 @@ def study(wanted: int, seed: int, path: Path) -> None:
 
 
 def climb_foams(data: Path) -> pd.DataFrame:
-    """Climb the first cycle of each shoe foam; one row for each rung."""
+    """Climb the first cycle of each shoe foam; one row for each model."""
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         toml = Path(folder) / "specimen.toml"
@@ -229,23 +229,23 @@ def climb_foams(data: Path) -> pd.DataFrame:
             toml.write_text(f'[specimen]\nheight = "{height} mm"\ndiameter = "{diameter} mm"\n')
             test = ff.read_test(data / "shoe-foam" / f"{name}_cycle1.csv", toml)
             ladder = ff.fit(test, model="auto").ladder
-            for rung in ladder.rungs:
+            for one in ladder.rungs:
                 rows.append(
                     {
                         "specimen": name,
-                        "model": rung.name,
-                        "misfit": rung.misfit["stress_strain"],
-                        "varied": rung.n_vary,
-                        "rank": rung.rank,
+                        "model": one.name,
+                        "misfit": one.misfit["stress_strain"],
+                        "varied": one.n_vary,
+                        "rank": one.rank,
                         "n_eff": ladder.n_eff,
-                        "AICc": rung.aicc,
-                        "BIC": rung.bic,
-                        "runs p": rung.runs_p,
-                        "not determined": len(rung.not_determined),
-                        "weak": len(rung.weak),
-                        "seconds": rung.seconds,
-                        "chosen": rung.chosen,
-                        "said": " ".join(ladder.sentences) if rung.chosen else "",
+                        "AICc": one.aicc,
+                        "BIC": one.bic,
+                        "runs p": one.runs_p,
+                        "not determined": len(one.not_determined),
+                        "weak": len(one.weak),
+                        "seconds": one.seconds,
+                        "chosen": one.chosen,
+                        "said": " ".join(ladder.sentences) if one.chosen else "",
                     }
                 )
             print(name, *ladder.sentences, sep="\n  ", flush=True)
@@ -265,7 +265,7 @@ Impacts simulated on random springs, {samples} samples, white noise of 0.5–1 %
 stress and displacement. `foamfit.fit(test, model="auto")` with its defaults. A test is *clear*, by
 the simulation alone and before it is climbed, if every bistable spring goes through all four
 branches, if dashpots (where there are any) dissipate at least {damping:.0f} % of the striker's
-energy, and if every rung below the true one, fitted to the curves without noise, keeps a misfit of
+energy, and if every simpler model, fitted to the curves without noise, keeps a misfit of
 at least {misfit:g} times the noise. Found means: the same springs **and** the same damping.
 
 {structures}
@@ -289,8 +289,8 @@ not part of this repository.
 
 {foams}
 
-No rung reaches the noise on any specimen: what one or two springs leave over follows itself for
-tens of samples, and is about as large as the scatter between neighbouring samples or larger. AICc
+No model reaches the noise on any specimen: the residuals of one or two springs are correlated over
+tens of samples, and about as large as the noise or larger. AICc
 and BIC therefore count some twenty or thirty effective samples instead of 1,200, and the evidence
 for two springs is weak where the misfit alone (2.3 to 1.0 %) would call it overwhelming; where AICc
 and BIC disagree, the simpler model is taken and the result says so. Two springs have parameters
@@ -304,7 +304,7 @@ What the results say:
 
 def structure_table(table: pd.DataFrame) -> str:
     lines = [
-        "| structure | clear: found | unclear: found | seconds (median) | rungs (median) |",
+        "| structure | clear: found | unclear: found | seconds (median) | models tried (median) |",
         "| --- | --- | --- | --- | --- |",
     ]
     for name, rows in table.groupby("structure", sort=False):
@@ -312,7 +312,7 @@ def structure_table(table: pd.DataFrame) -> str:
         lines.append(
             f"| {name} | {clear['found'].sum()} of {len(clear)} "
             f"| {unclear['found'].sum()} of {len(unclear)} "
-            f"| {rows['seconds'].median():.1f} | {rows['rungs'].median():.0f} |"
+            f"| {rows['seconds'].median():.1f} | {rows['models tried'].median():.0f} |"
         )
     return "\n".join(lines)
 
@@ -324,8 +324,8 @@ def wrong_sentences(table: pd.DataFrame) -> str:
     lines = ["Clear tests that are taken for another structure:", ""]
     for _, row in wrong.iterrows():
         lines.append(
-            f"- {row['structure']} (case {row['case']}) for {row['chosen']}: the rungs below the "
-            f"true one miss by {row['misfit of simpler over noise']:.2f} times the noise; runs "
+            f"- {row['structure']} (case {row['case']}) for {row['chosen']}: the simpler models "
+            f"miss by {row['misfit of simpler over noise']:.2f} times the noise; runs "
             f"test p = {row['runs p']:.2g}, neighbours test p = {row['lag p']:.2g}, {row['ended']}"
         )
     return "\n".join(lines)
@@ -350,8 +350,8 @@ def foam_table(table: pd.DataFrame) -> str:
 def picture(table: pd.DataFrame, path: Path) -> None:
     """Counts of chosen against true structure, clear and unclear tests side by side."""
     truths = [name_of(*one) for one in STRUCTURES]
-    rungs = [name_of(name, with_) for name in LADDER for with_ in (False, True)]
-    rungs = [name for name in rungs if name in truths or (table["chosen"] == name).any()]
+    models = [name_of(name, with_) for name in LADDER for with_ in (False, True)]
+    models = [name for name in models if name in truths or (table["chosen"] == name).any()]
     figure = Figure(figsize=(8.4, 4.3), layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(1, 2, sharey=True)
@@ -359,7 +359,7 @@ def picture(table: pd.DataFrame, path: Path) -> None:
         rows = table[table["clear"] == clear]
         counts = np.array(
             [
-                [((rows["structure"] == t) & (rows["chosen"] == c)).sum() for c in rungs]
+                [((rows["structure"] == t) & (rows["chosen"] == c)).sum() for c in models]
                 for t in truths
             ]
         )
@@ -370,7 +370,7 @@ def picture(table: pd.DataFrame, path: Path) -> None:
                 colour = "white" if count > 0.6 * totals[i, 0] else "black"
                 axes.text(j, i, str(count), ha="center", va="center", fontsize=9, color=colour)
         for i, truth in enumerate(truths):
-            j = rungs.index(truth)
+            j = models.index(truth)
             axes.add_patch(
                 Rectangle(
                     (j - 0.5, i - 0.5),
@@ -382,8 +382,8 @@ def picture(table: pd.DataFrame, path: Path) -> None:
                     clip_on=False,
                 )
             )
-        names = [[n.replace(" with", "\nwith") for n in names] for names in (rungs, truths)]
-        axes.set_xticks(range(len(rungs)), names[0], rotation=45, ha="right", fontsize=8)
+        names = [[n.replace(" with", "\nwith") for n in names] for names in (models, truths)]
+        axes.set_xticks(range(len(models)), names[0], rotation=45, ha="right", fontsize=8)
         axes.set_yticks(range(len(truths)), names[1], fontsize=8)
         axes.set_title(
             f"{len(rows)} {'clear' if clear else 'unclear'} synthetic tests", fontsize=10

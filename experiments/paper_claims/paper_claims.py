@@ -114,9 +114,9 @@ def extra_turns(curve: Array, reference: Array, share: float = TURN) -> int:
 
 
 def oscillation(drive: Drive, mass: float, damper: float) -> dict[str, float]:
-    """Deviation from equilibrium, parted into ringing and lag; all in % of the peak.
+    """Deviation from equilibrium, parted into vibration and lag; all in % of the peak.
 
-    Ringing is what the mass adds to the massless answer with the same damper; lag is what the
+    Vibration is what the mass adds to the massless answer with the same damper; lag is what the
     damper does to the massless answer.
     """
     got, massless = driven(drive, mass, damper), driven(drive, 0.0, damper)
@@ -127,8 +127,8 @@ def oscillation(drive: Drive, mass: float, damper: float) -> dict[str, float]:
         "stress": rms(stress - drive.stress, drive.stress),
         "largest": float(100 * np.max(abs(stress - drive.stress)) / np.max(drive.stress)),
         "displacement": rms(w - drive.displacement, drive.displacement),
-        "ringing": rms(stress - stress_0, drive.stress),
-        "ringing_w": rms(w - w_0, drive.displacement),
+        "vibration": rms(stress - stress_0, drive.stress),
+        "vibration_w": rms(w - w_0, drive.displacement),
         "lag": rms(stress_0 - drive.stress, drive.stress),
         "lag_w": rms(w_0 - drive.displacement, drive.displacement),
         "turns": extra_turns(stress, drive.stress),
@@ -152,7 +152,7 @@ def damper_needed(drive: Drive, mass: float = OWN_MASS, share: float = TURN) -> 
     return high
 
 
-def ringing_by_branch(drive: Drive, mass: float = OWN_MASS) -> dict[str, float]:
+def vibration_by_branch(drive: Drive, mass: float = OWN_MASS) -> dict[str, float]:
     """Largest deviation of the stress from the drive on each branch, undamped, % of the peak."""
     got = driven(drive, mass, 0.0)
     branches = drive.spring.branches(got.strain)
@@ -409,7 +409,7 @@ def draw_oscillation(drive: Drive, needed: float, path: Path) -> None:
     dampers = np.geomspace(1.0, ETA, 33)
     rows = [oscillation(drive, OWN_MASS, damper) for damper in dampers]
     for key, colour, marker, name in (
-        ("ringing", VERMILION, "o", "ringing (what the mass adds)"),
+        ("vibration", VERMILION, "o", "vibration (what the mass adds)"),
         ("lag", BLUE, "s", "lag (what the damper does)"),
     ):
         ax.loglog(
@@ -613,7 +613,7 @@ def of_oscillation() -> dict[str, Any]:
         row = oscillation(given, OWN_MASS, damper)
         lines.append(
             f"| {label} | {float(f'{damper:.3g}'):g} | {row['stress']:.2f} "
-            f"| {row['displacement']:.2f} | {row['ringing']:.3f} | {row['lag']:.2f} "
+            f"| {row['displacement']:.2f} | {row['vibration']:.3f} | {row['lag']:.2f} "
             f"| {row['turns']} | {row['turns_w']} |"
         )
     slopes = {"": drive.spring.k0, "_c": drive.spring.kc}
@@ -632,8 +632,8 @@ def of_oscillation() -> dict[str, Any]:
         ),
         "free": free,
         "damped": damped,
-        "quieter": free["ringing"] / damped["ringing"],
-        "by_branch": ", ".join(f"{k} {v:.1f} %" for k, v in ringing_by_branch(drive).items()),
+        "quieter": free["vibration"] / damped["vibration"],
+        "by_branch": ", ".join(f"{k} {v:.1f} %" for k, v in vibration_by_branch(drive).items()),
         "early": early,
         "moved": float(100 * np.max(abs(undamped.base_stress[::4] - fewer)) / drive.stress.max()),
         "eta_over_needed": round(ETA / needed, -2),

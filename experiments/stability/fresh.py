@@ -397,7 +397,7 @@ def slope_error(spec: Spec, scene: Scene, rtol: float, most: int, known: dict[st
 
 REASONS = {
     "step underflow": "shrank to nothing",
-    "ringing": "masses vibrate too fast",
+    "vibration": "masses vibrate too fast",
     "errors grow": "let the least error grow",
     "end of a branch": "of the end of its branch",
     "not finite": "no longer finite",

@@ -55,7 +55,7 @@ SHARED = "several gaps or flat branches share an elongation, and the law does no
 # ------------------------------------------------------------------------------------ the law
 
 
-def _bistable(spring: Any, height: float) -> list[float]:
+def bistable_row(spring: Any, height: float) -> list[float]:
     k0, kc, up, down = spring.k0, spring.kc, spring.kh_plus, spring.kh_minus
     eps_a, eps_c = spring.eps_a, spring.eps_c
     sigma_a = k0 * eps_a / (1.0 - eps_a)
@@ -747,7 +747,7 @@ def follow(chain: Any, drive: Any, time: Array, tol: float = TIGHT, most: int = 
     bistable = [hasattr(spring, "kc") for spring in chain.springs]
     rows = np.array(
         [
-            (_bistable if two else _linear)(spring, h)
+            (bistable_row if two else _linear)(spring, h)
             for spring, h, two in zip(chain.springs, chain.heights, bistable, strict=True)
         ]
     )

@@ -294,7 +294,7 @@ def _balance_on_panels(
             index = np.searchsorted(grid, motion.switches[:, 0])
             for j in index[(index > 0) & (index < grid.size)]:
                 edges[float(grid[j - 1])] = edges[float(grid[j])] = stop
-    return _balance(finer[0], finer[1], ends, motion)
+    return motion_balance(finer[0], finer[1], ends, motion)
 
 
 def _resolved(
@@ -337,7 +337,7 @@ def _shaped(values: Array, count: int) -> Array:
     return values[..., index]
 
 
-def _balance(
+def motion_balance(
     chain: ff.Chain,
     drive: ff.Impact | ff.StressDrive | ff.DisplacementDrive,
     ends: Array,
@@ -405,7 +405,7 @@ def _balance(
     return Balance(float(np.abs(brought - kinetic - work - heat).max()) / scale, impulse)
 
 
-# ------------------------------------------------------------------------------------------ ringing
+# ---------------------------------------------------------------------------------------- vibration
 
 
 def ripple_of(scene: Scene, answer: ff.Response | Motion, rtol: float) -> float | None:

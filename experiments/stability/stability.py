@@ -48,7 +48,7 @@ BRUTE = 3_000_000  # steps times springs up to which brute force judges
 CHEAP = 50_000  # steps times springs up to which the other method is tried too
 REASONS = {
     "step underflow": "shrank to nothing",  # first: its message speaks of flat branches too
-    "ringing": "masses vibrate too fast",
+    "vibration": "masses vibrate too fast",
     "errors grow": "let the least error grow",
     "end of a branch": "of the end of its branch",
     "not finite": "no longer finite",

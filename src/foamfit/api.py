@@ -40,7 +40,7 @@ def fit(
         The test; see `foamfit.read_test`.
     model : str
         Springs from the base up, joined by "+"; "auto" takes the simplest that holds, see
-        `foamfit.auto.climb`.
+        `foamfit.auto.compare_models`.
     params : lmfit.Parameters, optional
         Values, bounds, fixed values and expressions; see `make_params`.
     progress : callable, optional
@@ -100,9 +100,9 @@ def fit(
     if model == "auto":
         if params is not None:
             raise InputError("params belong to one model; name it instead of 'auto'")
-        from foamfit.auto import climb  # the one fit that has rungs
+        from foamfit.auto import compare_models
 
-        found = climb(measurement, chosen, progress, tell)
+        found = compare_models(measurement, chosen, progress, tell)
     else:
         searched = identify(measurement, model, params, chosen, progress)
         found, _ = judge(searched, chosen.choice, tell)

@@ -1,10 +1,8 @@
 """The simplest model that follows the curves, and the evidence for each that was tried.
 
-A ladder of models is fitted from the simplest up, each without damping and then with it. What is
-compared are AICc and BIC with the effective number of samples and the effective number of
-parameters, so that neither correlated residuals nor combinations that the curves do not fix count
-as evidence. It ends where the residuals are structureless, or where two models in a row bring no
-evidence.
+A ladder of models is fitted from the simplest up, each without damping and then with it, and
+compared by AICc and BIC with the effective numbers of samples and of parameters. It ends where the
+residuals are structureless, or where two models in a row bring no evidence.
 """
 
 from __future__ import annotations
@@ -27,14 +25,7 @@ from foamfit.results import Fit, Ladder, Rung, rung_name
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import split_name
 from foamfit.text import counted, percent
-from foamfit.trust.evidence import (
-    MARGIN,
-    Criteria,
-    Tried,
-    choose,
-    effective_samples,
-    reference_of,
-)
+from foamfit.trust.evidence import MARGIN, Criteria, Tried, choose, effective_samples, reference_of
 from foamfit.trust.intervals import Announce, Choice
 from foamfit.trust.residual_tests import BENT, find_structure, neighbours_test, runs_test
 
@@ -57,52 +48,37 @@ def _carry(params: lmfit.Parameters, model: Model, below: Fit | None) -> None:
     """
     if below is None:
         return
+    values, was = below.params.valuesdict(), list(Model.parse(below.model).kinds)
     if "time_shift" in params:
-        params["time_shift"].value = below.params["time_shift"].value
-    was = Model.parse(below.model)
+        params["time_shift"].value = values["time_shift"]
     sources: dict[int, int] = {}
     for spring in reversed(range(len(model.kinds))):
-        left = len(was.kinds) - 1 - len(sources)
-        if left >= 0 and model.kinds[spring] == was.kinds[left]:
-            sources[spring] = left
+        if was and model.kinds[spring] == was[-1]:
+            was.pop()
+            sources[spring] = len(was)
     for name in model.names:
         spring, short = split_name(name)
         source = "site_eta" if spring < 0 else f"s{sources.get(spring, -1) + 1}_{short}"
         if not params[name].vary:
             continue
-        if source in below.params:
-            params[name].value = below.params[source].value
+        if source in values:
+            params[name].value = values[source]
         elif spring not in sources and model.kinds[spring] == "linear":
-            end = params[name].min if short == "height" else 0.1 * params[name].max
-            params[name].value = end
+            params[name].value = params[name].min if short == "height" else 0.1 * params[name].max
 
 
-# ---------------------------------------------------------------- the climb
+# ---------------------------------------------------------------- the comparison
 
 
-def climb(
+def compare_models(
     measurement: Measurement, options: Options, progress: Progress, announce: Announce
 ) -> Fit:
     """Fit ever richer models until one holds; this is `foamfit.fit` with model="auto".
 
-    The time limit is that of all rungs together. The time limit and Ctrl-C keep what is done. Rungs
-    have local intervals; those that were asked for are made of the chosen one.
-
-    Returns
-    -------
-    Fit
-        That of the chosen rung, with its `ladder`.
-
-    Raises
-    ------
-    InputError, SimulationError
-        As `foamfit.fit`, if not one rung could be tried.
+    The time limit is that of all rungs together; it and Ctrl-C keep what is done. Rungs have local
+    intervals; those that were asked for are made of the chosen one.
     """
-    drive = choose_drive(measurement) if options.drive is None else options.drive
-    deadline = None if options.max_time is None else time.monotonic() + options.max_time
-    state = _Climb(
-        measurement, drive, replace(options, drive=drive), progress, time.perf_counter(), deadline
-    )
+    state = _Comparison(measurement, options, progress)
     models, skipped = _models(measurement)
     tried: list[Tried] = []
     ended, stopped, idle = "the top of the ladder was reached", None, 0
@@ -128,8 +104,9 @@ def climb(
         raise SimulationError(f"{measurement.name}: no rung could be tried: {'; '.join(skipped)}")
     if stopped is None and options.choice.method != "local":
         best = choose(tried)[0]
-        tried[best] = state.reassessed(best, tried[best], announce)
-    state.progress(1.0, "done")
+        result, point = one_model.judge(state.fits[best], options.choice, announce)
+        tried[best] = replace(tried[best], result=result, best=point)  # it may be a better point
+    progress(1.0, "done")
     ended = f"it was stopped by {stopped}" if stopped else ended
     return _conclude(tried, ended, stopped, tuple(skipped), time.perf_counter() - state.began)
 
@@ -140,24 +117,27 @@ def _has_evidence(tried: Sequence[Tried], below: int) -> bool:
         return len(tried) > below
     found = choose(tried)[1]
     return any(
-        min(getattr(one, name) for one in found[below:])
-        < min(getattr(one, name) for one in found[:below]) - MARGIN
-        for name in ("aicc", "bic")
+        min(values[below:]) < min(values[:below]) - MARGIN
+        for values in ([one.aicc for one in found], [one.bic for one in found])
     )
 
 
 @dataclass(eq=False)
-class _Climb:
-    """What every rung is fitted with, and what stopped the climb."""
+class _Comparison:
+    """What every rung is fitted with, and what stopped the comparison."""
 
     measurement: Measurement
-    drive: str
     options: Options
     progress: Progress
-    began: float
-    deadline: float | None
     stopped: str | None = None
     fits: list[Found] = field(default_factory=list)  # of what was tried, in its order
+
+    def __post_init__(self) -> None:
+        """Choose the drive and begin."""
+        self.began, limit = time.perf_counter(), self.options.max_time
+        self.deadline = None if limit is None else time.monotonic() + limit
+        if self.options.drive is None:
+            self.options = replace(self.options, drive=choose_drive(self.measurement))
 
     def family(
         self, model: str, models: Sequence[str], tried: list[Tried], skipped: list[str]
@@ -170,12 +150,10 @@ class _Climb:
         dampings = ("without", "with") if _dampers(params) else ("none",)
         family: list[Tried] = []
         for i, damping in enumerate(dampings):
-            left = None if self.deadline is None else self.deadline - time.monotonic()
-            if left is not None and left <= 0.0 and tried:
+            left = None if self.deadline is None else max(self.deadline - time.monotonic(), 1e-6)
+            if left == 1e-6 and tried:
                 self.stopped = "the time limit"
                 break
-            if left is not None:
-                left = max(left, 1e-6)
             below = family[-1] if family else tried[choose(tried)[0]] if tried else None
             share = (models.index(model) + i / len(dampings)) / len(models)
             try:
@@ -193,8 +171,8 @@ class _Climb:
 
     def params(self, model: str) -> lmfit.Parameters:
         """Parameters of a model, as they are by default."""
-        shift = self.options.time_shift
-        return make_params(self.measurement, model, self.drive, time_shift=shift)
+        options = self.options
+        return make_params(self.measurement, model, options.drive, time_shift=options.time_shift)
 
     def rung(
         self, model: str, damping: str, below: Tried | None, left: float | None, share: float
@@ -217,17 +195,11 @@ class _Climb:
         result, best = one_model.judge(found, Choice("local"), lambda _: None)
         return found, Tried(result, damping, best, time.perf_counter() - began)
 
-    def reassessed(self, at: int, one: Tried, announce: Announce) -> Tried:
-        """Make the intervals that were asked for; they may meet a better point."""
-        result, best = one_model.judge(self.fits[at], self.options.choice, announce)
-        return Tried(result, one.damping, best, one.seconds)
-
 
 def _models(measurement: Measurement) -> tuple[list[str], list[str]]:
     """Models that a test allows, and which are left out and why.
 
-    Heights that imaging gave are those of so many springs and no other number; a mass inside that
-    was followed is data that every rung must have.
+    They have as many springs as heights were given, or one, and every mass that was followed.
     """
     heights, inside = measurement.specimen.heights, max(measurement.interior, default=0)
     models, skipped = [], []
@@ -292,7 +264,7 @@ def _rung(i: int, best: int, tried: Sequence[Tried], found: Sequence[Criteria]) 
         damping=one.damping,
         misfit=dict(one.result.misfit),
         chisqr=one.chisqr,
-        n_vary=sum(item.vary for item in one.result.parameters.values()),
+        n_vary=one.varied,
         rank=found[i].rank,
         n_eff=effective_samples(one),
         aicc=found[i].aicc,
@@ -312,9 +284,8 @@ def _why(i: int, best: int, tried: Sequence[Tried], found: Sequence[Criteria]) -
     """Why a rung was chosen or not."""
     if i == best:
         reason = "its residuals are structureless" if tried[i].structureless else "best supported"
-        if best == len(tried) - 1:
-            return f"{reason}, and no richer model was tried"
-        return f"{reason}, and no richer model lowers AICc and BIC by {MARGIN:g}"
+        richer = f"lowers AICc and BIC by {MARGIN:g}" if i < len(tried) - 1 else "was tried"
+        return f"{reason}, and no richer model {richer}"
     bic, aicc = found[i].bic - found[best].bic, found[i].aicc - found[best].aicc
     told = f"BIC {signed(bic)}, AICc {signed(aicc)}"
     return told if i < best else f"richer without evidence: {told}"
@@ -327,29 +298,21 @@ def signed(value: float) -> str:
     return f"{value:+.1f}".replace("-", "−")
 
 
-def p_value(p: float) -> str:
-    """Write a p-value, with a sign: "= 0.43", "< 1e-6"."""
-    return "< 1e-6" if p < 1e-6 else f"= {p:.2g}"
-
-
 def _choice_sentences(
     tried: Sequence[Tried], found: Sequence[Criteria], best: int, ended: str
 ) -> list[str]:
     """What was chosen, and what each criterion alone would choose."""
-    one, mine = tried[best], found[best]
-    varied = sum(item.vary for item in one.result.parameters.values())
-    tests = f"runs test p {p_value(one.runs_p)}, neighbours test p {p_value(one.neighbours_p)}"
-    reason = "the evidence supports it best"
-    if one.structureless:
-        reason = "it is the simplest whose residuals are structureless"
+    one = tried[best]
+    simplest = "it is the simplest whose residuals are structureless"
+    reason = simplest if one.structureless else "the evidence supports it best"
     said = [
-        f"{one.name} was chosen of {counted(len(tried), 'model')}: {reason} ({tests}). No more "
-        f"models were tried because {ended}."
+        f"{one.name} was chosen of {counted(len(tried), 'model')}: {reason}. No more models were "
+        f"tried because {ended}."
     ]
-    if mine.rank < varied:
+    if found[best].rank < one.varied:
         said.append(
-            f"The curves fix {mine.rank} combinations of its {varied} parameters; AICc and BIC "
-            "count those."
+            f"The curves fix {found[best].rank} combinations of its {one.varied} parameters; AICc "
+            "and BIC count those."
         )
     for name, values in (("AICc", [one.aicc for one in found]), ("BIC", [c.bic for c in found])):
         least = int(np.argmin(values))
@@ -362,16 +325,13 @@ def _choice_sentences(
 def _undetermined(tried: Sequence[Tried], found: Sequence[Criteria], best: int) -> str:
     """Sentence on the parameters of the chosen rung that the test does not determine."""
     lost = ", ".join(tried[best].states("not determined"))
-    start = f"The test does not determine {lost} of the chosen model {tried[best].name}"
+    told = f"The test does not determine {lost} of the chosen model {tried[best].name}"
     sound = [i for i, one in enumerate(tried) if not one.states("not determined")]
     if not sound:
-        return f"{start}; no model of the ladder has all parameters determined."
+        return f"{told}; no model of the ladder has all parameters determined."
     nearest = min(sound, key=lambda i: found[i].bic)
     off = found[nearest].bic - found[best].bic
-    return (
-        f"{start}; all parameters of {tried[nearest].name} are determined, at a BIC higher by "
-        f"{off:.1f}."
-    )
+    return f"{told}; all of {tried[nearest].name} are determined, at a BIC higher by {off:.1f}."
 
 
 def _structure_left(tried: Sequence[Tried], best: int) -> str:
@@ -380,16 +340,11 @@ def _structure_left(tried: Sequence[Tried], best: int) -> str:
     worst = int(np.argmin([min(runs_test(part), neighbours_test(part)) for part in one.curves]))
     found = find_structure(one.curves[worst], one.places[worst])
     size, noise = found.size / one.spans[worst], found.noise / one.spans[worst]
-    runs, near = (max(p) for p in zip(*((r.runs_p, r.neighbours_p) for r in tried), strict=True))
     told = (
-        f"No model reaches the noise (at best runs test p {p_value(runs)}, neighbours test p "
-        f"{p_value(near)}): the residuals of {one.counted[worst]} have a structure of "
+        f"No model reaches the noise: the residuals of {one.counted[worst]} have a structure of "
         f"{percent(size)} of the range (noise {percent(noise)}), {percent(found.share)} of it on "
         f"{found.place}."
     )
     if found.bent > BENT and found.straight:
-        told += (
-            f" A parabola describes {percent(found.bent)} of it: the measured branch is curved "
-            "where the law is a straight line."
-        )
+        told += " The measured branch is curved where the law is a straight line."
     return told

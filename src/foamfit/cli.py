@@ -13,9 +13,8 @@ import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
@@ -69,8 +68,7 @@ class _Group(click.Group):
 def _spare_the_collector() -> None:
     """Keep the garbage collector from going through what the imports have made.
 
-    These are some hundred thousand objects, and they all stay. To look through them again and
-    again, and once more when the command is over, took a quarter of a fit.
+    These are some hundred thousand objects that all stay; to collect them took a quarter of a fit.
     """
     gc.set_threshold(100_000, 20, 10)
     atexit.register(gc.freeze)
@@ -206,18 +204,34 @@ def _fixes(
     for text in values:
         name, _, number = text.partition("=")
         try:
-            fixed[name.strip()] = float(number)
+            fixed[name.strip()] = value = float(number)
         except ValueError:
-            fixed[name.strip()] = math.nan
-        if not math.isfinite(fixed[name.strip()]):
+            value = math.nan
+        if not math.isfinite(value):
             raise click.BadParameter(f"'{text}' is not NAME=VALUE in SI, as s1_eta=0.")
     return fixed
 
 
-def _hold_and_vary(
-    params: lmfit.Parameters, model: str, fix: dict[str, float], vary: tuple[str, ...]
-) -> None:
-    """Do what --fix and --vary say to the parameters of a model."""
+def _params(
+    measurement: Measurement, model: str, search: dict[str, Any],
+    fix: dict[str, float], vary: tuple[str, ...],
+) -> lmfit.Parameters | None:  # fmt: skip
+    """Return the parameters of a model as --fix and --vary want them; None for auto."""
+    from foamfit.fitting.curves import check_time_shift, choose_drive
+    from foamfit.fitting.problem import make_params
+
+    drive, time_shift = search["drive"], search["time_shift"]
+    if time_shift:
+        check_time_shift(measurement, drive or choose_drive(measurement))
+    if model == "auto":
+        if fix or vary:
+            raise InputError(
+                "--fix and --vary belong to one model; name it instead of --model auto"
+            )
+        return None
+    params = make_params(
+        measurement, model, drive, time_shift=time_shift, relaxation=search["relaxation"]
+    )
     for name in (*fix, *vary):
         if name not in params:
             raise InputError(
@@ -237,67 +251,17 @@ def _hold_and_vary(
         params[name].set(value=value, vary=False, min=-math.inf, max=math.inf)
     for name in vary:
         params[name].set(vary=True)
+    return params
 
 
-class _Shown(NamedTuple):
-    """How a result is printed."""
-
-    as_json: bool
-    quiet: bool
-    verbose: bool
-
-
-@dataclass(frozen=True)
-class _FitOptions:
-    """What the options of `fit` say of the search and of the intervals, by their names."""
-
-    drive: str | None
-    seed: int
-    starts: int | None
-    max_time: float | None
-    fix: dict[str, float]
-    vary: tuple[str, ...]
-    interior_mass: bool
-    time_shift: bool
-    relaxation: int
-    loss: str
-    profile: bool
-    bootstrap: int | None
-    mcmc: int | None
-
-    def arguments(self) -> dict[str, Any]:
-        """Return the arguments of `foamfit.fit` that do not depend on the test."""
-        methods = {"profile": None, "bootstrap": self.bootstrap, "mcmc": self.mcmc}
-        given = [name for name, draws in methods.items() if draws is not None]
-        given = (["profile"] if self.profile else []) + given
-        if len(given) > 1:
-            names = " and ".join(f"--{name}" for name in given)
-            raise InputError(f"{names} exclude each other; choose one way to make the intervals")
-        taken = (
-            "drive", "seed", "starts", "max_time", "interior_mass", "time_shift", "relaxation",
-            "loss",
-        )  # fmt: skip
-        way = {"intervals": given[0], "draws": methods[given[0]]} if given else {}
-        return {name: getattr(self, name) for name in taken} | way
-
-    def params(self, measurement: Measurement, model: str) -> lmfit.Parameters | None:
-        """Return the parameters of a model as --fix and --vary want them; None for auto."""
-        from foamfit.fitting.curves import check_time_shift, choose_drive
-        from foamfit.fitting.problem import make_params
-
-        if self.time_shift:
-            check_time_shift(measurement, self.drive or choose_drive(measurement))
-        if model == "auto":
-            if self.fix or self.vary:
-                raise InputError(
-                    "--fix and --vary belong to one model; name it instead of --model auto"
-                )
-            return None
-        params = make_params(
-            measurement, model, self.drive, time_shift=self.time_shift, relaxation=self.relaxation
-        )
-        _hold_and_vary(params, model, self.fix, self.vary)
-        return params
+def _interval_method(profile: bool, bootstrap: int | None, mcmc: int | None) -> str:
+    """Return the way of making intervals that --profile, --bootstrap or --mcmc names."""
+    given = {"profile": profile or None, "bootstrap": bootstrap, "mcmc": mcmc}
+    ways = [name for name, value in given.items() if value is not None]
+    if len(ways) > 1:
+        names = " and ".join(f"--{name}" for name in ways)
+        raise InputError(f"{names} exclude each other; choose one way to make the intervals")
+    return ways[0] if ways else "auto"
 
 
 @main.command()
@@ -337,10 +301,14 @@ class _FitOptions:
 @click.option("--mcmc", type=int, metavar="N", help="95 % intervals by N steps of emcee.")
 @click.option("--json", "as_json", is_flag=True, help="Print fit.json on stdout, nothing else.")
 @click.option("--quiet", is_flag=True, help="Print nothing but warnings of failure.")
-@click.option("--verbose", is_flag=True, help="Print the checklist, reasons, notes and rungs too.")
+@click.option(
+    "--verbose", is_flag=True, help="Print the checklist, reasons, notes and all models too."
+)
 def fit(
     test: Path, specimen: Path | None, model: str, out: Path | None,
-    as_json: bool, quiet: bool, verbose: bool, **given: Any,
+    fix: dict[str, float], vary: tuple[str, ...],
+    profile: bool, bootstrap: int | None, mcmc: int | None,
+    as_json: bool, quiet: bool, verbose: bool, **search: Any,
 ) -> int:  # fmt: skip
     """Identify the parameters of TEST.csv and write a result folder.
 
@@ -359,47 +327,46 @@ def fit(
     from foamfit.data.csv_file import read_test
     from foamfit.springs.model import Model
 
-    options = _FitOptions(**given)
-    arguments = options.arguments()
+    intervals = _interval_method(profile, bootstrap, mcmc)
     model = "auto" if model.strip() == "auto" else Model.parse(model).name
-    show = _Shown(as_json, quiet, verbose)
     with _compiling(quiet or as_json) as compile_rest:
         measurement = read_test(test, specimen)
         folder = _result_folder(out, test, specimen, model)
         from foamfit import api
 
-        params = options.params(measurement, model)
+        params = _params(measurement, model, search, fix, vary)
         compile_rest()
         with _progress(quiet or as_json) as progress:
             result = api.fit(
-                measurement, model=model, params=params, progress=progress, **arguments,
+                measurement, model=model, params=params, progress=progress, **search,
+                intervals=intervals, draws=mcmc if bootstrap is None else bootstrap,
                 tell=None if quiet else lambda told: say(f"foamfit: {told}", err=True),
             )  # fmt: skip
         try:
             with without_ctrl_c():
                 result.save(folder)
         except InputError:  # the numbers are not lost with the folder
-            _tell_result(result, None, show)
+            _tell_result(result, as_json, quiet, verbose)
             raise
-    _tell_result(result, folder, show)
+    _tell_result(result, as_json, quiet, verbose)
+    if not quiet and not as_json:
+        say(f"\nwritten to {folder}: open {folder / 'report.html'}")
     if result.status == "failed":
         say(f"foamfit: no acceptable fit was found; see {folder}", err=True)
         return NOT_ACCEPTABLE
     return 0
 
 
-def _tell_result(result: FitResult, folder: Path | None, show: _Shown) -> None:
-    """Print a result, and the folder that it was written to."""
-    if show.as_json:
+def _tell_result(result: FitResult, as_json: bool, quiet: bool, verbose: bool) -> None:
+    """Print a result."""
+    if as_json:
         import json
 
         say(json.dumps(result.to_json_dict(), allow_nan=False))
-    elif not show.quiet:
+    elif not quiet:
         from foamfit.report.summary import summary_text
 
-        say(summary_text(result, verbose=show.verbose))
-        if folder is not None:
-            say(f"\nwritten to {folder}: open {folder / 'report.html'}")
+        say(summary_text(result, verbose=verbose))
 
 
 def _result_folder(out: Path | None, test: Path, specimen: Path | None, model: str) -> Path:
@@ -441,14 +408,10 @@ def _progress(quiet: bool) -> Iterator[Callable[[float, str], None]]:
         yield lambda fraction, what: None
         return
     with click.progressbar(length=1000, label="fit", file=sys.stderr, show_eta=False) as bar:
-        done = 0
 
         def progress(fraction: float, what: str) -> None:
-            nonlocal done
-            now = round(1000 * fraction)
             bar.label = f"fit: {what:<10}"
-            bar.update(now - done)
-            done = now
+            bar.update(round(1000 * fraction) - bar.pos)
 
         yield progress
 

@@ -44,13 +44,7 @@ def check_file(path: Path) -> None:
 
 
 def write_file(path: str | Path, content: bytes) -> None:
-    """Write a whole file; what stood there stays if that fails.
-
-    Raises
-    ------
-    InputError
-        If it cannot be written.
-    """
+    """Write a whole file; if it cannot be written, InputError, and what stood there stays."""
     path = Path(path)
     try:
         if path.exists() and not path.is_file():  # a device or a pipe, which stays what it is
@@ -73,13 +67,7 @@ def write_file(path: str | Path, content: bytes) -> None:
 
 @contextmanager
 def replacing(folder: Path) -> Iterator[Path]:
-    """Give an empty sibling of `folder` to write into, and put it in its place if all went well.
-
-    Parameters
-    ----------
-    folder : Path
-        Resolved: no link, no "..".
-    """
+    """Give an empty sibling of `folder` (resolved) to write into, which replaces it at the end."""
     made = [parent for parent in folder.parents if not parent.exists()]
     fresh, old = _beside(folder, "new"), _beside(folder, "old")
     try:

@@ -27,7 +27,6 @@ from foamfit.fitting.search import (
     what_stopped,
 )
 from foamfit.results import Fit
-from foamfit.springs.model import Model
 from foamfit.springs.parameters import HYSTERETIC, split_name
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
@@ -123,10 +122,7 @@ class Found:
     record: SearchRecord
 
     def best(self) -> BestPoint:
-        """The best point, its springs in order and its parameters on the limits that they reach.
-
-        Within rounding of a limit, rounding would decide the ends of the intervals.
-        """
+        """The best point, its springs in order, what is within rounding of a limit on it."""
         values = self.tracker.best_values
         assert values is not None  # checked by identify
         best = BestPoint(self.problem, _ordered(self.problem, values))
@@ -134,21 +130,10 @@ class Found:
 
 
 def identify(
-    measurement: Measurement,
-    model: str,
-    params: lmfit.Parameters | None,
-    options: Options,
+    measurement: Measurement, model: str, params: lmfit.Parameters | None, options: Options,
     progress: Progress,
-) -> Found:
-    """Search and refine; see `foamfit.fit` for the arguments.
-
-    Raises
-    ------
-    InputError
-        If the test cannot feed the drive or a parameter is unknown; the message names it.
-    SimulationError
-        If nothing that was tried could be simulated.
-    """
+) -> Found:  # fmt: skip
+    """Search and refine; see `foamfit.fit` for the arguments and the errors."""
     began = time.perf_counter()
     problem = options.problem(measurement, model, params)
     starts = STARTS * len(problem.model.kinds) if options.starts is None else options.starts
@@ -212,20 +197,12 @@ def _assess(
 
 
 def _search(
-    problem: Problem,
-    tracker: Tracker,
-    record: SearchRecord,
-    progress: Progress,
+    problem: Problem, tracker: Tracker, record: SearchRecord, progress: Progress
 ) -> SearchRecord:
     """Search, then refine by lmfit; returns the record with its costs and what stopped it."""
+    rng = np.random.default_rng(record.seed)
     try:
-        costs = search(
-            tracker,
-            problem.space(),
-            starts=record.starts,
-            rng=np.random.default_rng(record.seed),
-            progress=progress,
-        )
+        costs = search(tracker, problem.space(), starts=record.starts, rng=rng, progress=progress)
         record = replace(record, costs=tuple(costs))
         progress(0.95, "refinement")
         _refine(problem, tracker)
@@ -251,7 +228,11 @@ def _refine(problem: Problem, tracker: Tracker) -> None:
         params[name].vary = False
     if not names:
         return
-    _move_inside(params, names)
+    for name in names:  # least_squares wants its start off the bounds
+        parameter = params[name]
+        if math.isfinite(span := parameter.max - parameter.min):
+            low, high = parameter.min + 1e-9 * span, parameter.max - 1e-9 * span
+            parameter.value = min(max(parameter.value, low), high)
 
     def residual(p: lmfit.Parameters) -> Array:
         return tracker.residual(problem.vector(p))
@@ -267,23 +248,8 @@ def _refine(problem: Problem, tracker: Tracker) -> None:
         )  # fmt: skip
 
 
-def _move_inside(params: lmfit.Parameters, names: tuple[str, ...]) -> None:
-    """Move values off their bounds by a hair, where least_squares wants its start."""
-    for name in names:
-        parameter = params[name]
-        span = parameter.max - parameter.min
-        if math.isfinite(span):
-            margin = 1e-9 * span
-            parameter.value = min(
-                max(parameter.value, parameter.min + margin), parameter.max - margin
-            )
-
-
 def _on_limits(best: BestPoint, cost: float) -> BestPoint:
-    """Put parameters that are within rounding of a limit on it, if `cost` hardly rises.
-
-    The refinement stays off the limits by a hair (`_move_inside`).
-    """
+    """Put parameters that are within rounding of a limit on it, if `cost` hardly rises."""
     problem, space = best.problem, best.problem.space()
     values = best.values + 0.0  # no -0
     if np.any(np.signbit(best.values) & (values == 0.0)):
@@ -305,16 +271,6 @@ def _on_limits(best: BestPoint, cost: float) -> BestPoint:
         return best
 
 
-def _moved(model: Model, values: Array, sources: Mapping[int, int]) -> Array:
-    """Put other springs in some places of a chain: {place: spring}, 0 at the base."""
-    moved = values.copy()
-    for name in model.names:
-        place, short = split_name(name)
-        if place in sources:
-            moved[model.index[name]] = values[model.index[f"s{sources[place] + 1}_{short}"]]
-    return moved
-
-
 def _ordered(problem: Problem, values: Array) -> Array:
     """Order springs that can be exchanged by where they start to snap, the softest at the base.
 
@@ -331,11 +287,12 @@ def _ordered_of_kind(problem: Problem, values: Array, kind: str) -> Array:
     """Order the springs of one kind; see `_ordered`."""
     model = problem.model
     own = [i for i, other in enumerate(model.kinds) if other == kind]
-    held = {name for name in model.names if not problem.params[name].vary}
-    if len(own) < 2 or any(
-        split_name(name)[0] in own for name in held if not name.endswith(("eta", "height"))
-    ):
+    held = [split_name(name) for name in model.names if not problem.params[name].vary]
+    if any(spring in own and short not in ("eta", "height") for spring, short in held):
         return values
+    nodes = [
+        n for name, n in problem.objective.interior.items() if name in problem.objective.counted
+    ]
 
     def onset(spring: int) -> float:
         """σ_a, or the median snap-through stress, Pa."""
@@ -344,16 +301,17 @@ def _ordered_of_kind(problem: Problem, values: Array, kind: str) -> Array:
         k0, eps_a = (values[model.index[f"s{spring + 1}_{short}"]] for short in ("k0", "eps_a"))
         return float(k0 * eps_a / (1.0 - eps_a))
 
-    counted = problem.objective.counted
-    nodes = [node for name, node in problem.objective.interior.items() if name in counted]
-
     def order(spring: int) -> tuple[int, float]:
         return sum(node <= spring for node in nodes), onset(spring)
 
     ranked = sorted(own, key=order)
     if ranked == own:
         return values
-    moved = _moved(model, values, dict(zip(own, ranked, strict=True)))
+    moved, sources = values.copy(), dict(zip(own, ranked, strict=True))
+    for name in model.names:
+        place, short = split_name(name)
+        if place in sources:
+            moved[model.index[name]] = values[model.index[f"s{sources[place] + 1}_{short}"]]
     before, after = (problem.objective.residual(v) for v in (values, moved))
     same = np.allclose(before, after, rtol=0.0, atol=1e-9 * max(float(np.max(np.abs(before))), 1.0))
     return moved if same else values

@@ -140,7 +140,7 @@ class Ladder:
     rungs: tuple[Rung, ...]  # From the simplest up
     n_eff: float  # Effective samples that AICc and BIC use
     noise_from: str  # The rung of the least chi-square: its residuals are taken for the noise
-    ended: str  # Why the climb ended
+    ended: str  # Why the comparison ended
     stopped: str | None  # "the time limit" or "Ctrl-C" if that ended it
     skipped: tuple[str, ...]  # Rungs that could not be tried, and why
     sentences: tuple[str, ...]  # What the comparison says
@@ -151,28 +151,16 @@ class Ladder:
         """The rung whose result was taken."""
         return next(rung for rung in self.rungs if rung.chosen)
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the content of `ladder` in fit.json."""
-        return asdict(self)
-
     def rows(self) -> Iterator[list[object]]:
         """Rows of ladder.csv, the header first; a list of names is joined by blanks."""
-        curves = [
-            name
-            for name in self.rungs[0].misfit
-            if any(rung.misfit.get(name) is not None for rung in self.rungs)
-        ]
-        rest = [name for name in Rung.__dataclass_fields__ if name not in ("model", "misfit")]
-        yield ["model", "damping", *(f"misfit_{name}" for name in curves), *rest[1:]]
+        misfits = [rung.misfit for rung in self.rungs]
+        curves = [name for name in misfits[0] if any(one.get(name) is not None for one in misfits)]
+        rest = [n for n in Rung.__dataclass_fields__ if n not in ("model", "damping", "misfit")]
+        yield ["model", "damping", *(f"misfit_{name}" for name in curves), *rest]
         for rung in self.rungs:
-            cells = [getattr(rung, name) for name in rest]
-            plain = [" ".join(cell) if isinstance(cell, tuple) else cell for cell in cells]
-            finite = [
-                None if isinstance(cell, float) and not math.isfinite(cell) else cell
-                for cell in plain
-            ]
-            misfits = [rung.misfit.get(name) for name in curves]
-            yield [rung.model, finite[0], *misfits, *finite[1:]]
+            cells = (plain(getattr(rung, name)) for name in rest)
+            told = (" ".join(cell) if isinstance(cell, list) else cell for cell in cells)
+            yield [rung.model, rung.damping, *(rung.misfit.get(name) for name in curves), *told]
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,24 +198,11 @@ class Fit:
     @property
     def bistable_springs(self) -> dict[str, BistableSpring]:
         """The bistable springs of the chain by their prefix, "s1" at the base."""
-        return {
-            f"s{i}": spring
-            for i, spring in enumerate(self.chain.springs, start=1)
-            if isinstance(spring, BistableSpring)
-        }
+        springs = enumerate(self.chain.springs, start=1)
+        return {f"s{i}": one for i, one in springs if isinstance(one, BistableSpring)}
 
     def to_json_dict(self) -> dict[str, Any]:
-        """Return the content of ``fit.json``: SI, plain types, null for what is not there.
-
-        Returns
-        -------
-        dict
-            Serialisable with ``allow_nan=False``; a number that is not finite becomes None.
-        """
-        derived = {
-            name: {point: getattr(spring, point) for point in DERIVED_POINTS}
-            for name, spring in self.bistable_springs.items()
-        }
+        """Return the content of ``fit.json``: SI, plain types, null for what is not there."""
         content: dict[str, Any] = plain(
             {
                 "schema": SCHEMA,
@@ -250,23 +225,22 @@ class Fit:
                 ],
                 "parameters": {name: asdict(p) for name, p in self.parameters.items()},
                 **({"correlation": vars(self.correlation)} if self.correlation else {}),
-                "derived": derived,
+                "derived": {
+                    name: {point: getattr(spring, point) for point in DERIVED_POINTS}
+                    for name, spring in self.bistable_springs.items()
+                },
                 "visited": self.visited,
                 "misfit": self.misfit,
                 "weights": self.weights,
                 "statistics": self.statistics,
                 "noise": self.noise,
                 "outliers": {
-                    channel: {
-                        "at": found.at,
-                        "values": found.values,
-                        "clipped_at": found.clipped_at,
-                    }
+                    channel: {name: getattr(found, name) for name in ("at", "values", "clipped_at")}
                     for channel, found in self.measurement.outliers.items()
                 },
                 "energy": self.energy,
                 "runtime_s": self.runtime_s,
-                **({"ladder": self.ladder.as_dict()} if self.ladder else {}),
+                **({"ladder": asdict(self.ladder)} if self.ladder else {}),
             }
         )
         return content

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import math
 from collections.abc import Callable
@@ -11,8 +10,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from foamfit.arrays import Array
 from foamfit.data.csv_file import read_history
-from foamfit.data.measurement import Array
 from foamfit.data.toml_file import check_keys, load_toml
 from foamfit.data.units import parse_quantity
 from foamfit.errors import InputError
@@ -42,13 +41,7 @@ _MOST_SAMPLES = 1_000_000
 
 
 def read_scene(path: Path) -> tuple[Chain, Drive, Array]:
-    """Read chain, drive and samples (s) of a scene; see `foamfit simulate --help` for the keys.
-
-    Raises
-    ------
-    InputError
-        Naming the file and the key that is wrong.
-    """
+    """Read chain, drive and samples (s) of a scene; see `foamfit simulate --help` for the keys."""
     document = load_toml(path, "give the TOML file of a scene")
     check_keys(f"{path}:", document, ["chain", "drive", "time"])
     chain = _chain(f"{path}: [chain]", _table(path, document, "chain"))
@@ -104,13 +97,13 @@ def _chain(where: str, table: dict[str, Any]) -> Chain:
         heights.append(_number(here, item, "height"))
         masses.append(_number(here, item, "mass") if "mass" in item else 0.0)
     site = _number(where, table, "site_damping") if "site_damping" in table else 0.0
-    return _made(where, lambda: Chain(springs, heights, area, masses, site_damping=site))
+    return _made(where, Chain, springs, heights, area, masses, site_damping=site)
 
 
-def _made(where: str, make: Callable[[], Made]) -> Made:
+def _made(where: str, make: Callable[..., Made], *given: Any, **named: Any) -> Made:
     """Make a part of the scene; a refusal names where its numbers stand."""
     try:
-        return make()
+        return make(*given, **named)
     except InputError as error:
         raise InputError(f"{where} {error}.") from None
 
@@ -121,11 +114,12 @@ def _spring(where: str, given: dict[str, Any]) -> Spring:
         raise InputError(f"{where} kind = {kind!r}; it must be one of {', '.join(KINDS)}.")
     names = BISTABLE_NAMES if kind == "bistable" else LINEAR_NAMES
     check_keys(where, given, ["kind", "height", "mass", *names])
-    needed = [name for name in names if name != "eta" or name in given]
-    values: dict[str, Any] = {name: _number(where, given, name) for name in needed}
+    values: dict[str, Any] = {
+        name: _number(where, given, name) for name in names if name != "eta" or name in given
+    }
     if kind == "bistable":
-        return _made(where, lambda: BistableSpring(**values))
-    return _made(where, lambda: LinearSpring(**values, unilateral=kind == "unilateral"))
+        return _made(where, BistableSpring, **values)
+    return _made(where, LinearSpring, **values, unilateral=kind == "unilateral")
 
 
 def _drive(path: Path, document: dict[str, Any]) -> tuple[Drive, Array]:
@@ -134,8 +128,8 @@ def _drive(path: Path, document: dict[str, Any]) -> tuple[Drive, Array]:
     kind = table.get("kind")
     if kind == "impact":
         check_keys(where, table, ["kind", "mass", "velocity"])
-        mass, velocity = (_number(where, table, key) for key in ("mass", "velocity"))
-        return _made(where, lambda: Impact(mass, velocity)), _samples(path, document)
+        given = (_number(where, table, key) for key in ("mass", "velocity"))
+        return _made(where, Impact, *given), _samples(path, document)
     if kind not in ("stress", "displacement"):
         raise InputError(f"{where} kind = {kind!r}; it must be impact, stress or displacement.")
     check_keys(where, table, ["kind", "file"])
@@ -163,18 +157,10 @@ def _samples(path: Path, document: dict[str, Any]) -> Array:
 
 
 def write_response(response: Response, path: Path) -> None:
-    """Write a response as CSV, SI, one row per sample; what stood there stays if that fails.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
-    """
+    """Write a response as CSV, SI, one row per sample; what stood there stays if that fails."""
     nodes = range(1, len(response.displacement) + 1)
     header = ["time (s)", "base stress (Pa)", "strain", *(f"displacement_{i} (m)" for i in nodes)]
     columns = [response.time, response.base_stress, response.strain, *response.displacement]
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(zip(*(column.tolist() for column in columns), strict=True))
+    np.savetxt(text, np.transpose(columns), "%s", ",", header=",".join(header), comments="")
     write_file(path, text.getvalue().encode())

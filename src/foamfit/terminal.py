@@ -34,22 +34,18 @@ def printable(text: str) -> str:
 
 
 def _instead(error: UnicodeError) -> tuple[str, int]:
-    """Replace what an encoding does not have: an error handler of `codecs`."""
+    """Replace what an encoding does not have by ASCII: an error handler of `codecs`."""
     assert isinstance(error, UnicodeEncodeError)
-    missing = error.object[error.start : error.end]
-    return "".join(map(_spelt, missing)), error.end
-
-
-def _spelt(character: str) -> str:
-    """Return what stands for a character in ASCII."""
-    match unicodedata.name(character, "").split():
-        case ["GREEK", "SMALL", "LETTER", letter]:
-            return letter.lower()
-        case ["GREEK", "CAPITAL", "LETTER", letter]:
-            return letter.capitalize()
-        case ["COMBINING", *_]:
-            return ""
-    return _INSTEAD.get(character, "?")
+    told = ""
+    for character in error.object[error.start : error.end]:
+        match unicodedata.name(character, "").split():
+            case ["GREEK", size, "LETTER", letter]:
+                told += letter.lower() if size == "SMALL" else letter.capitalize()
+            case ["COMBINING", *_]:
+                pass
+            case _:
+                told += _INSTEAD.get(character, "?")
+    return told, error.end
 
 
 codecs.register_error("foamfit.instead", _instead)
@@ -63,14 +59,9 @@ def show_all() -> None:
 
 
 def say(text: str, *, err: bool = False, newline: bool = True) -> None:
-    """Print a text on stdout or stderr.
+    """Print a text on stdout or stderr; InputError if stdout cannot be written, as to a full disk.
 
     A reader that has enough, as `head`, is no error; what is left is then not printed.
-
-    Raises
-    ------
-    InputError
-        If stdout cannot be written for another reason, as a full disk.
     """
     stream: TextIO | None = sys.stderr if err else sys.stdout
     if stream is None:  # closed by whoever started this process
@@ -97,13 +88,7 @@ def drop_output() -> None:
 
 
 class TerminatedError(BaseException):
-    """The process is asked to end, by SIGTERM or because its terminal has gone.
-
-    Attributes
-    ----------
-    number : int
-        The signal.
-    """
+    """The process is asked to end, by the signal `number`: SIGTERM, or its terminal has gone."""
 
     def __init__(self, number: int) -> None:
         super().__init__(number)

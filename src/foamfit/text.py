@@ -1,13 +1,4 @@
-"""Numbers and sentences for people: the one home of their formatting.
-
-Numbers: `engineering` writes a value with a prefix of its unit ("3.839 MPa"), `number` one without
-a unit ("0.01230", "−1.200e−07"), `significant` a few digits without an exponent ("140"), `percent`
-a share ("140 %", "0.23 %").
-Words: `counted` writes a count with its noun ("1 sample", "3 samples"), `listed` a list ("a, b and
-c").
-Lines: `wrapped` breaks a paragraph into lines, `aligned` makes a table of cells, `labelled` sets
-labels before wrapped texts.
-"""
+"""Numbers and sentences for people: the one home of their formatting."""
 
 from __future__ import annotations
 
@@ -51,6 +42,12 @@ def percent(share: float, digits: int = 2) -> str:
     if 0.0 < abs(share) < 1e-5:
         return "less than 0.001 %"
     return f"{significant(100.0 * share, digits)} %"
+
+
+def signed(value: float, decimals: int) -> str:
+    """Write a difference with its sign and a minus, zero without: "+1.2", "−0.3", "0.0"."""
+    shown = f"{value:+.{decimals}f}"
+    return shown[1:] if float(shown) == 0.0 else shown.replace("-", "−")
 
 
 def counted(count: int, noun: str) -> str:

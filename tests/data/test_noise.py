@@ -73,14 +73,14 @@ def test_slow_noise_is_not_taken_for_signal(n, phi, off):
     assert np.median(found[:, 1]) == pytest.approx(phi, abs=0.1)
 
 
-def test_spikes_and_ringing_are_no_noise():
+def test_spikes_and_vibration_are_no_noise():
     rng = np.random.default_rng(2)
     n = 1000
     values = signal("stress", n) + 0.01 * rng.standard_normal(n)
     values[rng.choice(n, 10, replace=False)] += 0.3
     assert residual_noise(values)[0] == pytest.approx(0.01, rel=0.15)
-    ringing = values + 0.1 * np.sin(2 * np.pi * np.arange(n) / 60)
-    assert residual_noise(ringing)[0] == pytest.approx(0.01, rel=0.15)
+    vibration = values + 0.1 * np.sin(2 * np.pi * np.arange(n) / 60)
+    assert residual_noise(vibration)[0] == pytest.approx(0.01, rel=0.15)
 
 
 @pytest.mark.parametrize("step", [0.002, 0.02])
@@ -101,11 +101,11 @@ def test_noise_is_taken_from_the_samples_before_contact():
     motion = np.concatenate([np.zeros(200), test.displacement])
     motion += 3e-6 * rng.standard_normal(801)
     done = condition(Record(time, stress, motion), SPECIMEN, striker=Striker(7e-3, 2.0))
-    level = done.noise["stress"]
+    level = done.noise.estimated["stress"]
     assert "samples before contact" in level.how
     assert level.sigma == pytest.approx(40e3, rel=0.15)
     assert level.time == pytest.approx((1 + 0.4) / (1 - 0.4), rel=0.5)
-    assert done.noise["displacement"].sigma == pytest.approx(3e-6, rel=0.15)
+    assert done.noise.estimated["displacement"].sigma == pytest.approx(3e-6, rel=0.15)
     assert not level.given
 
 
@@ -115,7 +115,7 @@ def test_noise_of_a_held_channel_is_that_of_its_fresh_samples():
     fresh = 4e-4 * (1 - np.abs(np.linspace(-1, 1, n // hold))) + 1e-6 * rng.standard_normal(240)
     held = np.repeat(fresh, hold)
     done = condition(Record(np.arange(n) * 1e-3, 1e9 * held + 1e3, held), SPECIMEN)
-    level = done.noise["displacement"]
+    level = done.noise.estimated["displacement"]
     assert level.sigma == pytest.approx(1e-6, rel=0.2)
     assert level.time == pytest.approx(hold, rel=0.05)
     assert "fresh samples" in level.how
@@ -128,8 +128,8 @@ def test_thinned_noise_is_that_of_the_means():
     motion = 4e-4 * signal("displacement", n) + 1e-6 * rng.standard_normal(n)
     time = np.linspace(0, 0.75e-3, n)
     done = condition(Record(time, stress, motion), SPECIMEN, striker=Striker(7e-3, 2.0))
-    block = -(-n // len(done.record))
-    sigma, _ = residual_noise(done.record.stress)
+    block = -(-n // len(done.stress))
+    sigma, _ = residual_noise(done.stress)
     assert block > 10
     assert sigma == pytest.approx(1e4 / np.sqrt(block), rel=0.25)
 
@@ -275,7 +275,7 @@ def test_outliers_are_bridged_named_and_kept_for_the_eye():
     np.testing.assert_allclose(found.at, time[[200, 300, 301]], atol=1e-6)
     np.testing.assert_allclose(found.values, [0.0, 1e8, 1e8], rtol=1e-6, atol=2e4)
     assert found.left_out.sum() == 3
-    assert done.record.stress[~found.left_out].max() < 1.1 * clean.max()
+    assert done.stress[~found.left_out].max() < 1.1 * clean.max()
     (note,) = [note for note in done.notes if "spikes or gaps" in note]
     assert note.startswith("Check: 3 samples of the stress")
     assert "100 MPa" in note

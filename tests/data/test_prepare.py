@@ -60,10 +60,9 @@ def run(record, **window):
 
 def error_of_motion(conditioned):
     """RMS error of displacement along the contact, as a share of its peak."""
-    record = conditioned.record
-    truth = pulse(record.time)[1]
-    inside = record.time <= DURATION
-    return np.sqrt(np.mean((record.displacement - truth)[inside] ** 2)) / truth.max()
+    truth = pulse(conditioned.time)[1]
+    inside = conditioned.time <= DURATION
+    return np.sqrt(np.mean((conditioned.displacement - truth)[inside] ** 2)) / truth.max()
 
 
 # Where contact starts.
@@ -76,8 +75,8 @@ def test_a_file_that_starts_in_contact_keeps_its_time_zero(n, noise, w):
     record = impact(n, noise=noise, w=w)
     conditioned = run(record)
     width = -(-len(record) // 1000) if n > 1500 else 1
-    assert conditioned.record.time[0] == pytest.approx(np.mean(record.time[:width]), abs=1e-15)
-    assert conditioned.record.stress[0] == pytest.approx(np.mean(record.stress[:width]))
+    assert conditioned.time[0] == pytest.approx(np.mean(record.time[:width]), abs=1e-15)
+    assert conditioned.stress[0] == pytest.approx(np.mean(record.stress[:width]))
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.003, 0.01])
@@ -86,18 +85,17 @@ def test_a_file_that_starts_in_contact_keeps_its_time_zero(n, noise, w):
 )
 def test_contact_is_found_after_a_pretrigger(noise, w):
     conditioned = run(impact(before=0.4, after=0.4, noise=noise, offset=0.03, origin=5e-3, w=w))
-    record = conditioned.record
-    assert 0 <= record.time[0] < 0.012 * DURATION
-    assert record.time[-1] == pytest.approx(DURATION, rel=0.05)
+    assert 0 <= conditioned.time[0] < 0.012 * DURATION
+    assert conditioned.time[-1] == pytest.approx(DURATION, rel=0.05)
     assert error_of_motion(conditioned) < 0.015
     # the sensor's offset is gone
-    assert record.stress[-3:].mean() == pytest.approx(0, abs=0.02 * PEAK)
+    assert conditioned.stress[-3:].mean() == pytest.approx(0, abs=0.02 * PEAK)
     assert any("offset" in note for note in conditioned.notes)
     assert any("are cut" in note for note in conditioned.notes)
 
 
 def test_contact_starts_between_samples():
-    record = run(impact(before=0.4, after=0.2, origin=5e-3)).record
+    record = run(impact(before=0.4, after=0.2, origin=5e-3))
     assert record.time[0] == pytest.approx(0.37 * DURATION / 600, rel=0.02)
 
 
@@ -106,7 +104,7 @@ def test_a_drifting_sensor_is_left_alone_and_noted():
     drift = np.where(record.time < 0, 0.2 * PEAK * (record.time - record.time[0]) / DURATION, 0)
     conditioned = run(Record(record.time, record.stress + drift, record.displacement))
     assert any("drifts" in note for note in conditioned.notes)
-    assert conditioned.record.stress.max() == pytest.approx(PEAK, rel=1e-3)
+    assert conditioned.stress.max() == pytest.approx(PEAK, rel=1e-3)
 
 
 # Records of the study of recovery: random springs, 1 % noise, contact at the first sample. Where
@@ -151,7 +149,7 @@ def test_one_sample_is_no_rest(off):
         done = run(replace(record, displacement=w))
         assert done.contact == "file"
         assert not any("taken off" in note for note in done.notes)
-        np.testing.assert_array_equal(done.record.displacement, w[: len(done.record)])
+        np.testing.assert_array_equal(done.displacement, w[: len(done.stress)])
 
 
 def test_what_is_taken_off_stands_with_its_size_against_the_noise():
@@ -191,8 +189,8 @@ def test_a_file_that_misses_the_first_samples_keeps_its_time_zero():
     """By time and velocity the striker has gone as far as the first displacement says."""
     record = impact(noise=0.003).rows(slice(30, None))
     done = run(record)
-    np.testing.assert_array_equal(done.record.time, record.time[: len(done.record)])
-    np.testing.assert_array_equal(done.record.displacement, record.displacement[: len(done.record)])
+    np.testing.assert_array_equal(done.time, record.time[: len(done.stress)])
+    np.testing.assert_array_equal(done.displacement, record.displacement[: len(done.stress)])
     assert any("Contact starts before the first sample, 0 s in the file" in n for n in done.notes)
 
 
@@ -202,9 +200,9 @@ def test_a_slow_test_from_another_zero_without_a_rest_says_what_is_taken_off():
     w = strain * SPECIMEN.height + 1e-6 * random.normal(size=400)
     stress = 1e6 * strain + 2e3 * random.normal(size=400)
     own = condition(Record(np.arange(400.0), stress, w), SPECIMEN)
-    np.testing.assert_array_equal(own.record.displacement, w[: len(own.record)])
+    np.testing.assert_array_equal(own.displacement, w[: len(own.stress)])
     other = condition(Record(np.arange(400.0), stress, w - 8e-3), SPECIMEN)
-    np.testing.assert_allclose(other.record.displacement, own.record.displacement, atol=1.5e-6)
+    np.testing.assert_allclose(other.displacement, own.displacement, atol=1.5e-6)
     told = [note for note in other.notes if "The displacement there, -8 mm, is taken off" in note]
     assert len(told) == 1
     assert "noise standard deviations; line through 16 samples" in told[0]
@@ -228,9 +226,9 @@ def test_a_low_stress_before_and_after_a_sharp_peak_is_contact():
         noisy = PEAK * (stress + 0.01 * random.normal(size=n))
         done = run(Record(s * DURATION, noisy, w + 4e-6 * random.normal(size=n)))
         assert done.contact == "file"
-        assert done.record.time[0] == 0.0
-        assert done.record.time[-1] > 0.8 * DURATION
-        assert done.record.time[-1] < 1.1 * DURATION
+        assert done.time[0] == 0.0
+        assert done.time[-1] > 0.8 * DURATION
+        assert done.time[-1] < 1.1 * DURATION
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])
@@ -240,7 +238,7 @@ def test_contact_ends_before_a_second_bounce(noise):
     second = 0.4 * pulse(t - 2 * DURATION)[0]
     random = np.random.default_rng(0)
     record = Record(t, stress + second + noise * PEAK * random.normal(size=t.size), w)
-    end = run(record).record.time[-1]
+    end = run(record).time[-1]
     assert end == pytest.approx(DURATION, rel=0.04)
 
 
@@ -316,11 +314,10 @@ def followed(record, share=0.4, zero=3e-3, noise=0.0):
 )
 def test_a_mass_inside_goes_through_the_same_steps(before, n, noise):
     conditioned = run(followed(impact(n, before=before, after=0.3), noise=noise))
-    record = conditioned.record
-    assert record.interior[1].shape == record.time.shape
-    truth = 0.4 * pulse(np.minimum(record.time, DURATION))[1]
-    inside = record.time <= DURATION
-    away = np.abs(np.mean(record.interior[1] - truth, where=inside)) / truth.max()
+    assert conditioned.interior[1].shape == conditioned.time.shape
+    truth = 0.4 * pulse(np.minimum(conditioned.time, DURATION))[1]
+    inside = conditioned.time <= DURATION
+    away = np.abs(np.mean(conditioned.interior[1] - truth, where=inside)) / truth.max()
     assert away < 2e-3  # its own zero, 3 mm by the file, is gone
     assert any("displacement_1 at contact, 3 mm, is taken off" in n for n in conditioned.notes)
 
@@ -328,14 +325,14 @@ def test_a_mass_inside_goes_through_the_same_steps(before, n, noise):
 def test_a_mass_inside_that_starts_at_zero_keeps_its_zero():
     record = followed(impact(noise=0.01), zero=0.0, noise=0.01)
     np.testing.assert_array_equal(
-        run(record).record.interior[1], record.interior[1][: len(run(record).record)]
+        run(record).interior[1], record.interior[1][: len(run(record).stress)]
     )
 
 
 def test_a_later_cycle_keeps_the_zero_of_a_mass_inside():
     record = cycles()
     half = replace(record, interior={1: 0.5 * record.displacement + 7e-3})
-    inside = condition(half, SPECIMEN, window=Window(cycle=3)).record.interior[1]
+    inside = condition(half, SPECIMEN, window=Window(cycle=3)).interior[1]
     assert inside.max() == pytest.approx(0.5e-3, rel=2e-3)
     assert inside[-1] == pytest.approx(1e-5, abs=3e-6)  # not zero: the foam has set
 
@@ -375,12 +372,11 @@ def cycles(n=3, hold=50):
 @pytest.mark.parametrize("cycle", [1, 2, 3])
 def test_one_cycle_of_a_slow_test_is_kept(cycle):
     conditioned = condition(cycles(), SPECIMEN, window=Window(cycle=cycle))
-    record = conditioned.record
-    assert 440 <= len(record) <= 510
-    assert record.time[0] == pytest.approx(0, abs=0.011)
+    assert 440 <= len(conditioned.stress) <= 510
+    assert conditioned.time[0] == pytest.approx(0, abs=0.011)
     # the zero is that of the first contact, in every cycle
-    assert record.displacement.max() == pytest.approx(1e-3, rel=1e-3)
-    assert record.displacement[-1] == pytest.approx(2e-5, abs=6e-6)
+    assert conditioned.displacement.max() == pytest.approx(1e-3, rel=1e-3)
+    assert conditioned.displacement[-1] == pytest.approx(2e-5, abs=6e-6)
     assert any(f"Cycle {cycle} of 3" in note for note in conditioned.notes)
 
 
@@ -401,15 +397,15 @@ def test_the_approach_of_a_slow_test_is_cut():
     w = np.concatenate([np.linspace(-1e-3, 1e-3, 400), np.linspace(1e-3, 0, 200)]) + 7e-3
     stress = 1e9 * np.maximum(w - 7e-3, 0)
     conditioned = condition(Record(np.arange(600) * 0.01, stress, w), SPECIMEN)
-    assert conditioned.record.displacement.max() == pytest.approx(1e-3, rel=0.01)
-    assert conditioned.record.displacement[0] == pytest.approx(0, abs=1e-5)
+    assert conditioned.displacement.max() == pytest.approx(1e-3, rel=0.01)
+    assert conditioned.displacement[0] == pytest.approx(0, abs=1e-5)
 
 
 def test_adhesion_is_kept_and_noted():
     record = cycles(1)
     stress = record.stress - 0.1 * record.stress.max() * (np.arange(len(record)) > 450)
     conditioned = condition(Record(record.time, stress, record.displacement), SPECIMEN)
-    assert conditioned.record.stress.min() < 0
+    assert conditioned.stress.min() < 0
     assert any("kept" in note and "-" in note for note in conditioned.notes)
 
 

@@ -37,7 +37,7 @@ def test_foams_mass_oscillates_where_branches_change(drive: claims.Drive) -> Non
     assert free["displacement"] == pytest.approx(5.1, abs=0.2)
     assert free["turns"] > 20
     assert free["turns_w"] > 20
-    by_branch = claims.ringing_by_branch(drive)
+    by_branch = claims.vibration_by_branch(drive)
     assert by_branch["c"] == pytest.approx(11.7, abs=0.2)
     assert by_branch["c"] > 3 * max(by_branch[name] for name in "ade")
 
@@ -99,12 +99,12 @@ def test_literal_reading_with_other_drives(
         assert claims.displacement_error(drive, mass, damper) == pytest.approx(error, abs=0.3)
 
 
-def test_ringing_closes_a_loop_that_the_drive_does_not() -> None:
+def test_vibration_closes_a_loop_that_the_drive_does_not() -> None:
     drive = claims.drive_of_impact(velocity=1.9)
-    exact, ringing = (claims.driven(drive, mass, 0.0) for mass in (0.0, claims.OWN_MASS))
+    exact, vibration = (claims.driven(drive, mass, 0.0) for mass in (0.0, claims.OWN_MASS))
     on_c = claims.BRANCH_NAMES.index("c")
     assert on_c not in exact.switches[:, 3]
-    assert on_c in ringing.switches[:, 3]
+    assert on_c in vibration.switches[:, 3]
 
 
 def test_slow_drive_brings_equilibrium(drive: claims.Drive) -> None:

@@ -60,7 +60,7 @@ def test_tiny_noise_counts_as_a_share_of_the_range():
     n = measurement.time.size
     simulated = plain.simulate(values_of(spring) * np.r_[1.01, np.ones(8)])
     unit = MODEL_ERROR * np.ptp(measurement.stress)
-    expected = (simulated.stress_time - measurement.stress) / unit
+    expected = (simulated.curves["stress_time"] - measurement.stress) / unit
     np.testing.assert_allclose(off[:n], expected, rtol=1e-14)
     assert off.size == 2 * n
 

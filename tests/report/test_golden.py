@@ -92,7 +92,7 @@ def auto() -> Fit:
     ladder = Ladder(
         rungs=rungs, n_eff=986.4, noise_from="linear+bistable", ended="the test is told",
         stopped=None, skipped=("bistable+bistable needs heights",),
-        sentences=("Of 2 rungs linear+bistable is the simplest that holds.",), cautions=(),
+        sentences=("linear+bistable was chosen of 2 models.",), cautions=(),
     )  # fmt: skip
     return with_rows(replace(fabricated.chain_result(), ladder=ladder))
 

@@ -183,8 +183,8 @@ def test_value_and_uncertainty_are_rounded_together(
 @pytest.mark.parametrize(
     ("value", "text"),
     [
-        (None, "–"), (True, "yes"), (1202, "1202"), (float("inf"), "–"), (0.0, "0"),
-        (-0.25, "−0.2500"), (1234.56, "1235"), (1e-7, "1.000e−07"), (["a", 1.0], "a, 1.000"),
+        (None, "–"), (1202, "1202"), (float("inf"), "–"), (0.0, "0"), (-0.25, "−0.2500"),
+        (1234.56, "1235"), (1e-7, "1.000e−07"),
     ],
 )  # fmt: skip
 def test_number(value: object, text: str) -> None:

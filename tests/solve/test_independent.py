@@ -103,7 +103,7 @@ def test_a_loop_keeps_its_energy() -> None:
     assert got.contact_end is not None
     assert got.switches == 3
     rebound = (got.displacement[-1, -1] - got.displacement[-1, 1]) / (time[2] - time[1])
-    row = independent._bistable(SPRING, H)
+    row = independent.bistable_row(SPRING, H)
     x = independent
     up = quad(lambda e: SPRING.k0 * e / (1 - e), 0.0, SPRING.eps_a)[0]
     up += quad(lambda e: row[x.SIG_A] + row[x.UP] * (e - SPRING.eps_a), 0.4, row[x.HAT_C])[0]

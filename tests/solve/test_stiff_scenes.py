@@ -109,8 +109,8 @@ def test_against_reference(name: str, drive: str, rtol: float, bar: float) -> No
     assert len(got.switches) >= len(want.switches) - (want.contact_end is not None)
     if want.contact_end is not None:
         assert got.contact_end == pytest.approx(want.contact_end, rel=bar)
-    ringing = (", mass" in name and "dashpot" not in name) or "own mass" in name
-    assert got.steps < (8000 if ringing and rtol < 1e-6 else 3000)
+    vibration = (", mass" in name and "dashpot" not in name) or "own mass" in name
+    assert got.steps < (8000 if vibration and rtol < 1e-6 else 3000)
 
 
 @pytest.mark.parametrize("name", PAIRS)
@@ -189,7 +189,7 @@ def test_light_masses_tend_to_none(name: str, mass: float) -> None:
 
 
 @pytest.mark.parametrize("mass", [1e-14, 1e-12, 1e-10])
-def test_the_ringing_that_steps_pass_over_is_owned_up_to(mass: float) -> None:
+def test_the_vibration_that_steps_pass_over_is_owned_up_to(mass: float) -> None:
     """Steps of 100 radians: against the closed form of a mass between two springs on branch a."""
     chain, blow = struck("foam-2", mass=mass)
     below, above = (s.k0 / h for s, h in zip(chain.springs, chain.heights, strict=True))
@@ -206,7 +206,7 @@ def test_the_ringing_that_steps_pass_over_is_owned_up_to(mass: float) -> None:
 
 
 @pytest.mark.parametrize("eta", [0.0, 1e-3])
-def test_ringing_that_is_lost_is_refused_or_followed(eta: float) -> None:
+def test_vibration_that_is_lost_is_refused_or_followed(eta: float) -> None:
     chain, blow = struck("foam-2", eta, 1e-11)
     time = np.linspace(0.0, 6e-5, 41)
     want = run(chain, blow, 1e-10, implicit=False, time=time)
@@ -381,7 +381,7 @@ def test_cost_of_a_long_chain_is_linear(kind: str) -> None:
         rows = np.array([spring.row for spring in built(chain).springs])
         tally, curves = np.zeros(2, np.int64), np.empty((2, TIME.size))
         outcome, end, taken, switches, _ = steps.integrate_implicit(
-            scene.given(rows, np.array(chain.heights)), 3e-8, 1e-6, 10_000, NO_DIRECTIONS,
+            scene.given(rows, np.array(chain.heights)), 3e-8, 10_000, NO_DIRECTIONS,
             np.zeros((1, 0)), curves, NO_SLOPES, np.empty((4, 5)), tally,
         )  # fmt: skip
         stress = curves[0]

@@ -27,14 +27,15 @@ from foamfit.report.identifiability_plots import (
 from foamfit.report.page import render_report
 from foamfit.report.summary import summary_text
 from foamfit.springs.chain import Chain, Impact
+from foamfit.trust import checklist
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.checklist import Check, _by_reason, status_of
+from foamfit.trust.checklist import Check, status_of
 from foamfit.trust.conclude import conclude
 from foamfit.trust.identifiability import Insight
 from foamfit.trust.intervals import Intervals
 from reference import reference_impact
 
-STRIKER = Striker(mass=7e-3, velocity=1.75)
+IMPACT = Impact(mass=7e-3, velocity=1.75)
 SLOW = EXPERIMENTS / "foam-1" / "model-1-1.75mps-reconstruction.csv"
 AGREED = ((1.0, 5), (4.0, 2))
 
@@ -88,8 +89,8 @@ def test_the_closing_velocity_brings_the_energy_of_the_way_to_c1(name: str) -> N
     s = ff.published[name].bistable
     rise = s.eps_hat_c - s.eps_a
     work = s.k0 * (-s.eps_a - math.log1p(-s.eps_a)) + s.sigma_a * rise + 0.5 * s.kh_plus * rise**2
-    direct = math.sqrt(2.0 * AREA * HEIGHT * work / STRIKER.mass)
-    found = planning.closing_velocity(Chain([s], [HEIGHT], AREA), STRIKER, 1)
+    direct = math.sqrt(2.0 * AREA * HEIGHT * work / IMPACT.mass)
+    found = planning.closing_velocity(Chain([s], [HEIGHT], AREA), IMPACT, 1)
     assert found == pytest.approx(direct, rel=3e-5)
     assert found == pytest.approx(1.911, abs=6e-4)
 
@@ -97,20 +98,20 @@ def test_the_closing_velocity_brings_the_energy_of_the_way_to_c1(name: str) -> N
 def test_the_closing_velocity_of_a_chain_by_independent_integration() -> None:
     item = ff.published["foam-1/model-3"]
     chain = Chain(item.chain.springs, item.chain.heights, item.chain.area, [0.0, 0.0])
-    found = planning.closing_velocity(chain, STRIKER, 2)
+    found = planning.closing_velocity(chain, IMPACT, 2)
     assert found == pytest.approx(1.923, abs=6e-4)
     time = np.linspace(0.0, 1.2e-3, 7)
     for factor, closed in ((0.999, False), (1.001, True)):
-        run = reference_impact(chain, Impact(STRIKER.mass, factor * found), time, rtol=1e-9)
+        run = reference_impact(chain, Impact(IMPACT.mass, factor * found), time, rtol=1e-9)
         assert any(branch == "c" for _, _, branch in run.switches) == closed
 
 
 def test_dampers_raise_the_closing_velocity_and_a_wall_has_none() -> None:
     spring = ff.published["foam-1/model-1"].bistable
     damped = Chain([spring], [HEIGHT], AREA, site_damping=200.0)
-    assert planning.closing_velocity(damped, STRIKER, 1) > 1.95
+    assert planning.closing_velocity(damped, IMPACT, 1) > 1.95
     stiff = Chain([replace(spring, k0=1e14, kc=1e15, kh_plus=1e14)], [HEIGHT], AREA)
-    assert planning.closing_velocity(stiff, STRIKER, 1) is None
+    assert planning.closing_velocity(stiff, IMPACT, 1) is None
 
 
 # ---------------------------------------------------------------- expected errors
@@ -367,7 +368,7 @@ def test_the_standard_error_goes_with_an_interval_that_is_not_local() -> None:
 
 
 def test_a_profile_much_narrower_than_the_local_interval_is_not_taken() -> None:
-    """Refits that stall in a long valley make it so."""
+    """Refits that stall where the cost is flat make it so."""
     local = concluded().parameters["s1_k0"]
     half = (local.ci95[1] - local.ci95[0]) / 2
     ends = {"s1_k0": (local.value - 0.1 * half, local.value)}
@@ -379,12 +380,16 @@ def test_a_profile_much_narrower_than_the_local_interval_is_not_taken() -> None:
     assert "was not taken" in found.why
 
 
-def test_many_reasons_are_left_to_the_table() -> None:
-    few = [("s1_k0", "one"), ("s1_kc", "one"), ("s1_eta", "two")]
-    assert _by_reason(few) == "s1_k0, s1_kc (one); s1_eta (two)"
-    many = _by_reason([(f"s{i}_k0", f"reason {i}") for i in range(1, 6)])
-    assert many.startswith("s1_k0, s2_k0, s3_k0, s4_k0, s5_k0 (")
-    assert "reason 1" not in many
+def test_many_reasons_are_left_to_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    slow = synthetic_impact(velocity=1.0, samples=201)[1]
+    assert concluded(slow).warnings[0] == (
+        "Not determined: s1_kc (branch c of spring 1 was never reached); "
+        "s1_dsigma, s1_eps_c, s1_kh_minus (branch e of spring 1 was never reached)."
+    )
+    monkeypatch.setattr(checklist, "REASONS", 1)
+    assert concluded(slow).warnings[0] == (
+        "Not determined: s1_kc, s1_dsigma, s1_eps_c, s1_kh_minus (see why of each in the report)."
+    )
 
 
 def test_parameters_that_are_not_determined_count_as_varied() -> None:

@@ -257,7 +257,7 @@ def test_the_ends_of_a_profile_satisfy_the_cut_by_an_independent_refit(impact):
         assert rise == pytest.approx(found.cut, rel=0.06)
 
 
-def test_a_profile_goes_on_beyond_a_valley_that_is_as_good():
+def test_a_profile_goes_on_beyond_a_minimum_that_is_as_good():
     """A cost of two minima: x² (x-3)² seen by its residual x (x-3), flat noise elsewhere."""
     rng = np.random.default_rng(0)
     noise = rng.standard_normal(400)
@@ -300,7 +300,7 @@ def test_what_one_profile_meets_counts_for_the_others():
     """Two minima a low barrier apart: a = 0, b = 0 and a = 1, b = 3.
 
     With a held b does not move, since a - (3 - 2u) u², u = b/3, has no slope there: the profile of
-    a alone stays in the first valley. That of b crosses the barrier and meets the second.
+    a alone stays in the first minimum. That of b crosses the barrier and meets the second.
     """
     noise = np.random.default_rng(1).standard_normal(400)
     noise[:2] = 0.0
@@ -627,10 +627,14 @@ def test_what_is_within_rounding_of_its_limit_is_at_it(impact, monkeypatch):
     assert "lies at its limit 0" in item.why
     assert item.ci95[1] == 0.0
     values[at] = -0.0
-    assert str(one_model._on_limits(BestPoint(problem, values), np.inf).values[at]) == "0.0"
+    found = Found(problem, Tracker(problem.objective, best_values=values), AGREED)
+    result, _ = judge(found, Choice("local"), lambda _: None)
+    assert str(result.parameters["s1_dsigma"].value) == "0.0"
     # What would cost something stays where it is.
     monkeypatch.setattr(one_model, "AT_LIMIT", 1.0)
-    assert one_model._on_limits(impact, impact.cost) is impact
+    tracker = Tracker(problem.objective, best_values=impact.values, best_cost=impact.cost)
+    _, best = judge(Found(problem, tracker, AGREED), Choice("local"), lambda _: None)
+    np.testing.assert_array_equal(best.values, impact.values)
 
 
 def test_intervals_are_made_with_the_parameters_on_their_limits(impact, monkeypatch):

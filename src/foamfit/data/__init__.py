@@ -4,5 +4,5 @@
 `columns` their channels and units, `toml_file` the specimen and the striker. `prepare.condition`
 turns the samples into one loading and unloading: `outliers` mends single samples, `cycles` and
 `contact` find the part that counts. `noise` estimates, `energy` audits what striker, force and
-motion say of each other, `describe` prints a test. A newcomer may skip `units` and `rest`.
+motion say of each other, `describe` prints a test. A newcomer may skip `units`.
 """

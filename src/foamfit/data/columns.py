@@ -14,6 +14,7 @@ from foamfit.data.units import is_unit
 from foamfit.errors import InputError
 
 _NONE = Column("")
+_MOTIONS = "displacement", "strain"
 
 
 def assign_columns(table: Table, given: dict[str, Column], toml: Path | None) -> dict[str, int]:
@@ -22,7 +23,15 @@ def assign_columns(table: Table, given: dict[str, Column], toml: Path | None) ->
     strained = "strain" in given or any(h.rank("strain") is not None for h in table.headers)
     for channel in _channels(table, given):
         if channel in given:
-            found[channel] = _given_column(table, channel, given[channel].column, toml)
+            name = given[channel].column
+            places = [k for k, h in enumerate(table.headers) if h.is_named(name)]
+            if len(places) != 1:
+                raise InputError(
+                    f"{toml}: [columns] {channel}: column {name!r} is "
+                    f"{'twice' if places else 'nowhere'} in {table.path.name}, which has "
+                    f"{table.listed}."
+                )
+            found[channel] = places[0]
             continue
         ranks = {k: r for k, h in enumerate(table.headers) if (r := h.rank(channel)) is not None}
         if interior_node(channel):  # a column that the TOML calls the top is not inside
@@ -34,14 +43,14 @@ def assign_columns(table: Table, given: dict[str, Column], toml: Path | None) ->
         if len(best) > 1:
             both = " and ".join(repr(table.headers[k].text) for k in best)
             entry = f'{channel} = {{ column = "{table.headers[best[0]].text}" }}'
+            more = f", or write {entry} in [columns] of {toml.name}" if toml else ""
             raise InputError(
-                f"{table.path}: columns {both} could both be the {channel}; keep one"
-                + (f", or write {entry} in [columns] of {toml.name}." if toml else ".")
+                f"{table.path}: columns {both} could both be the {channel}; keep one{more}."
             )
         if best and not (ranks[best[0]] == WEAK and strained):
             found[channel] = best[0]
     # A channel that the TOML names replaces its twin that only a header names.
-    for one, other in (("stress", "force"), ("displacement", "strain")):
+    for one, other in (("stress", "force"), _MOTIONS):
         for named, twin in ((one, other), (other, one)):
             if named in given and twin not in given:
                 found.pop(twin, None)
@@ -55,22 +64,8 @@ def _channels(table: Table, given: dict[str, Column]) -> list[str]:
     return [*CHANNELS, *sorted(inside, key=lambda c: (c not in given, interior_node(c) or 0))]
 
 
-def _given_column(table: Table, channel: str, name: str, toml: Path | None) -> int:
-    """Place of the one column that the TOML names."""
-    matches = [k for k, h in enumerate(table.headers) if h.is_named(name)]
-    if len(matches) != 1:
-        raise InputError(
-            f"{toml}: [columns] {channel}: column {name!r} is {'twice' if matches else 'nowhere'} "
-            f"in {table.path.name}, which has {table.listed}."
-        )
-    return matches[0]
-
-
 def _clear_time(table: Table, columns: list[int]) -> list[int]:
-    """Of several columns that could be the time keep the one that never goes back, if it is one.
-
-    The others start anew with each cycle, or stand still.
-    """
+    """Of several columns that could be the time keep the one that never goes back, if it is one."""
     numbers, _ = read_numbers(table, {str(k): k for k in columns})
     steps = {k: np.diff(numbers[str(k)]) for k in columns}
     onward = [k for k, step in steps.items() if step.size and step.min() >= 0.0 < step.max()]
@@ -131,7 +126,7 @@ def needed_columns(table: Table, columns: dict[str, int], settings: Settings) ->
             "with a time and the [striker] mass an acceleration will do."
         )
     helping = {"velocity", "acceleration"} if forced else {"velocity"}
-    if has & {"displacement", "strain"}:
+    if has & set(_MOTIONS):
         return {c: k for c, k in columns.items() if c not in helping}
     for channel in has & helping - set(settings.columns):
         try:  # these only help, so one whose unit does not say what it is can be left
@@ -150,7 +145,7 @@ def needed_columns(table: Table, columns: dict[str, int], settings: Settings) ->
     return {c: k for c, k in columns.items() if c in has}
 
 
-def columns_note(table: Table, needed: dict[str, int], settings: Settings) -> str:
+def read_note(table: Table, needed: dict[str, int], settings: Settings) -> str:
     """Say what is read from which column, and which columns are not used."""
     parts = []
     for channel, k in needed.items():
@@ -163,34 +158,25 @@ def columns_note(table: Table, needed: dict[str, int], settings: Settings) -> st
         if channel == "force" and own in WEIGHTS:
             part += f" ({WEIGHTS[own]}: the weight of that mass)"
         parts.append(part)
-    rest = [
-        repr(h.text) for k, h in enumerate(table.headers) if h.text and k not in needed.values()
-    ]
+    used = needed.values()
+    rest = [repr(h.text) for k, h in enumerate(table.headers) if h.text and k not in used]
     return f"Read {', '.join(parts)}" + (f"; not used: {', '.join(rest)}." if rest else ".")
 
 
-def sign_advice(table: Table, columns: dict[str, int], settings: Settings) -> dict[str, str]:
-    """Say for each channel of a record what would turn it round; see `check_signs`."""
-    found = {}
-    for channel, k in columns.items():
-        given, entry = settings.columns.get(channel, _NONE), f'column = "{table.headers[k].text}"'
-        motion = channel.startswith("displacement")
-        by = f"{-given.scale:g} {given.scale_unit}".strip()
-        by = f'"{by}"' if given.scale_unit else by
-        if given.counts_down:
-            told = "leave counts_down = true out"
-        elif given.scale < 0.0:
-            told = f"leave the minus sign of scale = {given.scale:g} out"
-        elif motion:
-            told = f"write {channel} = {{ {entry}, counts_down = true }}"
-            told += f" (of a gap or a position; else scale = {by})"
-        else:
-            told = f"write {channel} = {{ {entry}, scale = {by} }}"
-        wrong = "is negative in compression; it must be positive"
-        if motion:
-            wrong = "is negative or gets smaller in compression; it must get larger"
-        found[channel] = f"{channel} {wrong}: {told} in [columns]"
-    for channel, *others in (("stress", "force", "acceleration"), ("displacement", "strain")):
-        source = next((found[c] for c in (channel, *others) if c in found), None)
-        found |= {channel: source} if source else {}
-    return found
+def sign_advice(table: Table, columns: dict[str, int], settings: Settings, channel: str) -> str:
+    """Say what makes a channel positive that is negative in compression; see `check_signs`."""
+    sources = {"stress": ("stress", "force", "acceleration"), "displacement": _MOTIONS}
+    channel = next(c for c in sources.get(channel, (channel,)) if c in columns)
+    given, motion = settings.columns.get(channel, _NONE), channel.startswith("displacement")
+    entry = f'{channel} = {{ column = "{table.headers[columns[channel]].text}"'
+    by = f'"{-given.scale:g} {given.scale_unit}"' if given.scale_unit else f"{-given.scale:g}"
+    wrong = "is negative in compression; it must be positive"
+    right = f"write {entry}, scale = {by} }}"
+    if motion:
+        wrong = "is negative or gets smaller in compression; it must get larger"
+        right = f"write {entry}, counts_down = true }} (of a gap or a position; else scale = {by})"
+    if given.counts_down:
+        right = "leave counts_down = true out"
+    elif given.scale < 0.0:
+        right = f"leave the minus sign of scale = {given.scale:g} out"
+    return f"{channel} {wrong}: {right} in [columns]"

@@ -1,7 +1,6 @@
-"""A test file and its TOML become a `Measurement`: column names end here, SI begins.
+"""A test file and its TOML become a `Measurement` in SI.
 
-A file holds one table, one row per sample. Its separator, its decimal sign and the row that names
-the columns are found from the first lines; the unit of a channel stands in its header, in a row of
+A file holds one table, one row per sample; the unit of a channel is in its header, in a row of
 units beneath it, or in the ``[columns]`` table of the TOML.
 """
 
@@ -9,32 +8,19 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from foamfit.data.columns import (
-    assign_columns,
-    columns_note,
-    needed_columns,
-    si_factor,
-    sign_advice,
-)
+from foamfit.arrays import Array
+from foamfit.data.columns import assign_columns, needed_columns, read_note, si_factor, sign_advice
 from foamfit.data.csv_table import Table, find_table, read_numbers, read_text
 from foamfit.data.headers import CHANNELS, example
-from foamfit.data.measurement import (
-    MIN_ROWS,
-    Array,
-    Dropped,
-    Measurement,
-    Record,
-    Specimen,
-    Striker,
-    interior_channel,
-    interior_node,
-)
+from foamfit.data.measurement import MIN_ROWS, Dropped, Measurement, Record, Striker, interior_node
 from foamfit.data.noise import with_noise
+from foamfit.data.outliers import fresh_samples
 from foamfit.data.prepare import condition
 from foamfit.data.toml_file import Column, Settings, read_settings
 from foamfit.errors import InputError
@@ -70,46 +56,23 @@ def read_test(path: str | Path, specimen: str | Path | None = None) -> Measureme
     columns = assign_columns(table, settings.columns, toml)
     record, notes = _record(table, columns, settings)
     try:
-        conditioned = condition(
+        test = condition(
             record,
             settings.specimen,
             striker=settings.striker,
             window=settings.window,
-            advice=sign_advice(table, columns, settings),
+            advice=partial(sign_advice, table, columns, settings),
         )
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    _check_noise(toml, settings, conditioned.record)
-    measurement = Measurement(
-        name=settings.name,
-        path=path,
-        data_sha256=text.sha256,
-        time=conditioned.record.time,
-        stress=conditioned.record.stress,
-        displacement=conditioned.record.displacement,
-        specimen=settings.specimen,
-        striker=settings.striker,
-        noise=replace(settings.noise, estimated=conditioned.noise),
-        motion=conditioned.motion,
-        notes=(*notes, *conditioned.notes),
-        interior=conditioned.record.interior,
-        outliers=conditioned.outliers,
-        contact=conditioned.contact,
-        count=conditioned.count,
-    )
-    return with_noise(measurement)
+    _check_noise(toml, settings, test)
+    test = replace(test, name=settings.name, path=path, data_sha256=text.sha256)
+    noise = replace(settings.noise, estimated=test.noise.estimated)
+    return with_noise(replace(test, noise=noise, notes=(*notes, *test.notes)))
 
 
 def read_history(path: Path, channel: str) -> tuple[Array, Array]:
-    """Read time and one other channel of a table, both in SI, as they stand there.
-
-    A column without a unit is in SI.
-
-    Raises
-    ------
-    InputError
-        Where the file cannot be used.
-    """
+    """Read time and one other channel of a table in SI; a column without a unit is in SI."""
     wanted = f"a CSV with the columns 'time (ms)' and '{example(channel)}'"
     table = find_table(read_text(path, wanted), set())
     found = assign_columns(table, {}, None)
@@ -139,11 +102,11 @@ def _record(
     if count < MIN_ROWS:
         raise InputError(f"{table.path}: has fewer than {MIN_ROWS} rows; a test needs more.")
     for channel, values in numbers.items():
+        name = headers[needed[channel]].text
         if np.ptp(values) == 0:
-            name = headers[needed[channel]].text
             raise InputError(f"{table.path}: column {name!r} is constant; a {channel} must vary.")
         numbers[channel] = values * factors[channel]
-    notes = [columns_note(table, needed, settings), *_announced(table, count)]
+    notes = [read_note(table, needed, settings), *_announced(table, count)]
     rows, dropped = table.row_numbers(count), list[Dropped]()
     if empty.size:
         dropped.append(Dropped.of(empty, "no cell of it holds anything"))
@@ -151,33 +114,27 @@ def _record(
         if settings.duplicates == "average":
             numbers, rows = _averaged(numbers, rows, dropped, notes)
         _check_time(table, numbers["time"], headers[needed["time"]].text, rows)
-    record = _to_record(numbers, settings.specimen, settings.striker or Striker(), notes)
+    record = _to_record(numbers, settings, notes)
     return replace(record, numbers=rows, dropped=tuple(dropped)), tuple(notes)
 
 
-def _to_record(
-    numbers: dict[str, Array], specimen: Specimen, striker: Striker, notes: list[str]
-) -> Record:
+def _to_record(numbers: dict[str, Array], settings: Settings, notes: list[str]) -> Record:
     """Derive stress and displacement from the channels, in SI, that stand for them."""
+    specimen, mass = settings.specimen, (settings.striker or Striker()).mass
     stress = _one_of(numbers, "stress", "force", specimen.area, "the area", notes)
     displacement = _one_of(numbers, "displacement", "strain", 1 / specimen.height, "height", notes)
     acceleration = numbers.get("acceleration")
-    if stress is None:  # needed_columns has seen to it that these are there
-        assert striker.mass is not None
+    if stress is None:
+        assert mass is not None  # see needed_columns
         assert acceleration is not None
-        stress, acceleration = acceleration * striker.mass / specimen.area, None
+        stress, acceleration = acceleration * mass / specimen.area, None
         notes.append("The force is the striker's mass times its acceleration.")
     inside = {}
     for channel, values in numbers.items():
-        node = interior_node(channel)
-        if node is None:
-            continue
-        if displacement is not None and np.allclose(
-            values, displacement, rtol=0.0, atol=1e-9 * float(np.ptp(displacement))
-        ):
-            name = interior_channel(node)
-            notes.append(f"{name} is the displacement of the top; it is left out.")
-        else:
+        node, top = interior_node(channel), displacement
+        if node and top is not None and np.allclose(values, top, 0.0, 1e-9 * np.ptp(top)):
+            notes.append(f"{channel} is the displacement of the top; it is left out.")
+        elif node:
             inside[node] = values
     return Record(
         numbers.get("time"), stress, displacement, numbers.get("velocity"), acceleration, inside
@@ -186,12 +143,11 @@ def _to_record(
 
 def _announced(table: Table, count: int) -> list[str]:
     """Compare with the number of samples that an instrument's header announces."""
-    head = table.text.raw.split(b"\n", table.first_row)[: table.first_row]
+    head = table.raw.split(b"\n", table.first_row)[: table.first_row]
     for row, line in enumerate(head, 1):
         match = re.match(rb"\W*(?:number of )?samples\W+(\d+)", line, re.IGNORECASE)
         if match and int(match[1]) != count:
-            told = f"row {row} announces {int(match[1])} samples, but the table has {count}"
-            return [f"Check: {told}."]
+            return [f"Check: row {row} announces {int(match[1])} samples, the table has {count}."]
     return []
 
 
@@ -200,12 +156,10 @@ def _averaged(
 ) -> tuple[dict[str, Array], NDArray[np.int64]]:
     """Average neighbouring rows with the same time stamp; each is counted with its reason."""
     time = numbers["time"]
-    fresh = np.append(True, np.diff(time) != 0.0)
-    again = rows[~fresh]
+    starts, counts = fresh_samples(time)
+    again = np.delete(rows, starts)
     if not again.size:
         return numbers, rows
-    starts = np.flatnonzero(fresh)
-    counts = np.diff(np.append(starts, len(time)))
     dropped.append(Dropped.of(again, "the time stamp of the row before, averaged with it"))
     notes.append(
         f"Check: {again.size} of {len(time)} rows have the time stamp of the row before, the first "
@@ -225,10 +179,8 @@ def _check_time(table: Table, time: Array, name: str, rows: NDArray[np.int64]) -
         if time[i] == time[i - 1]:
             more = ' (in a test, [data] duplicates = "average" averages rows with the same stamp)'
             wrong = "repeats"
-        raise InputError(
-            f"{table.path}: row {rows[i]}, column {name!r}: time {wrong}; it must increase from "
-            f"row to row{more}."
-        )
+        where = f"{table.path}: row {rows[i]}, column {name!r}"
+        raise InputError(f"{where}: time {wrong}; it must increase from row to row{more}.")
 
 
 def _one_of(
@@ -239,25 +191,23 @@ def _one_of(
     if two is None:
         return one
     if one is None:
-        notes.append(
-            f"The {first} is the {second} {'over' if first == 'stress' else 'times'} {by}."
-        )
+        operation = "over" if first == "stress" else "times"
+        notes.append(f"The {first} is the {second} {operation} {by}.")
         return two / ratio
     slope = float(np.dot(two, one) / np.dot(one, one)) / ratio
     if abs(slope - 1) > 0.03:
-        agree = f"the {second} is {slope:.3g} times what it gives with {by} of the specimen"
-        notes.append(f"Check: the {first} is used, but {agree}; they are inconsistent.")
+        agree = f"{slope:.3g} times what it gives with {by} of the specimen; they are inconsistent"
+        notes.append(f"Check: the {first} is used, but the {second} is {agree}.")
     else:
         notes.append(f"The {first} is used rather than the {second}, and they agree.")
     return one
 
 
-def _check_noise(toml: Path, settings: Settings, record: Record) -> None:
+def _check_noise(toml: Path, settings: Settings, test: Measurement) -> None:
     """Refuse a stated noise that is larger than all that was measured."""
     for channel, unit in (("stress", "Pa"), ("displacement", "m")):
-        values, sigma = record.channel(channel), getattr(settings.noise, channel)
-        if values is not None and sigma is not None and sigma > np.ptp(values):
-            size = float(np.ptp(values))
+        size, sigma = float(np.ptp(test.channels()[channel])), getattr(settings.noise, channel)
+        if sigma is not None and sigma > size:
             raise InputError(
                 f"{toml}: [noise] {channel} = {engineering(sigma, unit)} is "
                 f"{percent(sigma / size, 3)} of the range of the measured {channel}, "

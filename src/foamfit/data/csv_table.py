@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from foamfit.arrays import Array
 from foamfit.data.headers import CHANNELS, Header, parse_header
-from foamfit.data.measurement import MIN_ROWS, Array
-from foamfit.data.toml_file import LONGEST
+from foamfit.data.measurement import MIN_ROWS
+from foamfit.data.toml_file import LONGEST, read_bytes
 from foamfit.data.units import is_unit
 from foamfit.errors import InputError
 
@@ -42,10 +43,9 @@ class Text:
 
 
 @dataclass(frozen=True)
-class Table:
-    """Where the numbers of a file are, before they are read."""
+class Table(Text):
+    """The text of a file, and where its numbers are, before they are read."""
 
-    text: Text
     separator: str
     decimal: str
     header_row: int
@@ -54,26 +54,21 @@ class Table:
     headers: tuple[Header, ...]
 
     @property
-    def path(self) -> Path:
-        """The file."""
-        return self.text.path
-
-    @property
     def listed(self) -> str:
         """The headers, in quotation marks."""
         return ", ".join(repr(h.text) for h in self.headers if h.text)
 
     def rows(self) -> Iterator[tuple[int, list[str]]]:
         """Yield (row number in the file, cells) of the rows that are not blank."""
-        raw, encoding = self.text.raw, self.text.encoding
-        lines = io.TextIOWrapper(io.BytesIO(raw), encoding, errors="replace", newline="")
+        file = io.BytesIO(self.raw)
+        lines = io.TextIOWrapper(file, self.encoding, errors="replace", newline="")
         for number, cells in _cells(self.path, lines, self.separator):
             if number > self.first_row and any(cell.strip() for cell in cells):
                 yield number, cells
 
     def body(self) -> bytes:
         """Return the rows below the header."""
-        return self.text.raw.split(b"\n", self.first_row)[-1] if self.first_row else self.text.raw
+        return self.raw.split(b"\n", self.first_row)[-1] if self.first_row else self.raw
 
     def row_numbers(self, count: int) -> NDArray[np.int64]:
         """Return the row numbers in the file of its `count` samples."""
@@ -92,14 +87,7 @@ class Table:
 
 def read_text(path: Path, wanted: str) -> Text:
     """Read a file as text; `wanted` says what the path must be."""
-    try:
-        raw = path.read_bytes()
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; give {wanted}.") from None
-    except IsADirectoryError:
-        raise InputError(f"{path}: is a directory; give {wanted}.") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
+    raw = read_bytes(path, f"give {wanted}")
     sha256 = hashlib.sha256(raw).hexdigest()
     if not raw.strip():
         raise InputError(f"{path}: the file is empty; it must hold a header and rows of numbers.")
@@ -124,24 +112,20 @@ def find_table(text: Text, names: set[str]) -> Table:
     separator, grid, i = _header_row(path, head, names)
     above = [k for k, cells in enumerate(grid[:i], 1) if _holds_numbers(cells)]
     if len(above) >= MIN_ROWS:
-        raise InputError(
-            f"{path}: rows {above[0]} to {above[-1]} hold numbers above the header in row {i + 1}; "
-            "a file must hold one table with one header."
-        )
-    for k, cell in enumerate(grid[i], 1):
-        if len(cell) > LONGEST:
-            raise InputError(
-                f"{path}: row {i + 1}: the name of column {k} has {len(cell)} characters; "
-                f"it must have {LONGEST} at most."
-            )
+        where = f"rows {above[0]} to {above[-1]} hold numbers above the header in row {i + 1}"
+        raise InputError(f"{path}: {where}; a file must hold one table with one header.")
+    for k, n in enumerate(map(len, grid[i]), 1):
+        if n > LONGEST:
+            many = f"row {i + 1}: the name of column {k} has {n} characters"
+            raise InputError(f"{path}: {many}; it must have {LONGEST} at most.")
     first, texts = _unit_row(grid, i)
     headers = tuple(map(parse_header, texts))
     body = [cells for cells in grid[first:] if any(c.strip() for c in cells)]
     if not body:
         raise InputError(f"{path}: has a header in row {i + 1} but no rows of numbers below it.")
     decimal = _decimal_sign(path, body, len(texts), separator)
-    cells = tuple(cell.strip() for cell in grid[i])
-    return Table(text, separator, decimal, i + 1, cells, first, headers)
+    cells, whole = tuple(cell.strip() for cell in grid[i]), (path, text.raw, text.encoding)
+    return Table(*whole, text.sha256, separator, decimal, i + 1, cells, first, headers)
 
 
 def _cells(path: Path, lines: Iterable[str], separator: str) -> Iterator[tuple[int, list[str]]]:
@@ -151,10 +135,8 @@ def _cells(path: Path, lines: Iterable[str], separator: str) -> Iterator[tuple[i
         for cells in reader:
             yield reader.line_num, cells
     except csv.Error:
-        raise InputError(
-            f"{path}: row {reader.line_num} has a cell of more than {csv.field_size_limit()} "
-            "characters; the file must be a text table (CSV)."
-        ) from None
+        cell = f"row {reader.line_num} has a cell of more than {csv.field_size_limit()} characters"
+        raise InputError(f"{path}: {cell}; the file must be a text table (CSV).") from None
 
 
 def _header_row(path: Path, lines: list[str], names: set[str]) -> tuple[str, list[list[str]], int]:
@@ -206,7 +188,7 @@ def _decimal_sign(path: Path, body: list[list[str]], width: int, separator: str)
             f"{path}: {commas[0]!r} may have a decimal comma or a separator of thousands; "
             "write the numbers with a decimal point and without separators."
         )
-    points = sum(1 for v in values if "." in v and _is_number(v))
+    points = sum("." in v and _is_number(v) for v in values)
     return "," if len(commas) > points else "."
 
 
@@ -229,10 +211,7 @@ def read_numbers(
 ) -> tuple[dict[str, Array], NDArray[np.int64]]:
     """Read columns as they stand in the file, and the numbers of rows that are left out as empty.
 
-    Raises
-    ------
-    InputError
-        Naming the first cell that is no number.
+    InputError names the first cell that is no number.
     """
     empty = np.zeros(0, dtype=np.int64)
     try:
@@ -265,7 +244,7 @@ def _frame(table: Table, columns: dict[str, int], body: bytes) -> pd.DataFrame:
         io.BytesIO(header + b"\n" + body),
         sep=table.separator,
         decimal=table.decimal,
-        encoding=table.text.encoding,
+        encoding=table.encoding,
         usecols=[*kinds, str(excess)],
         dtype=kinds | {str(excess): "str"},
         na_filter=False,
@@ -279,15 +258,11 @@ def _refuse_cells(table: Table, columns: dict[str, int]) -> None:
     for row, cells in table.rows():
         where = f"{table.path}: row {row}"
         if tuple(cell.strip() for cell in cells) == table.header_cells:
-            raise InputError(
-                f"{where} repeats the header of row {table.header_row}; a file must hold one table "
-                "with one header."
-            )
+            again = f"repeats the header of row {table.header_row}"
+            raise InputError(f"{where} {again}; a file must hold one table with one header.")
         if any(cell.strip() for cell in cells[count:]):
-            raise InputError(
-                f"{where} has {len(cells)} cells, but the header has {count}; every row must have "
-                "as many as the header."
-            )
+            many = f"has {len(cells)} cells, but the header has {count}"
+            raise InputError(f"{where} {many}; every row must have as many as the header.")
         for k in columns.values():
             cell = cells[k].strip() if k < len(cells) else ""
             wrong = _wrong(cell, table.decimal)
@@ -300,12 +275,10 @@ def _wrong(cell: str, decimal: str) -> str:
     if not cell:
         return "empty; every sample must have a number there"
     if decimal == "," and "." in cell and _is_number(cell):
-        same = "all must have the same decimal sign"
-        return f"{cell!r}, but other numbers have a decimal comma; {same}"
+        return f"{cell!r}, but others have a decimal comma; all must have the same decimal sign"
     text = cell.replace(",", ".") if decimal == "," else cell
     if not _NUMBER.fullmatch(text):
-        # Digits in groups?
-        plain = re.sub(r"(?<=\d)[_' ,\u2009\u202f](?=\d{3})", "", cell)
+        plain = re.sub(r"(?<=\d)[_' ,\u2009\u202f](?=\d{3})", "", cell)  # digits in groups
         hint = f" without separators, {plain}" if plain != cell and _is_number(plain) else ""
         shown = repr(cell if len(cell) <= LONGEST else cell[:LONGEST] + " …")
         return f"{shown}; it must be a number{hint}"

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from foamfit.data.measurement import Array, Record
+from foamfit.arrays import Array
+from foamfit.data.measurement import Record
 from foamfit.data.noise import noise_level
 from foamfit.errors import InputError
 from foamfit.text import percent
@@ -19,8 +20,7 @@ def select_cycle(record: Record, cycle: int) -> tuple[Record, list[str]]:
     """Keep one loading and unloading of a slow test, cycle 1 being the first in the file.
 
     A cycle ends where the motion has gone back most of the way of the smaller of the peaks on
-    either side, so that cycles of growing amplitude count from the first; a reversal that goes
-    back less is part of its cycle.
+    either side; a reversal that goes back less is part of its cycle.
     """
     displacement = record.displacement
     if displacement is None:
@@ -64,14 +64,10 @@ def find_turns(values: Array) -> NDArray[np.int64]:
     back = max(_TURN * float(np.ptp(values)), 8.0 * noise_level(values))
     # The extremes of short blocks are all that counts.
     block = max(1, len(values) // 20_000)
-    at = np.arange(len(values))
-    if block > 1:
-        parts = values[: len(values) // block * block].reshape(-1, block)
-        first = np.arange(len(parts)) * block
-        ends = np.arange(parts.size, len(values))
-        at = np.unique(
-            np.concatenate([first + parts.argmin(axis=1), first + parts.argmax(axis=1), ends])
-        )
+    parts = values[: len(values) // block * block].reshape(-1, block)
+    first, rest = np.arange(len(parts)) * block, np.arange(parts.size, len(values))
+    extremes = first + parts.argmin(axis=1), first + parts.argmax(axis=1)
+    at = np.unique(np.concatenate([*extremes, rest]))
     turns: list[int] = []
     up, best = True, int(at[0])
     for i, value in zip(at.tolist(), values[at].tolist(), strict=True):

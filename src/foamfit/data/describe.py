@@ -5,22 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from foamfit.data.energy import EnergyAudit, largest_motion
-from foamfit.data.measurement import Array, Measurement, Specimen, Striker, interior_node
+from foamfit.data.measurement import Measurement, Specimen, Striker, interior_node
 from foamfit.text import engineering, labelled, percent
 
 
-def describe(measurement: Measurement, audit: EnergyAudit) -> str:
-    """Write what was read of a test, what was done to it, and its balance of energy and momentum.
-
-    The text has about thirty aligned lines, without a newline at its end.
-    """
-    test = measurement
-    striker = "none given" if test.striker is None else _striker(test.striker)
+def describe(test: Measurement, audit: EnergyAudit) -> str:
+    """Write what was read of a test, what was done to it, and its energy and momentum."""
     lines = [
         ("test", [test.name]),
         ("file", [str(test.path or "none")]),
         ("specimen", [_specimen(test.specimen)]),
-        ("striker", [striker]),
+        ("striker", [_striker(test.striker)]),
         ("rows", test.rows.sentences()),
         ("samples", [_samples(test)]),
         *_peaks(test),
@@ -33,15 +28,15 @@ def describe(measurement: Measurement, audit: EnergyAudit) -> str:
 
 def noise_sentences(measurement: Measurement) -> list[str]:
     """Say of each channel what its noise is, one standard deviation, and how it is known."""
-    told = []
+    sentences = []
     for channel, values in measurement.channels().items():
         level = measurement.noise.of(channel)
         if level is not None:
             sigma = engineering(level.sigma, "Pa" if channel == "stress" else "m")
             share = percent(level.sigma / (float(np.ptp(values)) or 1.0))
             slow = f", correlated over {level.time:.1f} samples" if level.time > 1.0 else ""
-            told.append(f"{channel} {sigma} ({share} of its range), {level.how}{slow}.")
-    return told
+            sentences.append(f"{channel} {sigma} ({share} of its range), {level.how}{slow}.")
+    return sentences
 
 
 def _specimen(s: Specimen) -> str:
@@ -54,7 +49,9 @@ def _specimen(s: Specimen) -> str:
     return text
 
 
-def _striker(s: Striker) -> str:
+def _striker(s: Striker | None) -> str:
+    if s is None:
+        return "none given"
     mass = engineering(s.mass * 1e3, "g") if s.mass else "mass unknown"
     return f"{mass}, {s.velocity:.4g} m/s" if s.velocity else f"{mass}, velocity unknown"
 
@@ -82,9 +79,6 @@ def _peaks(test: Measurement) -> list[tuple[str, list[str]]]:
             if node is None:
                 label, text = "strain", f"{w / test.specimen.height:.4g} ({text})"
         source = f", {test.motion}" if label == "strain" else ""
-        lines.append((label, [f"peak {text}{_moment(test.time, top)}{source}"]))
+        moment = "" if test.time is None else f" at {engineering(float(test.time[top]), 's')}"
+        lines.append((label, [f"peak {text}{moment}{source}"]))
     return lines
-
-
-def _moment(time: Array | None, sample: int) -> str:
-    return "" if time is None else f" at {engineering(float(time[sample]), 's')}"

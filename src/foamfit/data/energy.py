@@ -10,15 +10,16 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from foamfit.data.measurement import INTEGRATED, Array, Measurement, Striker
+from foamfit.arrays import Array
+from foamfit.data.contact import line_at
+from foamfit.data.measurement import INTEGRATED, Measurement, Striker
 from foamfit.data.noise import noise_level
-from foamfit.data.rest import line_at
 from foamfit.text import engineering, percent
 
 
 @dataclass(frozen=True)
 class EnergyAudit:
-    """The energy and momentum of one test; None where the test does not say enough.
+    """The energy and momentum of one test; None where the test lacks what it takes.
 
     Attributes
     ----------
@@ -125,8 +126,7 @@ def audit(measurement: Measurement) -> EnergyAudit:
         missing.append("The absorbed energy needs stress and displacement.")
     elif dissipated is None:
         missing.append("The dissipated energy needs the unloading.")
-    rebound = _rebound(test)
-    impulse, change = _momentum(test, striker, rebound)
+    rebound, impulse, change = _momentum(test)
     if test.motion == INTEGRATED:
         missing.append("The motion comes from the force, so the balances check nothing here.")
     elif change is None:
@@ -164,10 +164,8 @@ def _absorbed(test: Measurement) -> tuple[float | None, float | None]:
 def largest_motion(displacement: Array, time: Array | None = None) -> tuple[int, float]:
     """Find the turn of a motion: the largest of its samples would be the largest of its noise.
 
-    A quartic is fitted to the samples about the turn that the noise could confuse with it; where
-    the motion is so clean that they are few, the largest sample is the turn.
-
-    Returns the sample at the turn and the displacement there, free of the noise of that sample.
+    A quartic is fitted to the samples that the noise could confuse with the turn; where they are
+    few, the largest sample is the turn. Returns that sample and the displacement there.
     """
     floor = displacement.max() - 8.0 * noise_level(displacement)
     near = np.flatnonzero(displacement >= floor)
@@ -186,25 +184,16 @@ def _unloaded(stress: Array) -> bool:
     return float(stress[-3:].mean()) < 0.1 * float(stress.max())
 
 
-def _rebound(test: Measurement) -> float | None:
-    """Velocity away from the specimen at the end of an impact, from its last samples."""
-    time, w = test.time, test.displacement
-    if test.striker is None or time is None or w is None:
-        return None
-    if test.stress is None or not _unloaded(test.stress):
-        return None
-    last = slice(-max(5, len(w) // 20), None)
-    return -line_at(time[last], w[last], time[-1])[1]
-
-
-def _momentum(
-    test: Measurement, striker: Striker, rebound: float | None
-) -> tuple[float | None, float | None]:
-    """Impulse of the force, and the striker's change of momentum by a motion of its own."""
-    time, stress = test.time, test.stress
-    if test.striker is None or time is None or stress is None:
-        return None, None
+def _momentum(test: Measurement) -> tuple[float | None, float | None, float | None]:
+    """Rebound velocity, impulse of the force and the striker's change of momentum in an impact."""
+    time, stress, w, striker = test.time, test.stress, test.displacement, test.striker
+    if striker is None or time is None or stress is None:
+        return None, None, None
     impulse = test.specimen.area * float(np.trapezoid(stress, time) + 0.5 * stress[0] * time[0])
-    if not (striker.mass and striker.velocity) or rebound is None or test.motion == INTEGRATED:
-        return impulse, None
-    return impulse, striker.mass * (striker.velocity + rebound)
+    if w is None or not _unloaded(stress):
+        return None, impulse, None
+    last = slice(-max(5, len(w) // 20), None)
+    rebound = -line_at(time[last], w[last], time[-1])[1]
+    if not (striker.mass and striker.velocity) or test.motion == INTEGRATED:
+        return rebound, impulse, None
+    return rebound, impulse, striker.mass * (striker.velocity + rebound)

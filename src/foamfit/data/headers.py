@@ -66,11 +66,7 @@ class Header:
     def is_named(self, name: str) -> bool:
         """Whether a column name in the TOML means it: with its unit or without."""
         bare = self.text.split("(")[0].split("[")[0]
-        return _plain(name) in {_plain(self.text), _plain(bare)}
-
-
-def _plain(text: str) -> str:
-    return " ".join(text.casefold().split())
+        return name.casefold().split() in (t.casefold().split() for t in (self.text, bare))
 
 
 def parse_header(text: str) -> Header:
@@ -103,7 +99,7 @@ def _words(name: str) -> tuple[str, ...]:
 
 
 def channel_of(name: str) -> Channel:
-    """Return a channel by its name; those of masses inside, displacement_1, are displacements."""
+    """Return a channel by its name; displacement_1 of a mass inside is a displacement."""
     return CHANNELS["displacement" if interior_node(name) else name]
 
 

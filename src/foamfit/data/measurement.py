@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from foamfit.arrays import Array
+
 MIN_ROWS = 10  # samples of a test
 
 # Where a motion comes from; the second is no measurement of its own.
@@ -53,8 +54,8 @@ class Striker:
 class NoiseLevel:
     """The noise of one channel: one standard deviation, Pa or m.
 
-    It is `given` by the test, or else estimated from the data; `how` says so ("estimated from 40
-    samples before contact"). `time` is its autocorrelation time, in samples (1: white).
+    It is `given` by the test, or else estimated from the data, and `how` says from what. `time` is
+    its autocorrelation time, in samples (1: white).
     """
 
     sigma: float
@@ -89,9 +90,8 @@ class Outliers:
     """Samples of a channel that are not fitted: spikes, short gaps, and a clipped top.
 
     `left_out` marks these samples, shape (n,); at spikes and gaps the channel holds a straight
-    line. What the file has there is `values` (k,), Pa or m, `at` (k,) times in s, or samples where
-    the test has no time. `clipped_at` is the value at which the sensor or its amplifier clips the
-    channel, Pa.
+    line. The file has the `values` (k,), Pa or m, `at` times (k,), s, or samples where the test has
+    no time. At `clipped_at`, Pa, the sensor or its amplifier clips the channel.
     """
 
     left_out: NDArray[np.bool_]
@@ -102,10 +102,9 @@ class Outliers:
 
 @dataclass(frozen=True)
 class Dropped:
-    """Rows of a file that are not used, for one reason, which follows "not used: ".
+    """Rows of a file that are not used, for one reason; rows that are used may lie between.
 
     `first` and `last` are lines of the file as an editor counts them, from 1 and with the header.
-    Rows that are used may lie between.
     """
 
     rows: int
@@ -146,10 +145,10 @@ class RowCount:
 
 @dataclass(frozen=True)
 class Window:
-    """The part of a file to look at: times in s as the file counts them, and which cycle."""
+    """The part of a file to use: times in s as the file counts them, and which cycle."""
 
-    start: float | None = None
-    end: float | None = None
+    start: float = -np.inf
+    end: float = np.inf
     cycle: int = 1
 
 
@@ -288,10 +287,8 @@ class Measurement:
     @property
     def rows(self) -> RowCount:
         """Rows of the file, used and not used; without a file all samples are used."""
-        if self.count is not None:
-            return self.count
         n = max((values.size for values in self.channels().values()), default=0)
-        return RowCount(n, n)
+        return self.count or RowCount(n, n)
 
     def channels(self) -> dict[str, Array]:
         """Stress, displacement and displacements of masses inside, as far as they are there."""

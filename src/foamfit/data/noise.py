@@ -1,7 +1,6 @@
-"""The noise of a channel, from its own samples.
+"""The noise of a channel, from its own samples: each is judged by its neighbours, not by a model.
 
-Nothing here knows the model: a sample is judged by its neighbours alone, so that no switch of a
-spring and no vibration is taken for noise where it is sampled well enough to be seen.
+No switch of a spring and no vibration is taken for noise where it is sampled finely.
 """
 
 from __future__ import annotations
@@ -11,13 +10,15 @@ from functools import cache
 
 import numpy as np
 
-from foamfit.data.measurement import Array, Measurement, NoiseLevel
+from foamfit.arrays import Array
+from foamfit.data.measurement import Measurement, NoiseLevel
 
+MIN_REST = 20  # samples that show their own noise
 # Widths of the local cubics (samples); the widest may cover a twelfth of the record.
 _WIDTHS = (5, 7, 11, 17, 25, 37, 55, 83, 125)
 _SHARE = 12
-# Autocorrelations from one sample to the next that are tried, and the largest that is believed: a
-# slower noise cannot be told from the signal.
+# Autocorrelations from one sample to the next that are tried, and the largest that is accepted: a
+# slower noise cannot be distinguished from the signal.
 _CORRELATIONS = np.linspace(0.0, 0.98, 99)
 _SLOWEST = 0.95
 # Scatter of the logarithms of the variances up to which they are those of one noise.
@@ -55,19 +56,13 @@ def quantum(values: Array) -> float:
 def residual_noise(values: Array) -> tuple[float, float]:
     """Noise of a sampled signal from what local cubics leave of it.
 
-    Cubics over 5, 7, 11, … samples take off the signal; of the variance of what is left each shows
-    a known share, which depends on the correlation of the noise: for an autocorrelation φ^k it is
-    c_0 + 2 Σ c_k φ^k, with c the autocorrelation of the filter. If the three narrowest widths agree
-    with white noise, their variance is the answer. Else σ and φ are those that explain all widths
-    best. Switches and spikes are cut from the residuals at three deviations.
+    Cubics over 5, 7, 11, … samples take off the signal; each leaves a known share of the variance
+    of noise with the autocorrelation φ^k: c_0 + 2 Σ c_k φ^k, with c the autocorrelation of the
+    filter. If the three narrowest agree with white noise, their variance is the answer, else σ and
+    φ explain all widths best. Switches and spikes are cut from the residuals at three deviations.
 
-    Returns
-    -------
-    sigma : float
-        Standard deviation; at least that of the digitiser's step q, q/√12.
-    phi : float
-        Autocorrelation from one sample to the next; 0 for white noise, and where a vibration or a
-        noise slower than the signal hides it.
+    Returns σ, at least that of the digitiser's step q, q/√12, and φ, 0 for white noise and where a
+    vibration or a noise slower than the signal hides it.
     """
     n = values.size
     digital = quantum(values) / np.sqrt(12.0)
@@ -78,11 +73,9 @@ def residual_noise(values: Array) -> tuple[float, float]:
     variance = np.array([robust_variance(np.convolve(values, w, "valid")) for w, _ in filters])
     if variance.min() <= 0.0:
         return digital, 0.0
-    powers = _CORRELATIONS[:, None, None] ** np.arange(1, max(widths))[None, None, :]
-    shares = np.array(
-        [c[0] + 2.0 * (powers[:, 0, : c.size - 1] @ c[1:]) for _, c in filters]
-    ).T  # (correlations, widths)
-    off = np.log(variance) - np.log(shares)
+    powers = _CORRELATIONS[:, None] ** np.arange(1, max(widths))
+    shares = np.array([c[0] + 2.0 * (powers[:, : c.size - 1] @ c[1:]) for _, c in filters])
+    off = np.log(variance) - np.log(shares.T)  # (correlations, widths)
     narrow = off[:, :3]
     phi = _CORRELATIONS[int(np.argmin(np.var(narrow, axis=1)))]
     # The scatter of φ over records of white noise is about 1.5/√n.
@@ -101,10 +94,7 @@ def residual_noise(values: Array) -> tuple[float, float]:
 
 
 def noise_level(values: Array) -> float:
-    """Estimate the standard deviation of the noise of a smooth signal from its second differences.
-
-    It is quick and takes part of the signal for noise where that is sampled coarsely.
-    """
+    """Noise of a finely sampled signal, a standard deviation, from its second differences."""
     if len(values) < 4:
         return 0.0
     return float(1.4826 * np.median(np.abs(np.diff(values, 2))) / np.sqrt(6))
@@ -121,34 +111,38 @@ def correlation_time(phi: float) -> float:
     return (1.0 + phi) / (1.0 - phi)
 
 
-def estimated_noise(values: Array) -> NoiseLevel:
+def estimated_noise(values: Array, what: str = "samples") -> NoiseLevel:
     """Noise of a channel by `residual_noise`."""
     sigma, phi = residual_noise(values)
-    how = f"estimated from what local cubics leave of {values.size} samples"
+    how = f"estimated from what local cubics leave of {values.size} {what}"
     return NoiseLevel(sigma, False, how, correlation_time(phi))
 
 
-def noise_at_rest(rest: Array, during: NoiseLevel, block: int) -> NoiseLevel | None:
-    """Noise of a channel from its samples before contact, about their line; None for no noise.
+def noise_before_contact(
+    rest: dict[str, Array], curves: dict[str, Array], block: int
+) -> dict[str, NoiseLevel]:
+    """Noise of channels from their samples before contact, about their line, if they are twenty.
 
-    During contact `block` samples are averaged. What the signal itself shows there, `during`, is
-    the answer where it contradicts: a sensor may be quieter at rest, and a motion may start before
-    the stress.
+    The `curves` during contact are means of `block` samples; where the noise that they show
+    contradicts, it is the answer.
     """
-    n = len(rest)
-    x = np.arange(n, dtype=np.float64)
-    off = rest - np.polyval(np.polyfit(x, rest, 1), x)
-    sigma, phi = float(np.sqrt(off @ off / (n - 2))), lag_one(off)
-    if sigma == 0.0:
-        return None
-    time = correlation_time(phi) if 2 / np.sqrt(n) < phi < 1 else 1.0
-    how = f"estimated from {n} samples before contact"
-    level = averaged(NoiseLevel(sigma, False, how, time), block)
-    if 0.5 < level.sigma / max(during.sigma, 1e-300) < 4.0:
-        return level
-    word = "quieter" if level.sigma < during.sigma else "less quiet"
-    how = f"{during.how}, the {n} before contact being {word}"
-    return replace(during, how=how) if during.sigma > 0.0 else None
+    found = dict[str, NoiseLevel]()
+    for name, values in rest.items():
+        n, x = len(values), np.arange(len(values), dtype=np.float64)
+        if n < MIN_REST:
+            continue
+        off = values - np.polyval(np.polyfit(x, values, 1), x)
+        sigma, phi = float(np.sqrt(off @ off / (n - 2))), lag_one(off)
+        time = correlation_time(phi) if 2 / np.sqrt(n) < phi < 1 else 1.0
+        how = f"estimated from {n} samples before contact"
+        level = averaged(NoiseLevel(sigma, False, how, time), block)
+        during = estimated_noise(curves[name])
+        if 0.5 < level.sigma / max(during.sigma, 1e-300) < 4.0:
+            found[name] = level
+        elif min(sigma, during.sigma) > 0.0:
+            word = "quieter" if level.sigma < during.sigma else "less quiet"
+            found[name] = replace(during, how=f"{during.how}, the {n} before contact being {word}")
+    return found
 
 
 def averaged(level: NoiseLevel, block: int) -> NoiseLevel:
@@ -161,10 +155,7 @@ def averaged(level: NoiseLevel, block: int) -> NoiseLevel:
 
 
 def with_noise(measurement: Measurement) -> Measurement:
-    """Complete the noise of a test: what is neither stated nor known is estimated from the samples.
-
-    A test whose channels all have their noise is returned as it is.
-    """
+    """Estimate the noise of the channels that have none; a test that has all stays as it is."""
     noise, curves = measurement.noise, measurement.channels()
     missing = {c: estimated_noise(v) for c, v in curves.items() if noise.of(c) is None}
     if not missing:

@@ -1,17 +1,18 @@
 """Samples that are no measurements: spikes, short gaps, a clipped force, and values that are held.
 
-A sample is judged by its neighbours alone; nothing here knows the model.
+A sample is judged by its neighbours, not by a model.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from foamfit.data.measurement import MIN_ROWS, Array, NoiseLevel, Outliers, Record
-from foamfit.data.noise import residual_noise, robust_variance
+from foamfit.arrays import Array
+from foamfit.data.measurement import MIN_ROWS, NoiseLevel, Outliers, Record
+from foamfit.data.noise import estimated_noise, robust_variance
 from foamfit.text import counted, engineering
 
 # An outlier is off by this many standard deviations of its leave-one-out residual, and by this
@@ -35,29 +36,28 @@ _FLAT, _PARABOLA = 5, 3
 def find_outliers(values: Array, time: Array | None = None) -> NDArray[np.bool_]:
     """Isolated samples that no smooth signal with this noise can hold: spikes and gaps.
 
-    First the jumps into and out of gaps of up to five samples are looked for (dropped to zero,
-    saturated): ten times the median jump nearby, to and fro. Then each sample is predicted by the
-    cubic through its eight neighbours: it is an outlier if it is off by four standard deviations of
-    that prediction, as seen over the whole record, while the neighbours agree among themselves and
-    the lines from either side do not lead to it. Where the signal bends they do one or the other.
+    Gaps are up to five samples between two opposite jumps of ten times the median jump nearby. Then
+    each sample is predicted by the cubic through its eight neighbours: it is an outlier if it is
+    off by four standard deviations of that prediction, as seen over the whole record, while the
+    neighbours agree among themselves and the lines from either side do not lead to it.
 
-    `values` and `time` have the shape (n,); without a time the samples are evenly spaced. Cubics
-    and lines go by the true spacing, and nothing is judged across a pause. In a channel that is
-    held for some samples at a time only gaps are looked for: its steps have no even spacing. Never
-    are more than 2 % of the samples outliers: then none is, they are no exceptions.
+    `values` and `time` have the shape (n,); without a time the samples are evenly spaced. Nothing
+    is judged across a pause, and of a channel that is held for some samples at a time only gaps.
+    If more than 2 % of the samples stand out, none is an outlier.
     """
     n = values.size
     if n < 30:
         return np.zeros(n, dtype=bool)
     least = _LEAST * float(np.ptp(np.quantile(values, (0.005, 0.995))))
-    time = None if time is None or _is_even(time, values, least) else time
-    cubics = _Cubics.of(np.arange(n, dtype=np.float64) if time is None else time, time is None)
-    wrong = _gaps(values, time)
-    for _ in range(4):  # what a big spike hides
-        smooth = _bridged(values, wrong, cubics.time)
+    even = time is None or _is_even(time, values, least)
+    at = np.arange(n, dtype=np.float64) if time is None or even else time
+    cubics = _cubics(at, even)
+    wrong = _gaps(values, at)
+    for _ in range(4):  # beside a large spike a small one is found later
+        smooth = _bridged(values, wrong, at)
         if is_staircase(smooth):
             break
-        found = _spikes(smooth, least, cubics) & ~wrong
+        found = _spikes(smooth, least, at, *cubics) & ~wrong
         if not found.any():
             break
         wrong |= found
@@ -65,11 +65,7 @@ def find_outliers(values: Array, time: Array | None = None) -> NDArray[np.bool_]
 
 
 def _is_even(time: Array, values: Array, least: float) -> bool:
-    """Whether the steps of time are the same, or as near as makes no difference to the values.
-
-    Time stamps are rounded; what the signal does in the time that a step is off is far less than
-    what counts as an outlier then.
-    """
+    """Whether the steps of time are equal, or so nearly that the values hardly differ by it."""
     step = np.diff(time)
     usual = float(np.median(step))
     off = float(np.abs(step - usual).max()) / usual
@@ -77,23 +73,18 @@ def _is_even(time: Array, values: Array, least: float) -> bool:
 
 
 def _bridged(values: Array, wrong: NDArray[np.bool_], time: Array) -> Array:
-    """Put the straight line between the samples around them in the place of some."""
+    """Replace samples by the straight line between those around them."""
     return np.where(wrong, np.interp(time, time[~wrong], values[~wrong]), values)
 
 
-def _gaps(values: Array, time: Array | None) -> NDArray[np.bool_]:
-    """Short runs into which the signal jumps and out of which it jumps back.
-
-    In a step of time that is longer than usual the signal itself may go farther.
-    """
+def _gaps(values: Array, time: Array) -> NDArray[np.bool_]:
+    """Short runs into which the signal jumps and out of which it jumps back."""
     from scipy.ndimage import median_filter
 
     out = np.zeros(values.size, dtype=bool)
-    jump = np.diff(values)
-    usual = np.abs(jump)
-    if time is not None:
-        step = np.diff(time)
-        usual = usual / np.maximum(step / median_filter(step, _NEARBY), 1.0)
+    jump, step = np.diff(values), np.diff(time)
+    # In a step of time that is longer than usual the signal itself may go farther.
+    usual = np.abs(jump) / np.maximum(step / median_filter(step, _NEARBY), 1.0)
     floor = float(np.median(usual[usual > 0.0])) if usual.any() else 0.0
     high = np.flatnonzero(usual > _JUMP * np.maximum(median_filter(usual, _NEARBY), floor))
     for start, end in ((i, j) for i in high for j in high[(high > i) & (high <= i + _MAX_RUN)]):
@@ -104,20 +95,22 @@ def _gaps(values: Array, time: Array | None) -> NDArray[np.bool_]:
     return out
 
 
-def _spikes(values: Array, least: float, cubics: _Cubics) -> NDArray[np.bool_]:
-    """Samples that the cubic through their eight neighbours does not expect."""
-    out, own = np.zeros(values.size, dtype=bool), cubics.own
-    residual = cubics.residual(values)
+def _spikes(
+    values: Array, least: float, time: Array, weights: Array, own: Array
+) -> NDArray[np.bool_]:
+    """Samples that the cubic through their eight neighbours does not expect; see `_cubics`."""
+    out = np.zeros(values.size, dtype=bool)
+    residual = np.einsum("sw,ws->w", weights, _windows(values))
     off = np.abs(residual) / own
     usual = np.sqrt(robust_variance(residual / np.sqrt(own)) / own)
     far = np.flatnonzero(off > np.maximum(_OFF * usual, least))
-    near, times = _windows(values)[far], _windows(cubics.time)[far]
+    near, times = _windows(values)[far], _windows(time)[far]
     basis = _orthonormal(times.T)
     left = near - np.einsum("kw,ksw->ws", np.einsum("ksw,ws->kw", basis, near), basis)
     rest = np.sum(left**2, axis=1) - residual[far] ** 2 / own[far]
     alone = np.sqrt(np.maximum(rest, 0.0) / (_WIDTH - 5) / own[far])
     # Beside a spike the cubic is off too: only the farthest of five is one.
-    nearby = np.lib.stride_tricks.sliding_window_view(np.pad(off, 2), 5).max(axis=1)
+    nearby = _windows(np.pad(off, 2), 5).max(axis=1)
     # The tip of a kink is where the line from one of its sides leads.
     leads = [np.sum(near[:, at] * _line_to_middle(times, at), axis=1) for at in _SIDES]
     beside = np.min((near[:, _HALF] - np.array(leads)) * np.sign(residual[far]), axis=0)
@@ -127,52 +120,27 @@ def _spikes(values: Array, least: float, cubics: _Cubics) -> NDArray[np.bool_]:
     return out
 
 
-@dataclass(frozen=True, eq=False)
-class _Cubics:
-    """Cubics over nine samples, for every sample with four on either side.
+def _cubics(time: Array, even: bool) -> tuple[Array, Array]:
+    """Weights (samples, windows) of "sample minus local cubic", and those of the middle samples.
 
-    `weights` (samples of a window, windows) are those of "sample minus cubic", and `own` that of
-    the middle sample itself. They are zero and one where nothing is judged: across a pause, and
-    where the middle sample alone holds the cubic.
+    They are zero and one where nothing is judged: across a pause, and where the middle sample
+    alone holds the cubic.
     """
-
-    time: Array
-    weights: Array
-    own: Array
-
-    @classmethod
-    def of(cls, time: Array, even: bool) -> _Cubics:
-        """Prepare the cubics; in parts, for all at once would take much memory."""
-        windows = _windows(time)
-        n = len(windows)
-        if even:  # all are the same
-            windows = windows[:1]
-        weights = np.empty((_WIDTH, len(windows)))
-        for first in range(0, len(windows), _CHUNK):
-            basis = _orthonormal(windows[first : first + _CHUNK].T)
-            weights[:, first : first + _CHUNK] = -np.einsum("kw,ksw->sw", basis[:, _HALF], basis)
-        weights[_HALF] += 1.0
-        if even:
-            weights = np.broadcast_to(weights, (_WIDTH, n))
-            return cls(time, weights, weights[_HALF])
-        step = np.diff(time)
-        steps = np.lib.stride_tricks.sliding_window_view(step, _WIDTH - 1)
-        pause = steps.max(axis=1) > _PAUSE * float(np.median(step))
-        unjudged = pause | (weights[_HALF] < _OPEN)
-        weights[:, unjudged] = 0.0
-        return cls(time, weights, np.where(unjudged, 1.0, weights[_HALF]))
-
-    def residual(self, values: Array) -> Array:
-        """What the cubics leave of the middle samples."""
-        n = self.own.size
-        left = np.zeros(n)
-        for i, weights in enumerate(self.weights):
-            left += weights * values[i : i + n]
-        return left
+    windows = _windows(time)[: 1 if even else None]  # even ones are all the same
+    weights = np.empty((_WIDTH, len(windows)))
+    for first in range(0, len(windows), _CHUNK):  # all at once would take much memory
+        basis = _orthonormal(windows[first : first + _CHUNK].T)
+        weights[:, first : first + _CHUNK] = -np.einsum("kw,ksw->sw", basis[:, _HALF], basis)
+    weights[_HALF] += 1.0
+    step = np.diff(time)
+    pause = _windows(step, _WIDTH - 1).max(axis=1) > _PAUSE * float(np.median(step))
+    unjudged = pause | (weights[_HALF] < _OPEN)
+    own = np.where(unjudged, 1.0, weights[_HALF])
+    return np.where(unjudged, 0.0, weights) if unjudged.any() else weights, own
 
 
-def _windows(values: Array) -> Array:
-    return np.lib.stride_tricks.sliding_window_view(values, _WIDTH)
+def _windows(values: Array, width: int = _WIDTH) -> Array:
+    return np.lib.stride_tricks.sliding_window_view(values, width)
 
 
 def _orthonormal(times: Array) -> Array:
@@ -197,7 +165,7 @@ def _line_to_middle(times: Array, at: list[int]) -> Array:
 
 
 def bridge_outliers(record: Record) -> Record:
-    """Put a straight line in the place of spikes and short gaps; `excess` keeps what was there."""
+    """Replace spikes and short gaps by a straight line; `excess` keeps what the file has there."""
     for name, values in record.curves("velocity", "acceleration").items():
         wrong = find_outliers(values, record.time)
         if wrong.any():
@@ -210,21 +178,20 @@ def bridge_outliers(record: Record) -> Record:
 def mark_clipped(record: Record) -> tuple[Record, list[str]]:
     """Find the samples at which the force is clipped: a flat top at one value, with steep flanks.
 
-    A rounded top shows equal samples, too, where its values are rounded: it is about a parabola,
-    which falls by some three more steps of the digits within half the length of the flat on either
-    side. A clipped force falls by more.
+    A top whose values are rounded shows equal samples, too, but it is about a parabola, which falls
+    by three more steps of the digits within half the length of the flat; a clipped force by more.
     """
     stress = record.stress
     top = float(stress.max())
     at_top = stress >= top - 1e-9 * float(np.ptp(stress))
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], at_top.astype(np.int8), [0]])))
-    starts, ends = edges[::2], edges[1::2]
-    longest = int(np.argmax(ends - starts))
-    first, end = int(starts[longest]), int(ends[longest])
-    if end - first < max(_FLAT, 3 * float(np.median(fresh_samples(stress)[1]))):
+    starts, lengths = fresh_samples(at_top)
+    longest = int(np.argmax(np.where(at_top[starts], lengths, 0)))
+    first, length = int(starts[longest]), int(lengths[longest])
+    if length < max(_FLAT, 3 * float(np.median(fresh_samples(stress)[1]))):
         return record, []
-    reach = -(-(end - first) // 2)
-    around = stress[max(first - reach, 0)], stress[min(end - 1 + reach, len(stress) - 1)]
+    reach = -(-length // 2)
+    last = min(first + length - 1 + reach, len(stress) - 1)
+    around = stress[max(first - reach, 0)], stress[last]
     levels = np.diff(np.unique(stress))
     step = float(levels[levels > 1e-9 * np.ptp(stress)].min())
     if top - max(around) < 4 * _PARABOLA * step:
@@ -252,7 +219,7 @@ def outliers_of_blocks(record: Record, block: int) -> dict[str, Outliers]:
     if record.clipped is not None and record.clipped.any():
         left_out = np.add.reduceat(record.clipped.astype(float), edges) > 0.0
         none = np.zeros(0)
-        spikes = found.get("stress") or Outliers(np.zeros(left_out.size, dtype=bool), none, none)
+        spikes = found.get("stress") or Outliers(np.zeros_like(left_out), none, none)
         top = float(record.stress[record.clipped].max())
         found["stress"] = replace(spikes, left_out=spikes.left_out | left_out, clipped_at=top)
     return found
@@ -264,19 +231,21 @@ def outlier_note(name: str, count: int, found: Outliers | None, timed: bool) -> 
     if found is None or not found.at.size:
         return f"{note} were bridged, none of them in the part that is used."
     unit = {"stress": "Pa", "velocity": "m/s", "acceleration": "m/s²"}.get(name, "m")
-    told = []
-    for at, value in list(zip(found.at.tolist(), found.values.tolist(), strict=True))[:4]:
-        place = engineering(at, "s") if timed else f"sample {at:.0f}"
-        told.append(f"{engineering(value, unit)} at {place}")
+    told = [
+        f"{engineering(value, unit)} at {engineering(at, 's') if timed else f'sample {at:.0f}'}"
+        for at, value in zip(found.at[:4], found.values[:4], strict=True)
+    ]
     used = found.at.size
-    more = f" and {used - len(told)} more" if used > len(told) else ""
+    more = f" and {used - 4} more" if used > 4 else ""
     part = "" if used == count else f", {used} of them in the part that is used"
     return f"{note} are not fitted{part}: {', '.join(told)}{more}."
 
 
-def fresh_samples(values: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def fresh_samples(
+    values: Array | NDArray[np.bool_],
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Samples at which a value is new, and for how many samples each is held."""
-    fresh = np.append(0, np.flatnonzero(np.diff(values) != 0.0) + 1)
+    fresh = np.append(0, np.flatnonzero(np.diff(values) != 0) + 1)
     return fresh, np.diff(np.append(fresh, len(values)))
 
 
@@ -291,17 +260,16 @@ def noise_of_held(record: Record) -> dict[str, NoiseLevel]:
     for name, values in record.curves().items():
         fresh = values[fresh_samples(values)[0]]
         if name != "stress" and is_staircase(values) and len(fresh) >= MIN_ROWS:
-            how = f"estimated from what local cubics leave of {len(fresh)} fresh samples"
-            step = len(values) / len(fresh)
-            levels[name] = NoiseLevel(residual_noise(fresh)[0], False, how, step)
+            level = estimated_noise(fresh, "fresh samples")
+            levels[name] = replace(level, time=len(values) / len(fresh))
     return levels
 
 
 def fill_staircase(record: Record) -> tuple[Record, list[str]]:
     """Interpolate displacements that are held while the stress goes on.
 
-    The instants where a value is fresh are kept. A much longer hold is a real one: it lasts
-    until one usual step before the next fresh value.
+    The instants where a value is fresh are kept. A hold of more than three usual steps is a real
+    one: it lasts until one usual step before the next fresh value.
     """
     notes, time = [], record.instants
     for name, values in record.curves().items():

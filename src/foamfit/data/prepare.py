@@ -1,27 +1,26 @@
 """From the samples of a file to one loading and unloading, with time zero where contact starts.
 
-`condition` tells the steps in their order. Each is a function that returns a new `Record` and a
-sentence for each thing that it did; nothing is dropped or changed without a sentence.
+`condition` holds the steps in their order. Each returns a new `Record` and a sentence for each
+thing that it changed or left out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import NoReturn
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from foamfit.data.contact import Start, cut_to_contact, find_start, remove_offset, zero_interior
+from foamfit.arrays import Array
+from foamfit.data.contact import cut_to_contact, find_start, remove_offset, smooth, zero_interior
 from foamfit.data.cycles import inner_reversals, select_cycle
 from foamfit.data.measurement import (
     INTEGRATED,
     MEASURED,
     MIN_ROWS,
-    Array,
     Dropped,
-    NoiseLevel,
+    Measurement,
+    Noise,
     Outliers,
     Record,
     RowCount,
@@ -30,7 +29,7 @@ from foamfit.data.measurement import (
     Window,
     interior_channel,
 )
-from foamfit.data.noise import averaged, estimated_noise, noise_at_rest, noise_level
+from foamfit.data.noise import averaged, estimated_noise, noise_before_contact, noise_level
 from foamfit.data.outliers import (
     bridge_outliers,
     fill_staircase,
@@ -39,28 +38,10 @@ from foamfit.data.outliers import (
     outlier_note,
     outliers_of_blocks,
 )
-from foamfit.data.rest import MIN_REST, line_at, smooth
 from foamfit.errors import InputError
 from foamfit.text import engineering, percent
 
 _MAX_ROWS, _BLOCKS = 1500, 1000  # above so many samples they are averaged in so many blocks
-
-
-@dataclass(frozen=True, eq=False)
-class Conditioned:
-    """A conditioned record, where its displacement came from, and what was done.
-
-    `noise` is what the samples before contact, or those where a held channel is fresh, say of it;
-    `contact` is the channel that set time zero: "stress", "motion", or "file" for the file's own.
-    """
-
-    record: Record
-    motion: str
-    notes: tuple[str, ...]
-    outliers: dict[str, Outliers]
-    noise: dict[str, NoiseLevel]
-    contact: str
-    count: RowCount
 
 
 def condition(
@@ -69,18 +50,16 @@ def condition(
     *,
     striker: Striker | None = None,
     window: Window | None = None,
-    advice: Mapping[str, str] | None = None,
-) -> Conditioned:
-    """Turn all samples of a file into one loading and unloading.
+    advice: Callable[[str], str] | None = None,
+) -> Measurement:
+    """Turn all samples of a file into one loading and unloading, a test without a name.
 
-    With a striker and a time the record is an impact, else a slow test whose displacement is
-    driven. `window` is what the user chose to look at, and `advice` what to say of a channel that
-    is plainly the other way round; see `check_signs`. At most 1500 samples are left; time and
-    displacement are zero where contact starts.
+    With a striker and a time it is an impact, else a slow test whose displacement is driven; for
+    `advice` see `check_signs`. At most 1500 samples are left; time and displacement are zero where
+    contact starts. The noise is estimated where samples before contact, or held ones, show it.
     """
     window, notes = window or Window(), list[str]()
-    striker = None if record.time is None else striker
-    impact = striker is not None
+    impact = striker is not None and record.time is not None
 
     def done(result: tuple[Record, list[str]]) -> Record:
         notes.extend(result[1])
@@ -89,14 +68,14 @@ def condition(
     record = done(cut_to_window(record, window))
     record = done(mark_clipped(bridge_outliers(record)))
     spoilt = {name: int(np.count_nonzero(excess)) for name, excess in record.excess.items()}
-    check_signs(record, advice or {})
+    check_signs(record, advice)
     held = noise_of_held(record)
     record = done(fill_staircase(record))
     if impact and window.cycle != 1:
         raise InputError("[window] cycle is for slow tests; for an impact give start and end.")
     first = record if impact else select_cycle(record, 1)[0]
     levels = held | {c: estimated_noise(v) for c, v in first.curves().items() if c not in held}
-    start = find_start(first, levels, striker)
+    start = find_start(first, levels, striker if impact else None)
     # Before a slow test nothing shows that the specimen is free.
     resting = start.rest(first) if impact or start.free else 0
     record = done(zero_interior(record, first, start, levels))
@@ -104,33 +83,41 @@ def condition(
     if not impact:
         record = done(select_cycle(record, window.cycle))
     if window.cycle > 1:  # a later cycle keeps the zero of the first, when the foam was fresh
-        how, resting = f"with cycle {window.cycle}", 0
-        start = Start(how, zero=start.zero, zero_from=start.zero_from)
+        start = replace(start, how=f"with cycle {window.cycle}", time=None, at_zero=False)
+        resting = 0
     record = done(cut_to_contact(record, start, impact, levels["stress"]))
     record, motion = integrate_motion(record, specimen, striker or Striker())
     if motion != MEASURED:
         notes.append(f"The file has no displacement: the motion is {motion}.")
-    notes += checks(record, specimen, striker, motion)
+    notes += checks(record, specimen, striker or Striker(), motion)
     whole, record = record, done(thin(record))
     block = -(-len(whole) // len(record))
-    noise = noise_before_contact(first.rows(slice(resting)), record, block)
+    before = {name: values[:resting] for name, values in first.curves().items()}
+    noise = noise_before_contact(before, record.curves(), block)
     noise |= {name: averaged(level, block) for name, level in held.items()}
     outliers = outliers_of_blocks(whole, block)
-    timed = record.time is not None
-    notes += [outlier_note(name, n, outliers.get(name), timed) for name, n in spoilt.items()]
-    count = count_rows(whole, outliers, block)
-    return Conditioned(record, motion, tuple(notes), outliers, noise, start.by, count)
+    for name, n in spoilt.items():
+        notes.append(outlier_note(name, n, outliers.get(name), record.time is not None))
+    channels = record.time, record.stress, record.displacement
+    return Measurement(
+        *("", None, "", *channels, specimen, striker),  # no name and no file
+        noise=Noise(estimated=noise),
+        motion=motion,
+        notes=tuple(notes),
+        interior=record.interior,
+        outliers=outliers,
+        contact=start.by,
+        count=count_rows(whole, outliers, block),
+    )
 
 
 def cut_to_window(record: Record, window: Window) -> tuple[Record, list[str]]:
     """Keep what lies between the window's start and end, as the file counts time."""
-    if window.start is None and window.end is None:
+    if (window.start, window.end) == (-np.inf, np.inf):
         return record, []
     if record.time is None:
         raise InputError("[window] start and end need a time column; the file has none.")
-    start = -np.inf if window.start is None else window.start
-    end = np.inf if window.end is None else window.end
-    inside = (record.time >= start) & (record.time <= end)
+    inside = (record.time >= window.start) & (record.time <= window.end)
     kept = int(inside.sum())
     if kept < MIN_ROWS:
         first, last = (engineering(float(t), "s") for t in record.time[[0, -1]])
@@ -146,39 +133,31 @@ def cut_to_window(record: Record, window: Window) -> tuple[Record, list[str]]:
     return record, [note]
 
 
-def check_signs(record: Record, advice: Mapping[str, str]) -> None:
-    """Refuse a channel that is plainly the other way round: compression is positive.
-
-    `advice` holds, by channel, what is wrong and what the user can write to turn it round.
-    """
-
-    def refuse(channel: str) -> NoReturn:
-        wrong = "is negative in compression; it must be positive: give its column and scale = -1"
-        raise InputError(f"the {advice.get(channel, f'{channel} {wrong} in [columns]')}.")
-
+def check_signs(record: Record, advice: Callable[[str], str] | None) -> None:
+    """Refuse a channel that is negative in compression; `advice` says what would be right."""
     stress, peak = record.stress, int(np.argmax(record.stress))
-    first = float(np.median(stress[:5]))
-    if first - stress.min() > 2 * max(stress[peak] - first, 0) and abs(stress.min()) > stress[peak]:
-        refuse("stress")
+    first, lowest = float(np.median(stress[:5])), stress.min()
+    negative = first - lowest > 2 * max(stress[peak] - first, 0) and abs(lowest) > stress[peak]
+    wrong = ["stress"] if negative else []
     for name, values in record.curves().items():
         moved = values[peak] - values[0]
         if name != "stress" and moved < -0.5 * np.ptp(values[: peak + 1]):
-            refuse(name)
+            wrong.append(name)
     acceleration, velocity = record.acceleration, record.velocity
-    if record.displacement is not None:
-        return
-    if acceleration is not None:
-        if np.dot(stress - first, acceleration) < 0:
-            refuse("acceleration")
-    elif velocity is not None and velocity[0] < velocity[-1]:
-        refuse("velocity")
+    if record.displacement is None and acceleration is not None:
+        wrong += ["acceleration"] if np.dot(stress - first, acceleration) < 0 else []
+    elif record.displacement is None and velocity is not None:
+        wrong += ["velocity"] if velocity[0] < velocity[-1] else []
+    if wrong:
+        plain = f"{wrong[0]} is negative in compression; give it scale = -1 in [columns]"
+        raise InputError(f"the {advice(wrong[0]) if advice else plain}.")
 
 
 def integrate_motion(record: Record, specimen: Specimen, striker: Striker) -> tuple[Record, str]:
     """Integrate a displacement that was not measured: from acceleration, velocity or force.
 
-    From w(0) = 0 and w'(0) the striker's velocity; w'' = −a, or −σA/m. The integrals are exact
-    where the channel is straight between samples.
+    w(0) = 0, w'(0) is the striker's velocity, w'' = −a or −σA/m; a channel is linear between
+    samples.
     """
     if record.displacement is not None:
         return record, MEASURED
@@ -209,7 +188,7 @@ def integrate_motion(record: Record, specimen: Specimen, striker: Striker) -> tu
     return record.changed("displacement", w[1:] if lead else w), f"integrated from {source}"
 
 
-def checks(record: Record, specimen: Specimen, striker: Striker | None, motion: str) -> list[str]:
+def checks(record: Record, specimen: Specimen, striker: Striker, motion: str) -> list[str]:
     """Refuse strains beyond one; say what is not plausible."""
     displacement, height = record.displacement, specimen.height
     assert displacement is not None  # measured or integrated by now
@@ -223,16 +202,16 @@ def checks(record: Record, specimen: Specimen, striker: Striker | None, motion: 
     for node, values in record.interior.items():
         name, most = interior_channel(node), float(values.max())
         if most >= height:
-            told = f"{engineering(most, 'm')}, the height {engineering(height, 'm')}"
-            raise InputError(f"{name} reaches {told}; check its unit.")
+            reached = f"{engineering(most, 'm')}, the height {engineering(height, 'm')}"
+            raise InputError(f"{name} reaches {reached}; check its unit.")
         if most > 1.05 * displacement.max():
             notes.append(f"Check: {name} goes farther than the top; check its unit and its node.")
     notes += _stress_notes(record.stress)
-    if striker and striker.velocity and record.time is not None and motion != INTEGRATED:
+    if striker.velocity and record.time is not None and motion != INTEGRATED:
         early = displacement <= 0.15 * displacement.max()
         early[int(np.argmax(displacement)) :] = False
         if early.sum() >= 3:
-            speed = line_at(record.time[early], displacement[early], 0.0)[1]
+            speed = float(np.polyfit(record.time[early], displacement[early], 1)[0])
             if abs(speed / striker.velocity - 1) > 0.1:
                 notes.append(
                     f"Check: the displacement starts at {speed:.3g} m/s, but the striker's velocity"
@@ -247,17 +226,13 @@ def checks(record: Record, specimen: Specimen, striker: Striker | None, motion: 
 def _stress_notes(stress: Array) -> list[str]:
     """Say where a stress does not start or end at zero."""
     peak, width, notes = float(stress.max()), max(1, len(stress) // 100), []
-    share = stress[:3].mean() / peak
-    if share > 0.05:
-        notes.append(
-            f"Check: the record starts under load, at {percent(share)} of the peak stress."
-        )
-    lowest = float(smooth(stress, width)[int(np.argmax(stress)) :].min())
+    first, lowest = stress[:3].mean(), float(smooth(stress, width)[np.argmax(stress) :].min())
+    if first > 0.05 * peak:
+        load = f"at {percent(first / peak)} of the peak stress"
+        notes.append(f"Check: the record starts under load, {load}.")
     if lowest < -max(0.002 * peak, 4 * noise_level(stress) / np.sqrt(width)):
-        notes.append(
-            f"The stress goes down to {engineering(lowest, 'Pa')} after the peak (adhesion, drift "
-            "or vibration); it is kept."
-        )
+        after = f"{engineering(lowest, 'Pa')} after the peak (adhesion, drift or vibration)"
+        notes.append(f"The stress goes down to {after}; it is kept.")
     return notes
 
 
@@ -276,36 +251,22 @@ def thin(record: Record) -> tuple[Record, list[str]]:
     return thinned, [f"{n} samples are averaged in {len(edges)} blocks of {size}."]
 
 
-def noise_before_contact(rest: Record, record: Record, block: int) -> dict[str, NoiseLevel]:
-    """Estimate the noise of each channel from the samples before contact, if they are twenty."""
-    if len(rest) < MIN_REST:
-        return {}
-    curves, before = record.curves(), rest.curves()
-    found = {
-        name: noise_at_rest(before[name], estimated_noise(values), block)
-        for name, values in curves.items()
-        if name in before  # else integrated
-    }
-    return {name: level for name, level in found.items() if level is not None}
-
-
 def count_rows(record: Record, outliers: dict[str, Outliers], block: int) -> RowCount:
     """Count the rows of the file: those in `record`, whose blocks are fitted, and those dropped."""
     dropped, used = list(record.dropped), np.ones(len(record), dtype=bool)
-
-    def drop(wrong: NDArray[np.bool_], why: str) -> None:
-        lost = record.row_numbers[wrong & used]
-        used[wrong] = False
-        if lost.size:
-            dropped.append(Dropped.of(lost, why))
-
     of_blocks = {c: np.repeat(o.left_out, block)[: len(record)] for c, o in outliers.items()}
-    for name, excess in record.excess.items():
-        drop(excess != 0.0, f"a spike or gap of the {name}, bridged by a straight line")
+    wrong = {
+        f"a spike or gap of the {name}, bridged by a straight line": excess != 0.0
+        for name, excess in record.excess.items()
+    }
     if record.clipped is not None:
-        drop(of_blocks["stress"] & record.clipped, "the force is clipped")
+        wrong["the force is clipped"] = of_blocks["stress"] & record.clipped
     for name, left_out in of_blocks.items():
-        drop(left_out, f"in a block of {block} samples of the {name} that is not fitted")
+        wrong[f"in a block of {block} samples of the {name} that is not fitted"] = left_out
+    for why, rows in wrong.items():
+        lost = record.row_numbers[rows & used]
+        used[rows] = False
+        dropped += [Dropped.of(lost, why)] if lost.size else []
     total = len(record) + sum(item.rows for item in record.dropped)
     in_order = tuple(sorted(dropped, key=lambda item: item.first))
     return RowCount(total, int(used.sum()), in_order)

@@ -44,10 +44,7 @@ _SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
 
 @dataclass(frozen=True)
 class Column:
-    """What [columns] says of one channel: its column, and the unit and scale of its numbers.
-
-    A column that `counts_down` is a gap or a position that gets smaller in compression.
-    """
+    """What [columns] says of one channel; one that `counts_down` gets smaller in compression."""
 
     column: str
     unit: str | None = None
@@ -69,26 +66,30 @@ class Settings:
     duplicates: str = "average"
 
 
-def load_toml(path: Path, otherwise: str) -> dict[str, Any]:
-    """Load a TOML file; `otherwise` says what it is needed for where there is none."""
+def read_bytes(path: Path, otherwise: str, most: int = -1) -> bytes:
+    """Read a file, its first bytes if `most` are given; `otherwise` says what would be right."""
     try:
         with path.open("rb") as file:
-            raw = file.read(_LARGEST + 1)
-        if len(raw) > _LARGEST:
-            size = path.stat().st_size
-            raise InputError(f"{path}: has {size} characters; a TOML must have {_LARGEST} at most.")
+            return file.read(most)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; {otherwise}.") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); {otherwise}.") from None
+
+
+def load_toml(path: Path, otherwise: str) -> dict[str, Any]:
+    """Load a TOML file; `otherwise` says what it is needed for where there is none."""
+    raw = read_bytes(path, otherwise, _LARGEST + 1)
+    if len(raw) > _LARGEST:
+        size = path.stat().st_size
+        raise InputError(f"{path}: has {size} characters; a TOML must have {_LARGEST} at most.")
+    try:
         text = raw.decode("utf-8-sig")
         if _DOTTED.search(text):  # tomllib takes a time that grows with the square of their number
             raise RecursionError
         return tomllib.loads(text)
     except RecursionError:
-        raise InputError(
-            f"{path}: is nested too deeply; a TOML of foamfit has few levels."
-        ) from None
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; {otherwise}.") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give a TOML file.") from None
+        raise InputError(f"{path}: is nested too deeply; write a TOML of few levels.") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: is no UTF-8 text; a TOML file must be.") from None
     except tomllib.TOMLDecodeError as error:
@@ -108,16 +109,11 @@ def check_keys(where: str, given: Iterable[str], valid: Iterable[str]) -> None:
 def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Settings:
     """Read and check the TOML at `path` that describes the file `test`.
 
-    [columns] may name `channels`, displacement_1, displacement_2, …
-
-    Raises
-    ------
-    InputError
-        Naming the file and the key that is wrong or missing.
+    [columns] may name `channels`, displacement_1, displacement_2, … InputError names the file and
+    the key that is wrong or missing.
     """
     document = load_toml(path, f"{test.name} needs a TOML with [specimen] height and diameter")
     check_keys(f"{path}:", document, ["name", "columns", *_SECTIONS])
-    name = _name(path, document["name"]) if "name" in document else printable(test.stem)
     values: dict[str, dict[str, Any]] = {}
     for section, keys in _SECTIONS.items():
         table = document.get(section, {})
@@ -126,7 +122,7 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
         check_keys(f"{path}: [{section}]", table, keys)
         values[section] = {k: _value(path, section, k, v) for k, v in table.items()}
     return Settings(
-        name=name,
+        name=_name(path, document["name"]) if "name" in document else printable(test.stem),
         specimen=_specimen(path, values["specimen"]),
         striker=Striker(**values["striker"]) if values["striker"] else None,
         noise=Noise(**values["noise"]),
@@ -137,44 +133,33 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
 
 
 def _name(path: Path, name: Any) -> str:
-    """Check the name of a test."""
     if not isinstance(name, str) or not name.strip():
         raise InputError(f"{path}: name = {name!r} is no text; give it in quotation marks.")
-    if len(name) > LONGEST:
-        raise InputError(
-            f"{path}: name has {len(name)} characters; it must have {LONGEST} at most."
-        )
-    control = next((c for c in name if not c.isprintable()), None)
-    if control is not None:
-        raise InputError(
-            f"{path}: name has a control character, U+{ord(control):04X}; write it in plain text."
-        )
+    n = len(name)
+    if n > LONGEST:
+        raise InputError(f"{path}: name has {n} characters; it must have {LONGEST} at most.")
+    for code in (f"U+{ord(c):04X}" for c in name if not c.isprintable()):
+        raise InputError(f"{path}: name has a control character, {code}; write it in plain text.")
     return name
 
 
 def _value(path: Path, section: str, key: str, value: Any) -> Any:
     si, example = _SECTIONS[section][key]
     where = f"{path}: [{section}] {key}"
-    if key == "cycle":
-        if type(value) is not int or value < 1:
-            raise InputError(f"{where} = {value!r} must be a whole number from 1 up.")
+    if key == "cycle" and (type(value) is not int or value < 1):
+        raise InputError(f"{where} = {value!r} must be a whole number from 1 up.")
+    if key == "duplicates" and value not in ("average", "refuse"):
+        raise InputError(f"{where} = {value!r} must be one of average, refuse.")
+    if key == "heights" and (not isinstance(value, list) or not value):
+        raise InputError(f'{where} must be a list like ["0.700 mm", "0.490 mm"], base first.')
+    if key in ("cycle", "duplicates"):
         return value
-    if key == "duplicates":
-        if value not in ("average", "refuse"):
-            raise InputError(f"{where} = {value!r} must be one of average, refuse.")
-        return value
-    if key == "heights":
-        if not isinstance(value, list) or not value:
-            raise InputError(f'{where} must be a list like ["0.700 mm", "0.490 mm"], base first.')
-        return tuple(_positive(parse_quantity(v, si, where, example), where, v) for v in value)
-    number = parse_quantity(value, si, where, example)
-    return number if section == "window" else _positive(number, where, value)
-
-
-def _positive(number: float, where: str, value: object) -> float:
-    if not (number > 0 and math.isfinite(number)):
-        raise InputError(f'{where} = "{value}" must be positive.')
-    return number
+    given = value if key == "heights" else [value]
+    numbers = tuple(parse_quantity(v, si, where, example) for v in given)
+    for number, v in zip(numbers, given, strict=True):
+        if section != "window" and not 0.0 < number < math.inf:
+            raise InputError(f'{where} = "{v}" must be positive.')
+    return numbers if key == "heights" else numbers[0]
 
 
 def _specimen(path: Path, values: dict[str, Any]) -> Specimen:
@@ -211,13 +196,9 @@ def _columns(path: Path, table: Any, channels: Iterable[str]) -> dict[str, Colum
         unit = spec.get("unit")
         if unit is not None and (not isinstance(unit, str) or not is_unit(unit)):
             raise InputError(f'{where}: unit = {unit!r} is unknown; give it like unit = "mm".')
-        scale = _scale(where, spec.get("scale", 1))
-        columns[channel] = Column(spec["column"], unit, *scale, down)
+        scale = spec.get("scale", 1)
+        parts = split_quantity(str(scale))
+        if parts is None or parts[0] in (0.0, math.inf, -math.inf) or not is_unit(parts[1]):
+            raise InputError(f'{where}: scale = {scale!r} must be like -1 or "4444.4 N/V".')
+        columns[channel] = Column(spec["column"], unit, *parts, down)
     return columns
-
-
-def _scale(where: str, scale: Any) -> tuple[float, str]:
-    parts = split_quantity(str(scale))
-    if parts is None or parts[0] in (0.0, math.inf, -math.inf) or not is_unit(parts[1]):
-        raise InputError(f'{where}: scale = {scale!r} must be like -1 or "4444.4 N/V".')
-    return parts

@@ -18,12 +18,11 @@ _QUANTITY = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*)")
 def _registry() -> Any:
     import pint
 
+    make = functools.partial(pint.UnitRegistry, autoconvert_offset_to_baseunit=True)
     try:  # parsing pint's definitions takes longer than most fits: it keeps them in a cache
-        registry: Any = pint.UnitRegistry(
-            autoconvert_offset_to_baseunit=True, cache_folder=":auto:"
-        )
+        registry: Any = make(cache_folder=":auto:")
     except OSError:
-        registry = pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
+        registry = make()
     registry.define("microstrain = 1e-6 = ustrain")
     return registry
 
@@ -71,10 +70,7 @@ def split_quantity(text: str) -> tuple[float, str] | None:
 
 
 def parse_quantity(value: object, si: str, where: str, example: str) -> float:
-    """Read a quantity such as "1.19 mm" in the unit `si`, "" for none.
-
-    A refusal names `where` it stands, file and key, and gives an `example`.
-    """
+    """Read a quantity such as "1.19 mm" in the unit `si`; `where` and `example` are for errors."""
     parts = split_quantity(value) if isinstance(value, str) else None
     if parts is None:
         raise InputError(f'{where} = {value!r} is no quantity; give it like "{example}".')

@@ -162,13 +162,12 @@ class Space:
     @cached_property
     def coordinates(self) -> list[tuple[int, str, int]]:
         """Place, short name, place of the spring's first parameter; what others need is first."""
-        out = []
-        order = list(BOX)
-        for name in sorted(self.free, key=lambda name: order.index(family(split_name(name)[1]))):
+        out, shorts = [], list(BOX)
+        for name in sorted(self.free, key=lambda name: shorts.index(family(split_name(name)[1]))):
             spring, short = split_name(name)
             first = self.model.index[f"s{spring + 1}_k0"] if spring >= 0 else -1
-            place = self.model.index.get(name, len(self.model.names))  # the nuisance stands last
-            out.append((place, short, first))
+            # The nuisance stands last.
+            out.append((self.model.index.get(name, len(self.model.names)), short, first))
         return out
 
     @cached_property
@@ -179,17 +178,12 @@ class Space:
 
     def _unit(self, short: str) -> float:
         """What a parameter is measured in, SI."""
-        if short == "height":
-            return self.scales.height
-        if short == "time_shift":
-            return LARGEST_SHIFT * self.scales.duration
-        if short in ("k0", "kc", "sigma_plus", "sigma_minus"):
-            return self.scales.stress
-        if short in ("kh_plus", "kh_minus"):
-            return self.scales.slope
-        if short == "eta":
-            return self.scales.eta
-        return self.scales.duration if is_time(short) else 1.0
+        scales = self.scales
+        units = {"height": scales.height, "eta": scales.eta, "tau": scales.duration}
+        units |= dict.fromkeys(("k0", "kc", "sigma_plus", "sigma_minus"), scales.stress)
+        units |= dict.fromkeys(("kh_plus", "kh_minus"), scales.slope)
+        units["time_shift"] = LARGEST_SHIFT * scales.duration
+        return units.get(family(short), 1.0)
 
     def encode(self, values: Array) -> Array:
         """Coordinates of a vector of parameters, moved into the box."""
@@ -252,11 +246,9 @@ class Space:
                 moves[i] = (1.0 - point[j]) * moves[first + 3]
                 moves[i, j] = LAST_STRAIN - values[first + 3]
             elif short == "dsigma":
-                v = 1.0 - values[first + 3]
-                rise = (
-                    values[first + 3] / v * moves[first]
-                    + values[first] / (v * v) * moves[first + 3]
-                )
+                eps_a = values[first + 3]
+                rise = eps_a / (1.0 - eps_a) * moves[first]
+                rise += values[first] / (1.0 - eps_a) ** 2 * moves[first + 3]
                 moves[i] = -point[j] * rise
                 moves[i, j] = -_stress_at_a1(values, first)
             else:

@@ -24,12 +24,8 @@ def choose_drive(measurement: Measurement) -> str:
     Raises InputError if the test has neither.
     """
     striker = measurement.striker
-    if (
-        striker is not None
-        and striker.mass is not None
-        and striker.velocity
-        and measurement.time is not None
-    ):
+    moving = striker is not None and striker.mass is not None and striker.velocity
+    if moving and measurement.time is not None:
         return "impact"
     if measurement.displacement is not None:
         return "displacement"
@@ -78,16 +74,13 @@ def check_interior(measurement: Measurement, springs: int) -> None:
     A single spring has nothing inside; the result's notes say so.
     """
     wrong = [node for node in sorted(measurement.interior) if node >= springs]
-    if not wrong or springs == 1:
-        return
-    name = interior_channel(wrong[0])
-    top = (
-        f"node {springs} of a {springs}-spring chain is the top, which is the 'displacement' column"
-    )
-    raise InputError(
-        f"{measurement.name}: {name} is no mass inside a chain of {springs} springs: {top}; take "
-        "a model of more springs, or rename or leave out that column"
-    )
+    if wrong and springs > 1:
+        raise InputError(
+            f"{measurement.name}: {interior_channel(wrong[0])} is no mass inside a chain of "
+            f"{springs} springs: node {springs} of a {springs}-spring chain is the top, which is "
+            "the 'displacement' column; take a model of more springs, or rename or leave out that "
+            "column"
+        )
 
 
 def default_weights(measurement: Measurement, drive: str, springs: int = 1) -> dict[str, float]:
@@ -139,10 +132,8 @@ def driving_stress(stress: Array, model: Model) -> Array:
 
 def check_time_shift(measurement: Measurement, drive: str) -> None:
     """Refuse a time shift where the test has no two channels in time (InputError)."""
-    missing = None
-    if measurement.time is None:
-        missing = "it has no time"
-    elif measurement.displacement is None or measurement.motion == INTEGRATED:
+    missing = "it has no time" if measurement.time is None else None
+    if missing is None and (measurement.displacement is None or measurement.motion == INTEGRATED):
         missing = "its motion is not measured apart from the force"
     if missing:
         raise InputError(

@@ -47,26 +47,16 @@ MAX_STEPS = 20_000
 
 @dataclass(frozen=True, eq=False)
 class Simulated:
-    """The curves of one set of parameters; None where the drive prescribes or the test lacks them.
+    """The curves of one set of parameters and the run itself.
 
-    `stress_strain` is the stress (Pa) along the measured displacement. `motion` is the run itself.
-    `interior` holds the displacements (m) of the masses inside that the test has too, `slopes` the
+    `curves` are by their names in `Objective.curves`, absent where the drive prescribes or the test
+    lacks them; stress_strain is the stress (Pa) along the measured displacement. `slopes` are the
     derivatives (p, n) of the curves by the parameters that were asked for; None where none were.
     """
 
-    stress_time: Array | None
-    displacement_time: Array | None
-    stress_strain: Array | None
+    curves: dict[str, Array]
     motion: Motion
-    interior: dict[str, Array] = field(default_factory=dict)
     slopes: dict[str, Array] | None = None
-
-    def curve(self, name: str) -> Array | None:
-        """Return a curve by its name in `Objective.curves`."""
-        if name not in CURVES:
-            return self.interior.get(name)
-        values: Array | None = getattr(self, name)
-        return values
 
 
 @dataclass(eq=False)
@@ -105,7 +95,12 @@ class Objective:
         self._check_weights()
         self._dashpots = np.array([name.endswith("eta") for name in self.model.names])
         self._dashpots[-1] = False  # the onsite damper is none of a spring
-        self.time = self._time()
+        time = self.measurement.time
+        # Of the samples, s; their number where the test has no time.
+        self.time = np.arange(self._stress.size, dtype=float) if time is None else time
+        self._absent = {"stress": ["stress_time"], "displacement": ["displacement_time"]}.get(
+            self.drive, []
+        ) + (["stress_time"] if time is None else [])
         loading = self._loading()
         self._plans = {damped: self._scene(loading, damped=damped) for damped in (False, True)}
         self._along: dict[bool, Plan] = {}
@@ -113,29 +108,19 @@ class Objective:
             along = DisplacementDrive(self.measurement.displacement)
             self._along = {damped: self._scene(along, damped=damped) for damped in (False, True)}
         self.measured = self._measured()
-        self.counted = tuple(
-            name
-            for name in self.curves
-            if self.weights[name] > 0 and self.measured[name] is not None
-        )
+        self.counted = tuple(name for name in self.measured if self.weights[name] > 0)
         self._inside = any(name in self.interior for name in self.counted)
         if not self.counted:
             raise InputError(
                 f"{self.measurement.name}: no curve is left to fit; give one that the "
                 f"{self.drive} drive has a weight above zero"
             )
-        self.scale = {name: self._scale(name) for name in self.curves}
-        self._kept = {name: self._fitted(name) for name in self.curves}
-        self.sizes = tuple(self._curve(name)[self._kept[name]].size for name in self.counted)
+        self.scale = {name: self._scale(name) for name in self.measured}
+        self._kept = {name: self._fitted(name) for name in self.measured}
+        self.sizes = tuple(self.kept(name).size for name in self.counted)
         self.n_data = sum(self.sizes)
         # Worse per sample than any curve that stays within ten ranges.
-        self.penalty = max(
-            PENALTY
-            * self.weights[name] ** 0.5
-            * float(np.ptp(self._curve(name)))
-            / self.scale[name]
-            for name in self.counted
-        )
+        self.penalty = max(PENALTY * self.span(name) for name in self.counted)
 
     def _check_weights(self) -> None:
         for name, weight in self.weights.items():
@@ -146,12 +131,6 @@ class Objective:
                     f"{', '.join(self.curves)} a weight of zero or more"
                 )
         self.weights = dict.fromkeys(self.curves, 0.0) | self.weights
-
-    def _time(self) -> Array:
-        """Time of the samples, s; their number where the test has no time."""
-        time = self.measurement.time
-        stress = self._stress
-        return np.arange(stress.size, dtype=float) if time is None else time
 
     @property
     def _stress(self) -> Array:
@@ -190,24 +169,15 @@ class Objective:
         chain = Chain(springs, heights, specimen.area, masses)
         return make_plan(chain, loading, self.time, dashpots=damped, max_steps=MAX_STEPS)
 
-    def _measured(self) -> dict[str, Array | None]:
+    def _measured(self) -> dict[str, Array]:
         """Measured curves that the drive leaves free."""
-        motion = self.measurement.displacement
+        measured = {"stress_time": self._stress}
+        if self.measurement.displacement is not None:
+            measured["displacement_time"] = self.measurement.displacement
+            measured["stress_strain"] = self._stress
         inside = self.measurement.interior
-        return {
-            "stress_time": None if self.drive == "stress" else self._timed(self._stress),
-            "displacement_time": None if self.drive == "displacement" else motion,
-            "stress_strain": None if motion is None else self._stress,
-            **{name: inside[node] for name, node in self.interior.items()},
-        }
-
-    def _timed(self, values: Array) -> Array | None:
-        return None if self.measurement.time is None else values
-
-    def _curve(self, name: str) -> Array:
-        curve = self.measured[name]
-        assert curve is not None
-        return curve
+        measured |= {name: inside[node] for name, node in self.interior.items()}
+        return {name: curve for name, curve in measured.items() if name not in self._absent}
 
     @property
     def nuisance(self) -> tuple[str, ...]:
@@ -218,10 +188,6 @@ class Objective:
         """Channel of the test that a curve is compared with."""
         return name.removesuffix("_time") if name.startswith("displacement") else "stress"
 
-    def measured_size(self, name: str) -> int:
-        """Samples of a curve, outliers and all."""
-        return self._curve(name).size
-
     def noise(self, name: str) -> NoiseLevel:
         """Noise of a curve, stated or estimated."""
         level = self.measurement.noise.of(self.channel(name))
@@ -230,11 +196,9 @@ class Objective:
 
     def _scale(self, name: str) -> float:
         """One standard deviation of a curve's noise; an estimated one not below MODEL_ERROR."""
-        curve = self.measured[name]
-        if curve is None:
-            return 1.0
         level = self.noise(name)
-        return level.sigma if level.given else max(level.sigma, MODEL_ERROR * float(np.ptp(curve)))
+        least = MODEL_ERROR * float(np.ptp(self.measured[name]))
+        return level.sigma if level.given else max(level.sigma, least)
 
     def _fitted(self, name: str) -> slice | NDArray[np.bool_]:
         """Samples of a curve that count: all but the outliers of its channel."""
@@ -269,7 +233,7 @@ class Objective:
         self.failures += other.failures
 
     def _springs(self, values: Array, everything: bool, places: NDArray[np.int64]) -> Simulated:
-        """Simulate the parameters of the model, on one clock; see `simulate`."""
+        """Simulate the parameters of the model, without a time shift; see `simulate`."""
         height = self.measurement.specimen.height
         rows = self.model.rows(values)
         heights = np.ascontiguousarray(self.model.heights(values, height))
@@ -288,23 +252,21 @@ class Objective:
         if along is None and self._along and (everything or "stress_strain" in self.counted):
             plan = self._along[damped]
             along = plan.run(rows, heights, self.rtol, everything=False, directions=wanted)
-        slopes: dict[str, Array] | None = None
-        if run.slopes is not None and (along is None or along.slopes is not None):
-            moved, pressed = run.slopes
-            slopes = {"stress_time": pressed, "displacement_time": moved[:, -1]}
-            slopes |= {name: moved[:, node - 1] for name, node in inside.items()}
-            if along is not None and along.slopes is not None:
-                slopes["stress_strain"] = along.slopes.base_stress
-            for slope in slopes.values():
-                slope[places == values.size - 1] /= height  # site_eta acts through η_site/H
-        return Simulated(
-            stress_time=None if self.drive == "stress" else self._timed(run.base_stress),
-            displacement_time=None if self.drive == "displacement" else run.displacement[-1],
-            stress_strain=None if along is None else along.base_stress,
-            motion=run,
-            interior={name: run.displacement[node - 1] for name, node in inside.items()},
-            slopes=slopes,
-        )
+        curves = {"stress_time": run.base_stress, "displacement_time": run.displacement[-1]}
+        curves |= {name: run.displacement[node - 1] for name, node in inside.items()}
+        if along is not None:
+            curves["stress_strain"] = along.base_stress
+        curves = {name: curve for name, curve in curves.items() if name not in self._absent}
+        if run.slopes is None or (along is not None and along.slopes is None):
+            return Simulated(curves, run)
+        moved, pressed = run.slopes
+        slopes = {"stress_time": pressed, "displacement_time": moved[:, -1]}
+        slopes |= {name: moved[:, node - 1] for name, node in inside.items()}
+        if along is not None and along.slopes is not None:
+            slopes["stress_strain"] = along.slopes.base_stress
+        for slope in slopes.values():
+            slope[places == values.size - 1] /= height  # site_eta acts through η_site/H
+        return Simulated(curves, run, slopes)
 
     def shifted(
         self, curves: Simulated, late: float, by_shift: NDArray[np.bool_] = NOWHERE == 0
@@ -314,11 +276,10 @@ class Objective:
         Slopes are shifted with their curves. Where `by_shift` (n_places,) marks one by the shift
         itself, that is a difference over one sample: no simulation is in it.
         """
-        there = {name: curve for name in self.curves if (curve := curves.curve(name)) is not None}
-        slopes: dict[str, Array] | None = None
+        there, slopes = curves.curves, curves.slopes
         if by_shift.size:
             step = float(np.median(np.diff(self.time)))
-            own = curves.slopes or {name: np.empty((0, self.time.size)) for name in there}
+            own = slopes or {name: np.empty((0, self.time.size)) for name in there}
             slopes = {}
             for name in there.keys() & own.keys():
                 out = np.empty((by_shift.size, self.time.size))
@@ -329,22 +290,15 @@ class Objective:
                 slopes[name] = out
         if late != 0.0:
             there = {name: self._shift(name, curve, late) for name, curve in there.items()}
-        return replace(
-            curves,
-            stress_time=there.get("stress_time"),
-            displacement_time=there.get("displacement_time"),
-            stress_strain=there.get("stress_strain"),
-            interior={name: there[name] for name in curves.interior},
-            slopes=slopes,
-        )
+        return replace(curves, curves=there, slopes=slopes)
 
     def _shift(self, name: str, curve: Array, late: float, speed: float | None = None) -> Array:
         """One curve, or its derivative, seen by channels of which the motion is late (s).
 
-        Where the clock is that of the force, the motion is seen later; where it is that of the
-        motion (time zero is read off it, or it drives), the force is seen earlier. Before contact
-        the striker comes at its velocity, or at `speed` (m/s), and nothing bears stress; a
-        displacement that was set to zero where the stress starts is so here.
+        Where time is that of the force the motion is seen later; where it is that of the motion
+        (time zero is read off it, or it drives) the force is seen earlier. Before contact the
+        striker comes at its velocity, or at `speed` (m/s), and no stress acts; a displacement that
+        was set to zero where the stress starts is so here.
         """
         impact, contact = self.drive == "impact", self.measurement.contact
         by_motion = self.drive == "displacement" or (impact and contact == "motion")
@@ -385,18 +339,20 @@ class Objective:
 
     def compare(self, curves: Simulated) -> Array:
         """Residuals of simulated curves before the loss gives way to large ones, (n_data,)."""
-        parts = []
-        for name in self.counted:
-            simulated = curves.curve(name)
-            assert simulated is not None  # a curve is counted only if the drive leaves it free
-            difference = simulated - self._curve(name)
-            parts.append(difference[self._kept[name]] * self._factor(name))
+        parts = [
+            (curves.curves[name] - self.measured[name])[self._kept[name]] * self.factor(name)
+            for name in self.counted
+        ]
         # A stress near the pole of branch c is as bad as none.
         return np.asarray(np.clip(np.concatenate(parts), -self.penalty, self.penalty))
 
-    def _factor(self, name: str) -> float:
-        """What makes a curve's difference a residual."""
+    def factor(self, name: str) -> float:
+        """Residual of a curve that is off by one SI unit."""
         return float(self.weights[name] ** 0.5 / self.scale[name])
+
+    def span(self, name: str) -> float:
+        """Measured range of a curve, in the unit of its residual."""
+        return float(np.ptp(self.measured[name])) * self.factor(name)
 
     def jacobian(self, values: Array, places: NDArray[np.int64]) -> Array:
         """Derivative of the residual by the parameters at `places`, (n_data, n_places), SI.
@@ -410,7 +366,7 @@ class Objective:
         if curves.slopes is None:  # none were asked for
             return np.zeros((self.n_data, 0))
         parts = [
-            curves.slopes[name][:, self._kept[name]] * self._factor(name) for name in self.counted
+            curves.slopes[name][:, self._kept[name]] * self.factor(name) for name in self.counted
         ]
         slopes = np.concatenate(parts, axis=1).T
         residual = self.compare(curves)
@@ -424,13 +380,13 @@ class Objective:
 
     def kept(self, name: str) -> NDArray[np.intp]:
         """Samples of a curve that stand in the residual, in their order: all but outliers."""
-        return np.arange(self.measured_size(name))[self._kept[name]]
+        return np.arange(self.time.size)[self._kept[name]]
 
     def rms(self, residual: Array) -> dict[str, float]:
         """RMS of each counted curve in its unit, from residuals before the loss."""
         parts = np.split(residual, np.cumsum(self.sizes)[:-1])
         return {
-            name: float(np.sqrt(np.mean(part**2))) / self._factor(name)
+            name: float(np.sqrt(np.mean(part**2))) / self.factor(name)
             for name, part in zip(self.counted, parts, strict=True)
         }
 
@@ -446,7 +402,7 @@ class Objective:
 
     def off(self, curves: Simulated, name: str) -> float | None:
         """RMS of simulated minus measured over the measured range of one curve, if it is there."""
-        measured, simulated = self.measured[name], curves.curve(name)
+        measured, simulated = self.measured.get(name), curves.curves.get(name)
         if measured is None or simulated is None:
             return None
         miss = (simulated - measured)[self._kept[name]]

@@ -40,7 +40,7 @@ def make_params(
     model : str or Model
         For example "linear+bistable".
     drive : str, optional
-        "impact", "stress" or "displacement"; see `fitting.objective.choose_drive`.
+        "impact", "stress" or "displacement"; see `fitting.curves.choose_drive`.
     time_shift : bool
         Whether the time by which the motion channel is late is a parameter too.
     relaxation : int
@@ -89,11 +89,9 @@ def make_params(
     if time_shift:
         most = LARGEST_SHIFT * scales.duration
         params.add("time_shift", value=0.0, min=-most, max=most)
-    for name in model.names:
-        if name.endswith("_dsigma"):
-            own = name.removesuffix("dsigma")
-            eps_a = params[own + "eps_a"].value
-            params[name].value = -0.2 * params[own + "k0"].value * eps_a / (1.0 - eps_a)
+    for own in (name.removesuffix("dsigma") for name in model.names if name.endswith("_dsigma")):
+        eps_a = params[own + "eps_a"].value
+        params[own + "dsigma"].value = -0.2 * params[own + "k0"].value * eps_a / (1.0 - eps_a)
     return params
 
 
@@ -103,20 +101,19 @@ def _add_heights(params: lmfit.Parameters, measurement: Measurement, model: Mode
     if count == 1:
         return
     specimen = measurement.specimen
-    if specimen.heights is not None:
-        if len(specimen.heights) != count:
-            raise InputError(
-                f"{measurement.name}: [specimen] heights has {len(specimen.heights)} values for "
-                f"a model of {count} springs; give one per spring, base first"
-            )
-        for i, height in enumerate(specimen.heights, start=1):
-            params.add(f"s{i}_height", value=height, vary=False)
+    if specimen.heights is None:
+        low, value = 0.02 * specimen.height, specimen.height / count
+        for i in range(1, count):
+            params.add(f"s{i}_height", value=value, min=low, max=specimen.height - low)
+        params.add(f"s{count}_height", expr=_rest_of_height(measurement, model))
         return
-    low = 0.02 * specimen.height
-    for i in range(1, count):
-        value = specimen.height / count
-        params.add(f"s{i}_height", value=value, min=low, max=specimen.height - low)
-    params.add(f"s{count}_height", expr=_rest_of_height(measurement, model))
+    if len(specimen.heights) != count:
+        raise InputError(
+            f"{measurement.name}: [specimen] heights has {len(specimen.heights)} values for "
+            f"a model of {count} springs; give one per spring, base first"
+        )
+    for i, height in enumerate(specimen.heights, start=1):
+        params.add(f"s{i}_height", value=height, vary=False)
 
 
 def _rest_of_height(measurement: Measurement, model: Model) -> str:
@@ -192,23 +189,16 @@ class Problem:
 
     def _last_height(self, values: Array) -> Array:
         """Complete the heights to that of the specimen; the expression itself, but fast."""
-        count = len(self.model.kinds)
-        first = self.model.index["s1_height"]
-        others = values[first : first + count - 1]
-        values[first + count - 1] = self.measurement.specimen.height - others.sum()
+        first, last = self.model.index["s1_height"], len(self.model.kinds) - 1
+        others = values[first : first + last]
+        values[first + last] = self.measurement.specimen.height - others.sum()
         return values
 
     def space(self) -> Space:
         """The box in which the search moves."""
-        return Space(
-            model=self.model,
-            scales=self.scales,
-            values=self.vector(),
-            free=self.free(),
-            low=np.array([self.params[name].min for name in self.names]),
-            high=np.array([self.params[name].max for name in self.names]),
-            tied=self.tied(),
-        )
+        params = [self.params[name] for name in self.names]
+        low, high = np.array([one.min for one in params]), np.array([one.max for one in params])
+        return Space(self.model, self.scales, self.vector(), self.free(), low, high, self.tied())
 
     def sizes(self, names: tuple[str, ...], values: Array) -> Array:
         """Scales of some parameters at a point."""
@@ -283,14 +273,14 @@ def make_problem(
     )  # fmt: skip
     measurement = objective.measurement  # with the noise of each channel
     wanted = make_params(measurement, model, drive, time_shift=time_shift)
-    for name in params or ():
-        if name not in wanted:
-            raise InputError(
-                f"parameter '{name}' is not one of the model {model.name}; "
-                f"its parameters are {', '.join(wanted)}"
-            )
-    for name in params or ():
-        wanted[name] = params[name]  # type: ignore[index]
+    params = lmfit.Parameters() if params is None else params
+    if unknown := [name for name in params if name not in wanted]:
+        raise InputError(
+            f"parameter '{unknown[0]}' is not one of the model {model.name}; "
+            f"its parameters are {', '.join(wanted)}"
+        )
+    for name in params:
+        wanted[name] = params[name]
     _check_held(wanted)
     if not any(parameter.vary for parameter in wanted.values()):
         raise InputError("no parameter varies; let at least one vary")

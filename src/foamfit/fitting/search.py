@@ -1,8 +1,7 @@
 """The search: start values read from the curve, and descents from the best of many.
 
-It moves in the box of `fitting.box`, so that no start needs luck and no step can leave
-what the law admits. It first fits the loop (stress along the measured motion, closed form, cheap)
-and only then the curves of the drive itself.
+It moves in the box of `fitting.box`, so that no step leaves what the law admits. It first fits the
+loop (stress along the measured motion, closed form, cheap), then the curves of the drive itself.
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import numpy as np
 from scipy.stats import qmc
@@ -18,7 +16,7 @@ from scipy.stats import qmc
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.fitting import levenberg
-from foamfit.fitting.box import LAST_STRAIN, Scales, Space, is_share, is_time
+from foamfit.fitting.box import BOX, LAST_STRAIN, Scales, Space, family
 from foamfit.fitting.curves import smoothed
 from foamfit.fitting.objective import Objective
 from foamfit.springs.law import least_eps_star
@@ -51,9 +49,8 @@ def what_stopped(error: BaseException) -> str:
 class SearchRecord:
     """How a search went."""
 
-    # What it was asked for.
     seed: int
-    starts: int
+    starts: int  # Descents on the loop that were asked for
     began: float  # `time.perf_counter` at its start, s
     # Final costs of the descents on the drive's curves, best first, and how many descents on the
     # loop led to each.
@@ -86,12 +83,6 @@ class Tracker:
             raise SearchStoppedError
         return residual
 
-    def slopes(self, space: Space, point: Array) -> Array:
-        """Derivative of the residual by the coordinates of a point, (n_data, n_free)."""
-        values = space.decode(point)
-        moves = space.slopes(point, values)
-        return self.objective.jacobian_along(values, moves)
-
     def consider(self, values: Array, shift: Array | float = 0.0) -> Array:
         """Residual of the objective, whatever the time; with a shift, that of other data."""
         failures = self.objective.failures
@@ -109,21 +100,17 @@ class Tracker:
 
 def smooth_loop(measurement: Measurement) -> Measurement:
     """Smooth and thin the measured loop, for the first descent only."""
-    motion, stress = measurement.displacement, measurement.stress
+    motion, stress, time = measurement.displacement, measurement.stress, measurement.time
     assert motion is not None
     assert stress is not None
     window = max(motion.size // 60, 1) * 2 + 1
-    if window > 3:
-        motion = smoothed(motion, window)
+    motion = smoothed(motion, window) if window > 3 else motion
     keep = np.unique(np.linspace(0, motion.size - 1, min(motion.size, LOOP_SAMPLES)).astype(int))
-    time = measurement.time
+    thinned = None if time is None else time[keep]
     return replace(
-        measurement,
-        displacement=motion[keep],
-        stress=stress[keep],
-        time=None if time is None else time[keep],
+        measurement, displacement=motion[keep], stress=stress[keep], time=thinned,
         outliers={},  # bridged, and smoothed over
-    )
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,20 +120,11 @@ class Loop:
     strain: Array
     stress: Array
 
-    @cached_property
-    def peak(self) -> int:
-        """Sample of the largest strain."""
-        return int(np.argmax(self.strain))
-
-    def loading(self, strain: float) -> float:
-        """Stress on the way up, Pa."""
-        up = np.maximum.accumulate(self.strain[: self.peak + 1])
-        return float(np.interp(strain, up, self.stress[: self.peak + 1]))
-
-    def unloading(self, strain: float) -> float:
-        """Stress on the way down, Pa."""
-        down = np.maximum.accumulate(self.strain[self.peak :][::-1])
-        return float(np.interp(strain, down, self.stress[self.peak :][::-1]))
+    def at(self, strain: float, *, loading: bool) -> float:
+        """Stress (Pa) on the way up to the largest strain, or down from it."""
+        peak = int(np.argmax(self.strain))
+        way = slice(peak + 1) if loading else slice(None, peak - 1 if peak else None, -1)
+        return float(np.interp(strain, np.maximum.accumulate(self.strain[way]), self.stress[way]))
 
 
 def read_spring(loop: Loop, marks: Array, scales: Scales) -> Array:
@@ -156,15 +134,15 @@ def read_spring(loop: Loop, marks: Array, scales: Scales) -> Array:
     the stress at C2 and of the damping. Returned are k0 … kh_minus, eta (SI): initial slope from
     A1, k_h+ from A1 to C1, k_c through C1 and C2, k_h- from C2 towards rest.
     """
-    last = float(loop.strain[loop.peak])
+    last = float(np.max(loop.strain))
     eps_a = min((0.02 + 0.85 * marks[0]) * last, 0.9)
-    sigma_a = max(loop.loading(eps_a), 0.005 * scales.stress)
+    sigma_a = max(loop.at(eps_a, loading=True), 0.005 * scales.stress)
     hat_c = eps_a + (0.15 + 1.1 * marks[1]) * max(last - eps_a, 1e-3)  # perhaps never reached
     seen = min(hat_c, max(last, eps_a + 1e-3))
-    kh_plus = max((loop.loading(seen) - sigma_a) / (seen - eps_a), 0.0)
+    kh_plus = max((loop.at(seen, loading=True) - sigma_a) / (seen - eps_a), 0.0)
     sigma_hat_c = sigma_a + kh_plus * (hat_c - eps_a)
     eps_c = eps_a + (0.2 + 0.8 * marks[2]) * (hat_c - eps_a)
-    sigma_c = loop.unloading(eps_c) * (0.5 + marks[3])
+    sigma_c = loop.at(eps_c, loading=False) * (0.5 + marks[3])
     sigma_c = min(max(sigma_c, 0.02 * sigma_a), 0.98 * sigma_a)
     return np.array(
         [
@@ -224,8 +202,7 @@ def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> l
     """Vectors of parameters read off the measured loop, from a Latin hypercube of marks.
 
     Linear springs take a share of the largest displacement; each hysteretic spring is then read off
-    what is left with marks of its own. Springs in series that each follow the loop follow it
-    together.
+    what is left, with marks of its own.
     """
     assert loop.displacement is not None
     assert loop.stress is not None
@@ -271,24 +248,13 @@ def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> l
 
 def box_starts(space: Space, rng: np.random.Generator, count: int) -> list[Array]:
     """Latin hypercube over the inner part of the box, whatever the curve looks like."""
-    low, high = (edge.copy() for edge in space.box)
-    for j, (_, short, _) in enumerate(space.coordinates):
-        if short in ("kh_plus", "kh_minus"):
-            high[j] = 4.0
-        elif short == "eta":
-            high[j] = 0.3
-        elif short == "time_shift":
-            low[j], high[j] = -0.3, 0.3
-        elif short in ("k0", "kc"):
-            low[j], high[j] = np.log(0.3), np.log(300.0)
-        elif short in ("sigma_plus", "sigma_minus"):
-            low[j], high[j] = np.log(0.02), np.log(1.0)
-        elif short in ("spread_plus", "spread_minus"):
-            low[j], high[j] = np.log(0.05), np.log(2.0)
-        elif is_share(short):
-            high[j] = 1.0
-        elif is_time(short):
-            low[j], high[j] = np.log(0.002), np.log(1.0)
+    inner = {"kh_plus": (0.0, 4.0), "kh_minus": (0.0, 4.0), "eta": (0.0, 0.3), "g": (0.0, 1.0)}
+    inner |= {"time_shift": (-0.3, 0.3), "tau": tuple(np.log([0.002, 1.0]))}
+    inner |= dict.fromkeys(("k0", "kc"), tuple(np.log([0.3, 300.0])))
+    inner |= dict.fromkeys(("sigma_plus", "sigma_minus"), tuple(np.log([0.02, 1.0])))
+    inner |= dict.fromkeys(("spread_plus", "spread_minus"), tuple(np.log([0.05, 2.0])))
+    shorts = [family(short) for _, short, _ in space.coordinates]
+    low, high = np.array([inner.get(short, BOX[short]) for short in shorts]).T
     return list(low + (high - low) * qmc.LatinHypercube(low.size, rng=rng).random(count))
 
 
@@ -303,9 +269,13 @@ def descend(
     tracker: Tracker, space: Space, start: Array, iterations: int, enough: float = 1e-5
 ) -> tuple[float, Array]:
     """Levenberg-Marquardt descent inside the box; returns (cost, coordinates) of its end."""
+
+    def jacobian(point: Array) -> Array:
+        values = space.decode(point)
+        return tracker.objective.jacobian_along(values, space.slopes(point, values))
+
     end = levenberg.descend(
-        lambda point: tracker.residual(space.decode(point)),
-        lambda point: tracker.slopes(space, point),
+        lambda point: tracker.residual(space.decode(point)), jacobian,
         start, space.box, iterations, enough=enough,
     )  # fmt: skip
     return end.cost, end.point
@@ -314,8 +284,7 @@ def descend(
 def rank(tracker: Tracker, space: Space, points: list[Array]) -> list[tuple[float, Array]]:
     """Points of the box with their costs, cheapest first."""
     residuals = [tracker.residual(space.decode(point)) for point in points]
-    costs = [float(residual @ residual) for residual in residuals]
-    return sorted(zip(costs, points, strict=True), key=_cost)
+    return sorted(((float(r @ r), p) for r, p in zip(residuals, points, strict=True)), key=_cost)
 
 
 def spread_out(space: Space, points: list[Array], count: int) -> list[Array]:
@@ -327,10 +296,9 @@ def spread_out(space: Space, points: list[Array], count: int) -> list[Array]:
     if not marks:
         return points[:count]
     places = np.array([point[marks[0]] for point in points])
-    edges = np.quantile(places, np.linspace(0, 1, count + 1)[1:-1])
-    strata = np.searchsorted(edges, places)
-    first = [int(np.argmax(strata == stratum)) for stratum in np.unique(strata)]
-    chosen = list(dict.fromkeys([*sorted(first), *range(len(points))]))[:count]
+    strata = np.searchsorted(np.quantile(places, np.linspace(0, 1, count + 1)[1:-1]), places)
+    first = np.sort(np.unique(strata, return_index=True)[1]).tolist()
+    chosen = list(dict.fromkeys([*first, *range(len(points))]))[:count]
     return [points[i] for i in sorted(chosen)]
 
 
@@ -351,12 +319,7 @@ def distinct(ends: list[tuple[float, Array]], apart: float = 1e-3) -> list[tuple
 
 
 def search(
-    tracker: Tracker,
-    space: Space,
-    *,
-    starts: int,
-    rng: np.random.Generator,
-    progress: Progress,
+    tracker: Tracker, space: Space, *, starts: int, rng: np.random.Generator, progress: Progress
 ) -> list[tuple[float, int]]:
     """Search for the best parameters; the tracker keeps them.
 
@@ -368,8 +331,8 @@ def search(
     counts: dict[int, int] = {}
     if tracker.objective.measurement.displacement is not None:
         found = distinct(_search_loop(tracker, space, points, starts, rng, progress))
-        counts = {id(point): count for count, point in found}
         points = [point for _, point in found]
+        counts = {id(point): count for count, point in found}
     ranked = rank(tracker, space, points)
     if tracker.objective.interior_mass:
         progress(0.7, "vibration")
@@ -394,13 +357,9 @@ def ensure_feasible(tracker: Tracker, space: Space, rng: np.random.Generator) ->
 
 
 def _search_loop(
-    tracker: Tracker,
-    space: Space,
-    points: list[Array],
-    starts: int,
-    rng: np.random.Generator,
-    progress: Progress,
-) -> list[tuple[float, Array]]:
+    tracker: Tracker, space: Space, points: list[Array], starts: int,
+    rng: np.random.Generator, progress: Progress,
+) -> list[tuple[float, Array]]:  # fmt: skip
     """Descend on the smoothed loop, from the curve's own starts too; returns costs and ends.
 
     However this ends, the best point of the loop is handed to the tracker.
@@ -429,8 +388,8 @@ def _search_loop(
 def _scan_vibration(tracker: Tracker, space: Space, start: Array) -> list[tuple[float, Array]]:
     """Fits of the massless chain for each stiffness of a linear spring, ranked with its masses.
 
-    An interior mass vibrates on a stiff linear spring, and the cost has a minimum for every cycle
-    that the simulated vibration gains on the measured one: no descent crosses from one to the next.
+    The cost has a minimum for every cycle that the vibration of an interior mass on a stiff spring
+    gains on the measured one: no descent crosses from one to the next.
     """
     objective = replace(tracker.objective, interior_mass=False)
     massless = Tracker(objective, tracker.deadline)

@@ -1,5 +1,5 @@
 """What a person reads: the page, figures, comparisons, and the look ahead at a test.
 
 `page` makes the report, `plots` its figures, `comparison` sets results beside published ones.
-A newcomer may skip `explore`, the widget of the notebook.
+A newcomer may skip `explore`, which draws for the sliders of a notebook.
 """

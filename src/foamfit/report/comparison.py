@@ -1,8 +1,7 @@
 """Fitted parameters beside the published ones, or beside those of another fit.
 
 Everything is shown as the paper's tables show it: stiffness of branch a in MPa, the other slopes as
-ratios to it, the stress drop as a ratio to σ_a. Where the difference of two numbers would mean
-nothing, there is a sentence instead of a percentage.
+ratios to it, the stress drop as a ratio to σ_a.
 """
 
 from __future__ import annotations
@@ -24,31 +23,7 @@ ETA_PUBLISHED = (
     "the published η is numerical, it sets how the paper's relaxation under a held stress "
     "converges; an identified η is a viscosity in real time"
 )
-ETA_DRIVES = "η means something else in another drive"
-INDEPENDENT = (
-    "There is no correlation in fit.json: the errors of the ratios take the parameters as "
-    "independent."
-)
-PAPER_DRIVE = (
-    "The paper drove its model by the measured stress, this fit by the {drive}: the springs' "
-    "parameters mean the same in both, the damping does not."
-)
-STOPPED = (
-    "{one.label} was stopped by {one.stopped}: its numbers are the best until then, not the end of "
-    "a fit."
-)
-UNILATERAL = (
-    "A {one} stands beside a {other}: a unilateral spring is a linear one that bears no tension."
-)
-SAME_DATA = (
-    "Both fits are to the same data, so their errors are not independent, and the deviations in "
-    "standard errors are only a guide."
-)
 VAGUE = "its standard error is many times its value, so the test does not determine it"
-INPUT = (
-    "The measured {channel} is the input of this fit: its noise can bias the parameters, which the "
-    "standard errors do not count."
-)
 
 
 @dataclass(frozen=True)
@@ -125,28 +100,18 @@ class Comparison:
 
 @dataclass(frozen=True)
 class _Value:
-    value: float
-    stderr: float | None
-    state: str
-    why: str
+    value: float | None = None
+    stderr: float | None = None
+    state: str = ""
+    why: str = ""
 
 
 def compare(results: Sequence[Result], published: str | None = None) -> Comparison:
-    """Put fits beside what was published, or beside each other.
+    """Put fits, result folders or what `load_result` gives beside what was published.
 
-    Parameters
-    ----------
-    results : sequence of Fit, path or mapping
-        Fits, result folders, or what `load_result` gives.
-    published : str, optional
-        A published set to put all of them beside. Without it, each result goes beside the set that
-        its test names, for example "foam-1/model-3"; where a test names none, the results are put
-        beside the first of them.
-
-    Raises
-    ------
-    InputError
-        If a result cannot be read, the set is unknown, or there is nothing to compare with.
+    Without `published`, each goes beside the set that its test names, for example "foam-1/model-3";
+    where a test names none, all are put beside the first of them. InputError if a result cannot be
+    read, the set is unknown, or there is nothing to compare with.
     """
     names = ", ".join(published_sets)
     if published is not None and published not in published_sets:
@@ -201,27 +166,22 @@ def _drop(dsigma: Any, k0: Any, eps_a: Any) -> Any:
     return dsigma * (1.0 - eps_a) / (k0 * eps_a)
 
 
-def _same(value: Any) -> Any:
-    return value
+def _total(*parts: Any) -> Any:
+    return sum(parts)
 
 
-_K0 = _Quantity("k0", "MPa", ("k0",), lambda k0: k0 / MPA)
-_H = _Quantity("h", "mm", ("height",), lambda h: h / MM)
-_ETA = _Quantity("η", "Pa·s", ("eta",), _same)
-TABLES = {
-    "bistable": (
-        _K0,
-        _Quantity("Δσ/σ_a", "", ("dsigma", "k0", "eps_a"), _drop),
-        _ETA,
-        _Quantity("ε_a", "", ("eps_a",), _same),
-        _Quantity("ε_c", "", ("eps_c",), _same),
-        _H,
-        _Quantity("k_h+/k0", "", ("kh_plus", "k0"), _ratio),
-        _Quantity("k_h−/k0", "", ("kh_minus", "k0"), _ratio),
-        _Quantity("k_c/k0", "", ("kc", "k0"), _ratio),
-    ),
-    "linear": (_K0, _ETA, _H),
-}
+_ETA = _Quantity("η", "Pa·s", ("eta",), _total)
+TABLE = (  # of a linear spring, those whose parameters it has
+    _Quantity("k0", "MPa", ("k0",), lambda k0: k0 / MPA),
+    _Quantity("Δσ/σ_a", "", ("dsigma", "k0", "eps_a"), _drop),
+    _ETA,
+    _Quantity("ε_a", "", ("eps_a",), _total),
+    _Quantity("ε_c", "", ("eps_c",), _total),
+    _Quantity("h", "mm", ("height",), lambda h: h / MM),
+    _Quantity("k_h+/k0", "", ("kh_plus", "k0"), _ratio),
+    _Quantity("k_h−/k0", "", ("kh_minus", "k0"), _ratio),
+    _Quantity("k_c/k0", "", ("kc", "k0"), _ratio),
+)
 
 
 def _evaluate(side: Side, names: Sequence[str], formula: Callable[..., Any]) -> _Value | None:
@@ -238,16 +198,15 @@ def _evaluate(side: Side, names: Sequence[str], formula: Callable[..., Any]) -> 
     why = next(part.why for part in parts if part.state == state)
     if not any(part.stderr for part in parts) or state == "not determined":
         return _Value(value, None, state, why)
-    # Derivatives by a complex step: exact, and the formula is written once.
-    errors = [
-        (part.stderr or 0.0)
+    errors = {  # derivatives by a complex step: exact, and the formula is written once
+        names[i]: (part.stderr or 0.0)
         * (formula(*(x + 1e-30j * (i == j) for j, x in enumerate(at))).imag / 1e-30)
         for i, part in enumerate(parts)
-    ]
+    }
     variance = sum(
         a * b * (1.0 if one == other else side.correlation.get((one, other), 0.0))
-        for one, a in zip(names, errors, strict=True)
-        for other, b in zip(names, errors, strict=True)
+        for one, a in errors.items()
+        for other, b in errors.items()
     )
     return _Value(value, math.sqrt(max(variance, 0.0)) or None, state, why)
 
@@ -263,9 +222,12 @@ def _pair(side: Side, other: Side) -> Pair:
     nothing = _incomparable(side, other)
     rows = (*_spring_rows(side, other, nothing), *_damping_rows(side, other, nothing))
     remarks = [nothing[0].upper() + nothing[1:] + "."] if nothing else []
-    for one in (side, other):
-        if one.stopped:
-            remarks.append(STOPPED.format(one=one))
+    remarks += [
+        f"{one.label} was stopped by {one.stopped}: its numbers are the best until then, not the "
+        "end of a fit."
+        for one in (side, other)
+        if one.stopped
+    ]
     if not nothing:
         remarks += _remarks(side, other, any("/" in row.name for row in rows))
     status = f"{side.status}, stopped by {side.stopped}" if side.stopped else side.status
@@ -276,15 +238,30 @@ def _pair(side: Side, other: Side) -> Pair:
 def _remarks(side: Side, other: Side, ratios: bool) -> Iterator[str]:
     """Say what is to be known of a comparison as a whole."""
     if other.source is not None and side.drive != "stress":
-        yield PAPER_DRIVE.format(drive=side.drive)
+        yield (
+            f"The paper drove its model by the measured stress, this fit by the {side.drive}: the "
+            "springs' parameters mean the same in both, the damping does not."
+        )
     if side.drive in ("stress", "displacement"):
-        yield INPUT.format(channel=side.drive)
+        yield (
+            f"The measured {side.drive} is the input of this fit: its noise can bias the "
+            "parameters, which the standard errors do not count."
+        )
     if side.kinds != other.kinds:
-        yield UNILATERAL.format(one="+".join(side.kinds), other="+".join(other.kinds))
+        yield (
+            f"A {'+'.join(side.kinds)} stands beside a {'+'.join(other.kinds)}: a unilateral "
+            "spring is a linear one that bears no tension."
+        )
     if side.sha and side.sha == other.sha:
-        yield SAME_DATA
+        yield (
+            "Both fits are to the same data, so their errors are not independent, and the "
+            "deviations in standard errors are only a guide."
+        )
     if ratios and any(one.source is None and not one.correlation for one in (side, other)):
-        yield INDEPENDENT
+        yield (
+            "There is no correlation in fit.json: the errors of the ratios take the parameters as "
+            "independent."
+        )
 
 
 def _incomparable(side: Side, other: Side) -> str:
@@ -294,10 +271,8 @@ def _incomparable(side: Side, other: Side) -> str:
             f"the springs differ ({'+'.join(side.kinds)} and {'+'.join(other.kinds)}), so their "
             "parameters do not mean the same"
         )
-    for one in (side, other):
-        if one.status == "failed":
-            return f"{one.label} found no acceptable fit, so its numbers mean nothing"
-    return ""
+    failed = next((one.label for one in (side, other) if one.status == "failed"), None)
+    return f"{failed} found no acceptable fit, so its numbers mean nothing" if failed else ""
 
 
 def _family(kind: str) -> str:
@@ -308,38 +283,35 @@ def _spring_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
     chain = len(side.kinds) > 1
     for i, kind in enumerate(side.kinds, start=1):
         alike = i <= len(other.kinds) and _family(other.kinds[i - 1]) == _family(kind)
-        for quantity in TABLES[_family(kind)]:
-            if quantity is _ETA and not chain:
+        for quantity in TABLE:
+            eta = quantity is _ETA
+            if eta and not chain:
                 continue  # of one spring, it stands with the onsite damper
             names = [f"s{i}_{part}" for part in quantity.parts]
             value = _evaluate(side, names, quantity.formula)
             reference = _evaluate(other, names, quantity.formula) if alike else None
-            silent = quantity is _ETA and value is not None and value.state == "fixed"
-            if value is None or (silent and value.value == 0.0 and reference is None):
+            if value is None or (
+                eta and reference is None and (value.state, value.value) == ("fixed", 0.0)
+            ):
                 continue
-            remark = nothing or _remark(value, reference, quantity is _ETA, side, other)
+            remark = nothing or _remark(value, reference, eta, side, other)
             yield _row(i if chain else 0, quantity.name, quantity.unit, value, reference, remark)
 
 
 def _damping_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
     """Give the damping of the striker's motion, and its ratio as the paper defines it."""
-    one_spring = len(side.kinds) == 1
-    names = ["site_eta", "s1_eta"] if one_spring else ["site_eta"]
-    names = [name for name in names if name in side.estimates]
-    reference = _evaluate(other, [n for n in names if n in other.estimates], _total)
-    value = _evaluate(side, names, _total) if names else None
+    one_spring, item = len(side.kinds) == 1, other.source
+    names = [n for n in ("site_eta", "s1_eta")[: 1 + one_spring] if n in side.estimates]
+    theirs = [n for n in names if n in other.estimates] if item is None else ["site_eta"]
+    value, reference = _evaluate(side, names, _total), _evaluate(other, theirs, _total)
     if value is None:
         return
-    if other.source is None and value.value == 0.0 and not (reference and reference.value):
+    if item is None and value.value == 0.0 and not (reference and reference.value):
         return
-    if other.source is not None:
-        reference = _evaluate(other, ["site_eta"], _same)
     remark = nothing or _remark(value, reference, True, side, other)
     yield _row(0, "η" if one_spring else "site η", "Pa·s", value, reference, remark)
-    if other.source is None:
-        return
-    item, soft = other.source, [i for i, k in enumerate(side.kinds, 1) if k == "bistable"]
-    if len(soft) != 1 or nothing:
+    soft = [i for i, kind in enumerate(side.kinds, 1) if kind == "bistable"]
+    if item is None or len(soft) != 1 or nothing:
         return
     # ρ H = m/A, so that 2 H √(ρ k_c) = 2 √(m H k_c/A).
     inertia = item.striker_mass * item.chain.height / item.chain.area
@@ -352,23 +324,16 @@ def _damping_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
         # ζ is η over a root: it is known as well as η is, unless k_c is not known at all.
         if ratio.state != "not determined" or value.state == "fixed":
             ratio = replace(ratio, state=value.state, why=value.why)
-        published = None if item.damping_ratio is None else _Value(item.damping_ratio, None, "", "")
         lost = ratio.state == "not determined" != value.state
         remark = f"not determined: {ratio.why}" if lost and not remark else remark
-        yield _row(0, "ζ", "", ratio, published, remark)
-
-
-def _total(*etas: Any) -> Any:
-    return sum(etas)
+        yield _row(0, "ζ", "", ratio, _Value(item.damping_ratio), remark)
 
 
 def _row(
     spring: int, name: str, unit: str, value: _Value, reference: _Value | None, remark: str
 ) -> Row:
-    fitted = (value.value, value.stderr, value.state)
-    if reference is None:
-        return Row(spring, name, unit, *fitted, None, None, remark)
-    return Row(spring, name, unit, *fitted, reference.value, reference.stderr, remark)
+    fitted, beside = (value.value, value.stderr, value.state), reference or _Value()
+    return Row(spring, name, unit, *fitted, beside.value, beside.stderr, remark)
 
 
 def _remark(value: _Value, reference: _Value | None, eta: bool, side: Side, other: Side) -> str:
@@ -380,11 +345,11 @@ def _remark(value: _Value, reference: _Value | None, eta: bool, side: Side, othe
     if eta and other.source is not None:
         return ETA_PUBLISHED if other.source.eta is not None else "the published model has no η"
     if eta and side.drive != other.drive:
-        return ETA_DRIVES
+        return "η means something else in another drive"
     if value.state == "fixed":
         return f"not identified, {value.why or 'held fixed'}"
     if value.stderr is not None and reference is not None:
-        size = max(abs(value.value), abs(reference.value))
+        size = max(abs(value.value or 0.0), abs(reference.value or 0.0))
         if value.stderr > NOTHING * size:
             return VAGUE
     return ""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from foamfit.report.comparison import Comparison, Pair, Row
 from foamfit.report.figures import BLUE, GREY, VERMILION, drawing, save, say_nothing_there
+from foamfit.text import signed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,20 +35,19 @@ def plot_comparison(comparison: Comparison, path: str | Path | None = None) -> F
     for pair in comparison.pairs:
         groups.setdefault(pair.reference, []).append(pair)
     columns = min(len(groups), 2)
-    rows = [list(groups.items())[i : i + columns] for i in range(0, len(groups), columns)]
-    lines = [max(_comparison_lines(pairs) for _, pairs in row) for row in rows]
-    with drawing(7.0, 0.5 + sum(0.6 + 0.12 * n for n in lines)) as figure:
-        grid = figure.add_gridspec(len(rows), columns, height_ratios=[n + 2 for n in lines])
-        for i, row in enumerate(rows):
-            for j, (reference, pairs) in enumerate(row):
-                ax = figure.add_subplot(grid[i, j])
-                _draw_comparison(ax, pairs)
-                title = textwrap.fill(f"beside {reference}", 58 if columns == 2 else 110)
-                ax.set_title(
-                    title, loc="left", fontsize=7.5, pad=4, weight="bold", parse_math=False
-                )
-                if i == len(rows) - 1 or len(rows[i + 1]) <= j:
-                    ax.set_xlabel("deviation (standard errors)")
+    lines = [max(len(_shown(pairs)), 1) * (len(_lanes(pairs)) + 1) for pairs in groups.values()]
+    rows = [max(lines[i : i + columns]) for i in range(0, len(lines), columns)]
+    with drawing(7.0, 0.5 + sum(0.6 + 0.12 * n for n in rows)) as figure:
+        ratios = [n + 2 for n in rows]
+        axes = figure.subplots(len(rows), columns, squeeze=False, height_ratios=ratios).ravel()
+        for ax in axes[len(groups) :]:
+            ax.remove()
+        for ax, (reference, pairs) in zip(axes, groups.items(), strict=False):
+            _draw_comparison(ax, pairs)
+            title = textwrap.fill(f"beside {reference}", 58 if columns == 2 else 110)
+            ax.set_title(title, loc="left", fontsize=7.5, pad=4, weight="bold", parse_math=False)
+        for ax in figure.axes[-columns:]:  # the lowest ones
+            ax.set_xlabel("deviation (standard errors)")
         _name_results(figure, list(groups.values()))
     return save(figure, path)
 
@@ -60,16 +60,12 @@ def _shown(pairs: list[Pair]) -> list[str]:
     """Return the parameters of which some result has something to show, in their order."""
     rows = [row for pair in pairs for row in pair.rows]
     there = {row.label for row in rows if _is_shown(row)}
-    return list(dict.fromkeys(row.label for row in rows if row.label in there))
+    return [label for label in dict.fromkeys(row.label for row in rows) if label in there]
 
 
 def _lanes(pairs: list[Pair]) -> list[int]:
     """Return the places of the results that have anything to show: each gets a lane."""
     return [k for k, pair in enumerate(pairs) if any(map(_is_shown, pair.rows))]
-
-
-def _comparison_lines(pairs: list[Pair]) -> int:
-    return max(len(_shown(pairs)), 1) * (len(_lanes(pairs)) + 1)
 
 
 def _draw_comparison(ax: Axes, pairs: list[Pair]) -> None:
@@ -119,14 +115,11 @@ def _draw_comparison(ax: Axes, pairs: list[Pair]) -> None:
 def _name_results(figure: Figure, groups: list[list[Pair]]) -> None:
     """Say once what the colours mean: the drives, where these are the same in every panel."""
     drives = [[f"{pair.drive} drive" for pair in pairs] for pairs in groups]
-    longest = max(drives, key=len)
-    alike = all(names == longest[: len(names)] for names in drives)
-    if alike and len(set(longest)) == len(longest):
-        names = longest
-    elif len(groups) == 1:
+    names = max(drives, key=len)
+    if len(groups) == 1 and len(set(names)) < len(names):
         names = [f"{s.test}: {s.model}, {s.drive} drive" for s in groups[0]]
-    else:
-        names = [f"result {k + 1}" for k in range(len(longest))]
+    elif len(set(names)) < len(names) or any(d != names[: len(d)] for d in drives):
+        names = [f"result {k + 1}" for k in range(len(names))]
     drawn = {k for pairs in groups for k in _lanes(pairs)}
     for k, name in enumerate(names):
         color, mark = MARKS[k % len(MARKS)]
@@ -150,6 +143,4 @@ def _percent(row: Row) -> str:
     spread = 100.0 * math.hypot(row.stderr or 0.0, row.reference_stderr or 0.0)
     spread /= abs(row.reference)
     places = 0 if spread >= 10.0 else 1 if spread >= 1.0 else 2
-    shown = f"{row.percent:+.{places}f}"
-    shown = shown[1:] if float(shown) == 0.0 else shown.replace("-", "−")
-    return f"{shown} ± {spread:.{places}f} %"
+    return f"{signed(row.percent, places)} ± {spread:.{places}f} %"

@@ -13,22 +13,21 @@ from foamfit.report.comparison import Comparison, Pair, Row
 from foamfit.report.readable import readable
 from foamfit.results import ParameterEstimate
 from foamfit.springs.published import published
-from foamfit.text import aligned, significant, wrapped
+from foamfit.text import aligned, signed, significant, wrapped
 
 ZETA = "ζ = η/(2 H √(ρ k_c)) with ρ = m/(A H), m, A and H of the paper's striker and specimen"
 
 
 def comparison_text(comparison: Comparison) -> str:
     """Return a comparison as aligned text, at most 100 columns wide, no newline at the end."""
-    reference = "published" if comparison.with_published else "reference"
-    parts = ["\n".join(_pair_lines(pair, reference)) for pair in comparison.pairs]
+    reference, last = "reference", "The deviation is in standard errors (s.e.) of both fits."
     if comparison.with_published:
-        parts.append(
+        reference = "published"
+        last = (
             "Published numbers carry no uncertainty and are taken as exact; s.e. = standard errors."
         )
-    else:
-        parts.append("The deviation is in standard errors (s.e.) of both fits.")
-    return "\n\n".join(parts)
+    parts = ["\n".join(_pair_lines(pair, reference)) for pair in comparison.pairs]
+    return "\n\n".join([*parts, last])
 
 
 def _pair_lines(pair: Pair, reference: str) -> Iterator[str]:
@@ -46,17 +45,14 @@ def _pair_lines(pair: Pair, reference: str) -> Iterator[str]:
     lines += [f"{', '.join(labels)}: {remark}." for remark, labels in apart.items()]
     if any(row.name == "ζ" for row in pair.rows):
         lines.append(f"{ZETA}.{_damping_ratio(pair)}")
-    if lines:
-        yield ""
-    for line in lines:
-        yield from wrapped(line)
+    yield from ["", *(part for line in lines for part in wrapped(line))] if lines else []
 
 
 def _damping_ratio(pair: Pair) -> str:
     """Say whether the paper's damping ratio follows from its table."""
-    item = published.get(pair.reference.removeprefix("published "))
-    ratio = None if item is None else item.damping_ratio_by_formula()
-    if item is None or ratio is None or item.damping_ratio is None:
+    item = published[pair.reference.removeprefix("published ")]
+    ratio = item.damping_ratio_by_formula()
+    if ratio is None or item.damping_ratio is None:
         return ""
     agrees = math.isclose(ratio, item.damping_ratio, rel_tol=2e-3)
     rest = "as the paper says" if agrees else f"where the paper says {item.damping_ratio:g}"
@@ -65,22 +61,13 @@ def _damping_ratio(pair: Pair) -> str:
 
 def _cells(row: Row) -> tuple[str, ...]:
     off = "not compared" if row.remark and row.reference is not None else None
-    return (
-        row.label,
-        row.unit or "–",
-        _with_error(row.value, row.stderr),
-        _with_error(row.reference, row.reference_stderr),
-        off or _signed(row.percent, " %"),
-        _signed(row.standard_errors, " s.e."),
-        row.state,
-    )
+    values = _with_error(row.value, row.stderr), _with_error(row.reference, row.reference_stderr)
+    deviation = off or _signed(row.percent, " %"), _signed(row.standard_errors, " s.e.")
+    return (row.label, row.unit or "–", *values, *deviation, row.state)
 
 
 def _signed(value: float | None, unit: str) -> str:
-    if value is None:
-        return ""
-    shown = f"{value:+.{0 if abs(value) >= 99.5 else 1}f}"
-    return (shown[1:] if float(shown) == 0.0 else shown.replace("-", "−")) + unit
+    return "" if value is None else signed(value, 0 if abs(value) >= 99.5 else 1) + unit
 
 
 def _with_error(value: float | None, stderr: float | None) -> str:
@@ -95,13 +82,7 @@ def _with_error(value: float | None, stderr: float | None) -> str:
 
 
 def write_csv(comparison: Comparison, path: str | Path) -> None:
-    """Write a comparison as a table, one parameter of one result per line.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
-    """
+    """Write a comparison as a table, one parameter of one result per line."""
     head = (
         "test", "model", "drive", "reference", "spring", "parameter", "unit", "value", "stderr",
         "state", "reference_value", "reference_stderr", "percent", "standard_errors", "remark",

@@ -101,11 +101,10 @@ def say_nothing_there(ax: Axes) -> None:
 
 def figure_format(path: str | Path) -> Literal["png", "pdf", "svg"]:
     """Return the format that the suffix of a path names; any other is refused."""
-    forms: dict[str, Literal["png", "pdf", "svg"]] = {".png": "png", ".pdf": "pdf", ".svg": "svg"}
-    form = forms.get(Path(path).suffix.lower())
-    if form is None:
-        raise InputError(f"a figure is saved as .png, .pdf or .svg, not {Path(path).name!r}")
-    return form
+    match Path(path).suffix.lower()[1:]:
+        case ("png" | "pdf" | "svg") as form:
+            return form
+    raise InputError(f"a figure is saved as .png, .pdf or .svg, not {Path(path).name!r}")
 
 
 def save(figure: Figure, path: str | Path | None) -> Figure:

@@ -20,36 +20,18 @@ from foamfit.results import SCHEMA, Curves, Fit, ParameterEstimate, plain
 from foamfit.trust.intervals import Intervals
 
 # All that `save_result` may write.
-RESULT_FILES = frozenset(
-    {
-        "fit.json", "parameters.csv", "curves.csv", "profiles.csv", "ladder.csv", "fit.png",
-        "fit.pdf", "report.html",
-    }
+RESULT_FILES = (
+    "fit.json", "parameters.csv", "curves.csv", "profiles.csv", "ladder.csv", "fit.png",
+    "fit.pdf", "report.html",
 )  # fmt: skip
 
 
 def save_result(result: Fit, folder: str | Path) -> Path:
     """Write the result folder whole, replacing an older one at the end.
 
-    Parameters
-    ----------
-    result : Fit
-        What was found.
-    folder : str or Path
-        Where to; made with its parents. What stood there must be empty or a result folder that
-        holds nothing else.
-
-    Returns
-    -------
-    Path
-        The folder, with ``fit.json``, ``parameters.csv``, ``curves.csv``, ``fit.png``,
-        ``fit.pdf`` and ``report.html``; with profiles also ``profiles.csv``, of a ladder also
-        ``ladder.csv``.
-
-    Raises
-    ------
-    InputError
-        If something else stands there or it cannot be written; nothing is changed then.
+    It is made with its parents; InputError if something else stands there (see `check_target`) or
+    it cannot be written, and nothing is changed then. ``profiles.csv`` is written where there are
+    profiles, ``ladder.csv`` where there is a ladder. Returns the folder.
     """
     folder = Path(folder)
     check_target(folder)
@@ -79,15 +61,11 @@ def check_target(folder: str | Path) -> None:
             _check_replaceable(folder, place)
         elif os.path.lexists(place):
             raise InputError(f"{folder} is a file; choose a new or an empty folder")
-        there = next(path for path in place.parents if path.exists())
-        if not there.is_dir():
-            raise InputError(
-                f"{folder} cannot be written: {there} is a file; choose another folder"
-            )
-        if not os.access(there, os.W_OK | os.X_OK):
-            raise InputError(
-                f"{folder} cannot be written: Permission denied in {there}; choose another folder"
-            )
+        for there in (place, next(path for path in place.parents if path.exists())):
+            if there.exists() and not there.is_dir():
+                raise NotADirectoryError(0, f"{there} is a file")
+            if there.exists() and not os.access(there, os.W_OK | os.X_OK):
+                raise PermissionError(0, f"Permission denied in {there}")
     except (OSError, RuntimeError) as error:  # also a link to itself
         raise InputError(
             f"{folder} cannot be written: {reason(error)}; choose another folder"
@@ -98,8 +76,6 @@ def _check_replaceable(folder: Path, place: Path) -> None:
     """Refuse a folder that is there, at `place`, and must not or cannot be replaced."""
     if place.is_mount():
         raise InputError(f"{folder} is a mount point and cannot be replaced; name a folder in it")
-    if not os.access(place, os.W_OK | os.X_OK):
-        raise InputError(f"{folder} cannot be written: Permission denied; choose another folder")
     there = sorted(place.iterdir())
     if there and not _is_of_fit(place / "fit.json"):
         raise InputError(
@@ -129,22 +105,9 @@ def _is_of_fit(path: Path) -> bool:
 
 
 def load_result(folder: str | Path) -> dict[str, Any]:
-    """Read the ``fit.json`` of a result folder.
+    """Return the content of a result folder's ``fit.json``, or of that file itself; values are SI.
 
-    Parameters
-    ----------
-    folder : str or Path
-        The result folder, or its ``fit.json``.
-
-    Returns
-    -------
-    dict
-        The content of ``fit.json``; values are SI.
-
-    Raises
-    ------
-    InputError
-        If there is no ``fit.json`` that this version of foamfit understands.
+    InputError if there is none that this version of foamfit understands.
     """
     path = Path(folder)
     if path.is_dir():

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from foamfit.arrays import Array
 from foamfit.report.figures import BLUE, GREY, INSIDE, VERMILION, drawing, save, say_nothing_there
 from foamfit.report.readable import readable_unit
 
@@ -20,14 +20,8 @@ if TYPE_CHECKING:
     from foamfit.trust.identifiability import Insight
     from foamfit.trust.profile import Profile
 
-Array = NDArray[np.float64]
-
-SHADES = {
-    "a": "#eef3f7",
-    "d": "#fbeedd",
-    "c": "#e6ddd5",
-    "e": "#e3f1ea",
-}  # of one spring's branches
+# Of one spring's branches.
+SHADES = {"a": "#eef3f7", "d": "#fbeedd", "c": "#e6ddd5", "e": "#e3f1ea"}
 OTHERS = ("#f3f3f3", "#e4e4e4")  # of several springs' branches, in turn
 STRIP = 0.4  # height of a strip, in
 CELL = 0.24  # height of a cell, in
@@ -42,13 +36,14 @@ def plot_insight(
     """Draw the sensitivity of each curve to each parameter, what fixes it, and the correlation.
 
     Above, a row has one scale, its largest value, in standard deviations of the noise per 1 % of
-    the natural size. `correlation` is (k, k), where it is better known than from `insight`.
+    the parameter's scale. `correlation` is (k, k), where it is better known than from `insight`.
     """
     heights = [0.75 + STRIP * len(insight.names), 1.15 + CELL * len(insight.names)]
     with drawing(7.0, sum(heights) + 0.3 * bool(title)) as figure:
         if title:
-            look = {"ha": "left", "fontsize": 8.5, "weight": "bold", "parse_math": False}
-            figure.suptitle(title, x=0.012, **look)
+            figure.suptitle(
+                title, x=0.012, ha="left", fontsize=8.5, weight="bold", parse_math=False
+            )
         halves = figure.subfigures(2, 1, height_ratios=heights, squeeze=False)[:, 0]
         _draw_sensitivities(halves[0], insight)
         _draw_information(halves[1], insight, correlation)
@@ -61,8 +56,7 @@ def plot_insight(
 def plot_profiles(result: Fit, path: str | Path | None = None) -> Figure:
     """Draw the profile of each parameter that was followed, with its 95 % cut and its interval.
 
-    Four panels a row; dashed is the parabola of the local covariance. A profile that was stopped is
-    drawn as far as it came.
+    Four panels a row; dashed is the parabola of the local covariance.
     """
     profiles = result.intervals.profiles if result.intervals is not None else ()
     rows = max(-(-len(profiles) // 4), 1)
@@ -70,12 +64,11 @@ def plot_profiles(result: Fit, path: str | Path | None = None) -> Figure:
         axes = figure.subplots(rows, 4, squeeze=False, sharey=True).ravel()
         for ax, profile in zip(axes, profiles, strict=False):
             _draw_profile(ax, profile, result.parameters[profile.name])
-        for ax in axes[max(len(profiles), 1) :]:
+        for ax in axes[len(profiles) :]:
             ax.set_axis_off()
-        if profiles:
-            for ax in axes[: len(profiles) : 4]:
-                ax.set_ylabel("rise of χ²")
-        else:
+        for ax in axes[: len(profiles) : 4]:
+            ax.set_ylabel("rise of χ²")
+        if not profiles:
             say_nothing_there(axes[0])
     return save(figure, path)
 
@@ -133,23 +126,22 @@ def _draw_sensitivities(figure: FigureBase, insight: Insight) -> None:
 
 
 def _shade(ax: Axes, x: Array, cuts: tuple[Section, ...]) -> None:
-    last = x.size - 1
     for turn, cut in enumerate(cuts):
-        left, right = x[cut.start], x[min(cut.stop, last)]
-        shade = SHADES.get(cut.branches, "white" if " " in cut.branches else OTHERS[turn % 2])
+        left, right = x[cut.start], x[min(cut.stop, x.size - 1)]
+        flies = " " in cut.branches
+        shade = SHADES.get(cut.branches, "white" if flies else OTHERS[turn % 2])
         ax.axvspan(left, right, color=shade, lw=0, zorder=0)
         if right - left > 0.03 * (x[-1] - x[0]):
             ax.annotate(
-                "flight" if " " in cut.branches else cut.branches, (0.5 * (left + right), 1.0),
-                (0, 2), xycoords=("data", "axes fraction"), textcoords="offset points",
+                "flight" if flies else cut.branches, (0.5 * (left + right), 1.0), (0, 2),
+                xycoords=("data", "axes fraction"), textcoords="offset points",
                 ha="center", va="bottom", fontsize=6.5, color=GREY,
             )  # fmt: skip
 
 
 def _color(curve: str) -> str:
-    if curve == "displacement_time":
-        return BLUE
-    return INSIDE[0] if curve.startswith("displacement") else VERMILION
+    inside = INSIDE[0] if curve.startswith("displacement") else VERMILION
+    return BLUE if curve == "displacement_time" else inside
 
 
 # ---------------------------------------------------------------- information and correlation
@@ -166,12 +158,13 @@ def _draw_information(figure: FigureBase, insight: Insight, correlation: Array |
     left.set_title("where the information comes from (%)", loc="left", fontsize=7.5, pad=4)
     left.set_yticks(range(k), insight.names)
     labels = ["flight" if " " in branch else branch for _, branch in parts]
-    left.set_xticks(range(len(parts)), labels, rotation=90 if max(map(len, labels)) > 6 else 0)
+    longest = max(map(len, labels))
+    left.set_xticks(range(len(parts)), labels, rotation=90 if longest > 6 else 0)
     for curve in dict.fromkeys(curve for curve, _ in parts):
         at = [c for c, part in enumerate(parts) if part[0] == curve]
         if at[0]:
             left.axvline(at[0] - 0.5, color="black", lw=0.8)
-        beneath = -16 if max(map(len, labels)) <= 6 else -4.0 - 4.0 * max(map(len, labels))
+        beneath = -16.0 if longest <= 6 else -4.0 - 4.0 * longest
         left.annotate(
             curve.replace("_", "-"), (float(np.mean(at)), 0.0), (0, beneath),
             xycoords=("data", "axes fraction"), textcoords="offset points", ha="center", va="top",
@@ -191,17 +184,9 @@ def _cells(ax: Axes, values: Array, colors: str, limits: tuple[float, float], fo
     for (i, j), value in np.ndenumerate(values):
         if np.isfinite(value):
             shown = form.format(value).replace("-", "−").replace("0.", ".")
-            dark = abs(value) > 0.6 * limits[1]
-            text = ax.text(
-                j, i, _short(shown), ha="center", va="center", fontsize=5.5,
-                color="white" if dark else "black",
-            )  # fmt: skip
+            shown = {"−.00": "0", ".00": "0", "1.00": "1", "−0": "0", "0": ""}.get(shown, shown)
+            color = "white" if abs(value) > 0.6 * limits[1] else "black"
+            text = ax.text(j, i, shown, ha="center", va="center", fontsize=5.5, color=color)
             text.set_in_layout(False)  # inside its cell anyway; to measure each takes long
-    style: dict[str, Any] = {"length": 0, "labelsize": 6.5}
-    ax.tick_params(**style)
-    for spine in ax.spines.values():
-        spine.set_visible(False)
-
-
-def _short(text: str) -> str:
-    return {"−.00": "0", ".00": "0", "1.00": "1", "−0": "0", "0": ""}.get(text, text)
+    ax.tick_params(length=0, labelsize=6.5)
+    ax.spines[:].set_visible(False)

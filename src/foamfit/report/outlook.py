@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement, Noise, NoiseLevel, Striker
 from foamfit.data.toml_file import read_settings
 from foamfit.errors import InputError, SimulationError
@@ -21,6 +21,7 @@ from foamfit.fitting.branches import visited
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.search import Tracker, search
 from foamfit.report.folder import load_result
+from foamfit.report.sides import published_side
 from foamfit.results import ParameterEstimate
 from foamfit.solve.simulation import Response, simulate
 from foamfit.springs import kernels
@@ -28,13 +29,10 @@ from foamfit.springs.chain import Chain, Impact
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import split_name, unit_of
 from foamfit.springs.published import published
-from foamfit.springs.spring import BistableSpring
 from foamfit.trust import covariance
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import state_of
 from foamfit.trust.identifiability import Insight, look
-
-Array = NDArray[np.float64]
 
 # Descents of the quick search for start values, for each spring.
 QUICK_STARTS = 4
@@ -49,36 +47,27 @@ GUESSED = "the best"  # how a source begins that is no knowledge
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """What to expect of an experiment with one velocity of the striker.
+    """What to expect of an experiment with one velocity of the striker."""
 
-    `velocity` (m/s) is None in other drives than the impact; `estimates` are the start values of
-    the parameters that vary, with expected standard errors and states; `visited` are the branches
-    of each spring; `insight` is None if no parameter changes the curves.
-    """
-
-    velocity: float | None
-    estimates: dict[str, ParameterEstimate]
-    visited: dict[str, tuple[str, ...]]
-    insight: Insight | None
+    velocity: float | None  # m/s; None in other drives than the impact
+    estimates: dict[str, ParameterEstimate]  # What varies, with expected standard errors
+    visited: dict[str, tuple[str, ...]]  # Branches of each spring
+    insight: Insight | None  # None if no parameter changes the curves
 
 
 @dataclass(frozen=True, eq=False)
 class Outlook:
-    """What is to be said of an experiment before it is fitted.
-
-    All holds at `values` (SI), which come from `source`. `closing` is for each bistable spring the
-    velocity (m/s) from which on its loop closes, None if none up to 30 times the planned one does;
-    empty in other drives than the impact. `faster` is the experiment 5 % faster than what closes
-    all loops, where it leaves one open. `noise` is that of each counted curve.
-    """
+    """What is to be said of an experiment before it is fitted."""
 
     problem: Problem
-    values: Array
-    source: str
+    values: Array  # SI; all that is said holds there
+    source: str  # Where these come from
     planned: Expected
+    # Velocity (m/s) from which on the loop of each bistable spring closes, None if none up to 30
+    # times the planned one does; empty in other drives than the impact.
     closing: dict[str, float | None]
-    faster: Expected | None
-    noise: dict[str, NoiseLevel]
+    faster: Expected | None  # 5 % faster than what closes all loops, where one is left open
+    noise: dict[str, NoiseLevel]  # Of each counted curve
 
 
 def make_outlook(problem: Problem, values: Array, source: str) -> Outlook:
@@ -92,15 +81,15 @@ def make_outlook(problem: Problem, values: Array, source: str) -> Outlook:
     closing: dict[str, float | None] = {}
     quicker = None
     if problem.objective.drive == "impact":
-        chain, striker = chain_of(problem, values), _striker(problem.measurement)
+        chain, impact = chain_of(problem, values), _impact(problem.measurement)
         closing = {
-            f"s{i}": closing_velocity(chain, striker, i)
+            f"s{i}": closing_velocity(chain, impact, i)
             for i, kind in enumerate(problem.model.kinds, start=1)
             if kind == "bistable"
         }
-        fast = [v for v in closing.values() if v is not None]
-        if fast and striker.velocity is not None and max(fast) > striker.velocity:
-            quicker = expect(faster(problem, values, BEYOND * max(fast), sd), values, sd)
+        fast = max((v for v in closing.values() if v is not None), default=0.0)
+        if fast > impact.velocity:
+            quicker = expect(_faster(problem, values, BEYOND * fast, sd), values, sd)
     return Outlook(problem, values, source, planned, closing, quicker, noise)
 
 
@@ -131,18 +120,14 @@ def published_values(problem: Problem, name: str) -> tuple[Array, str]:
     if name not in published:
         known = ", ".join(published)
         raise InputError(f"there is no published set '{name}'; there are {known}")
-    item, values = published[name], problem.vector()
-    if [kind == "bistable" for kind in problem.model.kinds] != [
-        isinstance(spring, BistableSpring) for spring in item.chain.springs
-    ]:
+    item, side, values = published[name], published_side(name), problem.vector()
+    if [k == "bistable" for k in problem.model.kinds] != [k == "bistable" for k in side.kinds]:
         raise InputError(f"{name} is a {item.model}, not a {problem.model.name}; give --model")
     for full in problem.model.names:
-        spring, short = split_name(full)
+        short = split_name(full)[1]
+        new = 0.0 if short == "eta" else side.estimates[full].value
         if short == "height":
-            share = item.chain.heights[spring] / item.chain.height
-            new = share * problem.measurement.specimen.height
-        else:
-            new = 0.0 if short == "eta" else getattr(item.chain.springs[spring], short)
+            new = new / item.chain.height * problem.measurement.specimen.height
         if problem.params[full].vary or short == "eta":
             values[problem.model.index[full]] = new
     return problem.space().complete(values), f"published {name}, without its numerical damping"
@@ -166,10 +151,7 @@ def result_values(problem: Problem, folder: Path) -> tuple[Array, str]:
 
 
 def planned_test(settings_file: Path) -> Measurement:
-    """Make a test without curves of what a TOML plans; `simulated_test` fills them in.
-
-    It needs [specimen] height and diameter and [striker] mass and velocity; [noise] counts.
-    """
+    """Make a test without curves of what a TOML plans; `simulated_test` fills them in."""
     settings = read_settings(settings_file, settings_file, channels=())
     striker = settings.striker or Striker()
     for key, value in (("mass", striker.mass), ("velocity", striker.velocity)):
@@ -190,16 +172,16 @@ def planned_test(settings_file: Path) -> Measurement:
     )
 
 
-def simulated_test(like: Measurement, chain: Chain, striker: Striker) -> Measurement:
+def simulated_test(like: Measurement, chain: Chain, drive: Impact) -> Measurement:
     """Replace the curves of a test by a simulated impact, over as many samples as it has.
 
     Noise that is not stated becomes 1 % of the range of its curve.
     """
-    assert striker.mass is not None
-    assert striker.velocity is not None
     count = SAMPLES if like.time is None else like.time.size
-    drive = Impact(striker.mass, striker.velocity)
-    time = np.linspace(0.0, _duration(chain, drive), count)
+    *_, last = _runs(chain, drive)
+    if last.contact_end is None:
+        raise SimulationError("the striker does not come back; check its mass and the damping")
+    time = np.linspace(0.0, last.contact_end, count)
     response = simulate(chain, drive, time)
     stress, motion = response.base_stress, response.displacement[-1]
     noise = Noise(
@@ -208,8 +190,8 @@ def simulated_test(like: Measurement, chain: Chain, striker: Striker) -> Measure
     )
     inside = {node: response.displacement[node - 1] for node in like.interior}
     return replace(
-        like, time=time, stress=stress, displacement=motion, interior=inside, striker=striker,
-        noise=noise, outliers={}, contact="file",
+        like, time=time, stress=stress, displacement=motion, interior=inside, noise=noise,
+        striker=Striker(drive.mass, drive.velocity), outliers={}, contact="file",
     )  # fmt: skip
 
 
@@ -224,56 +206,38 @@ def _runs(chain: Chain, drive: Impact) -> Iterator[Response]:
         end *= 2.0
 
 
-def _duration(chain: Chain, drive: Impact) -> float:
-    """Duration of the contact of an impact, s."""
-    *_, last = _runs(chain, drive)
-    if last.contact_end is None:
-        raise SimulationError("the striker does not come back; check its mass and the damping")
-    return last.contact_end
-
-
 # ---------------------------------------------------------------- the questions
 
 
 def chain_of(problem: Problem, values: Array) -> Chain:
-    """Chain of a flat vector of parameters, with the interior masses that the problem has."""
-    specimen, count = problem.measurement.specimen, len(problem.model.kinds)
-    chain = problem.model.chain(values, specimen.height, specimen.area)
-    if not problem.objective.interior_mass or count == 1:
-        return chain
-    assert specimen.mass is not None  # checked by the objective
-    masses = [specimen.mass / (count - 1)] * (count - 1) + [0.0]
-    return Chain(chain.springs, chain.heights, chain.area, masses, chain.site_damping)
+    """Chain, massless inside, of a flat vector of parameters."""
+    specimen = problem.measurement.specimen
+    return problem.model.chain(values, specimen.height, specimen.area)
 
 
-def closing_velocity(chain: Chain, striker: Striker, spring: int) -> float | None:
+def closing_velocity(chain: Chain, impact: Impact, spring: int) -> float | None:
     """Velocity (m/s) from which on an impact closes the loop of a spring: it snaps, and snaps back.
 
-    By bisection of forward runs, to 1e-5, from the planned velocity of the striker; springs count
-    from 1 at the base. With light interior masses that vibrate, loops may close and open again
-    above it. None if no velocity from a hundredth to thirty times the planned one parts the two.
+    By bisection of forward runs, to 1e-5, from the planned impact; springs count from 1 at the
+    base. None if no velocity from a hundredth to thirty times the planned one parts the two.
     """
-    assert striker.mass is not None
-    assert striker.velocity is not None
-    low = high = striker.velocity
-    while closes(chain, Impact(striker.mass, low), spring):
+    low = high = impact.velocity
+    while _closes(chain, Impact(impact.mass, low), spring):
         high, low = low, low / 1.25
-        if low < SLOWEST * striker.velocity:
+        if low < SLOWEST * impact.velocity:
             return None
-    while not closes(chain, Impact(striker.mass, high), spring):
+    while not _closes(chain, Impact(impact.mass, high), spring):
         low, high = high, high * 1.25
-        if high > FASTEST * striker.velocity:
+        if high > FASTEST * impact.velocity:
             return None
     while high - low > CLOSE * high:
         middle = 0.5 * (low + high)
-        if closes(chain, Impact(striker.mass, middle), spring):
-            high = middle
-        else:
-            low = middle
+        closed = _closes(chain, Impact(impact.mass, middle), spring)
+        low, high = (low, middle) if closed else (middle, high)
     return high
 
 
-def closes(chain: Chain, drive: Impact, spring: int) -> bool:
+def _closes(chain: Chain, drive: Impact, spring: int) -> bool:
     """Whether a spring (1 at the base) comes to branch e in an impact."""
     try:
         return any(
@@ -284,13 +248,15 @@ def closes(chain: Chain, drive: Impact, spring: int) -> bool:
         return False
 
 
-def faster(problem: Problem, values: Array, velocity: float, noise: Mapping[str, float]) -> Problem:
+def _faster(
+    problem: Problem, values: Array, velocity: float, noise: Mapping[str, float]
+) -> Problem:
     """Return the same problem at another velocity of the striker, its curves simulated."""
     test = problem.measurement
     given = {name.startswith("displacement"): value for name, value in noise.items()}
     test = replace(test, noise=Noise(given.get(False), given.get(True)))
-    striker = replace(_striker(test), velocity=velocity)
-    test = simulated_test(test, chain_of(problem, values), striker)
+    impact = Impact(_impact(test).mass, velocity)
+    test = simulated_test(test, chain_of(problem, values), impact)
     return make_problem(
         test, problem.model.name, "impact", problem.params, problem.objective.weights,
         problem.objective.interior_mass,
@@ -316,30 +282,27 @@ def expect(problem: Problem, values: Array, noise: Mapping[str, float]) -> Expec
         half = covariance.half_width(stderr, problem.objective.n_data - len(names))
         limits = (params[name].min, params[name].max)
         state, why = state_of(name, value, (value - half, value + half), insight, limits)
-        told = state != "not determined"
-        expected[name] = ParameterEstimate(
-            value, stderr if told else None, None, unit, True, state, why
-        )
-    seen = visited(problem, best.simulated)
+        known = None if state == "not determined" else stderr
+        expected[name] = ParameterEstimate(value, known, None, unit, True, state, why)
     impact = problem.objective.drive == "impact"
-    velocity = _striker(problem.measurement).velocity if impact else None
-    return Expected(velocity, expected, seen, insight)
+    velocity = _impact(problem.measurement).velocity if impact else None
+    return Expected(velocity, expected, visited(problem, best.simulated), insight)
 
 
 def worth(insight: Insight) -> dict[str, dict[str, float]]:
     """Standard error of each parameter if a curve's noise were halved, over the present one."""
-    now = insight.stderr
     out = {}
     for curve in insight.curves:
-        then = insight.stderr_with(curve)
-        pairs = zip(insight.names, then, now, strict=True)
+        pairs = zip(insight.names, insight.stderr_with(curve), insight.stderr, strict=True)
         out[curve] = {name: float(a / b) for name, a, b in pairs if np.isfinite(b)}
     return out
 
 
-def _striker(test: Measurement) -> Striker:
-    assert test.striker is not None  # the impact drive has one
-    return test.striker
+def _impact(test: Measurement) -> Impact:
+    striker = test.striker or Striker()
+    assert striker.mass  # the drive has them
+    assert striker.velocity
+    return Impact(striker.mass, striker.velocity)
 
 
 def outlook_of(
@@ -374,6 +337,6 @@ def outlook_of(
         values, source = start_values(problem)
     if not made:
         chain = chain_of(problem, values)
-        measurement = simulated_test(measurement, chain, _striker(measurement))
+        measurement = simulated_test(measurement, chain, _impact(measurement))
         problem = make_problem(measurement, model, drive, None, None, interior_mass=False)
     return make_outlook(problem, values, source)

@@ -17,8 +17,9 @@ from foamfit.trust.identifiability import Insight
 def outlook_text(outlook: Outlook) -> str:
     """Write an outlook for people: at most 100 columns wide, no newline at the end."""
     problem, planned = outlook.problem, outlook.planned
+    units = {name: "m" if "displacement" in name else "Pa" for name in outlook.noise}
     noise = ", ".join(
-        f"{_spoken(name)} {engineering(level.sigma, 'm' if 'displacement' in name else 'Pa')} "
+        f"{_spoken(name)} {engineering(level.sigma, units[name])} "
         f"({'stated' if level.given else 'estimated'})"
         for name, level in outlook.noise.items()
     )
@@ -31,27 +32,23 @@ def outlook_text(outlook: Outlook) -> str:
     if planned.insight is not None:
         told.append(("channels", list(_worth_sentences(planned.insight))))
         told.append(("least", [planned.insight.sentence()]))
-    reasons = [
-        f"{name}: {item.state}, {item.why}."
+    lines = [
+        line
         for name, item in planned.estimates.items()
         if item.state != "determined"
+        for line in wrapped(f"{name}: {item.state}, {item.why}.")
     ]
-    lines = [line for reason in reasons for line in wrapped(reason)]
     return "\n".join([labelled(told), "", *_table(outlook), "", *lines]).rstrip()
 
 
 def _larger_residuals(outlook: Outlook) -> Iterator[str]:
     """Warn where the start values leave more than the noise: then the errors are too small."""
-    objective, at = outlook.problem.objective, 0
-    residual = objective.differences(outlook.values)
-    for (name, level), size in zip(outlook.noise.items(), objective.sizes, strict=True):
-        rms = float(np.sqrt(np.mean(residual[at : at + size] ** 2)))
-        rms *= objective.scale[name] / objective.weights[name] ** 0.5
-        at += size
-        if rms > ESTIMATED * level.sigma:
+    objective = outlook.problem.objective
+    for name, rms in objective.rms(objective.differences(outlook.values)).items():
+        if (times := rms / outlook.noise[name].sigma) > ESTIMATED:
             yield (
-                f"The start values leave {significant(rms / level.sigma)} times the noise of "
-                f"{_spoken(name)}, so the errors to expect are larger than those below."
+                f"The start values leave {significant(times)} times the noise of {_spoken(name)}, "
+                "so the errors to expect are larger than those below."
             )
 
 
@@ -71,15 +68,15 @@ def _closing_sentences(outlook: Outlook) -> Iterator[str]:
             closing = f"from {found:.4g} m/s on"
         last = "c" if "c" in seen else seen[-1]
         does = "closes its loop" if "e" in seen else f"turns back on branch {last}"
-        open_ones = [
+        sentence = f"{at} spring {name[1:]} {does}; the loop closes {closing}"
+        lost = ", ".join(
             parameter
             for parameter, item in planned.estimates.items()
             if "reached" in item.why and parameter.startswith(f"{name}_")
-        ]
-        guess = ""
-        if open_ones and outlook.source.startswith(GUESSED) and "e" not in seen:
-            guess = f", which is a guess: this test does not determine {', '.join(open_ones)}"
-        yield f"{at} spring {name[1:]} {does}; the loop closes {closing}{guess}."
+        )
+        if lost and outlook.source.startswith(GUESSED) and "e" not in seen:
+            sentence += f", which is a guess: this test does not determine {lost}"
+        yield f"{sentence}."
 
 
 def _needed(outlook: Outlook, spring: int) -> tuple[float, float]:
@@ -99,34 +96,31 @@ def _needed(outlook: Outlook, spring: int) -> tuple[float, float]:
 def _worth_sentences(insight: Insight) -> Iterator[str]:
     """Say what halving the noise of each channel would bring, and which is worth it most."""
     gains = {
-        curve: 1.0 - float(np.mean(list(ratios.values())))
+        _spoken(curve): 1.0 - float(np.mean(list(ratios.values())))
         for curve, ratios in worth(insight).items()
         if ratios
     }
     for curve, gain in gains.items():
-        yield (
-            f"Half the noise of {_spoken(curve)} narrows the intervals by {percent(gain)} on "
-            "average."
-        )
+        yield f"Half the noise of {curve} narrows the intervals by {percent(gain)} on average."
     if len(gains) > 1:
-        first = max(gains, key=lambda curve: gains[curve])
-        yield f"The channel worth measuring better is {_spoken(first)}."
+        yield f"The channel worth measuring better is {max(gains, key=gains.__getitem__)}."
     elif gains:
-        yield f"Only {_spoken(next(iter(gains)))} is compared in this drive."
+        yield f"Only {next(iter(gains))} is compared in this drive."
 
 
 def _table(outlook: Outlook) -> list[str]:
     """Align the expected standard errors, beside those of the faster test where there is one."""
-    tests = [outlook.planned] + ([outlook.faster] if outlook.faster is not None else [])
-    heads = [
-        "expected" if o.velocity is None else f"expected at {o.velocity:.4g} m/s" for o in tests
-    ]
-    table = [["parameter", "unit", *(x for head in heads for x in (head, "state"))]]
-    for name in outlook.planned.estimates:
-        shown = [readable(name, test.estimates[name]) for test in tests]
-        cells = [cell for item in shown for cell in (item.with_error, item.state)]
-        table.append([name, shown[0].unit, *cells])
-    return aligned(table)
+    table = [
+        ["parameter", *outlook.planned.estimates],
+        ["unit", *(readable(*item).unit for item in outlook.planned.estimates.items())],
+    ]  # its columns
+    for test in (outlook.planned, outlook.faster):
+        if test is not None:
+            at = "" if test.velocity is None else f" at {test.velocity:.4g} m/s"
+            shown = [readable(name, test.estimates[name]) for name in outlook.planned.estimates]
+            table.append([f"expected{at}", *(item.with_error for item in shown)])
+            table.append(["state", *(item.state for item in shown)])
+    return aligned(list(zip(*table, strict=True)))
 
 
 def _spoken(name: str) -> str:

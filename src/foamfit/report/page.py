@@ -5,17 +5,15 @@ from __future__ import annotations
 import base64
 from collections.abc import Iterator
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from foamfit.report.figures import DPI, image
 from foamfit.report.identifiability_plots import plot_insight, plot_profiles
 from foamfit.report.plots import origin_word, plot_fit, plot_residuals
 from foamfit.report.readable import number, readable, readable_unit
 from foamfit.report.summary import ANSWERS, LADDER, conclusions, ladder_cells, misfits
+from foamfit.results import Fit
 from foamfit.text import engineering, percent
-
-if TYPE_CHECKING:
-    from foamfit.results import Fit
 
 DRIVES = {
     "impact": "The motion follows from the mass and the velocity of the striker; nothing measured "

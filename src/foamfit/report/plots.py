@@ -13,15 +13,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from foamfit.report.figures import (
-    BLUE,
-    GREY,
-    INSIDE,
-    VERMILION,
-    drawing,
-    save,
-    say_nothing_there,
-)
+from foamfit.arrays import Array
+from foamfit.report.figures import BLUE, GREY, INSIDE, VERMILION, drawing, save, say_nothing_there
 from foamfit.report.readable import readable_unit
 from foamfit.terminal import printable
 
@@ -32,14 +25,15 @@ if TYPE_CHECKING:
     from foamfit.results import Fit
     from foamfit.solve.simulation import Response
 
-Array = NDArray[np.float64]
-
 POINTS = {
     ("a", "d"): "A1", ("d", "a"): "A1",
     ("d", "c"): "C1",
     ("c", "e"): "C2", ("e", "c"): "C2",
     ("e", "a"): "A2",
 }  # fmt: skip
+# Where the name of a point stands, in points from it: beside its curve, off the others.
+IN_LOOP = {"A1": (-4, 5), "C1": (-5, 3), "C2": (5, -3), "A2": (4, -7)}
+IN_TIME = {"A1": (5, -4), "C1": (-5, 3), "C2": (5, 3), "A2": (5, 4)}
 BESIDE = {"a": (-6, 4), "d": (-6, 4), "c": (7, -3), "e": (4, -7)}  # points from the branch
 MARKERS = 60  # of a measured curve: more of them blot
 PALE = "#A6CEE3"
@@ -49,21 +43,15 @@ PANEL = (137.0, 133.0)  # size of one of three panels, typographic points
 def plot_fit(result: Fit, path: str | Path | None = None) -> Figure:
     """Draw stress-time, displacement-time and stress-strain, measured and fitted.
 
-    Parameters
-    ----------
-    result : Fit
-        The fit; a panel of which it has no curve is left out.
-    path : str or Path, optional
-        Where to save the figure; the suffix gives the format.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        7 in wide where all three are there; it belongs to no pyplot state.
+    A panel of which the fit has no curve is left out; 7 in wide where all three are there. Saved at
+    `path`, if one is given, in the format of its suffix.
     """
     panels = list(_panels(result))
     with drawing({0: 4.0, 1: 4.0, 2: 5.4, 3: 7.0}[len(panels)], 2.75) as figure:
-        for ax, panel in zip(_row(figure, len(panels)), panels, strict=True):
+        axes = figure.subplots(1, max(len(panels), 1), squeeze=False)[0]
+        if not panels:
+            say_nothing_there(axes[0])
+        for ax, panel in zip(axes, panels, strict=False):
             _draw(ax, panel)
             _mark_outliers(ax, panel, result)
             _mark_switches(ax, panel, result)
@@ -74,19 +62,10 @@ def plot_fit(result: Fit, path: str | Path | None = None) -> Figure:
 
 
 def plot_residuals(result: Fit, path: str | Path | None = None) -> Figure:
-    """Draw fitted minus measured along each curve, in units of the measured range.
+    """Draw fitted minus measured along each curve, in percent of the measured range.
 
-    Parameters
-    ----------
-    result : Fit
-        The fit; a curve that has nothing to compare is left out.
-    path : str or Path, optional
-        Where to save the figure; the suffix gives the format.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        7 in wide, one strip above the other, over time, or over the sample where there is no time.
+    One strip above the other, 7 in wide, over time, or over the sample where there is no time; a
+    curve that has nothing to compare is left out. Saved at `path`, if one is given.
     """
     strips = list(_residuals(result))
     with drawing(7.0, 0.45 + 0.85 * max(len(strips), 1)) as figure:
@@ -120,20 +99,18 @@ def plot_response(response: Response, path: str | Path | None = None) -> Figure:
         for i, node in enumerate(nodes[:-1]):
             axes[1].plot(time / ft, node / fw, color=str(shades[i]), lw=1.0, label=f"node {i + 1}")
         axes[1].plot(time / ft, nodes[-1] / fw, label="top", **last)
-        end = np.inf if response.contact_end is None else response.contact_end
-        loop = time <= end  # then the striker flies
+        end = response.contact_end
+        loop = time <= (np.inf if end is None else end)  # then the striker flies
         axes[2].plot(response.strain[loop], stress[loop] / fs, **last)
-        base = f"base stress ({s_unit})"
-        axes[0].set(xlabel=f"time ({t_unit})", ylabel=base)
-        axes[1].set(xlabel=f"time ({t_unit})", ylabel=f"displacement ({w_unit})")
-        axes[2].set(xlabel="overall strain (–)", ylabel=base)
-        for ax in axes:
-            ax.margins(0.05, 0.11)
-        if response.contact_end is not None:
+        x, base = f"time ({t_unit})", f"base stress ({s_unit})"
+        axes[0].set(xlabel=x, ylabel=base, xmargin=0.05, ymargin=0.11)
+        axes[1].set(xlabel=x, ylabel=f"displacement ({w_unit})", xmargin=0.05, ymargin=0.11)
+        axes[2].set(xlabel="overall strain (–)", ylabel=base, xmargin=0.05, ymargin=0.11)
+        if end is not None:
             for ax in axes[:2]:
-                ax.axvline(response.contact_end / ft, color=GREY, lw=0.6, ls=(0, (2, 2)))
+                ax.axvline(end / ft, color=GREY, lw=0.6, ls=(0, (2, 2)))
             axes[0].annotate(
-                "end of contact", (response.contact_end / ft, 1.0), (-3, -3),
+                "end of contact", (end / ft, 1.0), (-3, -3),
                 xycoords=("data", "axes fraction"), textcoords="offset points",
                 ha="right", va="top", rotation=90, color=GREY, fontsize=6.5,
             )  # fmt: skip
@@ -160,7 +137,7 @@ class _Line:
 
 @dataclass(frozen=True)
 class _Panel:
-    key: Literal["stress_time", "displacement_time", "stress_strain"]
+    key: str
     x_name: str
     x_unit: str
     y_name: str
@@ -182,39 +159,34 @@ def _panels(result: Fit) -> Iterator[_Panel]:
     if result.drive == "displacement" and moved is None:
         moved = c.measured_displacement
     measured_strain = None if c.measured_displacement is None else c.measured_displacement / height
-    strain = None if moved is None else moved / height
-    stress = [("measured", c.time, c.measured_stress), ("fitted", c.time, c.stress)]
-    motion = [("measured", c.time, c.measured_displacement), ("fitted", c.time, c.displacement)]
-    loop = [
+    motion = result.measurement.motion or "measured"
+
+    def lines(source: str, *curves: tuple[Any, Any, Any]) -> list[_Line]:
+        there = [curve for curve in curves if curve[1] is not None and curve[2] is not None]
+        return [_Line(x, y, kind, source=source) for kind, x, y in there]
+
+    in_time = lines(
+        motion, ("measured", c.time, c.measured_displacement), ("fitted", c.time, c.displacement)
+    )
+    if c.time is not None:
+        for node, (measured, fitted) in c.interior.items():
+            in_time.append(_Line(c.time, measured, "measured", node))
+            in_time.append(_Line(c.time, fitted, "fitted", node))
+    stress = lines(
+        "measured", ("measured", c.time, c.measured_stress), ("fitted", c.time, c.stress)
+    )
+    loop = lines(
+        motion,
         ("measured", measured_strain, c.measured_stress),
-        ("fitted", strain, pushed),
+        ("fitted", None if moved is None else moved / height, pushed),
         ("along", measured_strain, c.stress_along),
-    ]
-    everything: list[tuple[Any, ...]] = [
-        ("stress_time", "time", "s", "stress", "Pa", stress),
-        ("displacement_time", "time", "s", "displacement", "m", motion),
-        ("stress_strain", "strain", "–", "stress", "Pa", loop),
-    ]
-    for key, x_name, x_unit, y_name, y_unit, curves in everything:
-        source = "measured" if key == "stress_time" else result.measurement.motion or "measured"
-        lines = [
-            _Line(x, y, kind, source=source)
-            for kind, x, y in curves
-            if x is not None and y is not None
-        ]
-        if key == "displacement_time" and c.time is not None:
-            for node, (measured, fitted) in c.interior.items():
-                lines.append(_Line(c.time, measured, "measured", node))
-                lines.append(_Line(c.time, fitted, "fitted", node))
-        if lines:
-            yield _Panel(key, x_name, x_unit, y_name, y_unit, lines)
-
-
-def _row(figure: Figure, n: int) -> list[Axes]:
-    axes: list[Axes] = list(figure.subplots(1, max(n, 1), squeeze=False)[0])
-    if n == 0:
-        say_nothing_there(axes[0])
-    return axes[:n]
+    )
+    panels = (
+        _Panel("stress_time", "time", "s", "stress", "Pa", stress),
+        _Panel("displacement_time", "time", "s", "displacement", "m", in_time),
+        _Panel("stress_strain", "strain", "–", "stress", "Pa", loop),
+    )
+    yield from (panel for panel in panels if panel.lines)
 
 
 def _draw(ax: Axes, panel: _Panel) -> None:
@@ -224,13 +196,13 @@ def _draw(ax: Axes, panel: _Panel) -> None:
         color = INSIDE[(line.node - 1) % len(INSIDE)] if line.node else VERMILION
         if line.kind == "measured":
             some = _evenly(x, y, MARKERS)
-            of_its_own = line.source == "measured"
+            mark, name = "o", "_measured inside" if line.node else "measured"
+            if line.source != "measured":
+                mark, name = "s", f"measured, motion {line.source}"
             ax.plot(x, y, color="0.82", lw=0.5, zorder=1)
             ax.plot(
-                x[some], y[some], "o" if of_its_own else "s", ms=3.4, mfc="white", mec="0.6",
-                mew=0.6, zorder=3,
-                label="_measured inside" if line.node
-                else "measured" if of_its_own else f"measured, motion {line.source}",
+                x[some], y[some], mark, label=name, ms=3.4, mfc="white", mec="0.6", mew=0.6,
+                zorder=3,
             )  # fmt: skip
         elif line.kind == "fitted":
             name = f"mass {line.node}" if line.node else "fitted"
@@ -266,8 +238,8 @@ def _mark_outliers(ax: Axes, panel: _Panel, result: Fit) -> None:
             motion = test.displacement
             if motion is None:
                 continue
-            clock = np.arange(motion.size) if test.time is None else test.time
-            x = np.interp(found.at, clock, motion) / test.specimen.height
+            time = np.arange(motion.size) if test.time is None else test.time
+            x = np.interp(found.at, time, motion) / test.specimen.height
         low, high = ax.get_ylim()  # fixed: a wild sample must not shrink the curves
         y = np.clip(found.values / fy, low, high)
         ax.plot(
@@ -294,19 +266,16 @@ def _mark_switches(ax: Axes, panel: _Panel, result: Fit) -> None:
             at.setdefault(name, []).append((x / fx, y / fy))
     corner, span = np.array([ax.get_xlim()[0], ax.get_ylim()[0]]), np.array(PANEL)
     span = span / [np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim())]  # typographic points per unit
-    fitted = [line for line in panel.lines if line.kind == "fitted"]
-    some = [_evenly(line.x / fx, line.y / fy, 4 * MARKERS) for line in fitted]
-    curve = [
-        np.column_stack((line.x[i] / fx, line.y[i] / fy))
-        for line, i in zip(fitted, some, strict=True)
-    ]
+    lines = [np.column_stack((s.x / fx, s.y / fy)) for s in panel.lines if s.kind == "fitted"]
+    curves = [line[_evenly(line[:, 0], line[:, 1], 4 * MARKERS)] for line in lines]
     points = [np.array(places) for places in at.values()]
-    avoid = (np.concatenate([np.empty((0, 2)), *curve, *points, *points]) - corner) * span
+    avoid = (np.concatenate([np.empty((0, 2)), *curves, *points, *points]) - corner) * span
+    wanted = IN_LOOP if panel.key == "stress_strain" else IN_TIME
     taken: list[Array] = []
     for name, places in at.items():
         ax.plot(*zip(*places, strict=True), "o", ms=3.2, color="black", zorder=5)
         anchor = (np.array(places[0]) - corner) * span
-        offset = _free_offset(anchor, name, _offset(name[-2:], panel.key), avoid, taken)
+        offset = _free_offset(anchor, name, wanted.get(name[-2:], (5, 5)), avoid, taken)
         ax.annotate(
             name, places[0], offset, textcoords="offset points", zorder=6,
             ha="left" if offset[0] > 0 else "right", va="center", fontsize=7,
@@ -319,8 +288,7 @@ def _free_offset(
 ) -> tuple[float, float]:
     """Return where a name stands beside its anchor: on no other name, on little of the curves.
 
-    All in typographic points; `avoid` has a row for each sample of the curves, and the box of the
-    name (left, low, right, high) is added to `taken`.
+    All in typographic points; the box of the name (left, low, right, high) is added to `taken`.
     """
     x, y = wanted
     size, best, found = np.array([4.2 * len(name), 9.0]), math.inf, (wanted, np.zeros(4))
@@ -338,13 +306,6 @@ def _free_offset(
     return found[0]
 
 
-def _offset(point: str, key: str) -> tuple[float, float]:
-    """Return where the name of a point stands (in points): beside its curve, off the others."""
-    if key == "stress_strain":
-        return {"A1": (-4, 5), "C1": (-5, 3), "C2": (5, -3), "A2": (4, -7)}.get(point, (5, 5))
-    return {"A1": (5, -4), "C1": (-5, 3), "C2": (5, 3), "A2": (5, 4)}.get(point, (5, 5))
-
-
 def _name_branches(ax: Axes, panel: _Panel, result: Fit) -> None:
     """Write a, d, c, e beside the branches of the only spring."""
     fitted = next((line for line in panel.lines if line.kind == "fitted"), None)
@@ -352,22 +313,17 @@ def _name_branches(ax: Axes, panel: _Panel, result: Fit) -> None:
         return
     fx, _, fy, _ = panel.scale()
     starts = [0, *_switch_samples(result, fitted), fitted.x.size - 1]
-    branches = [*(switch.source for switch in result.switches[:1]), *_targets(result)]
-    named: set[str] = set()
-    for branch, start, end in zip(branches, starts, starts[1:], strict=False):
-        if branch not in named and end > start:
+    branches = [switch.source for switch in result.switches[:1]] or ["a"]
+    branches += [switch.target for switch in result.switches]
+    for i, (branch, start, end) in enumerate(zip(branches, starts, starts[1:], strict=False)):
+        if branch not in branches[:i] and end > start:
             x, y = fitted.x[start : end + 1] / fx, fitted.y[start : end + 1] / fy
-            middle = _evenly(x, y, 3)[1:2]
+            middle = _evenly(x, y, 3)[1]
             ax.annotate(
-                branch, (float(x[middle][0]), float(y[middle][0])), BESIDE.get(branch, (6, 6)),
+                branch, (x[middle], y[middle]), BESIDE.get(branch, (6, 6)),
                 textcoords="offset points", ha="center", va="center", color=BLUE,
                 style="italic", weight="bold", zorder=6,
             )  # fmt: skip
-        named.add(branch)
-
-
-def _targets(result: Fit) -> list[str]:
-    return [switch.target for switch in result.switches] or ["a"]
 
 
 def _switch_samples(result: Fit, loop: _Line) -> list[int]:
@@ -398,8 +354,7 @@ def _head(figure: Figure, result: Fit) -> None:
     figure.suptitle(title, x=0.012, ha="left", fontsize=8.5, weight="bold", parse_math=False)
     entries: dict[str, Any] = {}
     for ax in figure.axes:
-        handles, labels = ax.get_legend_handles_labels()
-        entries.update(zip(labels, handles, strict=True))
+        entries |= dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
     if entries:
         figure.legend(
             list(entries.values()), list(entries), loc="outside lower center", ncols=len(entries)
@@ -417,8 +372,8 @@ def _residuals(result: Fit) -> Iterator[tuple[str, Array]]:
         if compared and fitted is not None and measured is not None:
             yield name, (fitted - measured) / (float(np.ptp(measured)) or 1.0)
     for node, (measured, fitted) in c.interior.items():
-        name = f"displacement-time of mass {node}"
-        yield name, (fitted - measured) / (float(np.ptp(measured)) or 1.0)
+        off = (fitted - measured) / (float(np.ptp(measured)) or 1.0)
+        yield f"displacement-time of mass {node}", off
 
 
 def _size(values: Array) -> float:

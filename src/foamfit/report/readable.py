@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 from foamfit import text
 from foamfit.results import ParameterEstimate
@@ -53,9 +52,7 @@ class Readable:
     @property
     def matters(self) -> bool:
         """Whether its reason is to be read: it is not determined, or more is said of it."""
-        return self.state not in ("determined", "fixed") or (
-            self.state == "determined" and ";" in self.why
-        )
+        return self.state != "fixed" and (self.state != "determined" or ";" in self.why)
 
 
 def readable(name: str, p: ParameterEstimate) -> Readable:
@@ -65,26 +62,20 @@ def readable(name: str, p: ParameterEstimate) -> Readable:
     """
     factor, unit = readable_unit(p.value or p.stderr or 0.0, p.unit)
     value = p.value / factor
-    interval = stderr = ""
-    shown = number(value)
+    shown, stderr, interval = number(value), "", ""
     if math.isfinite(value) and p.stderr is not None and 0 < p.stderr < math.inf:
         shown, stderr, places = _rounded(value, p.stderr / factor)
         if p.ci95 is not None:
             interval = " to ".join(_fixed(bound / factor, places) for bound in p.ci95)
     unit = {"": "–", "1": "–", "-": "–", "Pa s": "Pa·s", "Pa*s": "Pa·s"}.get(unit, unit)
-    return Readable(name, _symbol(name), shown, stderr, interval, unit, p.state, p.why,
-        p.ci95_method or "",
-    )  # fmt: skip
+    method = p.ci95_method or ""
+    return Readable(name, _symbol(name), shown, stderr, interval, unit, p.state, p.why, method)
 
 
-def number(value: Any) -> str:
-    """Return anything as text; a number with four digits, an integer with all of its own."""
+def number(value: float | None) -> str:
+    """Return a number with four digits, an integer with all of its own, None as a dash."""
     if value is None:
         return "–"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, list | tuple):
-        return ", ".join(number(item) for item in value)
     return text.number(value) if isinstance(value, float) else str(value)
 
 

@@ -103,23 +103,20 @@ def _correlation(content: Any, where: str) -> dict[tuple[str, str], float]:
 def published_side(name: str) -> Side:
     """Return the parameters of a published set."""
     item = published_sets[name]
-    estimates: dict[str, ParameterEstimate] = {}
+    values = {} if item.eta is None else {"site_eta": item.eta}
     kinds = []
     for i, spring in enumerate(item.chain.springs, start=1):
         names: tuple[str, ...] = BISTABLE_NAMES
+        kind = "bistable"
         if isinstance(spring, LinearSpring):
-            names = LINEAR_NAMES
-            kinds.append("unilateral" if spring.unilateral else "linear")
-        else:
-            kinds.append("bistable")
+            names, kind = LINEAR_NAMES, "unilateral" if spring.unilateral else "linear"
+        kinds.append(kind)
         for short in names:
             if short != "eta":
-                estimates[f"s{i}_{short}"] = _exact(getattr(spring, short))
-        estimates[f"s{i}_height"] = _exact(item.chain.heights[i - 1])
-    if item.eta is not None:
-        estimates["site_eta"] = _exact(item.eta)
+                values[f"s{i}_{short}"] = getattr(spring, short)
+        values[f"s{i}_height"] = item.chain.heights[i - 1]
+    estimates = {
+        name: ParameterEstimate(value, None, None, "", False, "published", "")
+        for name, value in values.items()
+    }
     return Side(f"published {name}", tuple(kinds), estimates, {}, source=item)
-
-
-def _exact(value: float) -> ParameterEstimate:
-    return ParameterEstimate(value, None, None, "", False, "published", "")

@@ -28,18 +28,8 @@ LONGEST = 180  # characters of the reasons for a state; longer ones are left to 
 def summary_text(result: Fit, *, verbose: bool = False) -> str:
     """Return what the command prints after a fit: one screen, at most 100 columns wide.
 
-    Parameters
-    ----------
-    result : Fit
-        What to sum up.
-    verbose : bool
-        Whether to add what else is only in the report: the ladder, the reasons of each state, the
-        checklist, the notes and all warnings.
-
-    Returns
-    -------
-    str
-        Status, misfits, parameters and what is known; no newline at the end.
+    `verbose` adds what else is only in the report: the ladder, the reasons of each state, the
+    checklist, the notes and all warnings.
     """
     m = result.measurement
     head = f"{m.name}: {result.model}, {result.drive} drive, seed {result.seed}: {result.status}"
@@ -55,8 +45,7 @@ def summary_text(result: Fit, *, verbose: bool = False) -> str:
     lines += ["", *_table(rows), "", *_paragraphs(conclusions(result)), ""]
     if verbose:
         return "\n".join([*lines, *_details(result, rows)])
-    lines += _fitting(f"rows: {_rows(result)}", f"rows: {result.measurement.rows.sentences()[0]}")
-    lines += _short_warnings(result)
+    lines += _rows(result) + list(_short_warnings(result))
     return "\n".join(lines).rstrip()
 
 
@@ -67,8 +56,10 @@ def conclusions(result: Fit) -> tuple[str, str, str]:
 
 def misfits(result: Fit) -> dict[str, float | None]:
     """Return the misfits by what their curves are called, masses inside last."""
-    inside = {f"{interior_channel(i)}_time": f"mass {i}" for i in result.curves.interior}
-    names = CURVES | {key: f"displacement-time of {name}" for key, name in inside.items()}
+    names = CURVES | {
+        f"{interior_channel(i)}_time": f"displacement-time of mass {i}"
+        for i in result.curves.interior
+    }
     return {name: result.misfit.get(key) for key, name in names.items()}
 
 
@@ -85,36 +76,32 @@ def _how_well(result: Fit) -> str:
     return f"The model follows {told} of the range{rest}."
 
 
-def _of_state(result: Fit, state: str) -> list[str]:
-    return [name for name, p in result.parameters.items() if p.state == state]
+def _of_state(result: Fit, state: str) -> dict[str, ParameterEstimate]:
+    return {name: p for name, p in result.parameters.items() if p.state == state}
 
 
 def _known(result: Fit) -> str:
-    names, varied = _of_state(result, "determined"), [p.vary for p in result.parameters.values()]
-    if not names:
-        return f"None of the {counted(sum(varied), 'varied parameter')} is determined."
-    told = f"{len(names)} of {counted(sum(varied), 'varied parameter')} "
-    told += "is determined" if len(names) == 1 else "are determined"
-    half = {name: _relative(result.parameters[name]) for name in names}
-    known = {name: size for name, size in half.items() if math.isfinite(size)}
-    ends = [choose(known, key=lambda name: known[name]) for choose in (min, max) if known]
-    shown = [f"{name} ±{percent(known[name])}" for name in dict.fromkeys(ends)]
-    return f"{told} (95 % intervals: {' to '.join(shown)})." if shown else f"{told}."
-
-
-def _relative(p: ParameterEstimate) -> float:
-    """Half of the 95 % interval over the value; NaN where there is none."""
-    if p.ci95 is None or not p.value:
-        return math.nan
-    return 0.5 * (p.ci95[1] - p.ci95[0]) / abs(p.value)
+    found = _of_state(result, "determined")
+    varied = counted(sum(p.vary for p in result.parameters.values()), "varied parameter")
+    if not found:
+        return f"None of the {varied} is determined."
+    told = f"{len(found)} of {varied} {'is' if len(found) == 1 else 'are'} determined"
+    half = {  # of the 95 % interval over the value
+        name: 0.5 * (p.ci95[1] - p.ci95[0]) / abs(p.value)
+        for name, p in found.items()
+        if p.ci95 is not None and p.value and math.isfinite(p.ci95[1] - p.ci95[0])
+    }
+    ends = dict.fromkeys(choose(half, key=half.__getitem__) for choose in (min, max) if half)
+    shown = " to ".join(f"{name} ±{percent(half[name])}" for name in ends)
+    return f"{told} (95 % intervals: {shown})." if shown else f"{told}."
 
 
 def _unknown(result: Fit) -> str:
     parts = []
     for state in ("not determined", "weak"):
         reasons = dict[str, list[str]]()
-        for name in _of_state(result, state):
-            reasons.setdefault(result.parameters[name].why, []).append(name)
+        for name, p in _of_state(result, state).items():
+            reasons.setdefault(p.why, []).append(name)
         groups = [f"{', '.join(names)} ({why})" for why, names in reasons.items()]
         if len("; ".join(groups)) > LONGEST:
             groups = [f"{', '.join(_of_state(result, state))} (see why in the report)"]
@@ -128,12 +115,15 @@ def _unknown(result: Fit) -> str:
     return f"No varied parameter is weak; least determined is the combination of {listed(names)}."
 
 
-def _rows(result: Fit) -> str:
-    """Say how many rows are used and why not the others, in one sentence."""
+def _rows(result: Fit) -> list[str]:
+    """Say how many rows are used and, where it is short, why not the others."""
     rows = result.measurement.rows
-    told = f"{rows.rows} read, {rows.used} used"
+    told = f"rows: {rows.rows} read, {rows.used} used"
     reasons = ", ".join(f"{item.rows} ({item.why})" for item in rows.dropped)
-    return f"{told}; not used: {reasons}" if reasons else told
+    lines = wrapped(f"{told}; not used: {reasons}" if reasons else told)
+    if len(lines) > ROW_LINES:
+        lines = wrapped(f"rows: {rows.sentences()[0]} See the report for the others.")
+    return lines
 
 
 def _warnings(result: Fit) -> list[str]:
@@ -145,22 +135,16 @@ def _short_warnings(result: Fit) -> Iterator[str]:
     """Give the warnings but those of the states, as many as fit, and how many more there are."""
     said = [w for check in result.checklist if check.key == "determined" for w in check.warnings]
     warnings = [warning for warning in _warnings(result) if warning not in said]
-    room = WARNING_LINES
+    given = 0
     for i, warning in enumerate(warnings):
         lines = wrapped(f"warning: {warning}")
-        if i and len(lines) > room:
+        if i and given + len(lines) > WARNING_LINES:
             yield f"and {counted(len(warnings) - i, 'more warning')}: see the report, or --verbose"
             return
         if len(lines) > WARNING_LINES:
             lines = [*lines[: WARNING_LINES - 1], "  … (see the report, or --verbose)"]
         yield from lines
-        room -= len(lines)
-
-
-def _fitting(text: str, short: str) -> list[str]:
-    """Wrap a text, or a shorter one if it takes too many lines."""
-    lines = wrapped(text)
-    return lines if len(lines) <= ROW_LINES else wrapped(f"{short} See the report for the others.")
+        given += len(lines)
 
 
 def _paragraphs(texts: Iterable[str]) -> list[str]:
@@ -194,23 +178,23 @@ def _details(result: Fit, rows: list[Readable]) -> Iterator[str]:
 
 
 def ladder_cells(ladder: Ladder) -> list[tuple[str, ...]]:
-    """Return the rungs of a ladder as text, in the columns of `LADDER`.
+    """Return the models of a ladder as text, in the columns of `LADDER`.
 
     The misfits are those of the curves in time where there are any, else that of stress-strain;
     "rank" is rank over parameters varied, "n.d." parameters not determined over weak ones.
     """
     cells = list[tuple[str, ...]]()
-    for rung in ladder.rungs:
-        timed = [off for name, off in rung.misfit.items() if name != "stress_strain"]
-        shown = [off for off in timed if off is not None]
-        shown = shown or [off for off in rung.misfit.values() if off is not None]
+    for one in ladder.rungs:
+        timed = {key: off for key, off in one.misfit.items() if key != "stress_strain"}
+        shown = [off for off in timed.values() if off is not None]
+        shown = shown or [off for off in one.misfit.values() if off is not None]
         cells.append(
             (
-                "→" if rung.chosen else "", rung.model, rung.damping,
-                " ".join(percent(off).removesuffix(" %") for off in shown), f"{rung.chisqr:.4g}",
-                f"{rung.rank}/{rung.n_vary}", _whole(rung.n_eff), _whole(rung.aicc),
-                _whole(rung.bic), _p(rung.runs_p), _p(rung.neighbours_p),
-                f"{len(rung.not_determined)}/{len(rung.weak)}", f"{rung.seconds:.1f}",
+                "→" if one.chosen else "", one.model, one.damping,
+                " ".join(percent(off).removesuffix(" %") for off in shown), f"{one.chisqr:.4g}",
+                f"{one.rank}/{one.n_vary}", _whole(one.n_eff), _whole(one.aicc),
+                _whole(one.bic), _p(one.runs_p), _p(one.neighbours_p),
+                f"{len(one.not_determined)}/{len(one.weak)}", f"{one.seconds:.1f}",
             )
         )  # fmt: skip
     return cells
@@ -225,9 +209,9 @@ def _p(value: float) -> str:
 
 
 def _ladder_lines(ladder: Ladder) -> list[str]:
-    """Return the table of a ladder, why each rung was chosen or not, and what it all says."""
+    """Return the table of a ladder, why each model was chosen or not, and what it all says."""
     lines = aligned([LADDER, *ladder_cells(ladder)], gap=" ")
-    lines += _paragraphs(f"{rung.name}: {rung.why}" for rung in ladder.rungs)
+    lines += _paragraphs(f"{one.name}: {one.why}" for one in ladder.rungs)
     lines += _paragraphs(f"not tried: {reason}" for reason in ladder.skipped)
     said = [sentence for sentence in ladder.sentences if sentence not in ladder.cautions]
     return [*lines, *_paragraphs(said)]

@@ -35,7 +35,7 @@ def announce(function: Any, what: str) -> None:
 
 
 def compiled(name: str = "integrate") -> bool:
-    """Tell whether an earlier run left a loop, compiled of this very source, in the cache.
+    """Whether an earlier run left a loop, compiled of this very source, in the cache.
 
     What is older than any module in these folders is removed: numba itself compares it with the
     module of the outermost loop alone.

@@ -9,7 +9,7 @@ analytic as far as the nearest pole of a curved branch (-k). Its Taylor polynomi
 stress stands for all springs: a spring that switches takes its terms out and puts others in, which
 costs the same in a chain of ten springs and of a thousand. The whole sum is made anew only where
 the stress nears the end of the polynomial's reach. The next spring to switch is found in a
-tournament of the switching stresses. So a run costs little more than in proportion to its springs,
+binary tree of the switching stresses. So a run costs little more than in proportion to its springs,
 where following every spring through every step costs their number squared.
 
 In time a step is a Taylor series again, with powers of the series of S put into the polynomial.
@@ -29,7 +29,6 @@ from foamfit.solve.polynomial import (
     fill_values,
     first_crossing,
     order_for,
-    value_and_slope,
     value_at,
 )
 from foamfit.solve.scene import (
@@ -60,59 +59,38 @@ from foamfit.springs.kernels import (
     first_branch,
     inner,
     maker,
-    strains_on,
     stress_interval,
 )
 from foamfit.springs.law import BISTABLE, UNILATERAL
 
-# A step of Newton's method so small, in distances to the nearest pole, is the last: what it leaves
-# is about its square.
-NEAR = 3e-8
 # Degree of the polynomial of the elongation, and how far from its anchor it is used, in distances
 # to the nearest pole: what it leaves out is below 0.125**17 < 1e-15 of the elongation.
 DEGREE, REACH = 16, 0.125
 # Springs whose switching stresses differ by less than this share switch together.
 CLOSE = 1e-13
-# Past so many times the least slope, and so many anchors, no room is left on a curved branch.
-FAR, MOST_ANCHORS = 1e30, 1000
 # Orders by which the time of the next event is guessed.
 GUESS = 3
-# Columns of `Group.law` and of `Group.place`.
-CURVED, SLOPE, ORIGIN, OFFSET, N_LAW = range(5)
+# Columns of `Group.place`.
 ANCHOR, UNIT, LEAST, N_PLACE = range(4)
 
 
 class Group(NamedTuple):
     """Springs in series under one stress, on the branches that they are on.
 
-    `rows` (springs, columns), `heights` (springs,) in m, `branches` (springs,); `law` (springs,
-    N_LAW) the shapes of the branches. `upper` and `lower` hold in their second halves the stresses
-    at which each spring leaves its branch upwards and, negative, downwards; every entry before is
-    the lesser of its two children, so that the first is the next to be met. `sum` (DEGREE + 1,) is
-    the elongation as a polynomial of (S - anchor)/unit, with both, Pa, in `place`, and the least
-    first slope of a branch.
+    `rows` (springs, columns), `heights` (springs,) in m, `branches` (springs,). `upper` and `lower`
+    hold in their second halves the stresses at which each spring leaves its branch upwards and,
+    negative, downwards; every entry before is the lesser of its two children, so that the first is
+    the next to be reached. `sum` (DEGREE + 1,) is the elongation as a polynomial of
+    (S - anchor)/unit, with both, Pa, in `place`, and the least first slope of a branch.
     """
 
     rows: Array
     heights: Array
     branches: Branches
-    law: Array
     upper: Array
     lower: Array
     sum: Array
     place: Array
-
-
-class Runs(NamedTuple):
-    """Histories to fill: stress (n,), strains and branches (springs or 0, n).
-
-    `since` (springs,) is the sample from which each spring has been on its branch.
-    """
-
-    sigma: Array
-    eps: Array
-    history: Branches
-    since: Branches
 
 
 class Step(NamedTuple):
@@ -131,7 +109,7 @@ class Step(NamedTuple):
 
 @compiled
 def holds(rows: Array) -> bool:
-    """Tell whether every spring has one strain at each stress on its branch, and no dashpot."""
+    """Whether every spring has one strain at each stress on its branch, and no dashpot."""
     for i in range(rows.shape[0]):
         if rows[i, ETA] > 0.0 or rows[i, KIND] == UNILATERAL:
             return False
@@ -144,8 +122,8 @@ def holds(rows: Array) -> bool:
 
 
 @inner
-def _put(tree: Array, i: int, value: float) -> None:
-    """Set an entry of a tournament."""
+def _set(tree: Array, i: int, value: float) -> None:
+    """Set a leaf of a tree in which every node is the lesser of its children."""
     at = tree.size // 2 + i
     tree[at] = value
     while at > 1:
@@ -154,8 +132,8 @@ def _put(tree: Array, i: int, value: float) -> None:
 
 
 @inner
-def _winner(tree: Array) -> int:
-    """Which entry of a tournament is the least."""
+def _least(tree: Array) -> int:
+    """Which leaf of a tree is the least."""
     at = 1
     while at < tree.size // 2:
         at = 2 * at if tree[2 * at] == tree[at] else 2 * at + 1
@@ -165,13 +143,10 @@ def _winner(tree: Array) -> int:
 @inner
 def _enter(group: Group, i: int, branch: int) -> None:
     """Put a spring on a branch."""
-    curved, slope, origin, offset = branch_shape(group.rows[i], branch)
     group.branches[i] = branch
-    group.law[i, CURVED] = 1.0 if curved else 0.0
-    group.law[i, SLOPE], group.law[i, ORIGIN], group.law[i, OFFSET] = slope, origin, offset
     low, high = stress_interval(group.rows[i], branch)
-    _put(group.upper, i, high)
-    _put(group.lower, i, -low)
+    _set(group.upper, i, high)
+    _set(group.lower, i, -low)
 
 
 @inner
@@ -180,9 +155,9 @@ def _add(group: Group, i: int, share: float) -> None:
 
     On a curved branch ε = x0 + 1 - k/(k + S), a geometric series.
     """
-    k, x0, s0 = group.law[i, SLOPE], group.law[i, ORIGIN], group.law[i, OFFSET]
+    curved, k, x0, s0 = branch_shape(group.rows[i], group.branches[i])
     anchor, unit, height = group.place[ANCHOR], group.place[UNIT], share * group.heights[i]
-    if group.law[i, CURVED] == 0.0:
+    if not curved:
         group.sum[0] += height * (x0 + (anchor - s0) / k)
         group.sum[1] += height * unit / k
         return
@@ -207,32 +182,16 @@ def _anchor(group: Group, stress: float, rising: bool) -> None:
         _add(group, i, 1.0)
 
 
-@inner
-def _swap(group: Group, i: int, branch: int) -> None:
-    """Put a spring on another branch, and its elongation there in the place of that before."""
-    _add(group, i, -1.0)
-    _enter(group, i, branch)
-    _add(group, i, 1.0)
-
-
 @maker
 def _make_group(rows: Array, heights: Array) -> Group:
-    """Make room for springs as one; `_begin` fills it."""
+    """Springs as one, all on their first branches, free of stress."""
     count, leaves = heights.size, 1
     while leaves < count:
         leaves *= 2
-    return Group(
-        rows, heights, np.zeros(count, np.int64), np.zeros((count, N_LAW)),
-        np.empty(2 * leaves), np.empty(2 * leaves), np.zeros(DEGREE + 1), np.zeros(N_PLACE),
+    group = Group(
+        rows, heights, np.zeros(count, np.int64), np.full(2 * leaves, math.inf),
+        np.full(2 * leaves, math.inf), np.zeros(DEGREE + 1), np.zeros(N_PLACE),
     )  # fmt: skip
-
-
-@inner
-def _begin(group: Group) -> None:
-    """Put all springs on their first branches, free of stress."""
-    rows = group.rows
-    for at in range(group.upper.size):
-        group.upper[at] = group.lower[at] = math.inf
     least = math.inf
     for i in range(rows.shape[0]):
         _enter(group, i, first_branch(rows[i]))
@@ -240,16 +199,15 @@ def _begin(group: Group) -> None:
         if rows[i, KIND] == BISTABLE:
             least = min(least, rows[i, KC])
     group.place[LEAST] = least
-    _anchor(group, 0.0, least > 0.0)
+    _anchor(group, 0.0, least > 0.0)  # not the literal, which is a type
+    return group
 
 
 @inner
 def _strain(group: Group, i: int, stress: float) -> float:
     """Strain of a spring on its branch."""
-    k, x0 = group.law[i, SLOPE], group.law[i, ORIGIN]
-    if group.law[i, CURVED] == 0.0:
-        return x0 + (stress - group.law[i, OFFSET]) / k
-    return x0 + stress / (k + stress)
+    curved, k, x0, s0 = branch_shape(group.rows[i], group.branches[i])
+    return x0 + (stress / (k + stress) if curved else (stress - s0) / k)
 
 
 @inner
@@ -260,12 +218,14 @@ def _switch(
     tree = group.upper if rising else group.lower
     met = (stress if rising else -stress) + CLOSE * abs(stress)
     while tree[1] <= met:
-        i = _winner(tree)
+        i = _least(tree)
         left = group.branches[i]
         entered = above(left) if rising else below(left)
         strain = _strain(group, i, stress)
         switches = log_switch(log, switches, now, i, left, entered, strain)
-        _swap(group, i, entered)
+        _add(group, i, -1.0)
+        _enter(group, i, entered)
+        _add(group, i, 1.0)
     return switches
 
 
@@ -297,16 +257,6 @@ def _next_order(group: Group, now: Step, n: int, mass: float, drag: float) -> No
 
 
 @inner
-def _start(group: Group, now: Step) -> None:
-    """Find order 0: the displacement, from the stress."""
-    step = (now.s[0] - group.place[ANCHOR]) / group.place[UNIT]
-    now.shifted[DEGREE] = group.sum[DEGREE]
-    for m in range(DEGREE - 1, -1, -1):
-        now.shifted[m] = group.sum[m] + step * now.shifted[m + 1]
-    now.w[0] = now.shifted[0]
-
-
-@inner
 def _longest(c: Array, n: int, limit: float, span: float) -> float:
     """Step within `span` at which the terms n - 1 and n of a series are below a limit."""
     for m in (n - 1, n):
@@ -329,9 +279,13 @@ def _expand(
 ) -> tuple[int, float]:
     """Expand a step until its terms fall below the limits: orders found, and the longest step.
 
-    The first orders tell about when the next event comes; the step is a little longer than that.
+    The first orders estimate the next event; the step is a little longer than that.
     """
-    _start(group, now)
+    step = (now.s[0] - group.place[ANCHOR]) / group.place[UNIT]
+    now.shifted[DEGREE] = group.sum[DEGREE]
+    for m in range(DEGREE - 1, -1, -1):
+        now.shifted[m] = group.sum[m] + step * now.shifted[m + 1]
+    now.w[0] = now.shifted[0]
     most = now.s.size - 1
     n = min(GUESS, most)
     for m in range(1, n + 1):
@@ -349,7 +303,7 @@ def _expand(
 @inner
 def _sample(
     group: Group, now: Step, order: int, t: Array, first: int, last: int, begin: float,
-    curves: Array,
+    curves: Array
 ) -> None:  # fmt: skip
     """Write base stress and displacements at the samples first … last-1 of a step."""
     if first == last:
@@ -405,7 +359,6 @@ def integrate_aggregate(
         np.zeros(order + 1), np.zeros(order + 1), np.zeros(order + 1),
         np.zeros((order + 1, order + 1)), np.zeros(DEGREE + 1),
     )  # fmt: skip
-    _begin(group)
     s_scale, w_scale = _scales(group, mass, drag, speed)
     effort[0] += 1
     done = before_contact(curves, t, speed)
@@ -451,85 +404,3 @@ def integrate_aggregate(
                 _anchor(group, stress, side > 0)
                 effort[0] += 1
     return TOO_MANY_STEPS, begin, max_steps, switches
-
-
-# ---------------------------------------------------------------- a known elongation
-
-
-@inner
-def _stress_at(group: Group, elongation: float, guess: float) -> tuple[float, float]:
-    """Stress at an elongation within the reach of the sum, by Newton's method, and its slope."""
-    unit, slope = group.place[UNIT], 1.0
-    x = (guess - group.place[ANCHOR]) / unit
-    for _ in range(50):
-        value, slope = value_and_slope(group.sum, DEGREE, x)
-        step = (elongation - value) / slope
-        x += step
-        if abs(step) < NEAR:
-            break
-    return group.place[ANCHOR] + unit * x, unit / slope
-
-
-@inner
-def _write(group: Group, i: int, first: int, last: int, runs: Runs) -> None:
-    """Write strains and branch of a spring over the samples that it was on it, if wanted."""
-    if runs.eps.shape[0] == 0:
-        return
-    strains_on(group.rows[i], group.branches[i], runs.sigma[first:last], runs.eps[i, first:last])
-    runs.history[i, first:last] = group.branches[i]
-
-
-@inner
-def _pass(group: Group, stress: float, rising: bool, j: int, runs: Runs) -> None:
-    """Change the branches of all springs that leave theirs at this stress, before sample j."""
-    tree = group.upper if rising else group.lower
-    met = (stress if rising else -stress) + CLOSE * abs(stress)
-    while tree[1] <= met:
-        i = _winner(tree)
-        _write(group, i, runs.since[i], j, runs)
-        runs.since[i] = j
-        _swap(group, i, above(group.branches[i]) if rising else below(group.branches[i]))
-
-
-@compiled
-def equilibrium_along(
-    rows: Array, heights: Array, top: Array, sigma: Array, eps: Array, history: Branches
-) -> bool:
-    """Springs in series, as `holds` wants them, along a history of the top's displacement (m).
-
-    Fills the common stress (n,), the strains and the branches (springs or 0, n), as does
-    `springs.kernels.equilibrium_along`, which goes through all springs at every trial. False, and
-    nothing of use filled, where the sum does not reach: past all room on a curved branch, or under
-    a tension beyond the least slope, which a spring on a straight branch may bear.
-    """
-    count, group = heights.size, _make_group(rows, heights)
-    runs = Runs(sigma, eps, history, np.zeros(count, np.int64))
-    _begin(group)
-    stress, place, slope, end, edge = 0.0, 0.0, 0.0, 0.0, 0.0
-    rose, stale = True, True
-    for j in range(top.size):
-        rising, there = top[j] >= place, False
-        stale, rose = stale or rising != rose, rising
-        for _ in range(4 * count + MOST_ANCHORS):
-            anchor, reach = group.place[ANCHOR], REACH * group.place[UNIT]
-            if stale:
-                end = min(group.upper[1], anchor + reach)
-                if not rising:
-                    end = max(-group.lower[1], anchor - reach)
-                edge = value_at(group.sum, DEGREE, (end - anchor) / group.place[UNIT])
-            there = top[j] <= edge if rising else top[j] >= edge
-            stale = not there
-            if there or not abs(end) < FAR * group.place[LEAST]:
-                break
-            stress = end
-            _pass(group, stress, rising, j, runs)
-            if abs(stress - anchor) >= reach * (1.0 - 1e-12):
-                _anchor(group, stress, rising)
-        if not there:
-            return False
-        guess = stress + slope * (top[j] - place)
-        stress, slope = _stress_at(group, top[j], min(guess, end) if rising else max(guess, end))
-        sigma[j], place = stress, top[j]
-    for i in range(count):
-        _write(group, i, runs.since[i], top.size, runs)
-    return True

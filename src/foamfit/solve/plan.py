@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
 from foamfit.solve import cache, many
 from foamfit.solve import scene as scenes
@@ -21,7 +22,6 @@ from foamfit.springs.parameters import OWN_ETA, OWN_HEIGHT
 from foamfit.springs.sensitivities import equilibrium_tangents
 from foamfit.springs.spring import as_samples
 
-Array = NDArray[np.float64]
 Directions = NDArray[np.int64]
 
 CLOSED_FORM, FIRST_ORDER, SECOND_ORDER = "closed form", "first order", "second order"
@@ -39,11 +39,10 @@ MOST_WORK, MOST_EXPLICIT_WORK, MOST_SAMPLED = 1_500_000, 500_000, 10_000_000
 # and without; of springs that count as one, whose errors add up.
 OF_MASSES, OF_IMPACT, ALONG_DRIVE = 1e-4, 1e-3, 1e-4
 OF_MASSES_IMPLICIT, IMPLICIT, AS_ONE = 3e-2, 3e-4, 1e-4
-# Truncation of implicit steps that rounding leaves room for.
+# Least truncation of implicit steps: less is rounding.
 LEAST_IMPLICIT = 1e-14
-# From so many springs on, those that carry one stress count as one: in an impact, and where their
-# elongation is prescribed.
-LEAST_AGGREGATE, LEAST_ELONGATED = 9, 3
+# From so many springs on, those that carry one stress in an impact count as one.
+LEAST_AGGREGATE = 9
 # Switches that are kept, of springs that do not count as one.
 LOGGED = 1024
 
@@ -71,7 +70,7 @@ _NOTHING = np.zeros(1)
 # Tops under which springs start from rest, and what they start from.
 _RESTING, _AT_REST = (scenes.FREE, scenes.VISCOUS), np.zeros((1, 0))
 # Outcomes of explicit steps after which implicit ones are tried.
-_WRONG_TOOL = (scenes.TOO_MANY_STEPS, scenes.STEP_UNDERFLOW)
+_STIFF = (scenes.TOO_MANY_STEPS, scenes.STEP_UNDERFLOW)
 NO_SLOPES = np.empty((0, 0, 0))
 
 
@@ -172,7 +171,9 @@ class Plan(NamedTuple):
         slopes = np.empty((p, *curves.shape)) if p else NO_SLOPES
         bounces = self.plain and not drag and self.implicit is None
         stiff = not bounces and self._is_stiff(self.given(rows, heights, drag))
-        if p == 0 and not stiff and len(heights) >= LEAST_AGGREGATE and self._is_one(rows):
+        one = self.speed > 0.0 and self.top == scenes.FREE and len(self.ends) == 1
+        one = one and p == 0 and not stiff and len(heights) >= LEAST_AGGREGATE
+        if one and many.holds(rows):
             return self._aggregate(self.given(rows, heights, drag), rtol, curves)
         start = _AT_REST if self.top in _RESTING else self._start(rows, heights, directions)
         log = np.empty((LOGGED, 5)) if everything else NO_SWITCHES
@@ -184,12 +185,12 @@ class Plan(NamedTuple):
                 self.values, self.speed, time, self.margin * rtol, most, directions, start, curves,
                 slopes, log,
             )  # fmt: skip
-            if self.implicit is False or ending[0] not in _WRONG_TOOL:
+            if self.implicit is False or ending[0] not in _STIFF:
                 return _motion(TAYLOR, ending, curves, slopes, log)
         margin = OF_MASSES_IMPLICIT if len(self.ends) > 1 else IMPLICIT
         cache.announce(steps.integrate_implicit, "the solver of stiff scenes")
         *ending, lost = steps.integrate_implicit(
-            self.given(rows, heights, drag), max(margin * rtol, LEAST_IMPLICIT), rtol,
+            self.given(rows, heights, drag), max(margin * rtol, LEAST_IMPLICIT),
             self.max_steps, directions, start, curves, slopes, log, np.zeros(2, np.int64),
         )  # fmt: skip
         return _motion(RADAU, ending, curves, slopes, log, lost)
@@ -208,7 +209,7 @@ class Plan(NamedTuple):
         moved, wanted = self.top == scenes.MOTION, everything or len(directions) > 0
         if moved:
             top = np.array(self.values)
-            stress, strain, branches = self._stretched(rows, heights, wanted)
+            stress, strain, branches = self._stretched(rows, heights)
             fine = True
         else:
             stress, top = np.array(self.values), np.empty(self.time.size)
@@ -240,20 +241,14 @@ class Plan(NamedTuple):
         switches = _switches(self.time, strain, branches)
         return Motion(nodes, stress, math.nan, switches, 0, CLOSED_FORM, slopes)
 
-    def _stretched(
-        self, rows: Array, heights: Array, wanted: bool
-    ) -> tuple[Array, Array, NDArray[np.int64]]:
-        """Stress, strains and branches (the last two if `wanted`) under a known motion."""
+    def _stretched(self, rows: Array, heights: Array) -> tuple[Array, Array, NDArray[np.int64]]:
+        """Stress, strains and branches under a known motion."""
         count, n = len(heights), self.time.size
         if count == 1:
             strain = self.values / heights
             stress, history = kernels.stress_along(rows[0], strain)
             return stress, strain[None, :], history[None, :]
         stress = np.empty(n)
-        if count >= LEAST_ELONGATED and many.holds(rows):
-            strain, branches = _new_history(count if wanted else 0, n)
-            if many.equilibrium_along(rows, heights, self.values, stress, strain, branches):
-                return stress, strain, branches
         strain, branches = _new_history(count, n)
         kernels.equilibrium_along(rows, heights, self.values, stress, strain, branches)
         miss = np.abs(heights @ strain - self.values).max()
@@ -302,36 +297,20 @@ class Plan(NamedTuple):
             start[1 + own, first:] = longer / heights
         return start
 
-    def _is_one(self, rows: Array) -> bool:
-        """Tell whether an impact acts on springs so many and so plain that they count as one."""
-        return (
-            len(self.ends) == 1
-            and self.top == scenes.FREE
-            and self.speed > 0.0
-            and bool(many.holds(rows))
-        )
-
     def fastest_rates(self, rows: Array, heights: Array) -> tuple[float, float]:
         """Vibration and relaxation (radians) that explicit steps would have to go through."""
         return vibration.fastest_rates(self.given(rows, heights))
 
     def _is_stiff(self, given: scenes.SceneTuple) -> bool:
-        """Tell whether explicit steps would have to follow what is long over."""
+        """Whether explicit steps would have to follow rates that have long died out."""
         if self.implicit is not None:
             return self.implicit
-        if self.speed > 0.0 and vibration.stops_the_striker(given):
-            return True
-        swings, decays = vibration.fastest_rates(given)
-        return bool(swings > MOST_VIBRATION or decays > MOST_RELAXATION)
+        vibrates, relaxes = vibration.fastest_rates(given)
+        return bool(vibrates > MOST_VIBRATION or relaxes > MOST_RELAXATION)
 
 
 def _motion(
-    method: str,
-    ending: Sequence[Any],
-    curves: Array,
-    slopes: Array,
-    log: Array,
-    unresolved: float = 0.0,
+    method: str, ending: Sequence[Any], curves: Array, slopes: Array, log: Array, lost: float = 0.0
 ) -> Motion:
     """Gather what an integrator found, or say why it found nothing."""
     outcome, time, steps, switches = ending
@@ -339,7 +318,7 @@ def _motion(
         raise SimulationError(_OUTCOMES[outcome].format(steps=steps, time=time))
     slope = None if slopes is NO_SLOPES else Slopes(slopes[:, 1:], slopes[:, 0])
     seen = log if log is NO_SWITCHES else log[:switches]
-    return Motion(curves[1:], curves[0], time, seen, steps, method, slope, unresolved)
+    return Motion(curves[1:], curves[0], time, seen, steps, method, slope, lost)
 
 
 def _new_history(count: int, n: int) -> tuple[Array, NDArray[np.int64]]:
@@ -361,20 +340,14 @@ def _time(t: ArrayLike) -> Array:
     if time.ndim != 1 or time.size == 0:
         raise InputError("t must be a one-dimensional array with at least one sample")
     at = kernels.fault(time)
-    if at >= 0 and not math.isfinite(time[at]):
-        raise InputError(f"t must be finite; sample {at} is not")
     if at >= 0:
-        raise InputError(f"t must increase; sample {at} is not later than the one before it")
+        what = "later than the one before it" if math.isfinite(time[at]) else "finite"
+        raise InputError(f"t must be finite and increase; sample {at} is not {what}")
     return time
 
 
 def plan(
-    chain: Chain,
-    drive: Drive,
-    t: ArrayLike,
-    *,
-    dashpots: bool = False,
-    max_steps: int = MAX_STEPS,
+    chain: Chain, drive: Drive, t: ArrayLike, *, dashpots: bool = False, max_steps: int = MAX_STEPS
 ) -> Plan:
     """Find what a scene needs: the nodes that have a state, and the least solver.
 

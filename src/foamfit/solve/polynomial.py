@@ -7,7 +7,7 @@ import math
 
 from foamfit.springs.kernels import Array, inner, piece
 
-# Truncation of a step that rounding leaves room for.
+# Least truncation of a step: less is rounding.
 LEAST_TRUNCATION = 1e-16
 
 

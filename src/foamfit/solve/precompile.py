@@ -11,8 +11,9 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
@@ -20,21 +21,21 @@ from foamfit.solve.cache import PACKAGE
 
 
 def _run(drive: str, count: int = 1, eta: float = 0.0) -> None:
-    """Simulate a few samples of a small chain, and a derivative, without a look at its rates."""
+    """Simulate a few samples of a small chain, and a derivative, by explicit steps."""
     from foamfit.solve.plan import plan
     from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
     from foamfit.springs.spring import BistableSpring
 
     spring = BistableSpring(5e6, 8e7, -2e5, 0.14, 0.31, 1.4e7, 2.5e6, eta)
     chain, shape = Chain([spring] * count, [1e-3] * count, 2e-5), np.array([0.0, 1.0, 0.5, 0.0])
-    loads: dict[str, Drive] = {
+    drives: dict[str, Drive] = {
         "impact": Impact(7e-3, 2.0),
         "stress": StressDrive(1e6 * shape),
         "displacement": DisplacementDrive(1e-4 * shape),
     }
-    scene = plan(chain, loads[drive], np.linspace(0.0, 1e-3, 4))._replace(implicit=False)
+    scene = plan(chain, drives[drive], np.linspace(0.0, 1e-3, 4))
     directions = np.zeros((1, 2), np.int64)
-    scene.run(chain.arrays.rows, chain.arrays.heights, 1e-2, directions=directions)
+    scene._replace(implicit=False).run(*chain.arrays[:2], 1e-2, directions=directions)
 
 
 def _calls() -> dict[Any, tuple[Any, ...]]:
@@ -58,32 +59,22 @@ def _calls() -> dict[Any, tuple[Any, ...]]:
 
         return call
 
-    modules = (kernels, sensitivities, polynomial, scene, series, taylor, plan)
-    was = {module: dict(vars(module)) for module in modules}
-    try:
-        for module, names in was.items():
-            for name, loop in names.items():
-                if hasattr(loop, "py_func"):
-                    setattr(module, name, plain(loop, module is taylor))
-        with np.errstate(all="ignore"):
-            _run("impact")
-            _run("impact", eta=50.0)
-            _run("displacement", 2, eta=50.0)
-    finally:
-        for module, names in was.items():
-            vars(module).update(names)
+    with ExitStack() as uncompiled, np.errstate(all="ignore"):
+        for module in (kernels, sensitivities, polynomial, scene, series, taylor, plan):
+            names = {name: loop for name, loop in vars(module).items() if hasattr(loop, "py_func")}
+            called = {name: plain(loop, module is taylor) for name, loop in names.items()}
+            uncompiled.enter_context(patch.dict(vars(module), called))
+        _run("impact")
+        _run("impact", eta=50.0)
+        _run("displacement", 2, eta=50.0)
     return calls
 
 
 def _compile(calls: dict[Any, tuple[Any, ...]], cached: bool) -> None:
     """Compile the loops that have, or have not, a file of their own in the cache."""
-    gc.disable()  # what compiling makes stays
-    try:
-        for loop, types in calls.items():
-            if (loop.stats.cache_path is not None) == cached:
-                loop.compile(types)
-    finally:
-        gc.enable()
+    for loop, types in calls.items():
+        if (loop.stats.cache_path is not None) == cached:
+            loop.compile(types)
 
 
 def _rest() -> None:
@@ -95,9 +86,8 @@ def _rest() -> None:
 
     Model(("linear",)).rows(np.ones(2))
     one, rows = np.ones(1), np.ones((1, kernels.N_COLUMNS))
-    given = (rows, one, np.ones(1, np.int64), one, 0.0, scene.FREE, one, 1.0, one)
-    vibration.stops_the_striker(given)
-    vibration.fastest_rates(given)
+    groups = np.ones(1, np.int64)
+    vibration.fastest_rates((rows, one, groups, one, 0.0, scene.FREE, one, 1.0, one))
     _run("displacement")
     _run("displacement", 2)
     _run("stress")
@@ -109,7 +99,7 @@ def side_by_side() -> Iterator[Callable[[], None]]:
 
     At the end all that a fit needs is in the cache. The other process is stopped if the body fails.
     """
-    path = os.pathsep.join([str(PACKAGE.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
+    path = f"{PACKAGE.parent}{os.pathsep}{os.environ.get('PYTHONPATH', '')}".rstrip(os.pathsep)
     with subprocess.Popen(
         [sys.executable, "-m", "foamfit.solve.precompile"],
         stdout=subprocess.PIPE,
@@ -118,11 +108,13 @@ def side_by_side() -> Iterator[Callable[[], None]]:
     ) as other:
 
         def finish() -> None:
+            gc.disable()  # what compiling makes stays
             integrator, *calls = _calls().items()
             _compile(dict(calls), cached=False)
             if other.stdout is not None:
                 other.stdout.readline()  # the pieces are there, or the other process has failed
             _compile(dict([integrator]), cached=True)
+            gc.enable()
 
         try:
             yield finish
@@ -132,12 +124,9 @@ def side_by_side() -> Iterator[Callable[[], None]]:
             raise
 
 
-def _other() -> None:
-    _, *calls = _calls().items()
-    _compile(dict(calls), cached=True)
+if __name__ == "__main__":
+    gc.disable()
+    _, *pieces = _calls().items()
+    _compile(dict(pieces), cached=True)
     print("pieces", flush=True)
     _rest()
-
-
-if __name__ == "__main__":
-    _other()

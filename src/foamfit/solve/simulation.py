@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
 from foamfit.solve.plan import (
     AGGREGATE,
@@ -28,8 +30,6 @@ from foamfit.springs.chain import Chain, Drive, check_scene
 from foamfit.springs.law import BISTABLE
 from foamfit.springs.parameters import DRAG, KINDS, OWN_HEIGHT, direction
 from foamfit.springs.spring import as_number
-
-Array = NDArray[np.float64]
 
 _UNRESOLVED = (
     "masses vibrate too fast to be followed, by up to {size:.1g} of the range: ask for no smaller "
@@ -92,11 +92,7 @@ class Response:
 
 
 def _verified(
-    scene: Plan,
-    rows: Array,
-    heights: Array,
-    rtol: float,
-    directions: Directions = NO_DIRECTIONS,
+    scene: Plan, rows: Array, heights: Array, rtol: float, directions: Directions = NO_DIRECTIONS
 ) -> Motion:
     """Run a scene; where masses make its errors grow, follow it again by shorter steps and compare.
 
@@ -106,15 +102,22 @@ def _verified(
         If the scene has no answer within `rtol`; the message says why.
     """
     motion = scene.run(rows, heights, rtol, directions=directions)
-    inside = len(scene.ends) > 2 or _damped_below_a_mass(scene, rows)
+    inside = len(scene.ends) > 2
+    if len(scene.ends) == 2:  # the base stress depends on the velocity of the mass above
+        inside = bool((rows[: scene.ends[0], kernels.ETA] > 0.0).any())
     many = _many(scene, motion, FEW_STEPS) or inside or motion.method == RADAU
     if scene.speed > 0.0 and not many and not _hard(scene, rows, heights):
         return motion
-    motion = _resolved(scene, rows, heights, rtol, directions, motion)
+    for factor in (1e-2, 1e-4):  # shorter implicit steps may follow what longer ones have lost
+        if motion.unresolved > 0.7 * rtol and rtol * factor >= 1e-14:
+            with suppress(SimulationError):
+                finer = scene._replace(implicit=True).run(
+                    rows, heights, rtol * factor, directions=directions
+                )
+                motion = finer if finer.unresolved <= 0.7 * rtol else motion
     lost = motion.unresolved
     if lost > 0.7 * rtol:  # the comparison below leaves 0.3
-        scene = scene._replace(implicit=False)
-        # an explicit step goes through two or three radians
+        scene = scene._replace(implicit=False)  # its steps go through some 3 radians each
         if max(scene.fastest_rates(rows, heights)) / 3.0 > MOST_WORK / len(heights):
             raise SimulationError(_UNRESOLVED.format(size=lost))
         motion = _followed(scene, rows, heights, rtol, directions, lost)
@@ -127,7 +130,7 @@ def _verified(
     forced = 0 if scene.speed > 0.0 else scene.time.size
     many = _many(scene, motion, FEW_STEPS + 2 * forced) or inside or distance < CLOSE
     many = many and scene.solver == SECOND_ORDER
-    if not (many or motion.method == RADAU) or rtol < 1e-12:  # no finer run could tell
+    if not (many or motion.method == RADAU) or rtol < 1e-12:  # a finer run is rounding
         return motion
     miss = math.inf
     for factor in (1e-2, 1e-4, 1e-6):
@@ -150,26 +153,6 @@ def _verified(
     )
 
 
-def _resolved(
-    scene: Plan, rows: Array, heights: Array, rtol: float, directions: Directions, motion: Motion
-) -> Motion:
-    """Take shorter implicit steps where these follow the vibrations that longer ones have lost.
-
-    What many damped masses have lost together is overestimated: shorter steps may show that.
-    """
-    by_implicit = scene._replace(implicit=True)
-    for factor in (1e-2, 1e-4):
-        if motion.unresolved <= 0.7 * rtol or rtol * factor < 1e-14:
-            break
-        try:
-            finer = by_implicit.run(rows, heights, rtol * factor, directions=directions)
-        except SimulationError:
-            break
-        if finer.unresolved <= 0.7 * rtol:
-            return finer
-    return motion
-
-
 def _followed(
     scene: Plan, rows: Array, heights: Array, rtol: float, directions: Directions, lost: float
 ) -> Motion:
@@ -184,13 +167,8 @@ def _followed(
 
 def _many(scene: Plan, motion: Motion, few: int) -> bool:
     """Whether a motion took many steps (those of springs under one stress are but switches)."""
-    shaken = len(scene.ends) > 1 and len(motion.switches) > FEW_SWITCHES
-    return (motion.steps > few or shaken) and motion.method != AGGREGATE
-
-
-def _damped_below_a_mass(scene: Plan, rows: Array) -> bool:
-    """Whether dashpots at the base feel how fast a mass inside moves."""
-    return len(scene.ends) > 1 and bool((rows[: scene.ends[0], kernels.ETA] > 0.0).any())
+    vibrates = len(scene.ends) > 1 and len(motion.switches) > FEW_SWITCHES
+    return (motion.steps > few or vibrates) and motion.method != AGGREGATE
 
 
 def _difference(one: Array, other: Array) -> float:
@@ -207,9 +185,9 @@ def _distance_to_pole(rows: Array, heights: Array, displacement: Array) -> float
 
 
 def _hard(scene: Plan, rows: Array, heights: Array) -> bool:
-    """Whether a blow may bring a spring close to the end of its branch c."""
-    brought = 0.5 * float(scene.mass[-1]) * scene.speed**2
-    return brought >= 6.0 * float(heights.dot(rows[:, kernels.KC]))
+    """Whether an impact may bring a spring close to the end of its branch c."""
+    energy = 0.5 * float(scene.mass[-1]) * scene.speed**2
+    return energy >= 6.0 * float(heights.dot(rows[:, kernels.KC]))
 
 
 def _distance_at_peak(
@@ -217,7 +195,7 @@ def _distance_at_peak(
 ) -> float:
     """Least distance, at the peak of an impact, of a spring from the end of its branch.
 
-    The peak of a hard blow is so short that no sample need lie in it: it is closed in on. In
+    The peak of a fast impact is so short that no sample need lie in it: it is bracketed. In
     equilibrium all springs are longest together.
     """
     if scene.solver == CLOSED_FORM:
@@ -225,9 +203,7 @@ def _distance_at_peak(
         return _distance_to_pole(rows, heights, motion.displacement[:, peak : peak + 1])
     distance = _distance_to_pole(rows, heights, motion.displacement)
     bistable = rows[:, kernels.KIND] == BISTABLE
-    if scene.speed == 0.0 or not bistable.any():
-        return distance
-    if not _hard(scene, rows, heights):
+    if scene.speed == 0.0 or not bistable.any() or not _hard(scene, rows, heights):
         return distance
     low, high = 0.0, float(scene.time[-1])
     for _ in range(12):

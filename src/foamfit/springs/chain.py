@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foamfit.arrays import Array
 from foamfit.errors import InputError
 from foamfit.springs.spring import (
     BistableSpring,
@@ -20,8 +21,6 @@ from foamfit.springs.spring import (
     as_number,
     as_samples,
 )
-
-Array = NDArray[np.float64]
 
 
 def _finite(value: object, name: str, least: float, strict: bool) -> float:

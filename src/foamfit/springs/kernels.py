@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from foamfit.arrays import Array as Array
 from foamfit.springs.law import (
     BISTABLE,
     LINEAR,
@@ -26,7 +27,6 @@ from foamfit.springs.law import (
     least_eps_star,
 )
 
-Array = NDArray[np.float64]
 Row = Array
 Branches = NDArray[np.int64]
 

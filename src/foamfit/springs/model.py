@@ -13,13 +13,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from foamfit.arrays import Array
 from foamfit.errors import InputError
 from foamfit.springs import kernels
 from foamfit.springs.chain import Chain
 from foamfit.springs.parameters import HYSTERETIC, KINDS, direction, names_of
 from foamfit.springs.spring import BistableSpring, LinearSpring, MicroscaleSpring, Spring
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -161,8 +161,8 @@ def table() -> str:
         ratio = item.damping_ratio_by_formula()
         if ratio is not None and item.damping_ratio is not None:
             agrees = math.isclose(ratio, item.damping_ratio, rel_tol=2e-3)
-            verdict = "agrees" if agrees else "does not follow from the paper's own table"
-            lines.append(f"{item.name:<16}{ratio:.3g}   (paper {item.damping_ratio}: {verdict})")
+            told = "agrees" if agrees else "does not follow from the paper's own table"
+            lines.append(f"{item.name:<16}{ratio:.3g}   (paper {item.damping_ratio}: {told})")
     return "\n".join(lines)
 
 

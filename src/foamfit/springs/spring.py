@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
 from foamfit.springs.law import (
     BISTABLE,
@@ -25,7 +26,6 @@ from foamfit.springs.law import (
 if TYPE_CHECKING:
     from foamfit.springs.kernels import Row
 
-Array = NDArray[np.float64]
 Relaxation = Sequence[tuple[float, float]]  # frozen to a tuple of tuples
 
 

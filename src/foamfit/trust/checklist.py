@@ -41,6 +41,14 @@ BRANCHES = ("a", "d", "c", "e")
 MAY_VANISH = ("dsigma", "kh_plus", "kh_minus", "eta")
 
 
+# Answer, what it rests on, warnings, and whether a "no" is fatal: the last fields of a `Check`.
+_Answer = (
+    tuple[bool | None, str]
+    | tuple[bool | None, str, tuple[str, ...]]
+    | tuple[bool | None, str, tuple[str, ...], bool]
+)
+
+
 @dataclass(frozen=True, eq=False)
 class Findings:
     """What the questions are put to: the best point, how it was found, and what was measured."""
@@ -78,124 +86,107 @@ def warnings_of(checklist: Iterable[Check]) -> tuple[str, ...]:
 
 def make_checklist(findings: Findings) -> tuple[Check, ...]:
     """Put all questions, what matters most first."""
-    questions: tuple[Callable[[Findings], Check], ...] = (
-        _ended, _followed, _floor, _determined, _trusted, _visited, _bounds, _agree, _structure,
-        _vibration, _simulated, _energy, _impulse, _time_shift,
-    )  # fmt: skip
-    return tuple(question(findings) for question in questions)
+    return tuple(
+        Check(key, question, *answer(findings)) for key, (question, answer) in QUESTIONS.items()
+    )
 
 
 # ---------------------------------------------------------------- the search
 
 
-def _ended(e: Findings) -> Check:
-    question, stopped = "Did the search end by itself?", e.record.stopped
-    if stopped is None:
-        return Check("ended", question, True, f"{e.objective.evaluations} simulations.")
-    warning = f"The search was stopped by {stopped}; this is the best point until then."
-    return Check("ended", question, False, f"It was stopped by {stopped}.", (warning,))
+def _ended(e: Findings) -> _Answer:
+    if e.record.stopped is None:
+        return True, f"{e.objective.evaluations} simulations."
+    told = f"stopped by {e.record.stopped}"
+    return False, f"It was {told}.", (f"The search was {told}; this is the best point until then.",)
 
 
-def _agree(e: Findings) -> Check:
-    question, record = "Do several starts agree?", e.record
-    if record.stopped is not None or not record.costs:
-        return Check("agree", question, None, "The search was stopped before it could tell.")
-    total = sum(count for _, count in record.costs)
-    if record.agreeing > 1:
-        found = f"{record.agreeing} of {total} descents reached the best point."
-        return Check("agree", question, True, found)
+def _agree(e: Findings) -> _Answer:
+    if e.record.stopped is not None or not e.record.costs:
+        return None, "The search was stopped before it could tell."
+    total = sum(count for _, count in e.record.costs)
+    if e.record.agreeing > 1:
+        return True, f"{e.record.agreeing} of {total} descents reached the best point."
     warning = "Only one of the descents reached the best point; try more starts."
-    return Check("agree", question, False, f"One of {total} descents did.", (warning,))
+    return False, f"One of {total} descents did.", (warning,)
 
 
-def _simulated(e: Findings) -> Check:
-    objective = e.objective
-    failed, tried = objective.failures, max(objective.evaluations, 1)
-    question = "Could most trials be simulated?"
+def _simulated(e: Findings) -> _Answer:
+    failed, tried = e.objective.failures, max(e.objective.evaluations, 1)
+    found = f"{failed} of {tried} could not."
     if failed <= 0.5 * tried:
-        return Check("simulated", question, True, f"{failed} of {tried} could not.")
+        return True, found
     warning = f"{failed} of {tried} trials could not be simulated; the bounds may be wrong."
-    return Check("simulated", question, False, f"{failed} of {tried} could not.", (warning,))
+    return False, found, (warning,)
 
 
-def _vibration(e: Findings) -> Check:
-    question = "Is the cost free of the minima that a vibrating mass makes?"
+def _vibration(e: Findings) -> _Answer:
     if not e.objective.interior_mass or len(e.best.problem.model.kinds) == 1:
-        return Check("vibration", question, True, "No interior mass vibrates.")
+        return True, "No interior mass vibrates."
     warning = (
         "With interior masses the cost has a minimum for every cycle of their vibration: trust no "
         "parameter that other seeds, or the fit without them, do not confirm."
     )
-    return Check("vibration", question, False, "The interior masses vibrate.", (warning,))
+    return False, "The interior masses vibrate.", (warning,)
 
 
 # ---------------------------------------------------------------- the curves
 
 
-def missed(objective: Objective, misfit: Mapping[str, float | None], name: str) -> bool:
-    """Whether a counted curve was not fitted at all."""
-    measured = objective.measured[name]
-    assert measured is not None
-    return (misfit[name] or 0.0) * float(np.ptp(measured)) > UNACCEPTABLE * float(np.std(measured))
-
-
-def _followed(e: Findings) -> Check:
+def _followed(e: Findings) -> _Answer:
     warnings, fatal = [], False
     for name in e.objective.counted:
-        off, lost = e.misfit[name] or 0.0, missed(e.objective, e.misfit, name)
+        off, measured = e.misfit[name] or 0.0, e.objective.measured[name]
+        lost = off * float(np.ptp(measured)) > UNACCEPTABLE * float(np.std(measured))
         fatal = fatal or lost
         if off > POOR or lost:
             word = "is not acceptable" if lost else "is large"
             warnings.append(f"The misfit of {name} is {off:.1%} of its range, which {word}.")
     told = ", ".join(f"{_spoken(name)} {e.misfit[name] or 0.0:.1%}" for name in e.objective.counted)
-    question, found = "Does the model follow the curves?", f"Misfit over range: {told}."
-    return Check("followed", question, not warnings, found, tuple(warnings), fatal)
+    return not warnings, f"Misfit over range: {told}.", tuple(warnings), fatal
 
 
-def _floor(e: Findings) -> Check:
+def _floor(e: Findings) -> _Answer:
     """Residuals against the noise of each curve, with the scatter that a chi-square has itself."""
-    objective, question = e.objective, "Is the noise floor reached?"
-    told, warnings, sizes = [], [], objective.sizes
+    objective, told, warnings = e.objective, [], []
     for i, (name, rms) in enumerate(objective.rms(e.best.residual).items()):
         noise, stated = objective.noise(name).sigma, objective.noise(name).given
         if noise <= 1e-9 * objective.scale[name]:  # there is none to be seen
             continue
         tau = e.tau[i] if e.tau else 1.0
-        most = (STATED if stated else ESTIMATED) + 3.0 * math.sqrt(tau / (2.0 * sizes[i]))
+        scatter = 3.0 * math.sqrt(tau / (2.0 * objective.sizes[i]))
         source = "stated" if stated else "estimated"
         told.append(f"{_spoken(name)} {rms / noise:.2f} ({source})")
-        if rms > most * noise:
+        if rms > ((STATED if stated else ESTIMATED) + scatter) * noise:
             warnings.append(
                 f"The residuals of {name} are {rms / noise:.1f} times the {source} noise: the "
                 "model does not follow all that was measured."
             )
     if not told:
-        return Check("floor", question, None, "The noise is neither stated nor estimated.")
-    found = f"Residuals over noise: {', '.join(told)}."
-    return Check("floor", question, not warnings, found, tuple(warnings))
+        return None, "The noise is neither stated nor estimated."
+    return not warnings, f"Residuals over noise: {', '.join(told)}.", tuple(warnings)
 
 
-def _structure(e: Findings) -> Check:
-    question = "Are the residuals free of structure?"
+def _structure(e: Findings) -> _Answer:
     if not e.tau:
-        return Check("structure", question, None, "No parameter varies whose branch was reached.")
+        return None, "No parameter varies whose branch was reached."
     longest = max(e.tau)
-    found = f"Noise correlated over {longest:.2g} samples."
     if longest < 1.05:
-        found = "Their autocorrelation is that of white noise."
+        return True, "Their autocorrelation is that of white noise."
+    found = f"Noise correlated over {longest:.2g} samples."
     if longest <= STRUCTURED:
-        return Check("structure", question, True, found)
+        return True, found
     warning = (
         f"The residuals have structure: noise correlated over {longest:.0f} samples; the intervals "
         "account for it."
     )
-    return Check("structure", question, False, found, (warning,))
+    return False, found, (warning,)
 
 
 # ---------------------------------------------------------------- the parameters
 
 
-def _determined(e: Findings) -> Check:
+def _determined(e: Findings) -> _Answer:
     """Ask for the states; a parameter with a small upper bound is known well enough."""
     warnings, vanishing = [], [name for name in e.estimates if _vanishes(e, name)]
     for state in ("not determined", "weak"):
@@ -210,17 +201,15 @@ def _determined(e: Findings) -> Check:
     found = f"{varied.count('determined')} of {len(varied)} are"
     if vanishing:
         found += f"; consistent with zero, with a small upper bound: {', '.join(vanishing)}"
-    question = "Are all parameters determined?"
-    return Check("determined", question, not warnings, f"{found}.", tuple(warnings))
+    return not warnings, f"{found}.", tuple(warnings)
 
 
-def _trusted(e: Findings) -> Check:
-    question, warnings = "Are the intervals those that were asked for?", e.intervals.warnings
+def _trusted(e: Findings) -> _Answer:
     made = Counter(item.ci95_method for item in e.estimates.values() if item.ci95_method)
     found = ", ".join(f"{n} by {method}" for method, n in made.items()) or "There are none"
-    if warnings:
-        return Check("intervals", question, False, f"{found}; see the warning.", warnings)
-    return Check("intervals", question, True if made else None, f"{found}.")
+    if e.intervals.warnings:
+        return False, f"{found}; see the warning.", e.intervals.warnings
+    return True if made else None, f"{found}."
 
 
 def _vanishes(e: Findings, name: str) -> bool:
@@ -243,8 +232,7 @@ def _by_reason(of: list[tuple[str, str]]) -> str:
     return "; ".join(f"{names} ({why})" for why, names in groups)
 
 
-def _visited(e: Findings) -> Check:
-    question = "Was every branch of every spring visited?"
+def _visited(e: Findings) -> _Answer:
     absent = {
         spring: [branch for branch in BRANCHES if branch not in seen]
         for spring, seen in visited(e.best.problem, e.best.simulated).items()
@@ -252,87 +240,96 @@ def _visited(e: Findings) -> Check:
     }
     lost = [f"{branch} of {spring}" for spring, gone in absent.items() for branch in gone]
     if not absent:
-        return Check("visited", question, True, "Linear springs have one branch.")
+        return True, "Linear springs have one branch."
     if not lost:
-        return Check("visited", question, True, "a, d, c and e were.")
+        return True, "a, d, c and e were."
     # It matters if some parameter that varies depends on it; its own warning says so.
-    depend = [
-        name
+    depend = any(
+        item.state == "not determined" and absent.get(f"s{split_name(name)[0] + 1}")
         for name, item in e.estimates.items()
-        if item.state == "not determined" and absent.get(f"s{split_name(name)[0] + 1}")
-    ]
-    found = f"Not visited: {', '.join(lost)}."
-    return Check("visited", question, False if depend else None, found)
+    )
+    return False if depend else None, f"Not visited: {', '.join(lost)}."
 
 
-def _bounds(e: Findings) -> Check:
-    question, params = "Are all parameters off their bounds?", e.best.problem.params
-    varied = [name for name, item in e.estimates.items() if item.vary]
+def _bounds(e: Findings) -> _Answer:
+    params, varied = e.best.problem.params, [n for n, item in e.estimates.items() if item.vary]
     sizes = e.best.problem.sizes(tuple(varied), e.best.values)
     stuck, natural = [], []
     for name, size in zip(varied, sizes, strict=True):
-        value, edge = e.estimates[name].value, AT_LIMIT * size
         for bound in (params[name].min, params[name].max):
-            if abs(value - bound) > edge or e.estimates[name].stderr is None:
+            off = abs(e.estimates[name].value - bound)
+            if off > AT_LIMIT * size or e.estimates[name].stderr is None:
                 continue
             if bound == 0.0 and split_name(name)[1] in MAY_VANISH:
                 natural.append(f"{name} is zero, which it may be")
             else:
                 stuck.append(f"{name} lies at {bound:g}")
-    found = ", ".join([*stuck, *natural]) or "None lies at one"
-    return Check("bounds", question, not stuck, f"{found}.")
+    return not stuck, f"{', '.join([*stuck, *natural]) or 'None lies at one'}."
 
 
 # ---------------------------------------------------------------- the test itself
 
 
-def _energy(e: Findings) -> Check:
-    question, taken = "Does the energy balance hold?", e.balance.absorbed_over_striker
-    warnings = tuple(e.balance.energy_warnings())
+def _energy(e: Findings) -> _Answer:
+    taken, warnings = e.balance.absorbed_over_striker, tuple(e.balance.energy_warnings())
     if taken is None and not warnings:
-        return Check("energy", question, None, "The test does not state enough for this.")
+        return None, "The test does not state enough for this."
     if e.balance.motion == INTEGRATED and not warnings:
-        return Check("energy", question, None, "The motion comes from the force.")
+        return None, "The motion comes from the force."
     found = "The loop returns more energy than it takes up."
     if taken is not None:
         found = f"The foam absorbs {taken:.2f} of the striker's energy."
-    return Check("energy", question, not warnings, found, warnings)
+    return not warnings, found, warnings
 
 
-def _impulse(e: Findings) -> Check:
-    question, ratio = "Does the momentum balance hold?", e.balance.impulse_ratio
-    warnings = tuple(e.balance.impulse_warnings())
+def _impulse(e: Findings) -> _Answer:
+    ratio, warnings = e.balance.impulse_ratio, tuple(e.balance.impulse_warnings())
     if ratio is None:
-        return Check("impulse", question, None, "The test does not state enough for this.")
+        return None, "The test does not state enough for this."
     found = f"The impulse of the force is {ratio:.2f} of the striker's change of momentum."
-    return Check("impulse", question, not warnings, found, warnings)
+    return not warnings, found, warnings
 
 
-def _time_shift(e: Findings) -> Check:
-    key, question = "time_shift", "Are force and motion free of a time shift?"
+def _time_shift(e: Findings) -> _Answer:
     measurement = e.best.problem.measurement
     if e.objective.time_shift:
         late = engineering(e.estimates["time_shift"].value, "s").replace("-", "−")
-        return Check(key, question, True, f"The time shift is fitted: {late}.")
+        return True, f"The time shift is fitted: {late}."
     force = measurement.outliers.get("stress")
     if force is not None and force.clipped_at is not None:
-        told = "The force is clipped, which looks like a time shift of its peak."
-        return Check(key, question, None, told)
+        return None, "The force is clipped, which looks like a time shift of its peak."
     try:
         check_time_shift(measurement, e.objective.drive)
     except InputError:
-        return Check(key, question, None, "Not both channels were measured in time.")
-    determined = [name for name, item in e.estimates.items() if item.stderr is not None]
-    found = shift_hint(e.best, determined)
+        return None, "Not both channels were measured in time."
+    found = shift_hint(e.best, [n for n, item in e.estimates.items() if item.stderr is not None])
     if found is None:
-        return Check(key, question, True, "A time shift would not lower the residuals.")
+        return True, "A time shift would not lower the residuals."
     told = f"{'late' if found > 0.0 else 'early'} by {engineering(abs(found), 's')}"
     warning = (
         f"The motion channel seems to be {told} against the force; fit the time shift by "
         "--time-shift (time_shift=True)."
     )
-    return Check(key, question, False, f"The motion seems {told}.", (warning,))
+    return False, f"The motion seems {told}.", (warning,)
 
 
 def _spoken(name: str) -> str:
     return name.replace("_", "-")
+
+
+QUESTIONS: dict[str, tuple[str, Callable[[Findings], _Answer]]] = {
+    "ended": ("Did the search end by itself?", _ended),
+    "followed": ("Does the model follow the curves?", _followed),
+    "floor": ("Is the noise floor reached?", _floor),
+    "determined": ("Are all parameters determined?", _determined),
+    "intervals": ("Are the intervals those that were asked for?", _trusted),
+    "visited": ("Was every branch of every spring visited?", _visited),
+    "bounds": ("Are all parameters off their bounds?", _bounds),
+    "agree": ("Do several starts agree?", _agree),
+    "structure": ("Are the residuals free of structure?", _structure),
+    "vibration": ("Is the cost free of the minima that a vibrating mass makes?", _vibration),
+    "simulated": ("Could most trials be simulated?", _simulated),
+    "energy": ("Does the energy balance hold?", _energy),
+    "impulse": ("Does the momentum balance hold?", _impulse),
+    "time_shift": ("Are force and motion free of a time shift?", _time_shift),
+}

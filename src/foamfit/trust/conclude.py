@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -65,11 +65,11 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
             time=measurement.time,
             measured_stress=measurement.stress,
             measured_displacement=measurement.displacement,
-            stress=simulated.stress_time,
-            displacement=simulated.displacement_time,
-            stress_along=simulated.stress_strain,
+            stress=simulated.curves.get("stress_time"),
+            displacement=simulated.curves.get("displacement_time"),
+            stress_along=simulated.curves.get("stress_strain"),
             interior={
-                node: (measurement.interior[node], simulated.interior[name])
+                node: (measurement.interior[node], simulated.curves[name])
                 for name, node in objective.interior.items()
             },
         ),
@@ -91,11 +91,7 @@ def _noise(best: BestPoint) -> dict[str, dict[str, Any]]:
     objective, found = best.problem.objective, {}
     for name, rms in objective.rms(best.residual).items():
         level = objective.noise(name)
-        found[name] = {
-            "sigma": level.sigma,
-            "given": level.given,
-            "how": level.how,
-            "time": level.time,
+        found[name] = asdict(level) | {
             "scale": objective.scale[name],
             "residual_over_noise": rms / level.sigma if level.sigma > 0.0 else None,
         }
@@ -106,9 +102,8 @@ def _noise_notes(objective: Objective) -> list[str]:
     """What the noise is, what the residuals are counted in, and which samples are left out."""
     measurement = objective.measurement
     told = [f"Noise of {sentence}" for sentence in noise_sentences(measurement)]
-    floored = [
-        name for name in objective.counted if objective.scale[name] > objective.noise(name).sigma
-    ]
+    counted = objective.counted
+    floored = [name for name in counted if objective.scale[name] > objective.noise(name).sigma]
     if floored:
         told.append(
             f"{', '.join(floored)}: residuals count in units of {MODEL_ERROR:.1%} of the range, "
@@ -121,10 +116,7 @@ def _noise_notes(objective: Objective) -> list[str]:
         if outliers.at.size:
             told.append(f"{outliers.at.size} outliers of the {channel} are not fitted.")
     if objective.time_shift and objective.drive != "impact":
-        told.append(
-            "time_shift: a foam whose stress relaxes leads its strain, and looks as if the "
-            "motion were late."
-        )
+        told.append("time_shift: a foam whose stress relaxes looks as if its motion were late.")
     if objective.loss != "linear":
         told.append(
             f"The loss is {objective.loss}: residuals past {LOSSES[objective.loss]:g} of their "
@@ -133,70 +125,54 @@ def _noise_notes(objective: Objective) -> list[str]:
     return told
 
 
-def _notes(best: BestPoint) -> tuple[str, ...]:
+def _notes(best: BestPoint) -> list[str]:
     """What was left out of the model, and what it would change."""
     problem, simulated = best.problem, best.simulated
     objective, specimen = problem.objective, problem.measurement.specimen
-    unused = problem.notes + _along_integrated(problem, simulated)
-    if len(problem.model.kinds) == 1 and problem.measurement.interior:
-        names = ", ".join(map(interior_channel, sorted(problem.measurement.interior)))
-        unused += (f"A single spring has no mass inside, so {names} is left out.",)
-    if objective.drive == "stress":
-        return (
-            *unused,
-            "The driving stress is smoothed by a parabola over a twenty-fifth of the samples.",
+    single = len(problem.model.kinds) == 1
+    told = [*problem.notes]
+    unseen = [name for name in MOTION_CURVES if name not in objective.counted]
+    off = [(name.replace("_", "-"), objective.off(simulated, name)) for name in unseen]
+    there = [f"the {name} curve is {share:.1%} of its range off" for name, share in off if share]
+    if problem.measurement.motion == INTEGRATED and there:
+        told.append(
+            "The motion was integrated from the force, so it is no second measurement and has no "
+            f"misfit; against it {' and '.join(there)}."
         )
-    if len(problem.model.kinds) == 1 or objective.drive != "impact" or objective.interior_mass:
-        return unused
+    if single and problem.measurement.interior:
+        names = ", ".join(map(interior_channel, sorted(problem.measurement.interior)))
+        told.append(f"A single spring has no mass inside, so {names} is left out.")
+    if objective.drive == "stress":
+        told.append(
+            "The driving stress is smoothed by a parabola over a twenty-fifth of the samples."
+        )
+    if single or objective.drive != "impact" or objective.interior_mass:
+        return told
     left_out = "The interior masses are left out"
     if specimen.mass is None:
-        return (
-            *unused,
-            f"{left_out}; with [specimen] mass foamfit could say what they would change.",
-        )
-    heavy = replace(objective, interior_mass=True)
+        return [
+            *told, f"{left_out}; with [specimen] mass foamfit could say what they would change."
+        ]  # fmt: skip
     try:
-        other = heavy.simulate(best.values)
+        other = replace(objective, interior_mass=True).simulate(best.values).curves
     except SimulationError as error:
-        return (*unused, f"{left_out}; with them the simulation ends: {error}.")
+        return [*told, f"{left_out}; with them the simulation ends: {error}."]
+    spoken = {"stress_time": "the base stress", "displacement_time": "the displacement"}
     changes = [
-        f"{name} by {_share(one, two)}"
-        for name, one, two in (
-            ("the base stress", simulated.stress_time, other.stress_time),
-            ("the displacement", simulated.displacement_time, other.displacement_time),
-            *((c.removesuffix("_time"), w, other.curve(c)) for c, w in simulated.interior.items()),
-        )
-        if one is not None and two is not None
+        f"{spoken.get(name, name.removesuffix('_time'))} by {_share(curve, other[name])}"
+        for name, curve in simulated.curves.items()
+        if name != "stress_strain" and name in other
     ]
-    return (
-        *unused,
+    return [
+        *told,
         f"{left_out}; the specimen's {specimen.mass * 1e6:.3g} mg between the springs would change "
         f"{' and '.join(changes)} (RMS over range).",
-    )
+    ]
 
 
 def _share(one: Array, two: Array) -> str:
     off = float(np.sqrt(np.mean((one - two) ** 2)) / np.ptp(one))
     return "less than 0.01 %" if off < 1e-4 else percent(off)
-
-
-def _along_integrated(problem: Problem, simulated: Simulated) -> tuple[str, ...]:
-    """How far the fit is from a motion that was integrated from the force it is fitted to."""
-    objective = problem.objective
-    names = [name for name in MOTION_CURVES if name not in objective.counted]
-    if problem.measurement.motion != INTEGRATED or not names:
-        return ()
-    off = [
-        f"the {name.replace('_', '-')} curve is {share:.1%} of its range off"
-        for name in names
-        if (share := objective.off(simulated, name)) is not None
-    ]
-    if not off:
-        return ()
-    return (
-        "The motion was integrated from the force, so it is no second measurement and has no "
-        f"misfit; against it {' and '.join(off)}.",
-    )
 
 
 def _estimates(
@@ -222,11 +198,11 @@ def _estimates(
 
 def _left_over(best: BestPoint) -> dict[str, float]:
     """One standard deviation of what is left of each curve, SI, its correlation counted."""
-    objective, out = best.problem.objective, {}
-    for name, process in zip(objective.counted, best.spread.noise, strict=True):
-        spread = math.sqrt(max(process.variance * process.tau, 1e-300))
-        out[name] = spread * objective.scale[name] / objective.weights[name] ** 0.5
-    return out
+    objective = best.problem.objective
+    return {
+        name: math.sqrt(max(process.variance * process.tau, 1e-300)) / objective.factor(name)
+        for name, process in zip(objective.counted, best.spread.noise, strict=True)
+    }
 
 
 def _varied(
@@ -237,11 +213,11 @@ def _varied(
     value, unit = float(best.values[best.index[name]]), unit_of(name)
     stderr, half = float(best.spread.stderr[column]), float(best.halves[column])
     local = (value - half, value + half)
-    ends = _ordered_with(value, intervals.ends.get(name, local))
-    made, by_local = (
-        min(pair[1], high) - max(pair[0], low)  # within the limits, which cut both
-        for pair in (ends, local)
-    )
+    # Percentiles of refits, or of a chain, may all lie to one side of the best point.
+    given = (*intervals.ends.get(name, local), value)
+    ends = min(given), max(given)
+    # Within the limits, which cut both.
+    made, by_local = (min(pair[1], high) - max(pair[0], low) for pair in (ends, local))
     ratio = made / by_local if by_local > 0.0 else math.nan
     method = intervals.methods.get(name, "local covariance")
     # refits that stall in a long minimum make a profile narrow: the wider interval is taken
@@ -264,31 +240,17 @@ def _varied(
     return ParameterEstimate(value, stderr, ci95, unit, True, state, why, method)
 
 
-def _ordered_with(value: float, ends: tuple[float, float]) -> tuple[float, float]:
-    """Ends of an interval in their order, moved out where they do not hold the value.
-
-    Percentiles of refits, or of a chain, may all lie to one side of the best point.
-    """
-    return min(*ends, value), max(*ends, value)
-
-
 def state_of(
-    name: str,
-    value: float,
-    ends: tuple[float, float],
-    insight: Insight,
+    name: str, value: float, ends: tuple[float, float], insight: Insight,
     limits: tuple[float, float],
-) -> tuple[str, str]:
+) -> tuple[str, str]:  # fmt: skip
     """State of a parameter that varies and whose branch is reached, and the reason in one sentence.
 
     `ends` are those of its 95 % interval, not cut at its `limits`; NaN or infinite where the data
     fix only a combination.
     """
-    size, short, unit = (
-        float(insight.sizes[insight.names.index(name)]),
-        split_name(name)[1],
-        unit_of(name),
-    )
+    size, short = float(insight.sizes[insight.names.index(name)]), split_name(name)[1]
+    unit = unit_of(name)
     half = 0.5 * (ends[1] - ends[0])
     half = half if math.isfinite(half) else math.nan
     state, why = covariance.state(value, half, size, *limits, scale_in_words(name, value, size))
@@ -321,7 +283,7 @@ def _statistics(best: BestPoint, record: SearchRecord) -> dict[str, float | int 
     return {
         "n_data": n,
         "n_effective": best.spread.effective if best.names else None,
-        "n_left_out": sum(objective.measured_size(name) for name in objective.counted) - n,
+        "n_left_out": len(objective.counted) * objective.time.size - n,
         "n_vary": n_vary,
         "chisqr": chisqr,
         "redchi": chisqr / max(n - n_vary, 1),
@@ -338,19 +300,15 @@ def _statistics(best: BestPoint, record: SearchRecord) -> dict[str, float | int 
 
 def _switches(problem: Problem, simulated: Simulated) -> tuple[Switch, ...]:
     """Place the switches of the fitted response on its curves."""
-    measurement, motion = problem.measurement, simulated.motion
-    clock = problem.objective.time
-    top, stress = motion.displacement[-1], motion.base_stress
-    out = []
-    for when, spring, left, entered, _ in motion.switches:
-        out.append(
-            Switch(
-                spring=int(spring) + 1,
-                source=kernels.BRANCH_NAMES[int(left)],
-                target=kernels.BRANCH_NAMES[int(entered)],
-                time=None if measurement.time is None else float(when),
-                displacement=float(np.interp(when, clock, top)),
-                stress=float(np.interp(when, clock, stress)),
-            )
+    motion, clock = simulated.motion, problem.objective.time
+    return tuple(
+        Switch(
+            spring=int(spring) + 1,
+            source=kernels.BRANCH_NAMES[int(left)],
+            target=kernels.BRANCH_NAMES[int(entered)],
+            time=None if problem.measurement.time is None else float(when),
+            displacement=float(np.interp(when, clock, motion.displacement[-1])),
+            stress=float(np.interp(when, clock, motion.base_stress)),
         )
-    return tuple(out)
+        for when, spring, left, entered, _ in motion.switches
+    )

@@ -156,12 +156,10 @@ def noise_processes(residual: Array, jacobian: Array, sizes: tuple[int, ...]) ->
     if not basis.shape[1]:
         return processes
     for _ in range(CORRECTIONS):
-        images = [
-            process.times(basis[part]) for process, part in zip(processes, curves, strict=True)
-        ]
-        middle = np.zeros((basis.shape[1], basis.shape[1]))
-        for image, part in zip(images, curves, strict=True):
-            middle += basis[part].T @ image
+        pairs = list(zip(processes, curves, strict=True))
+        images = [process.times(basis[part]) for process, part in pairs]
+        squares = [basis[part].T @ image for image, part in zip(images, curves, strict=True)]
+        middle = np.sum(squares, axis=0)
         processes = [
             _corrected(process, seen, basis[part], image, middle)
             for process, seen, part, image in zip(processes, sums, curves, images, strict=True)
@@ -182,9 +180,8 @@ def _corrected(
     lags *= min(1.0, 4.0 * seen[0] / n / lags[0]) if lags[0] > 0.0 else 1.0
     if lags[0] <= 0.0:
         return process
-    return replace(
-        process, coefficients=_damped(_levinson(lags)[-1][0], n), variance=float(lags[0])
-    )
+    coefficients = _damped(_levinson(lags)[-1][0], n)
+    return replace(process, coefficients=coefficients, variance=float(lags[0]))
 
 
 def _damped(coefficients: Array, n: int) -> Array:
@@ -258,9 +255,8 @@ def covariance(
     left, singular, vt = np.linalg.svd(scaled, full_matrices=False)
     seen = singular > SINGULAR * max(float(singular[0]), 1e-300)
     left, root = left[:, seen], vt[seen].T / singular[seen]
-    inner = np.zeros((len(root.T), len(root.T)))
-    for process, part in zip(noise, parts(sizes), strict=True):
-        inner += left[part].T @ process.times(left[part])
+    curves = list(zip(noise, parts(sizes), strict=True))
+    inner = np.sum([left[part].T @ process.times(left[part]) for process, part in curves], axis=0)
     power, axes = np.linalg.eigh(0.5 * (inner + inner.T))
     spread = root @ axes * np.sqrt(np.maximum(power, 1e-12 * power[-1]))  # no variance is negative
     matrix, inverse = spread @ spread.T, root @ root.T
@@ -269,7 +265,6 @@ def covariance(
     matrix[:, lost] = np.nan
     effective = sum(n / process.tau for n, process in zip(sizes, noise, strict=True))
     errors = left @ root.T  # of the estimates, by the noise of each sample
-    curves = list(zip(noise, parts(sizes), strict=True))
     variance = np.sum([process.forms(errors[part]) for process, part in curves], axis=0)
     doubt = np.sum([process.doubt(errors[part]) for process, part in curves], axis=0)
     known = 2.0 * variance**2 / np.maximum(doubt, 1e-300)

@@ -57,13 +57,7 @@ class Tried:
     @cached_property
     def spans(self) -> tuple[float, ...]:
         """Measured range of each curve, in the unit of its residual."""
-        objective, out = self.best.problem.objective, []
-        for name in self.counted:
-            measured = objective.measured[name]
-            assert measured is not None
-            weight, scale = objective.weights[name] ** 0.5, objective.scale[name]
-            out.append(weight * float(np.ptp(measured)) / scale)
-        return tuple(out)
+        return tuple(self.best.problem.objective.span(name) for name in self.counted)
 
     @property
     def places(self) -> list[NDArray[np.str_]]:
@@ -94,8 +88,7 @@ class Tried:
     @property
     def floor(self) -> float:
         """Chi-square of the simulation's own error."""
-        pairs = zip(self.sizes, self.spans, strict=True)
-        return sum(size * (EXACT * span) ** 2 for size, span in pairs)
+        return sum(n * (EXACT * span) ** 2 for n, span in zip(self.sizes, self.spans, strict=True))
 
     @property
     def chisqr(self) -> float:
@@ -122,6 +115,11 @@ class Tried:
         """Whether nothing but noise is left."""
         return self.chisqr <= self.floor or min(self.runs_p, self.neighbours_p) >= LEVEL
 
+    @property
+    def varied(self) -> int:
+        """How many parameters vary."""
+        return sum(item.vary for item in self.result.parameters.values())
+
     def states(self, state: str) -> tuple[str, ...]:
         """Names of the parameters in a state."""
         return tuple(n for n, item in self.result.parameters.items() if item.state == state)
@@ -141,19 +139,17 @@ class Criteria:
 
 
 def reference_of(tried: Sequence[Tried]) -> Tried:
-    """The rung whose residuals are taken for the noise: that of the least chi-square.
+    """The rung of the least chi-square: its residuals are taken for the noise of all.
 
-    One measure for all, as the variance inflation of the global model in QAICc (Burnham & Anderson
-    2002, Model Selection and Multimodel Inference, section 2.5): what a simpler rung leaves over is
-    not noise, and criteria with samples counted differently cannot be compared.
+    As the variance inflation of the global model in QAICc (Burnham & Anderson 2002, Model Selection
+    and Multimodel Inference, section 2.5): what a simpler rung leaves over is not noise.
     """
     return min(tried, key=lambda one: one.chisqr)
 
 
 def effective_samples(reference: Tried) -> float:
     """Effective samples n/τ of all curves."""
-    pairs = zip(reference.sizes, reference.taus, strict=True)
-    return float(sum(size / tau for size, tau in pairs))
+    return float(sum(n / tau for n, tau in zip(reference.sizes, reference.taus, strict=True)))
 
 
 def effective_parameters(grams: Array, reference: Tried) -> int:
@@ -187,7 +183,6 @@ def choose(tried: Sequence[Tried]) -> tuple[int, list[Criteria]]:
     reference = reference_of(tried)
     found = [criteria(one, reference) for one in tried]
     best = 0
-    for i in range(1, len(tried)):
-        if found[i].beats(found[best]):
-            best = i
+    for i, one in enumerate(found):
+        best = i if one.beats(found[best]) else best
     return best, found

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from foamfit.arrays import Array
 from foamfit.fitting.box import scale_in_words
@@ -93,30 +94,21 @@ class Insight:
         return np.asarray(self.scaled[at * n : (at + 1) * n, self.names.index(name)])
 
     def shares(self) -> tuple[tuple[tuple[str, str], ...], Array]:
-        """Say which part of which curve fixes which parameter.
+        """Parts (curve, branches), and the share of each in the information on a parameter.
 
         The information on a parameter, all others free, is the square of what is left of its column
         of sensitivities once the other columns are taken out of it (Frisch and Waugh 1933,
-        Econometrica 1, 387); being a sum over samples it is shared out among them.
-
-        Returns
-        -------
-        parts : tuple of (curve, branches)
-            In the order of curves and of first visits.
-        shares : (k, n_parts) array
-            Each row adds up to one; NaN for a parameter that the curves do not tell.
+        Econometrica 1, 387); being a sum over samples it is shared out among them. Each row of the
+        shares (k, n_parts) adds up to one; NaN for a parameter that the curves do not tell.
         """
-        labels = list(dict.fromkeys(section.branches for section in self.sections))
-        inverse = np.linalg.pinv(self.scaled, rcond=1e-12)  # (k, n): own parts, rescaled
-        squares = inverse**2
         n, columns, parts = self.clock.size, [], []
+        labels = np.full(n, "", object)
+        for section in self.sections:
+            labels[section.start : section.stop] = section.branches
+        squares = np.linalg.pinv(self.scaled, rcond=1e-12) ** 2  # (k, n): own parts, rescaled
         for c, curve in enumerate(self.curves):
-            for label in labels:
-                inside = np.zeros(n, bool)
-                for section in self.sections:
-                    if section.branches == label:
-                        inside[section.start : section.stop] = True
-                columns.append(squares[:, c * n : (c + 1) * n][:, inside].sum(axis=1))
+            for label in dict.fromkeys(section.branches for section in self.sections):
+                columns.append(squares[:, c * n : (c + 1) * n][:, labels == label].sum(axis=1))
                 parts.append((curve, label))
         shares = np.array(columns).T
         shares[~np.isfinite(self._variance)] = np.nan
@@ -126,11 +118,7 @@ class Insight:
     # ------------------------------------------------------------ in words
 
     def weakest(self) -> tuple[float, dict[str, float]]:
-        """Standard error along the weakest direction (relative), and its largest parts.
-
-        The direction is the right singular vector of the smallest singular value of `scaled`; its
-        parts are over the largest of them, which is 1.
-        """
+        """Relative standard error along the weakest direction, and its parts over the largest."""
         errors, vt = self._directions
         direction = vt[-1] / vt[-1][np.argmax(np.abs(vt[-1]))]
         order = np.argsort(-np.abs(direction), kind="stable")
@@ -142,20 +130,16 @@ class Insight:
         if not self.names:
             return ""
         error, parts = self.weakest()
-        names = list(parts)
-        lost = "the curves do not depend on it"
-        if len(names) == 1:
-            at = self.names.index(names[0])
-            of = scale_in_words(names[0], float(self.values[at]), float(self.sizes[at]))
-            known = lost if error > 1e3 else f"its standard error is {percent(error)} of {of}"
-            told = f"The least determined parameter is {names[0]}: {known}."
-        else:
+        name = next(iter(parts))
+        at = self.names.index(name)
+        told, of = f"parameter is {name}", scale_in_words(name, self.values[at], self.sizes[at])
+        if len(parts) > 1:
             joint = listed(f"{name} ({part:+.2g})" for name, part in parts.items())
-            known = lost if error > 1e3 else f"its standard error is {percent(error)}"
-            told = (
-                f"The least determined combination is a joint relative change of "
-                f"{joint.replace('-', '−')}: {known}."
-            )
+            told = f"combination is a joint relative change of {joint.replace('-', '−')}"
+            of = ""
+        known = f"its standard error is {percent(error)}" + (f" of {of}" if of else "")
+        known = "the curves do not depend on it" if error > 1e3 else known
+        told = f"The least determined {told}: {known}."
         if not self.silent:
             return told
         return (
@@ -165,31 +149,27 @@ class Insight:
     def combination(self, name: str, loose: float) -> str:
         """Say what the data fix instead of a parameter; "" if it is loose by itself.
 
-        Directions whose relative standard error is larger than `loose` are taken for free. If one
-        combination of the parameters that can move together is fixed, it is given as a product of
-        powers, good to first order; else those parameters that compensate a change of it.
+        Directions of a relative standard error above `loose` are taken for free. One combination
+        that is fixed is given as a product of powers, good to first order; else those parameters
+        that compensate a change of it.
         """
         errors, vt = self._directions
-        free = vt[errors > loose]
-        group = self._group(free, self.names.index(name))
+        free, me = vt[errors > loose], self.names.index(name)
+        movable = np.linalg.norm(free, axis=0) > 2.0 * PART
+        linked = (np.abs(free.T @ free) > PART) & np.outer(movable, movable)
+        _, groups = connected_components(linked)
+        group = np.flatnonzero(groups == groups[me])
         if len(group) < 2:
             return ""
         left, singular, _ = np.linalg.svd(free[:, group].T, full_matrices=True)
-        moving = int(np.sum(singular > NAMED))
-        names = [self.names[i] for i in group]
+        names, moving = [self.names[i] for i in group], int(np.sum(singular > NAMED))
         if moving == len(group):
             return f"the curves determine no combination of {listed(names)}"
-        if moving == len(group) - 1:
+        if moving == len(group) - 1 and np.all(self.values[group] != 0.0):
             # d ln|p| = (size/p) dx, so exponents are the weights of x times p/size.
-            powers = left[:, -1] * self.values[group] / self.sizes[group]
-            if np.all(self.values[group] != 0.0):
-                return f"the data fix only {_product(names, powers)}"
-        return self._compensated(name, free, errors[errors > loose])
-
-    def _compensated(self, name: str, free: Array, errors: Array) -> str:
-        """Say which parameters compensate a change of one, along the free directions."""
-        me = self.names.index(name)
-        change = (free[:, me] * np.minimum(errors, 1e6) ** 2) @ free
+            powers = left[:, -1] * (self.values / self.sizes)[group]
+            return f"the data fix only {_product(names, powers)}"
+        change = (free[:, me] * np.minimum(errors[errors > loose], 1e6) ** 2) @ free
         change = change / change[me]
         change[me] = 0.0
         order = np.argsort(-np.abs(change), kind="stable")
@@ -197,17 +177,6 @@ class Insight:
         told = ", ".join(f"{self.names[i]} ({change[i]:+.2g})" for i in parts[:MOST])
         more = f" and {len(parts) - MOST} more" if len(parts) > MOST else ""
         return f"compensated by {told.replace('-', '−')}{more} (relative changes)"
-
-    def _group(self, free: Array, member: int) -> list[int]:
-        """Parameters that can move together with one, itself included, along free directions."""
-        movable = np.linalg.norm(free, axis=0) > 2.0 * PART
-        linked = (np.abs(free.T @ free) > PART) & np.outer(movable, movable)
-        group, fresh = {member}, [member]
-        while fresh:
-            near = set(np.flatnonzero(linked[fresh.pop()]).tolist()) - group
-            group |= near
-            fresh += near
-        return sorted(group)
 
     def companion(self, name: str, correlation: float = 0.9) -> str:
         """Name the parameter that one is correlated with; "" if no correlation is that strong."""
@@ -230,9 +199,8 @@ def look(best: BestPoint, noise: Mapping[str, float]) -> Insight:
     scaled = np.zeros((len(objective.counted) * n, len(best.names)))
     for c, curve in enumerate(objective.counted):
         kept = objective.kept(curve)
-        weighed = objective.weights[curve] ** 0.5 / objective.scale[curve]
         rows = best.jacobian[at : at + kept.size] * best.sizes
-        scaled[c * n + kept] = rows / (weighed * noise[curve])
+        scaled[c * n + kept] = rows / (objective.factor(curve) * noise[curve])
         at += kept.size
     return Insight(
         names=best.names,
@@ -254,11 +222,8 @@ def _product(names: list[str], powers: Array) -> str:
     below: list[str] = []
     for name, power in sorted(zip(names, powers, strict=True), key=lambda item: -abs(item[1])):
         shown = f"{abs(power):.2f}".rstrip("0").rstrip(".")
-        if abs(power) < PART:
-            continue
-        text = name if shown == "1" else f"{name}^{shown}"
-        (above if power > 0.0 else below).append(text)
-    product = "·".join(above)
-    if not below:
-        return product
-    return f"{product}/({'·'.join(below)})" if len(below) > 1 else f"{product}/{below[0]}"
+        if abs(power) >= PART:
+            part = name if shown == "1" else f"{name}^{shown}"
+            (above if power > 0.0 else below).append(part)
+    under = "·".join(below)
+    return "·".join(above) + (f"/({under})" if len(below) > 1 else f"/{under}" if below else "")

@@ -19,7 +19,7 @@ from foamfit.errors import InputError
 from foamfit.fitting.search import Tracker
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.profile import PLACED, Profile, Tracing, departures
-from foamfit.trust.resample import block_length, bootstrap, check_emcee, mcmc, walkers
+from foamfit.trust.resample import bootstrap, check_emcee, mcmc, walkers
 
 # The default profiles a parameter if the root of the cost departs from a straight line by this
 # share at the end of its local interval.
@@ -34,9 +34,7 @@ Announce = Callable[[str], None]
 class Choice:
     """Which intervals are wanted."""
 
-    # "auto" (profiles of those parameters along which the cost is no parabola, local covariance for
-    # the others), "local", "profile", "bootstrap" or "mcmc".
-    method: str = "auto"
+    method: str = "auto"  # One of `METHODS`; see `foamfit.fit`
     draws: int = 0  # Refits of the bootstrap, or steps of the Markov chain
     seed: int = 0  # Source of all chance
 
@@ -60,17 +58,15 @@ class Choice:
 class Intervals:
     """The 95 % intervals of a fit, and how they were made."""
 
-    # Ends of the intervals that are not those of the local covariance.
+    # Ends of the intervals that are not those of the local covariance, and how each was made.
     ends: dict[str, tuple[float, float]] = field(default_factory=dict)
-    methods: dict[str, str] = field(default_factory=dict)  # How each of these was made
+    methods: dict[str, str] = field(default_factory=dict)
     profiles: tuple[Profile, ...] = ()  # All profiles that were followed, whole or not
     # Parameters along which the cost is no parabola and whose interval is local all the same.
     doubtful: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()  # One sentence each
-    # Why they are not, or hardly, what was asked for; one sentence each.
-    warnings: tuple[str, ...] = ()
-    # (n,): A point with a lower cost that was met: the fit should go on from there.
-    better: Array | None = None
+    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  # Why they are not, or hardly, what was asked for
+    better: Array | None = None  # A point of lower cost: the fit should go on from there
 
 
 def assess(
@@ -92,10 +88,7 @@ def assess(
         return Intervals()
     tracker, known = Tracker(best.problem.objective, deadline, best_cost=best.cost), best.known
     if not known:
-        what = {"mcmc": "a Markov chain", "bootstrap": "a bootstrap"}.get(choice.method, "profiles")
-        none = (
-            f"The test determines no parameter, so {what} would make no interval and was not run."
-        )
+        none = "The test determines no parameter, so no intervals were made."
         return Intervals(warnings=() if choice.method == "auto" else (none,))
     if choice.method == "bootstrap":
         return _by_bootstrap(best, choice, tracker, announce)
@@ -124,22 +117,15 @@ def _elsewhere(best: BestPoint, minima: Sequence[Array], tracker: Tracker) -> ND
 
 
 def _by_profiles(
-    best: BestPoint,
-    names: Sequence[str],
-    minima: Sequence[Array],
-    tracker: Tracker,
-    budget: float,
+    best: BestPoint, names: Sequence[str], minima: Sequence[Array], tracker: Tracker, budget: float
 ) -> Intervals:
     """Profiles of some parameters, until they are done, a better point is met or all ends.
 
-    A point within the cut that the profile of one parameter has met is evidence for the others too:
-    their intervals must hold it. So each profile goes on beyond what the others have met, and a
-    parameter that these put outside of its local interval is profiled as well. Refits with one
-    parameter held end in the nearest of several shallow minima; those with another one held have
-    been led through the next.
+    The intervals of all parameters must hold a point within the cut that the profile of one has
+    met: each profile goes on beyond what the others have met, and a parameter that these put
+    outside of its local interval is profiled as well.
     """
-    objective = tracker.objective
-    allowed = objective.evaluations + budget
+    allowed = tracker.objective.evaluations + budget
     tracings: dict[str, Tracing] = {}
     wanted, better = list(names), None
     for name in (*names, *best.known):
@@ -149,30 +135,24 @@ def _by_profiles(
             if not _outside(best, name, met):
                 continue
             wanted.append(name)
-        if objective.evaluations >= allowed and not begun:
+        if tracker.objective.evaluations >= allowed and not begun:
             continue
         tracing = tracings.setdefault(name, Tracing(best, name, tracker))
         tracing.follow(met if begun else [*minima, *met])
         better = tracing.better
         if better is not None or tracing.stopped:
             break
-    profiles = [tracing.profile for tracing in tracings.values()]
-    whole = {p.name: p for p in profiles if p.complete}
-    left = tuple(name for name in wanted if name not in whole)
+    profiles = tuple(tracing.profile for tracing in tracings.values())
+    ends = {p.name: p.ci95 for p in profiles if p.complete}
+    left = tuple(name for name in wanted if name not in ends)
     warnings = tuple(
-        f"The profiles were stopped by {p.stopped}: {len(whole)} of {len(wanted)} were done, and "
+        f"The profiles were stopped by {p.stopped}: {len(ends)} of {len(wanted)} were done, and "
         f"the intervals of {', '.join(left)} are local."
         for p in profiles
         if p.stopped
     )
-    return Intervals(
-        ends={name: p.ci95 for name, p in whole.items()},
-        methods=dict.fromkeys(whole, "profile likelihood"),
-        profiles=tuple(profiles),
-        doubtful=left,
-        warnings=warnings,
-        better=better,
-    )
+    methods = dict.fromkeys(ends, "profile likelihood")
+    return Intervals(ends, methods, profiles, left, warnings=warnings, better=better)
 
 
 def _met(best: BestPoint, name: str, tracings: Sequence[Tracing]) -> list[Array]:
@@ -197,12 +177,7 @@ def _by_bootstrap(
 ) -> Intervals:
     announce(_cost_told(best, "block bootstrap", choice.draws))
     drawn = bootstrap(best, choice.draws, choice.seed, tracker)
-    sizes = best.problem.objective.sizes
-    lengths = [block_length(p, n) for p, n in zip(best.spread.noise, sizes, strict=True)]
-    note = (
-        f"Block bootstrap: {len(drawn.values)} of {choice.draws} refits, blocks of "
-        f"{' and '.join(map(str, lengths))} samples."
-    )
+    note = f"Block bootstrap: {len(drawn.values)} of {choice.draws} refits."
     if drawn.stopped:
         note += f" It was stopped by {drawn.stopped}."
     if len(drawn.values) < ENOUGH_DRAWS:
@@ -217,11 +192,11 @@ def _by_mcmc(best: BestPoint, choice: Choice, tracker: Tracker, announce: Announ
     note = chain.sentence()
     if len(chain.samples) < ENOUGH_DRAWS:
         return Intervals(warnings=(note + " The intervals are local.",))
-    lost = [name for name in best.names if name not in best.known]
+    lost = ", ".join(name for name in best.names if name not in best.known)
     if lost:
         note += (
-            f" The test does not determine {', '.join(lost)}: the chain samples them with a flat "
-            "prior within their limits, and they have no interval."
+            f" The test does not determine {lost}: the chain samples them with a flat prior within "
+            "their limits, and they have no interval."
         )
     fine = chain.converged and chain.stopped is None
     return _percentiles(best, chain.samples, "MCMC", note, fine)

@@ -57,16 +57,8 @@ class Profile:
 def profile(
     best: BestPoint, name: str, tracker: Tracker | None = None, minima: Sequence[Array] = ()
 ) -> Profile:
-    """Follow the least cost along a parameter to both sides, past the 95 % cut.
-
-    The adjusted likelihood ratio: the rise of the cost over `Covariance.inflation`, which is χ²
-    with one degree of freedom also where the noise is correlated (Chandler & Bate 2007,
-    Biometrika 94, 167). `minima` are other points at which descents ended: the profile goes on
-    beyond them where they are within the cut, whatever barrier lies between. It is incomplete if
-    the deadline or Ctrl-C ended it: `ci95` is then that of what was done.
-    """
-    tracker = Tracker(best.problem.objective) if tracker is None else tracker
-    tracing = Tracing(best, name, tracker)
+    """Follow the least cost along a parameter to both sides; see `Tracing.follow`."""
+    tracing = Tracing(best, name, Tracker(best.problem.objective) if tracker is None else tracker)
     tracing.follow(minima)
     return tracing.profile
 
@@ -83,14 +75,12 @@ class _Side:
     def __post_init__(self) -> None:
         """Begin at the best point."""
         best = self.best
-        self.column = best.names.index(self.name)
-        self.place = best.index[self.name]
+        self.column, self.place = best.names.index(self.name), best.index[self.name]
         self.unit = float(best.spread.inflation[self.column])
         self.quantile = float(best.quantiles[self.column])
-        self.half = self.quantile * float(best.spread.stderr[self.column])
+        self.half = float(best.halves[self.column])
         self.refits = [self.refit.start()]
-        low, high = best.limits(self.name)
-        self.limit = low if self.sign < 0 else high
+        self.limit = best.limits(self.name)[0 if self.sign < 0 else 1]
 
     def value(self, at: Iterate) -> float:
         """Where the parameter was held."""
@@ -134,8 +124,8 @@ class _Side:
             if self.value(last) == self.limit or refused > 3:
                 break
             value = self.value(last) + self.sign * step
-            value = max(value, self.limit) if self.sign < 0 else min(value, self.limit)
-            found = self._hold(value, last)
+            over = self.sign * (value - self.limit) > 0.0
+            found = self._hold(self.limit if over else value, last)
             if found is None:
                 step, refused = 0.3 * step, refused + 1
                 continue
@@ -152,9 +142,9 @@ class _Side:
             if outer is None or self.better:
                 break
             miss = min(abs(self.root(at) - self.quantile) for at in (inner, outer))
-            if miss <= PLACED * self.quantile:
-                break
-            found = self._hold(self.bound, inner)
+            found = None
+            if miss > PLACED * self.quantile:
+                found = self._hold(self.bound, inner)
             if found is None:
                 break
             self.refits.append(found)
@@ -204,13 +194,21 @@ class Tracing:
     """A profile that is being followed; a side that was not begun ends at the best point."""
 
     def __init__(self, best: BestPoint, name: str, tracker: Tracker) -> None:
+        """Begin at the best point."""
         refit = Refit(best, tracker)
         self.low, self.high = (_Side(best, name, refit, sign) for sign in (-1.0, 1.0))
         self.stopped: str | None = None
         self._turned = False
 
     def follow(self, minima: Sequence[Array]) -> None:
-        """Follow both sides, or go on beyond further minima; incomplete if that was ended."""
+        """Follow the least cost to both sides, past the 95 % cut.
+
+        The adjusted likelihood ratio: the rise of the cost over `Covariance.inflation` is χ² with
+        one degree of freedom also where the noise is correlated (Chandler & Bate 2007, Biometrika
+        94, 167). `minima` are other points at which descents ended: it goes on beyond them where
+        they are within the cut, whatever barrier lies between. It is incomplete if the deadline or
+        Ctrl-C ended it: `ci95` is then that of what was done.
+        """
         try:
             self.low.follow(minima)
             self._turned = True
@@ -249,10 +247,10 @@ class Tracing:
 def departures(best: BestPoint) -> Array:
     """How far the cost is from a parabola at either end of each local interval, (k, 2).
 
-    One evaluation each: the parameter is put at the end of its interval (nearer if nothing can be
-    simulated there), the others follow their correlation, and what they could still gain is read
-    off the local slopes. Given is the root of the rise over what a parabola has, less one; zero
-    where a limit is next to the best point, infinite where nothing can be simulated.
+    The parameter is put at the end of its interval (nearer if nothing can be simulated there), the
+    others follow their correlation, and what they could still gain is read off the local slopes.
+    Given is the root of the rise over what a parabola has, less one; zero where a limit is next to
+    the best point, infinite where nothing can be simulated.
     """
     refit = Refit(best, Tracker(best.problem.objective))
     start = refit.start()

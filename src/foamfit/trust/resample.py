@@ -34,34 +34,25 @@ def block_length(process: NoiseProcess, n: int) -> int:
     return int(min(max(round(length), 1), max(n // 4, 1)))
 
 
-@dataclass(frozen=True, eq=False)
-class Blocks:
-    """Circular blocks of the residuals of one curve (Politis & Romano 1992).
+def _scaled_residual(residual: Array, process: NoiseProcess, like: Array, length: int) -> Array:
+    """Residual of one curve for circular blocks of it (Politis & Romano 1992).
 
-    Residuals are smaller than the noise was, and blocks break correlation at their ends: a factor
-    corrects both, such that sums over the curve vary as those of its noise.
+    A factor corrects that residuals are smaller than the noise was, which was read off `like`, and
+    that blocks break correlation at their ends: sums over the curve vary as those of its noise.
     """
+    lags = process.autocovariance(length) / process.variance
+    within = 1.0 + 2.0 * float((1.0 - np.arange(1, length) / length) @ lags[1:])
+    power = max(float(np.var(like)), 1e-300)
+    factor = process.variance / power * max(process.tau / within, 1.0)
+    return np.asarray((residual - residual.mean()) * math.sqrt(factor))
 
-    residual: Array
-    length: int
 
-    @classmethod
-    def of(cls, residual: Array, process: NoiseProcess, like: Array | None = None) -> Blocks:
-        """Blocks of a residual whose noise is known; `like` is what it was read off, if not it."""
-        length = block_length(process, residual.size)
-        centred = residual - residual.mean()
-        lags = process.autocovariance(length) / process.variance
-        within = 1.0 + 2.0 * float((1.0 - np.arange(1, length) / length) @ lags[1:])
-        power = max(float(np.var(residual if like is None else like)), 1e-300)
-        factor = process.variance / power * max(process.tau / within, 1.0)
-        return cls(centred * math.sqrt(factor), length)
-
-    def draw(self, rng: np.random.Generator) -> Array:
-        """As many samples as the residual has, from blocks with random starts."""
-        n = self.residual.size
-        starts = rng.integers(0, n, -(-n // self.length))
-        drawn = (starts[:, None] + np.arange(self.length)) % n
-        return np.asarray(self.residual[drawn.ravel()[:n]])
+def _draw(residual: Array, length: int, rng: np.random.Generator) -> Array:
+    """As many samples as the residual has, from circular blocks with random starts."""
+    n = residual.size
+    starts = rng.integers(0, n, -(-n // length))
+    drawn = (starts[:, None] + np.arange(length)) % n
+    return np.asarray(residual[drawn.ravel()[:n]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,16 +74,18 @@ def bootstrap(best: BestPoint, draws: int, seed: int, tracker: Tracker | None = 
     rng = np.random.default_rng([seed, 1])
     ends = np.cumsum(objective.sizes)[:-1]
     _, pseudo = m_estimate(best.residual, objective.sizes, objective.loss)
-    pairs = zip(np.split(best.residual, ends), np.split(pseudo, ends), strict=True)
-    blocks = [
-        Blocks.of(part, process, like)
-        for (part, like), process in zip(pairs, best.spread.noise, strict=True)
-    ]
+    sources = []
+    for n, part, like, process in zip(
+        objective.sizes, np.split(best.residual, ends), np.split(pseudo, ends), best.spread.noise,
+        strict=True,
+    ):  # fmt: skip
+        length = block_length(process, n)
+        sources.append((_scaled_residual(part, process, like, length), length))
     out: list[Array] = []
     stopped = None
     try:
         for _ in range(draws):
-            noise = np.concatenate([block.draw(rng) for block in blocks])
+            noise = np.concatenate([_draw(part, length, rng) for part, length in sources])
             refit = Refit(best, tracker, best.residual - noise)
             end = refit.run(best.values)
             assert end is not None  # the best point can be simulated
@@ -121,13 +114,12 @@ class MarkovChain:
 
     def sentence(self) -> str:
         """What the autocorrelation says of the chain."""
-        length = self.steps - self.burn_in
-        word = "enough" if self.converged else "too short: at least 50 are needed"
+        times = (self.steps - self.burn_in) / self.autocorrelation
+        enough = "enough" if self.converged else "too short: at least 50 are needed"
         return (
             f"Markov chain of {self.walkers} walkers and {self.steps} steps, the first "
-            f"{self.burn_in} left out: {length / self.autocorrelation:.0f} autocorrelation times "
-            f"of the slowest parameter, which is {word}."
-            + (f" It was stopped by {self.stopped}." if self.stopped else "")
+            f"{self.burn_in} left out: {times:.0f} autocorrelation times of the slowest parameter, "
+            f"which is {enough}." + (f" It was stopped by {self.stopped}." if self.stopped else "")
         )
 
 
@@ -197,12 +189,9 @@ def mcmc(best: BestPoint, steps: int, seed: int, tracker: Tracker | None = None)
 
 
 def _begin(
-    best: BestPoint,
-    refit: Refit,
-    log_probability: Callable[[Array], float],
-    count: int,
+    best: BestPoint, refit: Refit, log_probability: Callable[[Array], float], count: int,
     rng: np.random.Generator,
-) -> Array | None:
+) -> Array | None:  # fmt: skip
     """Points about the best one at which walkers begin, scaled, (count, k); None if there are none.
 
     Half a standard error away along what the test fixes, no more than `FARTHEST` along the rest.

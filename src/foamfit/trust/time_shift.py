@@ -44,9 +44,9 @@ def _shift_of_residuals(best: BestPoint, determined: list[str]) -> float | None:
 def _shift_of_motion(problem: Problem) -> float | None:
     """Time by which the motion is late (s), if the striker's balance of motion plainly shows it.
 
-    m w'' = -F: the force, integrated twice, must give the motion, but for its scale and for where
-    its zero lies. Accepted where a shift of a sample or more halves what is left, down to the
-    noise, or takes nine tenths.
+    m w'' = -F: the force, integrated twice, gives the motion but for its scale and its zero.
+    Accepted where a shift of a sample or more halves what is left, down to the noise, or takes nine
+    tenths.
     """
     test, striker = problem.measurement, problem.measurement.striker
     time, stress, motion = test.time, test.stress, test.displacement

@@ -80,7 +80,7 @@ class Body(NamedTuple):
 
 
 class Work(NamedTuple):
-    """Room for linear systems: residual (columns, springs, points) in, delta (the same) out.
+    """Arrays of linear systems: residual (columns, springs, points) in, delta (the same) out.
 
     lift (springs, points, points), stiff and spring (points, points) and m (points, 2 points +
     columns) are scratch.
@@ -143,7 +143,7 @@ class PointTangents(NamedTuple):
 
 @maker
 def _make_work(count: int, columns: int) -> Work:
-    """Make room for linear systems."""
+    """Allocate linear systems."""
     n = STAGES
     return Work(
         np.zeros((columns, count, n)), np.zeros((columns, count, n)), np.zeros((count, n, n)),
@@ -153,7 +153,7 @@ def _make_work(count: int, columns: int) -> Work:
 
 @maker
 def make_points(count: int) -> Points:
-    """Make room for the points of a step."""
+    """Allocate the points of a step."""
     s = (count, STAGES)
     return Points(
         np.zeros(s), np.zeros(s), np.zeros(s), np.zeros(s), np.zeros(s), _make_work(count, 1)
@@ -259,7 +259,7 @@ def _correct(body: Body, span: float, slope: Array, work: Work) -> bool:
     (K, r) become (S D⁻¹ K, S D⁻¹ r), D = K + S.
     """
     rows, heights, mass, drag, moving = body
-    residual, delta, lift, stiff, spring, m = work  # stiff: the chain below, as the node feels it
+    residual, delta, lift, stiff, spring, m = work  # stiff: the chain below, as it acts on the node
     s, columns = STAGES, residual.shape[0]
     for i in range(moving):
         _stiffness(rows, i, heights[i], span, slope, spring)
@@ -296,7 +296,7 @@ def _correct(body: Body, span: float, slope: Array, work: Work) -> bool:
                         force += spring[j, k] * delta[c, i - 1, k]
                 delta[c, i, j] = force
     last = moving - 1
-    if moving < heights.size:  # the spring above the last free node hangs on the driven top
+    if moving < heights.size:  # the spring above the last free node is held by the driven top
         _stiffness(rows, moving, heights[moving], span, slope, spring)
         for j in range(s):
             for k in range(s):
@@ -373,9 +373,9 @@ def collocate(
                 moved = max(moved, abs(z[i, j] + NODES[j] * span * state.v0[i]))
                 if i > 0:
                     gain -= delta[0, i - 1, j]
-                room = 0.9 * (1.0 - (eps[i, j] - x0))
-                if curved and gain / heights[i] > room:
-                    part = min(part, room * heights[i] / gain)
+                most = 0.9 * (1.0 - (eps[i, j] - x0))
+                if curved and gain / heights[i] > most:
+                    part = min(part, most * heights[i] / gain)
         for i in range(moving):
             for j in range(STAGES):
                 z[i, j] += part * delta[0, i, j]

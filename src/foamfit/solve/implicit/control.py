@@ -2,8 +2,7 @@
 
 A step is as long as its truncation allows. Where the error alone keeps steps short for long,
 something vibrates too fast to be worth following: from the follow limit on steps grow up to a step
-floor whatever their error, and the vibration is damped out (L-stability). Where that would cost
-more than the wanted error, it is followed for MOST_SHORT_STEPS of one spring all the same.
+floor whatever their error, and the vibration is damped out (L-stability).
 """
 
 # mypy: disallow-untyped-decorators=False, warn-return-any=False
@@ -16,14 +15,13 @@ from typing import NamedTuple
 import numpy as np
 
 from foamfit.solve.implicit.collocation import STAGES, Body, Points, State, polynomial, truncation
-from foamfit.solve.implicit.vibration import Unresolved, is_unresolved, unresolved_vibration
+from foamfit.solve.implicit.vibration import is_unresolved
 from foamfit.solve.polynomial import first_crossing, slope_at, value_at
-from foamfit.solve.scene import LEAST_BASE, Scene
+from foamfit.solve.scene import LEAST_BASE
 from foamfit.springs.kernels import Array, inner, interval, stress_on
 
-# A step is short below this share of the motion; so many in a row are followed at first, and later;
-# so many in all (of one spring) where damping out would cost more than the wanted error.
-SHORT, FOLLOW_LIMIT, LATER_FOLLOW_LIMIT, MOST_SHORT_STEPS = 5e-4, 600, 60, 10_000
+# A step is short below this share of the motion; so many in a row are followed.
+SHORT, FOLLOW_LIMIT = 5e-4, 600
 # Behind heavy dashpots contact ends when no more than 1e-12 of the peak of the base stress is left:
 # while the striker presses it is followed with so large an error of what is left, at most.
 SMALL_BASE_ERROR = 1e-7
@@ -34,39 +32,31 @@ AGAIN, FREELY, ARRIVED, AT_ONCE = range(4)
 class Limits(NamedTuple):
     """What does not change in a run besides the scene.
 
-    `tol` is the truncation of a step relative to the motion so far, `wanted` the error that
-    vibrations may have which are damped out, `duration` that of the motion (s), `short` the length
-    under which steps are short. `base_weight` weighs the truncation of the base stress relative to
-    what is left of it, vibrations (groups, 2) are those of each mass (`vibration.of_masses`), and
-    `fast` tells whether there are any.
+    `tol` is the truncation of a step relative to the motion so far, `short` the length (s) under
+    which steps are short. `base_weight` weighs the truncation of the base stress relative to what
+    is left of it.
     """
 
     tol: float
-    wanted: float
     max_steps: int
-    duration: float
     short: float
     base_weight: float
-    vibrations: Array
-    fast: bool
 
 
 class Control:
     """Memory of the step control: a record of numbers (numba knows no class).
 
     `taken` and `proposed` are the lengths of the last step and the next; `floor` is the least that
-    the error may ask for; `short_in_row` and `short_steps` count steps that the error alone made
-    short; `worst` is the largest error let pass, over tol. `damped` is the size of all vibrations
-    that were damped out, `damping` of those in the last steps. `motion` (m), `stress` and `base`
-    (Pa) are the largest so far, `step_motion` and `step_stress` with the step that is tried;
-    `trial` and `trial_error` are the length and error of the first trial of a step.
+    the error may ask for; `short_in_row` counts steps that the error alone made short; `worst` is
+    the largest error let pass, over tol. `damped` is the size of all vibrations that were damped
+    out, `damping` of those in the last steps. `motion` (m), `stress` and `base` (Pa) are the
+    largest so far, `step_motion` and `step_stress` with the step that is tried.
     """
 
     taken: float
     proposed: float
     floor: float
     short_in_row: float
-    short_steps: float
     worst: float
     damped: float
     damping: float
@@ -75,8 +65,6 @@ class Control:
     base: float
     step_motion: float
     step_stress: float
-    trial: float
-    trial_error: float
 
 
 # As numpy's own record it has attributes without compilation, too.
@@ -86,7 +74,7 @@ CONTROL = np.dtype((np.record, [(name, np.float64) for name in Control.__annotat
 class Start(NamedTuple):
     """Where a step starts: time, base stress, whether contact has come through to the base.
 
-    `push` is the stress on the top and `push_rate` its rate; `wait` is the time to the next sample.
+    `push` is the stress on the top and `push_rate` its rate.
     """
 
     now: float
@@ -94,18 +82,6 @@ class Start(NamedTuple):
     pressed: bool
     push: float
     push_rate: float
-    wait: float
-
-
-class Target(NamedTuple):
-    """What a step is to end at: a spring (one past the last: the base), at a strain (or stress).
-
-    `side` is that towards which the level is crossed; the spring is -1 if there is none.
-    """
-
-    spring: int
-    side: int
-    level: float
 
 
 class Polynomials(NamedTuple):
@@ -163,53 +139,28 @@ def error_of(
 
 @inner
 def allowed_length(
-    scene: Scene,
-    limits: Limits,
-    body: Body,
-    state: State,
-    at: Points,
-    r: Unresolved,
-    c: Control,
-    start: Start,
-    span: float,
-    error: float,
+    limits: Limits, rates: Array, c: Control, now: float, span: float, error: float, rounded: bool
 ) -> float:
-    """Length at which to take a step whose truncation is `error`: its own where that may pass."""
-    tol, count, now = limits.tol, body.heights.size, start.now
-    error /= tol
-    if not math.isfinite(error):
+    """Length at which to take a step whose truncation is `error`: its own where that may pass.
+
+    It may also where the error is one of rounding, or the step as short as times can resolve.
+    """
+    excess = error / limits.tol
+    if not math.isfinite(excess):
         return 0.3 * span
-    factor = 0.9 * max(error, 1e-12) ** (-1.0 / 6.0)
-    stuck = False  # rounding, or a layer thinner than the clock can tell
-    if error > 1.0 and span <= 1e-6 * c.trial:
-        stuck = error > 0.3 * c.trial_error
-        c.trial, c.trial_error = span, error
-    elif c.trial == math.inf:
-        c.trial, c.trial_error = span, error
-    stuck = stuck or now + 0.1 * span <= now
-    vibrates = error > 1.0 and is_unresolved(limits.vibrations, span)
-    if error > 1.0 and not stuck and span <= c.floor * (1.0 + 1e-9):
-        may_follow = c.short_steps * count < MOST_SHORT_STEPS
-        costs = c.damped - c.damping + error * tol > 0.3 * limits.wanted
-        if vibrates and may_follow and costs:
-            c.floor, c.short_in_row = 0.0, -4 * FOLLOW_LIMIT
-    if error > 1.0 and not stuck and span > c.floor * (1.0 + 1e-9):
-        return max(span * min(max(factor, 0.1), 0.9), c.floor)
-    if limits.fast and c.floor == 0.0 and not stuck:
-        moved, pressed, rate, decay = unresolved_vibration(scene, state, at, span, start.wait, r)
-        size = max(moved / c.step_motion, pressed / c.step_stress) if moved > 0.0 else 0.0
-        left = MOST_SHORT_STEPS // count - c.short_steps
-        if size > 0.1 * limits.wanted and rate > 0.0 and decay * left > 10.0 * rate:
-            return 1.0 / rate  # it dies out soon enough to be followed
-    if error > 1.0 and vibrates and error * tol > c.damping:
-        c.damped += error * tol - c.damping
-        c.damping = error * tol
-    elif error <= 1.0:
+    factor = 0.9 * max(excess, 1e-12) ** (-1.0 / 6.0)
+    floor = max(c.floor, 1e-15 * now)
+    if excess > 1.0 and not rounded and span > floor * (1.0 + 1e-9):
+        return max(span * min(max(factor, 0.1), 0.9), floor)
+    if excess <= 1.0:
         c.damping = 0.0
+    elif is_unresolved(rates, span) and error > c.damping:
+        c.damped += error - c.damping
+        c.damping = error
     c.proposed = max(span * min(max(factor, 0.2), 5.0), c.floor)
-    if error > 1.0:
+    if excess > 1.0:
         c.proposed = max(c.proposed, 2.0 * span)
-    c.worst = max(c.worst, error)
+    c.worst = max(c.worst, excess)
     return span
 
 
@@ -217,15 +168,13 @@ def allowed_length(
 def raise_floor(span: float, last: bool, limits: Limits, c: Control) -> None:
     """Let steps grow again that only the error has kept short for long."""
     c.taken = span
-    if c.proposed < limits.short and not last:
+    if c.proposed >= limits.short:
+        c.short_in_row = c.floor = 0.0
+    elif not last:
         c.short_in_row += 1
-        c.short_steps += 1
-        early = c.short_steps < 3 * FOLLOW_LIMIT
-        if c.short_in_row > (FOLLOW_LIMIT if early else LATER_FOLLOW_LIMIT):
+        if c.short_in_row > FOLLOW_LIMIT:
             c.floor = min(max(2.0 * c.floor, 2.0 * span), limits.short)
             c.proposed = max(c.proposed, c.floor)
-    elif c.proposed >= limits.short:
-        c.short_in_row = c.floor = 0.0
 
 
 # ---------------------------------------------------------------- where a step ends
@@ -271,43 +220,41 @@ def aim(
     struck: bool,
     span: float,
     longest: float,
-    trials: int,
-    target: Target,
-) -> tuple[int, float, Target]:
-    """What to do with a step, for what length, and what it is to end at.
+    last: bool,
+    which: int,
+    side: int,
+) -> tuple[int, float, int, int]:
+    """What to do with a step, for what length; the spring (or base) at whose event, and its side.
 
-    `target` is what a step of the length before this one has shown, `trials` how often it was aimed
-    at.
+    `which` and `side` are the event that the step aims at (-1: none).
     """
-    count, spring, level = body.heights.size, target.spring, target.level
-    when, which, where = _first_event(body, state, out, struck, start.pressed)
-    if spring >= 0:
-        value = at.total[0, STAGES - 1] if spring == count else at.eps[spring, STAGES - 1]
-        fine = 1e-13 * (abs(start.base) if spring == count else max(1.0, abs(level)))
-        same = which < 0 or which == spring or when > 1.0 - 1e-9
-        if same and abs(value - level) <= fine:
-            return ARRIVED, span, target
-        if same and trials > 12:
-            return (ARRIVED if abs(value - level) <= 1e5 * fine else FREELY), span, target
-        if which < 0:  # a little further
-            rate = slope_at(out.base if spring == count else out.strains[spring], STAGES, 1.0)
-            more = (level - value) / rate if rate * target.side > 0.0 else math.inf
-            further = (1.0 + more) * span
-            if not further < longest:  # it turned back: nothing was crossed
-                return FREELY, span, target
-            return AGAIN, further, target
+    when, event, way = _first_event(body, state, out, struck, start.pressed)
+    aimed = which >= 0 and (event < 0 or event == which or when > 1.0 - 1e-9)
+    if not aimed:
+        which, side = event, way
     if which < 0:
-        return FREELY, span, target
-    level = 0.0
-    if which < count:
+        return FREELY, span, which, side
+    level, fine = 0.0, 1e-13 * abs(start.base)
+    ending, value = out.base, at.total[0, STAGES - 1]
+    if which < body.heights.size:
         low, high = interval(body.rows[which], state.branches[which])
-        level = high if where > 0 else low
-    new = Target(which, where, level)
-    ending = out.base if which == count else out.strains[which]
-    beyond = value_at(ending, STAGES, 0.5 * when) - level
-    near = abs(ending[0] - level) <= out.slack[which] and beyond * where >= 0.0
-    if start.now + when * span <= start.now or near:
-        return AT_ONCE, 0.0, new
-    if when >= 1.0 - 1e-15:
-        return ARRIVED, span, new
-    return AGAIN, when * span, new
+        level = high if side > 0 else low
+        fine = 1e-13 * max(1.0, abs(level))
+        ending, value = out.strains[which], at.eps[which, STAGES - 1]
+    near = False
+    if aimed:
+        if abs(level - value) <= (1e5 * fine if last else fine):
+            return ARRIVED, span, which, side
+        if event < 0:  # a little further; where it turned back, nothing was crossed
+            more = (level - value) / slope_at(ending, STAGES, 1.0)
+            when = 1.0 + more if more > 0.0 else math.inf
+        if last or not when * span < longest:
+            return FREELY, span, which, side
+    else:
+        beyond = value_at(ending, STAGES, 0.5 * when) - level
+        near = abs(ending[0] - level) <= out.slack[which] and beyond * side >= 0.0
+    if near or start.now + when * span <= start.now:
+        return AT_ONCE, 0.0, which, side
+    if when >= 1.0 - 1e-15 and not aimed:
+        return ARRIVED, span, which, side
+    return AGAIN, when * span, which, side

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 from foamfit.solve.implicit.collocation import (
     NODES,
@@ -21,41 +20,23 @@ from foamfit.solve.implicit.collocation import (
 )
 from foamfit.solve.implicit.control import Polynomials
 from foamfit.solve.polynomial import value_at
-from foamfit.solve.scene import Scene, fly
+from foamfit.solve.scene import Samples, Scene, fly
 from foamfit.springs.kernels import ETA, Array, inner
 from foamfit.springs.parameters import OWN_ETA, OWN_HEIGHT
 
 
-class LoggedSamples(NamedTuple):
-    """The curves to fill, as `scene.Samples`, and the switches (m, 5), as `scene.log_switch`."""
-
-    t: Array
-    curves: Array
-    slopes: Array
-    log: Array
-
-
 @inner
 def _record(
-    now: float,
-    span: float,
-    first: int,
-    done: int,
-    state: State,
-    curves: Polynomials,
-    out: LoggedSamples,
+    now: float, span: float, first: int, done: int, state: State, curves: Polynomials, out: Samples
 ) -> None:
     """Write the samples first … done-1, which a step contains."""
-    top = state.w.size - 1
+    nodes, count = out.curves.shape[0] - 1, state.w.size
     for sample in range(first, done):
         at = (out.t[sample] - now) / span
         out.curves[0, sample] = value_at(curves.base, STAGES, at)
-        if out.curves.shape[0] == 2:
-            out.curves[1, sample] = state.w[top] + value_at(curves.moves[top], STAGES, at)
-        else:
-            for i in range(state.w.size):
-                moved = value_at(curves.moves[i], STAGES, at)
-                out.curves[1 + i, sample] = state.w[i] + moved
+        for node in range(nodes):
+            i = node if nodes > 1 else count - 1
+            out.curves[1 + node, sample] = state.w[i] + value_at(curves.moves[i], STAGES, at)
 
 
 @inner
@@ -63,7 +44,7 @@ def _through(values: Array, at: float) -> float:
     """Value at a place of a step of the polynomial through the values at its points.
 
     Where nothing has inertia or a dashpot, the derivatives by a dashpot jump at switches and kinks:
-    the polynomial of a step asks nothing of its start.
+    this polynomial does not pass through the start of the step.
     """
     total = 0.0
     for k in range(STAGES - 1, -1, -1):
@@ -76,7 +57,7 @@ def _through(values: Array, at: float) -> float:
 
 @inner
 def _record_tangents(
-    now: float, span: float, first: int, done: int, d: PointTangents, out: LoggedSamples
+    now: float, span: float, first: int, done: int, d: PointTangents, out: Samples
 ) -> None:
     """Write the derivatives at the samples first … done-1, which a step contains."""
     nodes, count = out.curves.shape[0] - 1, d.w.shape[0]
@@ -118,7 +99,7 @@ def record_step(
     first: int,
     done: int,
     d: PointTangents,
-    out: LoggedSamples,
+    out: Samples,
 ) -> bool:
     """Write the samples of a step and carry its derivatives; false if these are not finite."""
     for i in range(body.heights.size):
@@ -135,9 +116,7 @@ def record_step(
 
 
 @inner
-def record_rest(
-    first: int, state: State, base: float, d: PointTangents, out: LoggedSamples
-) -> None:
+def record_rest(first: int, state: State, base: float, d: PointTangents, out: Samples) -> None:
     """Write a single sample, or one that is left where the steps have ended."""
     nodes, count = out.curves.shape[0] - 1, state.w.size
     for sample in range(first, out.t.size):
@@ -153,7 +132,7 @@ def record_rest(
 
 @inner
 def mend_kink(
-    scene: Scene, body: Body, knot: int, jump: float, d: PointTangents, out: LoggedSamples
+    scene: Scene, body: Body, knot: int, jump: float, d: PointTangents, out: Samples
 ) -> None:
     """Dashpots feel the mean rate where the prescribed motion has a kink of `jump`."""
     flow = 0.0
@@ -182,7 +161,7 @@ def fly_on(
     now: float,
     done: int,
     d: PointTangents,
-    out: LoggedSamples,
+    out: Samples,
     w_end: Array,
 ) -> None:
     """Fill the samples after contact, which ended now with the base stress falling at `fall`.

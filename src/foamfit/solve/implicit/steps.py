@@ -2,7 +2,7 @@
 
 Light masses and heavy or very light dashpots make rates that explicit steps must follow. The steps
 of `implicit.collocation` (Radau IIA, order 9) need not: the method is L-stable, what relaxes or
-vibrates too fast to be followed dies out (and `implicit.vibration` tells how much that was).
+vibrates too fast to be followed dies out (and `implicit.vibration` estimates how much that was).
 
 No branch changes inside a step. A switch, or the end of contact, is the first crossing of the
 polynomial; the step is then taken again, shorter, until it ends there. Derivatives by parameters
@@ -39,14 +39,12 @@ from foamfit.solve.implicit.control import (
     Limits,
     Polynomials,
     Start,
-    Target,
     aim,
     allowed_length,
     error_of,
     raise_floor,
 )
 from foamfit.solve.implicit.recording import (
-    LoggedSamples,
     fly_on,
     mend_kink,
     record_rest,
@@ -56,8 +54,7 @@ from foamfit.solve.implicit.vibration import (
     Unresolved,
     contact_time,
     is_overdamped,
-    of_masses,
-    unresolved_vibration,
+    remember,
 )
 from foamfit.solve.polynomial import slope_at
 from foamfit.solve.scene import (
@@ -70,6 +67,7 @@ from foamfit.solve.scene import (
     STRESS,
     TOO_MANY_STEPS,
     VISCOUS,
+    Samples,
     Scene,
     SceneTuple,
     before_contact,
@@ -124,7 +122,7 @@ def _step(
     state: State,
     at: Points,
     out: Polynomials,
-    r: Unresolved,
+    rates: Array,
     control: Control,
     start: Start,
     span: float,
@@ -137,34 +135,35 @@ def _step(
     """
     count, struck, now = body.heights.size, scene.speed > 0.0, start.now
     zero: int = body.heights.size - count  # not the literal: every type is compiled on its own
-    longest, trials, target = span, zero, Target(zero - 1, zero, 0.0)
-    control.trial = control.trial_error = math.inf
+    longest, trials, which, side = span, zero, zero - 1, zero
     weight = limits.base_weight if start.pressed else 0.0
+    first, first_error = span, math.inf
     for _ in range(200):
         if now + span <= now:
             break
         guess(out.moves, state, body.moving, span, control.taken, at.z)
         if not collocate(body, state, start.push, start.push_rate, span, control.motion, at, tally):
-            if trials > 0:
-                trials, target = zero, Target(zero - 1, zero, 0.0)
             span *= 0.3
-            longest = span
+            longest, trials, which = span, zero, zero - 1
             continue
         error = error_of(body, state, at, start, weight, control, out)
         if trials == 0:
-            allowed = allowed_length(scene, limits, body, state, at, r, control, start, span, error)
+            if first_error == math.inf:
+                first, first_error = span, error
+            rounded = span <= 1e-6 * first and error > 0.3 * first_error
+            allowed = allowed_length(limits, rates, control, now, span, error, rounded)
             if allowed < span:
                 longest = span = allowed
                 continue
         for i in range(count):
             out.slack[i] = max(1e-12, limits.tol * control.step_motion / body.heights[i])
         out.slack[count] = min(control.worst * limits.tol, 1e-3) * control.step_stress
-        what, span, target = aim(body, state, at, out, start, struck, span, longest, trials, target)
-        if what != AGAIN:
-            return DONE, span, what != FREELY, target.spring, target.side
         trials += 1
-    if trials > 0:  # the crossing is here, within rounding
-        return DONE, 0.0, True, target.spring, target.side
+        what, span, which, side = aim(
+            body, state, at, out, start, struck, span, longest, trials > 13, which, side
+        )
+        if what != AGAIN:
+            return DONE, span, what != FREELY, which, side
     for i in range(count):
         curved, _, x0, _ = branch_shape(body.rows[i], state.branches[i])
         if curved and 1.0 - (state.eps0[i] - x0) < 1e-3:
@@ -213,7 +212,7 @@ def _drive(
     fresh: bool,
     now: float,
     d: PointTangents,
-    out: LoggedSamples,
+    out: Samples,
 ) -> tuple[float, float, float]:
     """Prescribe motion or stress from sample `knot` on, which may be reached just now (`fresh`).
 
@@ -253,17 +252,6 @@ def _carry(body: Body, state: State, at: Points, span: float, top: int, control:
         control.motion = max(control.motion, abs(state.w[last]))
     control.base = max(control.base, abs(at.total[0, end]))
     control.stress = max(control.stress, control.base)
-
-
-@inner
-def _remember(
-    scene: Scene, state: State, at: Points, span: float, wait: float, r: Unresolved
-) -> None:
-    """Add what a step could not resolve to the vibrations that the answer lacks."""
-    moved, pressed, _, _ = unresolved_vibration(scene, state, at, span, wait, r)
-    r.worst[0], r.worst[1] = max(r.worst[0], moved), max(r.worst[1], pressed)
-    for g in range(r.alive.size):
-        r.alive[g] = (r.alive[g] + r.begun[g]) * math.exp(-r.fading[g] * span)
 
 
 @inner
@@ -336,7 +324,8 @@ def _follow(
     r: Unresolved,
     control: Control,
     d: PointTangents,
-    samples: LoggedSamples,
+    samples: Samples,
+    log: Array,
     start: Array,
     tally: Branches,
 ) -> tuple[int, float, int, int]:
@@ -370,15 +359,10 @@ def _follow(
         if horizon <= now:  # a single sample, or the last one
             record_rest(done, state, base, d, samples)
             return DONE, math.nan, step, switches
-        span = horizon - now
-        if control.proposed > 0.0:
-            span = min(span, control.proposed)
-        elif struck:
-            span = min(span, 0.02 * limits.duration)
-        wait = _wait(t, done, now) if limits.fast else 0.0
-        begin = Start(now, base, pressed, push, push_rate, wait)
+        span = min(horizon - now, control.proposed)
+        begin = Start(now, base, pressed, push, push_rate)
         outcome, span, arrived, target, side = _step(
-            scene, limits, body, state, at, out, r, control, begin, span, tally
+            scene, limits, body, state, at, out, r.rates, control, begin, span, tally
         )
         if outcome != DONE:
             return outcome, now, step, switches
@@ -391,8 +375,7 @@ def _follow(
             begun, done = done, first_past(t, done, end, last)
             if not record_step(body, state, at, out, now, span, begun, done, d, samples):
                 return NOT_FINITE, now, step, switches
-            if limits.fast:
-                _remember(scene, state, at, span, wait, r)
+            remember(scene, state, at, span, _wait(t, begun, now), r)
             _carry(body, state, at, span, top, control)
             fall = slope_at(out.base, STAGES, 1.0) / span
             pressed = pressed or (not leaves and at.total[0, STAGES - 1] > 10.0 * out.slack[count])
@@ -404,7 +387,7 @@ def _follow(
             continue
         if not leaves:
             switches, opened = _switch(
-                body, state, out.strains, target, side, span, now, first, samples.log, switches
+                body, state, out.strains, target, side, span, now, first, log, switches
             )
             leaves = opened and struck and pressed
         if leaves:
@@ -417,7 +400,6 @@ def _follow(
 def integrate_implicit(
     given: SceneTuple,
     tol: float,
-    wanted: float,
     max_steps: int,
     directions: Branches,
     start: Array,
@@ -429,9 +411,8 @@ def integrate_implicit(
     """Integrate a chain from rest (or struck) over the samples of a scene, by implicit steps.
 
     The arguments are those of `explicit.taylor.integrate`, as are the outcomes; `tol` is the
-    truncation of a step relative to the motion so far. Vibrations whose damping out would cost more
-    than `wanted` are followed longer. `tally` (2,) is filled with the linear systems solved and
-    with the blocks eliminated in them.
+    truncation of a step relative to the motion so far. `tally` (2,) is filled with the
+    linear systems solved and with the blocks eliminated in them.
 
     Returns
     -------
@@ -451,11 +432,8 @@ def integrate_implicit(
     if struck:
         duration = min(duration, 5.0 * contact_time(scene))
     weight = min(1.0, tol / SMALL_BASE_ERROR) if is_overdamped(scene) else 0.0
-    vibrations = of_masses(scene)
-    limits = Limits(
-        tol, wanted, max_steps, duration, SHORT * duration * (tol / 3e-8) ** (1.0 / 6.0),
-        weight, vibrations, vibrations[:, 0].max() > 0.0,
-    )  # fmt: skip
+    short = SHORT * duration * (tol / 3e-8) ** (1.0 / 6.0)
+    limits = Limits(tol, max_steps, short, weight)
     body = Body(rows, heights, areal, scene.drag, count - 1 if top == MOTION else count)
     at, d = make_points(count), make_tangents(count, directions)
     shape = (count, STAGES + 1)
@@ -464,14 +442,14 @@ def integrate_implicit(
         np.zeros((count, STAGES)), np.zeros(STAGES + 1),
     )  # fmt: skip
     r = Unresolved(
-        np.zeros(groups), np.zeros(groups), np.zeros(groups), np.zeros(2), np.zeros(count)
+        np.zeros(groups), np.zeros(groups), np.zeros(2), np.zeros((groups, 3)), np.zeros(count)
     )
     moving = np.zeros((4, count))
     state = State(moving[0], moving[1], moving[2], moving[3], np.empty(count, np.int64))
     memory = np.zeros(1, CONTROL)  # used again below: it would be freed after its last use
-    memory[0].worst = 1.0
+    memory[0].worst, memory[0].proposed = 1.0, 0.02 * duration if struck else math.inf
     outcome, end, steps, switches = _follow(
-        scene, limits, body, state, at, out, r, memory[0], d, LoggedSamples(t, curves, slopes, log),
+        scene, limits, body, state, at, out, r, memory[0], d, Samples(t, curves, slopes), log,
         start, tally,
     )  # fmt: skip
     lost = memory[0].damped
