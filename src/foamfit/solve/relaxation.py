@@ -1,7 +1,8 @@
-"""One spring that relaxes, along a known motion: its stress and derivatives in closed form.
+"""Springs that remember more than their branch, in closed form: microscale ones, and relaxation.
 
-Relaxation term k adds q_k to the stress σ of equilibrium, dq_k/dt = -q_k/τ_k + g_k dσ/dt, from
-q_k = 0. With q_k = g_k (σ + y_k) no derivative of σ is needed: dy/dt = -(y + σ)/τ, or over a time h
+Under a known motion one spring may relax, too. Term k adds q_k to the stress σ of equilibrium,
+dq_k/dt = -q_k/τ_k + g_k dσ/dt, from q_k = 0. With q_k = g_k (σ + y_k) no derivative of σ is needed:
+dy/dt = -(y + σ)/τ, or over a time h
 
     y(h) = exp(-x) y(0) - x ∫₀¹ exp(-x (1-r)) σ(r h) dr,        x = h/τ.
 
@@ -18,6 +19,7 @@ import math
 
 import numpy as np
 
+from foamfit.springs import kernels
 from foamfit.springs import microscale_kernels as micro
 from foamfit.springs.kernels import (
     HELD,
@@ -49,7 +51,8 @@ from foamfit.springs.microscale_kernels import (
     SIGMA,
     STATE,
 )
-from foamfit.springs.sensitivities import branch_derivative
+from foamfit.springs.parameters import OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
+from foamfit.springs.sensitivities import branch_derivative, equilibrium_tangents
 
 # The nodes on [0, 1], and the coefficients of 1, r, r², r³ in the Lagrange polynomials on them.
 _NODES = (0.0, 0.5 - math.sqrt(0.05), 0.5 + math.sqrt(0.05), 1.0)
@@ -342,3 +345,85 @@ def relaxed_along(
                 by[c, j] += row[N_COLUMNS + 2 * k] * (d_nodes[3, c] + d_y[k, c])
         sigma[j], branches[j] = total, int(state[BRANCH])
     return sigma, branches, by, by_g, by_tau
+
+
+def stress_along(
+    row: Row, eps: Array, t: Array, height: float, rtol: float, directions: Branches
+) -> tuple[Array, Branches, Array]:
+    """Stress of one spring (without its dashpot) along a history of its strain.
+
+    Parameters
+    ----------
+    row : array
+        A spring of any kind, with any number of relaxation terms.
+    eps, t : (n,) arrays
+        Strains and times, s.
+    height : float
+        Height of the spring, m.
+    rtol : float
+        Wanted error over the largest stress.
+    directions : (p, 2) array
+        See `springs.parameters`.
+
+    Returns
+    -------
+    tuple of arrays
+        Stress (n,), Pa; branches (n,); derivatives of the stress at a fixed elongation (p, n).
+    """
+    own = directions[:, 1]
+    terms = row[N_COLUMNS::2]
+    out = np.zeros((len(own), eps.size))
+    if row[KIND] == MICROSCALE and not terms.any() and not (own >= OWN_RELAXATION).any():
+        stress, ranks, branches = micro.stress_along(row, eps)
+        if len(own) == 0:
+            return stress, branches, out
+        by, _ = micro.stress_tangents_along(row, eps, stress, ranks, branches)
+        by_g = by_tau = by[:0]
+    else:
+        stress, branches, by, by_g, by_tau = relaxed_along(row, eps, t, rtol, len(own) > 0)
+    for p, what in enumerate(own):
+        if what < OWN_ETA:
+            out[p] = by[what]
+        elif what == OWN_HEIGHT:
+            out[p] = by[OF_STRAIN] / -height
+        elif what >= OWN_RELAXATION:
+            term, of_tau = divmod(what - OWN_RELAXATION, 2)
+            out[p] = by_tau[term] if of_tau else by_g[term]
+    return stress, branches, out
+
+
+def strains_along(
+    rows: Array, heights: Array, sigma: Array, directions: Branches
+) -> tuple[Array, Branches, Array]:
+    """Strains of springs in series, which do not relax, along a history of their stress.
+
+    Returns
+    -------
+    tuple of arrays
+        Strains, -inf where a spring cannot have its stress, and branches (springs, n); derivatives
+        of the displacements above the springs (p, springs, n), m.
+    """
+    count, n = len(rows), sigma.size
+    strain, branches = np.empty((count, n)), np.empty((count, n), np.int64)
+    longer = np.zeros((len(directions), count, n))
+    for i, row in enumerate(rows):
+        mine = np.flatnonzero(directions[:, 0] == i)
+        own, here = directions[mine, 1], slice(i, i + 1)
+        if row[KIND] == MICROSCALE:
+            strain[i], ranks, branches[i] = micro.strain_along(row, sigma)
+            if len(own):
+                by = micro.strain_tangents_along(row, sigma, ranks, branches[i])
+                for p, what in zip(mine, own, strict=True):
+                    law = heights[i] * by[what] if what < OWN_ETA else 0.0
+                    longer[p, i:] = strain[i] if what == OWN_HEIGHT else law
+            continue
+        kernels.strains_along(
+            rows[here], heights[here], sigma, np.empty(n), strain[here], branches[here]
+        )
+        if len(own):
+            local = np.column_stack([np.zeros_like(own), own])
+            by, _ = equilibrium_tangents(
+                rows[here], heights[here], strain[here], branches[here], False, local
+            )
+            longer[mine, i:] = by
+    return strain, branches, longer
