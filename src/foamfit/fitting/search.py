@@ -180,8 +180,8 @@ def read_microscale(loop: Loop, marks: Array, scales: Scales) -> Array:
     micro-springs snap through and back, and the two spreads. Returned are k0 … spread_minus, and a
     dashpot of zero (SI).
     """
-    last = float(loop.strain[loop.peak])
-    first = max(loop.loading(0.05 * last), 0.002 * scales.stress) / (0.05 * last)
+    last = float(np.max(loop.strain))
+    first = max(loop.at(0.05 * last, loading=True), 0.002 * scales.stress) / (0.05 * last)
     k0, kc = first * 10.0 ** (1.2 * marks[0] - 0.4), scales.stress * 10.0 ** (2.3 * marks[1] - 0.5)
     least = least_eps_star(k0, kc)
     return np.array(
@@ -189,9 +189,9 @@ def read_microscale(loop: Loop, marks: Array, scales: Scales) -> Array:
             k0,
             kc,
             least + 0.5 * marks[2] * (LAST_STRAIN - least),
-            max(loop.loading((0.2 + 0.8 * marks[3]) * last), 0.02 * scales.stress),
+            max(loop.at((0.2 + 0.8 * marks[3]) * last, loading=True), 0.02 * scales.stress),
             10.0 ** (1.2 * marks[4] - 1.0),
-            max(loop.unloading((0.2 + 0.7 * marks[5]) * last), 0.01 * scales.stress),
+            max(loop.at((0.2 + 0.7 * marks[5]) * last, loading=False), 0.01 * scales.stress),
             10.0 ** (1.2 * marks[6] - 1.0),
             0.0,
         ]
