@@ -322,8 +322,8 @@ def strain_along(row: Row, sigma: Array) -> tuple[Array, Array, Branches]:
             rank, branch = plus, SNAP if minus > plus else BOTH
         elif rank > most:
             rank, branch = most, BACK if minus > plus else BOTH
-        elif plus < rank < most:
-            branch = HELD
+        elif plus < rank < most or branch == (BACK if rank == plus else SNAP):
+            branch = HELD  # also at an end of the held stresses that it has not passed
         if rank < LEAST_RANK:
             rank, branch = -math.inf, A
         eps[j] = -math.inf
