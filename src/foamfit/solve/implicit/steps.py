@@ -305,14 +305,6 @@ def _is_flat(body: Body, state: State, i0: int) -> bool:
     return False
 
 
-@inner
-def _wait(t: Array, done: int, now: float) -> float:
-    """Time until the next sample."""
-    while done < t.size - 1 and t[done] <= now:
-        done += 1
-    return max(t[done] - now, 0.0)
-
-
 @once
 def _follow(
     scene: Scene,
@@ -375,7 +367,7 @@ def _follow(
             begun, done = done, first_past(t, done, end, last)
             if not record_step(body, state, at, out, now, span, begun, done, d, samples):
                 return NOT_FINITE, now, step, switches
-            remember(scene, state, at, span, _wait(t, begun, now), r)
+            remember(scene, state, at, span, t[min(begun, t.size - 1)] - now, r)
             _carry(body, state, at, span, top, control)
             fall = slope_at(out.base, STAGES, 1.0) / span
             pressed = pressed or (not leaves and at.total[0, STAGES - 1] > 10.0 * out.slack[count])

@@ -175,7 +175,7 @@ def remember(
     `alive` is δv/√ω of all steps so far, since a vibration whose stiffness changes slowly keeps its
     energy over its frequency. `fading` is the rate at which it dies out: of masses in a row the
     slowest vibration that the step is too long for decays last, and moves as far as all of them
-    together. `worst` counts what is left after `wait`, at the next sample.
+    together. `worst` counts what is left after `wait`, at the first sample that may show it.
     """
     moved, pressed = 0.0, 0.0
     for i in range(scene.heights.size):
