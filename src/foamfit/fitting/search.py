@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 from scipy.stats import qmc
@@ -125,12 +126,13 @@ class Loop:
         return float(np.interp(strain, np.maximum.accumulate(self.strain[way]), self.stress[way]))
 
 
-def read_spring(loop: Loop, marks: Array, scales: Scales) -> Array:
+def read_spring(loop: Loop, marks: Array, scales: Scales, *, soft: bool = False) -> Array:
     """Read a bistable spring off a loop, given where on it A1, C1 and C2 are taken to lie.
 
     `marks` (5,) in [0, 1] are the places of A1, C1 and C2 between their neighbours, and shares of
     the stress at C2 and of the damping. Returned are k0 … kh_minus, eta (SI): initial slope from
-    A1, k_h+ from A1 to C1, k_c through C1 and C2, k_h- from C2 towards rest.
+    A1, k_h+ from A1 to C1, k_c through C1 and C2 (of two such branches the `soft` one, close to its
+    pole, or the stiff one), k_h- from C2 towards rest.
     """
     last = float(np.max(loop.strain))
     eps_a = min((0.02 + 0.85 * marks[0]) * last, 0.9)
@@ -142,10 +144,11 @@ def read_spring(loop: Loop, marks: Array, scales: Scales) -> Array:
     eps_c = eps_a + (0.2 + 0.8 * marks[2]) * (hat_c - eps_a)
     sigma_c = loop.at(eps_c, loading=False) * (0.5 + marks[3])
     sigma_c = min(max(sigma_c, 0.02 * sigma_a), 0.98 * sigma_a)
+    kc = _stiffness_between(hat_c - eps_c, sigma_c, sigma_hat_c)
     return np.array(
         [
             sigma_a * (1.0 - eps_a) / eps_a,
-            _stiffness_between(hat_c - eps_c, sigma_c, sigma_hat_c),
+            sigma_c * sigma_hat_c / kc if soft else kc,  # the product of the two
             sigma_c - sigma_a,
             eps_a,
             eps_c,
@@ -182,7 +185,7 @@ def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> l
     count = len(kinds)
     marks = qmc.LatinHypercube(7 * count, rng=rng).random(CURVE_STARTS)
     starts = []
-    for mark in marks:
+    for mark, near_pole in product(marks, (False, True)):
         values = space.values.copy()
         heights = np.full(count, space.scales.height / count)
         if count > 1:
@@ -204,7 +207,9 @@ def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> l
             if kind == "bistable":
                 first = index[f"s{i + 1}_k0"]
                 own = Loop(motion / soft, loop.stress)
-                values[first : first + 8] = read_spring(own, mark[7 * i : 7 * i + 5], space.scales)
+                values[first : first + 8] = read_spring(
+                    own, mark[7 * i : 7 * i + 5], space.scales, soft=near_pole
+                )
         starts.append(space.encode(values))
     return starts
 

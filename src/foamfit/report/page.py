@@ -13,6 +13,7 @@ from foamfit.report.plots import origin_word, plot_fit, plot_residuals
 from foamfit.report.readable import number, readable, readable_unit
 from foamfit.report.summary import ANSWERS, LADDER, conclusions, ladder_cells, misfits
 from foamfit.text import engineering, percent
+from foamfit.trust.covariance import RULE
 
 if TYPE_CHECKING:
     from foamfit.results import Fit
@@ -91,6 +92,8 @@ def render_report(result: Fit, *, fit_png: bytes | None = None) -> str:
         },
         visited=_visited(result),
         parameters=[readable(name, p) for name, p in result.parameters.items()],
+        ranged=any(p.range for p in result.parameters.values()),
+        rule=RULE,
         points={name: _points(spring) for name, spring in result.bistable_springs.items()},
         energy_sentences=energy.pop("sentences", None) or [],
         energy=dict(_energies(energy)),

@@ -72,11 +72,23 @@ class Refit:
         """Point that is off an iterate by a scaled step, within the limits."""
         return self.point(at.point[self.places] / self.best.sizes + step, self.low, self.high)
 
-    def run(self, start: Array, hold: tuple[int, float] | None = None) -> Iterate | None:
+    def taken(self, point: Array) -> Array:
+        """Scaled step from the best point to another one."""
+        return np.asarray((point - self.best.values)[self.places] / self.best.sizes, np.float64)
+
+    def run(
+        self,
+        start: Array,
+        hold: tuple[int, float] | None = None,
+        *,
+        weights: Array | float = 1.0,
+        iterations: int = STEPS,
+    ) -> Iterate | None:
         """Descend from a point, one parameter (its column) held at a value or none.
 
-        Returns None if the start cannot be simulated.
+        `weights` (n_data,) multiply the squares. Returns None if the start cannot be simulated.
         """
+        root = np.sqrt(weights)
         problem, names, sizes = self.best.problem, self.best.names, self.best.sizes
         low, high = self.low.copy(), self.high.copy()
         if hold is not None:
@@ -86,7 +98,7 @@ class Refit:
             return self.point(scaled, low, high)
 
         def jacobian(scaled: Array) -> Array:
-            slopes = problem.linear.slopes(point(scaled), names)
+            slopes = problem.linear.slopes(point(scaled), names) * np.reshape(root, (-1, 1))
             if problem.objective.loss == "linear":
                 return slopes * sizes
             differences = problem.objective.differences(point(scaled)) - self.shift
@@ -96,7 +108,7 @@ class Refit:
         if self.residual(point(scaled)) is None:
             return None
         end = descend(
-            lambda scaled: self.tracker.residual(point(scaled), self.shift), jacobian,
-            scaled, (low / sizes, high / sizes), STEPS, least=self.enough, damping=1e-6,
+            lambda scaled: root * self.tracker.residual(point(scaled), self.shift), jacobian,
+            scaled, (low / sizes, high / sizes), iterations, least=self.enough, damping=1e-6,
         )  # fmt: skip
         return replace(end, point=point(end.point))
