@@ -32,6 +32,7 @@ from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
 from foamfit.trust.covariance import AT_LIMIT
 from foamfit.trust.intervals import Announce, Choice, Intervals, assess
+from foamfit.trust.ranges import left_open
 
 Progress = Callable[[float, str], None]
 
@@ -176,17 +177,20 @@ def _assess(
     problem, tracker, record = found.problem, found.tracker, found.record
     budget = PROFILE_SHARE * problem.objective.evaluations
     for _ in range(IMPROVEMENTS + 1):
-        if choice.method == "local" or not best.names:
+        if not best.names:
             break
-        made = assess(
-            best, choice, minima=tracker.ends, deadline=tracker.deadline, budget=budget,
-            announce=announce,
-        )  # fmt: skip
-        if made.better is None:
-            return best, record, made
         before = tracker.best_cost
-        tracker.consider(made.better)
         try:
+            left = left_open(best, tracker.ends, tracker)
+            made = Intervals(better=left.better)
+            if left.better is None:
+                made = assess(
+                    best, choice, minima=[*tracker.ends, *left.minima],
+                    deadline=tracker.deadline, budget=budget, announce=announce,
+                )  # fmt: skip
+            if made.better is None:
+                return best, record, replace(made, ranges=left.ranges)
+            tracker.consider(made.better)
             _refine(problem, tracker)
         except SearchStoppedError:
             return found.best(), record, Intervals()

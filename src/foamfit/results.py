@@ -29,7 +29,10 @@ class ParameterEstimate:
     `stderr` and `ci95` are None where the test does not determine it; `state` is "determined",
     "weak", "not determined" or "fixed" (fixed by the user or the model), and `why` says so in a
     sentence. `ci95_method` names what made the interval: "local covariance", "profile likelihood",
-    "block bootstrap" or "MCMC".
+    "block bootstrap", "MCMC" or "other minima" (ends of
+    the search's descents that noise could have made the best). `range` is the hull of its values
+    over descriptions that follow the curves about as well, which the error of the law leaves open;
+    None where only noise is left of the curves.
     """
 
     value: float
@@ -40,6 +43,7 @@ class ParameterEstimate:
     state: str
     why: str
     ci95_method: str | None = None
+    range: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)

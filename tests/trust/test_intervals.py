@@ -32,8 +32,8 @@ from foamfit.report.identifiability_plots import plot_profiles
 from foamfit.trust import intervals, resample
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
-from foamfit.trust.covariance import NoiseProcess, noise_process
 from foamfit.trust.intervals import Choice, assess
+from foamfit.trust.noise_process import NoiseProcess, noise_process
 from foamfit.trust.profile import departures, profile
 from foamfit.trust.refit import Refit
 from foamfit.trust.resample import block_length, bootstrap, mcmc

@@ -14,6 +14,7 @@ from foamfit.report.readable import number, readable, readable_unit
 from foamfit.report.summary import ANSWERS, LADDER, conclusions, ladder_cells, misfits
 from foamfit.results import Fit
 from foamfit.text import engineering, percent
+from foamfit.trust.covariance import RULE
 
 DRIVES = {
     "impact": "The motion follows from the mass and the velocity of the striker; nothing measured "
@@ -89,6 +90,8 @@ def render_report(result: Fit, *, fit_png: bytes | None = None) -> str:
         },
         visited=_visited(result),
         parameters=[readable(name, p) for name, p in result.parameters.items()],
+        ranged=any(p.range for p in result.parameters.values()),
+        rule=RULE,
         points={name: _points(spring) for name, spring in result.bistable_springs.items()},
         energy_sentences=energy.pop("sentences", None) or [],
         energy=dict(_energies(energy)),

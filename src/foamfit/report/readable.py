@@ -43,6 +43,7 @@ class Readable:
     state: str
     why: str
     method: str = ""
+    range: str = ""
 
     @property
     def with_error(self) -> str:
@@ -62,14 +63,18 @@ def readable(name: str, p: ParameterEstimate) -> Readable:
     """
     factor, unit = readable_unit(p.value or p.stderr or 0.0, p.unit)
     value = p.value / factor
-    shown, stderr, interval = number(value), "", ""
+    shown, stderr, interval, span = number(value), "", "", ""
     if math.isfinite(value) and p.stderr is not None and 0 < p.stderr < math.inf:
         shown, stderr, places = _rounded(value, p.stderr / factor)
         if p.ci95 is not None:
             interval = " to ".join(_fixed(bound / factor, places) for bound in p.ci95)
+    if p.range is not None:  # an error of the law leaves two digits
+        span = " to ".join(f"{bound / factor:.2g}".replace("-", "−") for bound in p.range)
     unit = {"": "–", "1": "–", "-": "–", "Pa s": "Pa·s", "Pa*s": "Pa·s"}.get(unit, unit)
     method = p.ci95_method or ""
-    return Readable(name, _symbol(name), shown, stderr, interval, unit, p.state, p.why, method)
+    return Readable(
+        name, _symbol(name), shown, stderr, interval, unit, p.state, p.why, method, span
+    )
 
 
 def number(value: float | None) -> str:

@@ -152,9 +152,13 @@ def _paragraphs(texts: Iterable[str]) -> list[str]:
 
 
 def _table(rows: list[Readable]) -> list[str]:
-    header = ("parameter", "value ± stderr", "unit", "95 % interval", "state")
+    ranged = any(row.range for row in rows)  # where an error of the law leaves something open
+    span = (lambda text: (text,)) if ranged else (lambda _: ())
+    header = ("parameter", "value ± stderr", "unit", "95 % interval", *span("range"), "state")
     cells = [
-        (r.name, r.with_error, r.unit, r.interval, r.state) for r in rows if r.state != "fixed"
+        (r.name, r.with_error, r.unit, r.interval, *span(r.range), r.state)
+        for r in rows
+        if r.state != "fixed"
     ]
     fixed = ", ".join(f"{row.name} {row.value} {row.unit}" for row in rows if row.state == "fixed")
     return [*aligned([header, *cells]), *(wrapped(f"fixed: {fixed}") if fixed else [])]

@@ -19,7 +19,7 @@ from foamfit.fitting.objective import Objective
 from foamfit.fitting.search import SearchRecord
 from foamfit.results import Check, ParameterEstimate
 from foamfit.springs.parameters import split_name
-from foamfit.text import engineering
+from foamfit.text import engineering, percent
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import AT_LIMIT, WEAK
 from foamfit.trust.intervals import Intervals
@@ -170,7 +170,21 @@ def _floor(e: Findings) -> _Answer:
 def _structure(e: Findings) -> _Answer:
     if not e.tau:
         return None, "No parameter varies whose branch was reached."
+    objective = e.objective
+    missed = [
+        f"{_spoken(name)} {percent(error.law / objective.factor(name) / spread)}"
+        for name, error in zip(objective.counted, e.best.errors, strict=True)
+        if error.found and (spread := float(np.ptp(objective.measured[name])))
+    ]
     longest = max(e.tau)
+    if missed:
+        found = f"Error of the law, RMS over range: {', '.join(missed)}."
+        warning = (
+            f"The residuals have structure that is no noise: the law misses {' and '.join(missed)} "
+            "of the range. The 95 % intervals hold the noise alone; the range tells what this "
+            "error leaves open."
+        )
+        return False, found, (warning,)
     if longest < 1.05:
         return True, "Their autocorrelation is that of white noise."
     found = f"Noise correlated over {longest:.2g} samples."
@@ -218,7 +232,8 @@ def _vanishes(e: Findings, name: str) -> bool:
     if item.state != "weak" or item.ci95 is None or split_name(name)[1] not in MAY_VANISH:
         return False
     size = float(e.best.problem.sizes((name,), e.best.values)[0])
-    return item.ci95[0] <= 0.0 <= item.ci95[1] and max(np.abs(item.ci95)) <= WEAK * size
+    ends = (*item.ci95, *(item.range or ()))
+    return min(ends) <= 0.0 <= max(ends) and float(np.max(np.abs(ends))) <= WEAK * size
 
 
 def _by_reason(of: list[tuple[str, str]]) -> str:

@@ -87,12 +87,20 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
 
 
 def _noise(best: BestPoint) -> dict[str, dict[str, Any]]:
-    """Noise of each counted curve, how it is known, its scale, and the residuals over it."""
+    """Noise of each counted curve, how it is known, its scale, and the residuals over it.
+
+    `law_error` is the RMS of what the law misses beyond the noise, SI, None where it misses nothing
+    else; `law_error_evidence` by how much the Bayesian information criterion is for it.
+    """
     objective, found = best.problem.objective, {}
+    errors = dict(zip(objective.counted, best.errors, strict=True)) if best.names else {}
     for name, rms in objective.rms(best.residual).items():
-        level = objective.noise(name)
+        level, error = objective.noise(name), errors.get(name)
+        law = error is not None and error.found
         found[name] = asdict(level) | {
             "scale": objective.scale[name],
+            "law_error": error.law / objective.factor(name) if error and law else None,
+            "law_error_evidence": error.evidence if error else None,
             "residual_over_noise": rms / level.sigma if level.sigma > 0.0 else None,
         }
     return found
@@ -223,11 +231,12 @@ def _varied(
     # refits that stall in a long minimum make a profile narrow: the wider interval is taken
     stalled = ratio < 1.0 / ASTRAY and method == "profile likelihood"
     ends = local if stalled else ends
-    state, why = state_of(name, value, ends, insight, (low, high))
+    span = intervals.ranges.get(name)
+    state, why = state_of(name, value, ends, insight, (low, high), span)
     if state == "determined" and best.problem.objective.interior_mass:
         state, why = "weak", "the vibration of the interior mass leaves other minima; " + why
-    if state == "not determined":
-        return ParameterEstimate(value, None, None, unit, True, state, why)
+    if not 0.5 * (ends[1] - ends[0]) <= covariance.NOTHING * best.sizes[column]:
+        return ParameterEstimate(value, None, None, unit, True, state, why, range=span)
     if name in intervals.doubtful:
         why += "; its interval is local, though the cost is no parabola there"
     if stalled:
@@ -237,23 +246,28 @@ def _varied(
         stderr *= ratio
         why += "; its standard error is that of the interval, as the local one does not hold"
     ci95 = (max(ends[0], low), min(ends[1], high))
-    return ParameterEstimate(value, stderr, ci95, unit, True, state, why, method)
+    return ParameterEstimate(value, stderr, ci95, unit, True, state, why, method, span)
 
 
 def state_of(
     name: str, value: float, ends: tuple[float, float], insight: Insight,
-    limits: tuple[float, float],
+    limits: tuple[float, float], span: tuple[float, float] | None = None,
 ) -> tuple[str, str]:  # fmt: skip
     """State of a parameter that varies and whose branch is reached, and the reason in one sentence.
 
     `ends` are those of its 95 % interval, not cut at its `limits`; NaN or infinite where the data
-    fix only a combination.
+    fix only a combination. `span` is its range, if there is one; the wider of the two counts.
     """
+    what = "95 % interval"
+    if span is not None and span[1] - span[0] > ends[1] - ends[0]:
+        ends, what = span, "range"
     size, short = float(insight.sizes[insight.names.index(name)]), split_name(name)[1]
     unit = unit_of(name)
     half = 0.5 * (ends[1] - ends[0])
     half = half if math.isfinite(half) else math.nan
-    state, why = covariance.state(value, half, size, *limits, scale_in_words(name, value, size))
+    state, why = covariance.state(
+        value, half, size, *limits, scale_in_words(name, value, size), what
+    )
     if state == "not determined":
         reason = why if math.isfinite(half) else "the curves do not depend on it"
         return state, insight.combination(name, covariance.NOTHING / 1.96) or reason
@@ -262,7 +276,7 @@ def state_of(
         side, end = ("lower", ends[0]) if short == "dsigma" else ("upper", ends[1])
         bound = engineering(end, unit).replace("Pa s", "Pa·s").replace("-", "−")
         where = "lies at its limit 0" if value == 0.0 else "is consistent with zero"
-        return "weak", f"it {where}; {side} bound {bound} (95 %)"
+        return "weak", f"it {where}; {side} bound {bound} ({what.removesuffix(' interval')})"
     if state == "determined":
         return state, why
     past = [ends[0] <= limits[0], ends[1] >= limits[1]]
