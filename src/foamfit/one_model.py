@@ -180,8 +180,9 @@ def _assess(
         before = tracker.best_cost
         try:
             left = left_open(best, tracker.ends, tracker)
-            made = Intervals(better=left.better)
-            if left.better is None:
+            better = None if choice.method == "local" else left.better
+            made = Intervals(better=better)
+            if better is None:
                 made = assess(
                     best, choice, minima=[*tracker.ends, *left.minima],
                     deadline=tracker.deadline, budget=budget, announce=announce,
