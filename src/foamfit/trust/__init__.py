@@ -2,6 +2,6 @@
 
 `best_point` holds what was computed at the best point, `covariance` and `intervals` give numbers,
 `checklist` asks what a good fit must pass, `conclude` gives each parameter its state. A newcomer
-may skip `refit`, `profile`, `resample`, `evidence` and `residual_tests`. What the residual is made of,
-noise or an error of the law, is told in `law_error`, what the latter leaves open in `ranges`.
+may skip `refit`, `profile`, `resample`, `evidence` and `residual_tests`. `law_error` tells what the
+residual is made of, noise or an error of the law, and `ranges` what the latter leaves open.
 """
