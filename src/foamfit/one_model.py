@@ -32,7 +32,7 @@ from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
 from foamfit.trust.covariance import AT_LIMIT
 from foamfit.trust.intervals import Announce, Choice, Intervals, assess
-from foamfit.trust.ranges import left_open
+from foamfit.trust.ranges import Open, left_open
 
 Progress = Callable[[float, str], None]
 
@@ -40,9 +40,13 @@ Progress = Callable[[float, str], None]
 STARTS = 16
 # Refits of the bootstrap and steps of the Markov chain.
 DRAWS = {"bootstrap": 500, "mcmc": 2000}
-# Evaluations that the default spends on profiles, over those of the search; and how often it goes
-# on from a better point that a profile has met.
+# Evaluations that the default spends on profiles, and on ranges, over those of the search; and how
+# often it goes on from a better point that these have met.
 PROFILE_SHARE, IMPROVEMENTS = 0.5, 3
+# Evaluations over those of the search past which no better point is gone on from.
+TOGETHER = 0.8
+# Cost over the one before below which the ranges are made anew from a better point.
+MOVED = 0.999
 
 
 class Keywords(TypedDict, total=False):
@@ -176,14 +180,19 @@ def _assess(
     """Make the intervals; where these meet a better point, go on from there."""
     problem, tracker, record = found.problem, found.tracker, found.record
     budget = PROFILE_SHARE * problem.objective.evaluations
+    enough = (1.0 + TOGETHER) * problem.objective.evaluations
+    left, there = Open(), math.inf
     for _ in range(IMPROVEMENTS + 1):
-        if not best.names:
+        if not best.names or problem.objective.evaluations > enough:
             break
         before = tracker.best_cost
         try:
-            left = left_open(best, tracker.ends, tracker)
-            made = Intervals(better=left.better)
-            if left.better is None:
+            better = None
+            if best.cost < MOVED * there:  # what is left open is not that of the point before
+                left, there = left_open(best, tracker.ends, tracker, budget), best.cost
+                better = None if choice.method == "local" else left.better
+            made = Intervals(better=better)
+            if better is None:
                 made = assess(
                     best, choice, minima=[*tracker.ends, *left.minima],
                     deadline=tracker.deadline, budget=budget, announce=announce,
@@ -197,7 +206,7 @@ def _assess(
         best = found.best()
         if tracker.best_cost < before / 1.02:  # a minimum that no descent of the search has found
             record = replace(record, costs=((tracker.best_cost, 1), *record.costs))
-    return best, record, Intervals()
+    return best, record, Intervals(ranges=left.ranges)
 
 
 def _search(

@@ -232,6 +232,8 @@ def _varied(
     stalled = ratio < 1.0 / ASTRAY and method == "profile likelihood"
     ends = local if stalled else ends
     span = intervals.ranges.get(name)
+    if span is not None:  # of a point a little off, if that was improved last
+        span = min(span[0], value), max(span[1], value)
     state, why = state_of(name, value, ends, insight, (low, high), span)
     if state == "determined" and best.problem.objective.interior_mass:
         state, why = "weak", "the vibration of the interior mass leaves other minima; " + why

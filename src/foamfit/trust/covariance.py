@@ -69,11 +69,16 @@ class Covariance:
         return self.matrix / np.outer(scale, scale)
 
     def with_some(self, chosen: NDArray[np.intp], other: Covariance) -> Covariance:
-        """Take these parameters from another covariance; the rest is correlated with nothing."""
-        matrix = np.diag(np.diag(self.matrix))
-        matrix[np.ix_(chosen, chosen)] = other.matrix
+        """Take these parameters from another covariance; the rest is correlated with nothing.
+
+        No variance becomes smaller: the curvature of a cost with kinks is known to some tenths.
+        """
+        variance = np.diag(self.matrix)
+        more = np.sqrt(np.fmax(variance[chosen] / np.diag(other.matrix), 1.0))
+        matrix = np.diag(variance)
+        matrix[np.ix_(chosen, chosen)] = other.matrix * np.outer(more, more)
         inflation, freedom = self.inflation.copy(), self.freedom.copy()
-        inflation[chosen], freedom[chosen] = other.inflation, other.freedom
+        inflation[chosen], freedom[chosen] = other.inflation * more**2, other.freedom
         return replace(self, matrix=matrix, inflation=inflation, freedom=freedom)
 
 

@@ -130,8 +130,9 @@ def _with_minima(
             half = best.halves[best.names.index(name)]
             value, there = best.values[best.index[name]], point[best.index[name]]
             low, high = ends.get(name, (value - half, value + half))
-            if there < low or there > high:
-                ends[name] = min(low, there - half), max(high, there + half)
+            wider = min(low, there - half), max(high, there + half)
+            if wider[1] - wider[0] > (1.0 + PLACED) * (high - low):
+                ends[name] = wider
                 methods[name] = "other minima"
     return replace(made, ends=ends, methods=methods)
 

@@ -36,26 +36,29 @@ def tolerance(best: BestPoint) -> float:
     return (ALIKE**2 - 1.0) * sum(size * error.law**2 for error, size in pairs)
 
 
-def alike(best: BestPoint, minima: Sequence[Array], tracker: Tracker) -> list[Array]:
+def alike(
+    best: BestPoint, minima: Sequence[Array], tracker: Tracker, budget: float = math.inf
+) -> list[Array]:
     """Descriptions that follow the curves about as well as the best point, which is the first.
 
-    Ends of the search's descents (`minima`); refits with other weights of the samples, moved back
-    towards the best point where they miss too much; and refits with each parameter held as far off
-    as it can be, starting from where the law were linear.
+    Ends of the search's descents (`minima`); refits with each parameter held as far off as it can
+    be, starting from where it would be if the law were linear; and refits with other weights of the
+    samples, moved back towards the best point where they miss too much. After `budget` evaluations
+    no further refit is begun.
     """
     rise, refit = tolerance(best), Refit(best, tracker)
     refit.enough = 0.01 * rise
-    out = [best.values]
-    for point in minima:
-        if _rise(best, refit, point) <= rise:
-            out.append(point)
-    for weights in _weights(best):
-        out += _towards(best, refit, weights, rise)
+    allowed = tracker.objective.evaluations + budget
+    out = [best.values, *(point for point in minima if _rise(best, refit, point) <= rise)]
     start = refit.start()
     inverse = np.linalg.pinv(start.jacobian.T @ start.jacobian, rcond=1e-12, hermitian=True)
     for column, name in enumerate(best.names):
         for sign, limit in zip((-1.0, 1.0), best.limits(name), strict=True):
-            out += _held(best, refit, column, sign, limit, inverse[column], rise)
+            if tracker.objective.evaluations < allowed:
+                out += _held(best, refit, column, sign, limit, inverse[column], rise)
+    for weights in _weights(best):
+        if tracker.objective.evaluations < allowed:
+            out += _towards(best, refit, weights, rise)
     return out
 
 
@@ -68,17 +71,21 @@ class Open:
     better: Array | None = None  # a point of lower cost: the fit should go on from there
 
 
-def left_open(best: BestPoint, minima: Sequence[Array], tracker: Tracker) -> Open:
-    """Ranges of the parameters, and minima near by that the search has not found."""
+def left_open(
+    best: BestPoint, minima: Sequence[Array], tracker: Tracker, budget: float = math.inf
+) -> Open:
+    """Ranges of the parameters, and minima near by that the search has not found; see `alike`."""
     if not best.misfits:
         return Open()
-    points = alike(best, minima, tracker)
+    allowed = tracker.objective.evaluations + budget
+    points = alike(best, minima, tracker, budget)
     refit, further = Refit(best, tracker), []
     for point in points[1:]:
-        if not any(point is other for other in minima):
+        new = not any(point is other for other in minima)
+        if new and tracker.objective.evaluations < allowed:
             found = refit.run(point, iterations=DESCENT)
             further += [] if found is None else [found.point]
-    values = np.array(points)[:, refit.places]
+    values = np.array(points)[:, refit.places] + 0.0  # no -0
     ends = zip(values.min(axis=0).tolist(), values.max(axis=0).tolist(), strict=True)
     better, gain = tracker.best_values, best.cost - tracker.best_cost
     lowest = refit.enough / ENOUGH * BETTER  # of a cut

@@ -81,7 +81,7 @@ class Refit:
 
     def taken(self, point: Array) -> Array:
         """Scaled step from the best point to another one."""
-        return np.asarray((point - self.best.values)[self.places] / self.best.sizes, np.float64)
+        return np.asarray((point - self.best.values)[self.places] / self.best.sizes)
 
     def run(
         self,
@@ -96,6 +96,7 @@ class Refit:
         `weights` (n_data,) multiply the squares. Returns None if the start cannot be simulated.
         """
         root = np.sqrt(weights)
+        rows = np.reshape(root, (-1, 1))
         problem, names, sizes = self.best.problem, self.best.names, self.best.sizes
         low, high = self.low.copy(), self.high.copy()
         if hold is not None:
@@ -105,8 +106,7 @@ class Refit:
             return self.point(scaled, low, high)
 
         def jacobian(scaled: Array) -> Array:
-            slopes = problem.linear.slopes(point(scaled), names)
-            slopes = np.asarray(slopes * np.reshape(root, (-1, 1)))
+            slopes: Array = problem.linear.slopes(point(scaled), names) * rows
             if problem.objective.loss == "linear":
                 return slopes * sizes
             differences = problem.objective.differences(point(scaled)) - self.shift
