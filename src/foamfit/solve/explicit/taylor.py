@@ -12,6 +12,16 @@ import math
 
 import numpy as np
 
+from foamfit.solve.explicit.memory import (
+    EQ,
+    MARGIN,
+    Memory,
+    hold,
+    leave,
+    longest,
+    make_memory,
+    next_branch,
+)
 from foamfit.solve.explicit.series import (
     DASHPOT,
     EPS,
@@ -77,6 +87,8 @@ from foamfit.springs.kernels import (
 
 # Strains closer than this to the end of a branch are at it.
 CLOSE = 1e-13
+# A spring that turns within so small a part of a step turns at its start.
+NOW = 1e-8
 MOST_ORDERS = 24
 # Truncation of derivatives, relative to what they were so far, over that of the motion.
 OF_TANGENTS = 1e3
@@ -184,13 +196,33 @@ def tangent_length(
 
 @piece
 def first_switch(law: Array, s: Array, order: int, span: float) -> tuple[float, int, int]:
-    """First switch of branch within `span`: when, which spring (-1: none), on which side."""
+    """First end of a branch within `span`: when, which spring (-1: none), on which side."""
     spring, side = -1, 0
     for i in range(law.shape[0]):
         when, where = first_crossing(s[EPS, i], order, law[i, LOW], law[i, HIGH], span)
         if where != 0 and (spring < 0 or when < span):
             span, spring, side = when, i, where
     return span, spring, side
+
+
+@piece
+def first_turn(
+    branches: Branches, s: Array, order: int, span: float, c: Array
+) -> tuple[float, int]:
+    """First time within `span` at which a spring that snaps turns, and which; c is scratch.
+
+    After a kink it may have turned already.
+    """
+    spring, whole = -1, span
+    for i in range(branches.size):
+        if branches[i] == SNAP or branches[i] == BACK:
+            ahead = 1.0 if branches[i] == SNAP else -1.0
+            for n in range(order):
+                c[n] = ahead * (n + 1) * s[EPS, i, n + 1]
+            when, where = (0.0, -1) if c[0] < 0.0 else first_crossing(c, order - 1, 0.0, math.inf, span)
+            if where != 0 and (spring < 0 or when < span):
+                spring, span = i, (0.0 if when <= NOW * whole else when)
+    return span, spring
 
 
 @inner
@@ -325,8 +357,8 @@ def depart(
     for i in range(count):
         speed += law[i, HEIGHT] * slope_at(s[EPS, i], order, span)
         rate[min(i, nodes - 1)] = speed
-    advance(s, groups, order, span)
-    advance_tangents(d, groups, more, span)
+    advance(s, groups, order, span, None)
+    advance_tangents(d, groups, more, span, None)
     for i in range(count):
         moved += law[i, HEIGHT] * s[EPS, i, 0]
         place[min(i, nodes - 1)] = moved
@@ -347,7 +379,7 @@ def depart(
 
 
 @inner
-def settle(links: Links, s: Array) -> None:
+def settle(links: Links, s: Array, memory: Memory | None) -> None:
     """Share the elongation of undamped groups anew, so that rounding does not pile up."""
     law = links.law
     for g in range(links.ends.size):
@@ -358,13 +390,13 @@ def settle(links: Links, s: Array) -> None:
         compliance = 0.0
         miss = s[W, g, 0] - (s[W, g - 1, 0] if g > 0 else 0.0)
         for i in range(i0, i1):
-            slope = slope_now(law, i, s[EPS, i, 0])
+            slope = slope_now(law, i, s[EPS, i, 0], memory)
             plain = plain and law[i, DASHPOT] == 0.0 and slope > 0.0
             compliance += law[i, HEIGHT] / slope
             miss -= law[i, HEIGHT] * s[EPS, i, 0]
         if plain:
             for i in range(i0, i1):
-                s[EPS, i, 0] += miss / compliance / slope_now(law, i, s[EPS, i, 0])
+                s[EPS, i, 0] += miss / compliance / slope_now(law, i, s[EPS, i, 0], memory)
 
 
 @inner
@@ -382,6 +414,7 @@ def switch(
     side: int,
     log: Array,
     switches: int,
+    memory: Memory | None,
 ) -> int:
     """Change the branch of a spring, and of all that end theirs at the same time; counts them."""
     for i in range(branches.size):
@@ -396,10 +429,21 @@ def switch(
         if out == 0:
             continue
         left = branches[i]
-        branches[i] = above(left) if out > 0 else below(left)
-        s[EPS, i, 0] = high if out > 0 else low
+        if memory is None:
+            branches[i] = above(left) if out > 0 else below(left)
+            s[EPS, i, 0] = high if out > 0 else low
+        elif out == TURN:
+            hold(memory, i, left, eps, d.series[:, EPS, :, 0])
+            branches[i] = HELD
+        else:
+            s[EPS, i, 0] = high if out > 0 else low
+            if rows[i, KIND] == MICROSCALE:
+                branches[i] = next_branch(rows[i], left, memory.now[i, RANK], out)
+                leave(memory, i, left, out)
+            else:
+                branches[i] = above(left) if out > 0 else below(left)
         switches = log_switch(log, switches, now, i, left, branches[i], s[EPS, i, 0])
-        enter(rows, i, branches[i], law)
+        enter(rows, i, branches[i], law, memory)
         enter_tangents(rows, i, branches[i], directions, d)
     return switches
 
@@ -447,6 +491,7 @@ def begin(
     law: Array,
     s: Array,
     d: SeriesTangents,
+    memory: Memory | None,
 ) -> None:
     """Write the state at the first sample: branches, strains and their derivatives."""
     for i in range(branches.size):
