@@ -122,7 +122,7 @@ def _spring(where: str, given: dict[str, Any]) -> Spring:
     names = BISTABLE_NAMES if kind == "bistable" else LINEAR_NAMES
     check_keys(where, given, ["kind", "height", "mass", *names])
     needed = [name for name in names if name != "eta" or name in given]
-    values = {name: _number(where, given, name) for name in needed}
+    values: dict[str, Any] = {name: _number(where, given, name) for name in needed}
     if kind == "bistable":
         return _made(where, lambda: BistableSpring(**values))
     return _made(where, lambda: LinearSpring(**values, unilateral=kind == "unilateral"))

@@ -39,7 +39,7 @@ class Turned:
     trouble: str = ""
 
 
-def turn(strain: Array, measured: Array, values: Mapping[str, float]) -> Turned:
+def turn(strain: Array, measured: Array, values: Mapping[str, Any]) -> Turned:
     """Compute the stress of a bistable spring with values in SI along a measured strain."""
     spring = None
     try:

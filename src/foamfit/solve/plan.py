@@ -16,7 +16,7 @@ from foamfit.solve.explicit import taylor
 from foamfit.solve.implicit import steps, vibration
 from foamfit.springs import kernels
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
-from foamfit.springs.law import BISTABLE
+from foamfit.springs.law import BISTABLE, MICROSCALE
 from foamfit.springs.parameters import OWN_ETA, OWN_HEIGHT
 from foamfit.springs.sensitivities import equilibrium_tangents
 from foamfit.springs.spring import as_samples
@@ -59,6 +59,11 @@ _OUTCOMES = {
     "branch (strain 1 on branch a, 1 + eps_star on branch c)",
 }
 
+
+_WITH_MEMORY = (
+    "microscale springs and relaxation are followed in one spring under a prescribed displacement, "
+    "and, without relaxation, dashpots and masses, under a prescribed stress; no other scene yet"
+)
 
 NO_DIRECTIONS: Directions = np.empty((0, 2), np.int64)
 NO_SWITCHES = np.empty((0, 5))
@@ -117,6 +122,8 @@ class Plan(NamedTuple):
         Whether one mass bounces once: it has neither dashpot nor damper, nor a mass inside.
     implicit : bool or None
         Whether to take implicit steps; None = where explicit ones are the wrong tool.
+    memory : bool
+        Whether a spring keeps more than its branch: microscale springs and relaxation.
     """
 
     solver: str
@@ -133,6 +140,7 @@ class Plan(NamedTuple):
     max_explicit: int
     plain: bool = False
     implicit: bool | None = None
+    memory: bool = False
 
     def run(
         self,
@@ -155,6 +163,8 @@ class Plan(NamedTuple):
         SimulationError
             If the scene has no finite answer; the message says why.
         """
+        if self.memory and self.solver != CLOSED_FORM:
+            raise SimulationError(_WITH_MEMORY)
         if self.solver == CLOSED_FORM:
             return self._closed_form(rows, heights, everything, directions)
         p, time = len(directions), self.time
@@ -371,7 +381,8 @@ def plan(
     Parameters
     ----------
     chain : Chain
-        Only its heights, area, masses, site damping and which springs have a dashpot count.
+        Only its heights, area, masses, site damping and which springs have a dashpot,
+        relaxation terms or the microscale law count.
     drive : Impact, StressDrive or DisplacementDrive
         How it is loaded.
     t : (n_t,) array
@@ -410,10 +421,13 @@ def plan(
         inside = np.flatnonzero(chain.arrays.masses[:-1] > 0.0)
         ends = np.append(inside + 1, ends)
         masses = np.append(chain.arrays.masses[inside] / chain.area, masses)
+    relaxing = any(chain.relaxation)
+    memory = relaxing or any(spring.kind == MICROSCALE for spring in chain.springs)
+    alone = top == scenes.MOTION and len(chain.springs) == 1
     damped = dashpots or chain.arrays.damped or top == scenes.VISCOUS
     if len(ends) > 1 or above > 0.0:
         solver = SECOND_ORDER
-    elif damped and not (top == scenes.MOTION and len(chain.springs) == 1):
+    elif (damped or relaxing or (memory and top == scenes.MOTION)) and not alone:
         solver = FIRST_ORDER
     else:
         solver = CLOSED_FORM
@@ -435,4 +449,5 @@ def plan(
         max_steps=most,
         max_explicit=min(most, explicit),
         plain=speed > 0.0 and len(ends) == 1 and not damped and chain.site_damping == 0.0,
+        memory=memory,
     )

@@ -317,7 +317,7 @@ def simulate(
     directions = NO_DIRECTIONS
     if sensitivities:
         kinds = tuple(KINDS[spring.kind] for spring in chain.springs)
-        wanted = [direction(kinds, name) for name in sensitivities]
+        wanted = [direction(kinds, name, chain.relaxation) for name in sensitivities]
         longer = any(what == OWN_HEIGHT for _, what in wanted)
         if longer and chain.site_damping > 0.0:  # the onsite damper acts over the whole height
             wanted.append((-1, DRAG))

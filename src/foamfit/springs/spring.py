@@ -1,23 +1,32 @@
-"""One mesoscopic spring: the seven-parameter bistable law (eqs. 1-5) and the linear spring."""
+"""One mesoscopic spring: the bistable law (eqs. 1-5), the microscale law and the linear spring."""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foamfit.errors import InputError, SimulationError
-from foamfit.springs.law import BISTABLE, LINEAR, UNILATERAL, derived_points
+from foamfit.springs.law import (
+    BISTABLE,
+    LINEAR,
+    MICROSCALE,
+    UNILATERAL,
+    derived_points,
+    least_eps_star,
+)
 
 if TYPE_CHECKING:
     from foamfit.springs.kernels import Row
 
 Array = NDArray[np.float64]
+Relaxation = Sequence[tuple[float, float]]  # frozen to a tuple of tuples
 
 
 def _require(holds: bool, name: str, value: float, wanted: str) -> None:
@@ -69,6 +78,29 @@ def _freeze_numbers(spring: object, *names: str) -> None:
             _require(value > 0, name, value, "positive")
         elif name in ("kh_plus", "kh_minus", "eta"):
             _require(value >= 0, name, value, "zero or positive")
+
+
+def _freeze_terms(spring: object, given: Any) -> None:
+    """Make the relaxation terms of a spring pairs of finite floats of the right sign."""
+    wanted = "relaxation must be a sequence of pairs (g, tau in s)"
+    try:
+        pairs = [tuple(pair) for pair in given]
+    except TypeError:
+        raise InputError(wanted) from None
+    if any(len(pair) != 2 for pair in pairs):
+        raise InputError(wanted)
+    terms = []
+    for k, (g, tau) in enumerate(pairs, start=1):
+        g, tau = as_number(g, f"g{k}"), as_number(tau, f"tau{k}")
+        _require(0 <= g < math.inf, f"g{k}", g, "finite and zero or positive")
+        _require(0 < tau < math.inf, f"tau{k}", tau, "finite and positive")
+        terms.append((g, tau))
+    object.__setattr__(spring, "relaxation", tuple(terms))
+
+
+def _numbers_of(spring: Any) -> tuple[str, ...]:
+    """Names of the fields of a spring that are numbers."""
+    return tuple(item.name for item in fields(spring) if item.name != "relaxation")
 
 
 def _as_history(values: ArrayLike, name: str) -> Array:
@@ -172,6 +204,9 @@ class BistableSpring(_Law):
         k_h-, slope of the snap-back branch e, C2→A2, Pa.
     eta : float
         η, dashpot in parallel, Pa·s.
+    relaxation : sequence of pairs of float
+        Relaxation terms (g, τ in s) in parallel; left out = none. What follows the law along a
+        history (`stress`, `strain`) is the equilibrium, without them.
 
     Raises
     ------
@@ -187,10 +222,12 @@ class BistableSpring(_Law):
     kh_plus: float
     kh_minus: float
     eta: float = 0.0
+    relaxation: Relaxation = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
         """Refuse what is not admissible, by name."""
-        _freeze_numbers(self, *(item.name for item in fields(self)))
+        _freeze_numbers(self, *_numbers_of(self))
+        _freeze_terms(self, self.relaxation)
         _require(0 < self.eps_a < 1, "eps_a", self.eps_a, "between 0 and 1")
         past = f"greater than eps_a = {self.eps_a:g}"
         _require(self.eps_c > self.eps_a, "eps_c", self.eps_c, past)
@@ -262,6 +299,77 @@ class BistableSpring(_Law):
 
 
 @dataclass(frozen=True)
+class MicroscaleSpring(_Law):
+    """Micro-springs in series whose snap stresses are spread log-normally, with a dashpot.
+
+    Its state is the fraction p of them that has snapped. With P₊ and P₋ the fractions whose
+    snap-through and snap-back stress lies below σ (P₋ no less than P₊, both 0 in tension),
+
+        p ← min(max(p, P₊(σ)), P₋(σ))          along the history of σ, from p = 0,
+        ε = (1-p) σ/(k0+σ) + p (eps_star + σ/(kc+σ)).
+
+    Parameters
+    ----------
+    k0 : float
+        First slope of branch a, at zero stress, Pa.
+    kc : float
+        First slope of the densified branch c, at zero stress, Pa.
+    eps_star : float
+        Strain at which branch c starts from zero stress.
+    sigma_plus : float
+        Snap-through stress of the middle rank, Pa.
+    spread_plus : float
+        Standard deviation of the logarithm of the snap-through stress.
+    sigma_minus : float
+        Snap-back stress of the middle rank, Pa.
+    spread_minus : float
+        Standard deviation of the logarithm of the snap-back stress.
+    eta : float
+        η, dashpot in parallel, Pa·s.
+    relaxation : sequence of pairs of float
+        Relaxation terms (g, τ in s) in parallel; left out = none. What follows the law along a
+        history (`stress`, `strain`) is the equilibrium, without them.
+
+    Raises
+    ------
+    ValueError
+        If a parameter is not admissible; the message names it.
+    """
+
+    k0: float
+    kc: float
+    eps_star: float
+    sigma_plus: float
+    spread_plus: float
+    sigma_minus: float
+    spread_minus: float
+    eta: float = 0.0
+    relaxation: Relaxation = field(default=(), kw_only=True)
+
+    def __post_init__(self) -> None:
+        """Refuse what is not admissible, by name."""
+        _freeze_numbers(self, *_numbers_of(self))
+        _freeze_terms(self, self.relaxation)
+        for name in ("sigma_plus", "spread_plus", "sigma_minus", "spread_minus"):
+            _require(getattr(self, name) > 0, name, getattr(self, name), "positive")
+        least = least_eps_star(self.k0, self.kc)
+        wanted = f"at least {least:.9g}, so that branch c lies beyond branch a at every stress"
+        _require(self.eps_star >= least, "eps_star", self.eps_star, wanted)
+
+    @property
+    def kind(self) -> int:
+        """The kind of spring that the kernels know."""
+        return MICROSCALE
+
+    @cached_property
+    def row(self) -> Row:
+        """The spring as the kernels know it."""
+        from foamfit.springs import kernels
+
+        return kernels.microscale_row(*(getattr(self, name) for name in _numbers_of(self)))
+
+
+@dataclass(frozen=True)
 class LinearSpring(_Law):
     """The linear spring S1 of the two-spring models, σ = k0 ε, with a dashpot in parallel.
 
@@ -300,5 +408,10 @@ class LinearSpring(_Law):
 
         return kernels.linear_row(self.k0, self.eta, self.unilateral)
 
+    @property
+    def relaxation(self) -> Relaxation:
+        """Relaxation terms: a linear spring has none."""
+        return ()
 
-Spring = BistableSpring | LinearSpring
+
+Spring = BistableSpring | MicroscaleSpring | LinearSpring
