@@ -31,7 +31,6 @@ from foamfit.springs.kernels import (
     HELD,
     K0,
     KC,
-    LEAST_RANK,
     LOG_CROSS,
     LOG_MINUS,
     LOG_PLUS,
@@ -47,6 +46,7 @@ from foamfit.springs.kernels import (
     maker,
     piece,
 )
+from foamfit.springs.law import LEAST_RANK
 from foamfit.springs.parameters import OWN_ETA, OWN_RELAXATION
 
 # Rows of `Memory.series`: equilibrium stress s; 1 - a, 1 + eps_star - c; P; n u_n, u_n, φ, h.
@@ -265,6 +265,39 @@ def hold(memory: Memory, i: int, branch: int, eps: float, d: Array) -> None:
             moved = u
         change += steep * moved
         memory.ranks[k, i] = (change / (soft * s) - moved) / now[SCALE]
+
+
+@inner
+def loaded_branch(memory: Memory, i: int, eps: float) -> int:
+    """Branch of a microscale spring that was loaded from rest to a strain in one go."""
+    row, now = memory.rows[i], memory.now[i]
+    if eps <= end_of_virgin(row):
+        return A
+    now[STRESS] = math.exp(_limits(row, A, 0.0)[1])
+    enter_mixture(memory, i, SNAP)
+    s = stress_of_mixture(row, now, True, eps)
+    now[STRESS] = s
+    if s >= math.exp(now[PLACE] - LEAST_RANK * now[SCALE]):
+        now[RANK] = -LEAST_RANK
+        return HELD
+    return SNAP if is_hysteretic(row, math.log(s), 1.0) else BOTH
+
+
+@inner
+def start_relaxed(memory: Memory, i: int, s: float) -> None:
+    """Nothing has relaxed yet of the stress at which a spring starts."""
+    for k in range(memory.z.shape[0]):
+        memory.z[k, i, 0] = -memory.rows[i, N_COLUMNS + 2 * k] * s
+
+
+@inner
+def start_relaxed_tangent(memory: Memory, p: int, i: int, change: float) -> None:
+    """Derivative in direction p of what `start_relaxed` writes, from that of the stress."""
+    own = memory.directions[p, 1] if memory.directions[p, 0] == i else OWN_ETA
+    for k in range(memory.z.shape[0]):
+        memory.tangents[p, 1 + k, i, 0] = -memory.rows[i, N_COLUMNS + 2 * k] * change
+        if own == OWN_RELAXATION + 2 * k:
+            memory.tangents[p, 1 + k, i, 0] -= memory.series[EQ, i, 0]
 
 
 # ---------------------------------------------------------------- the motion

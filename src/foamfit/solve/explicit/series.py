@@ -39,6 +39,8 @@ from foamfit.solve.explicit.memory import (
     relaxed,
     relaxed_tangent,
     start_mixture,
+    start_relaxed,
+    start_relaxed_tangent,
     strain_of_mixture,
     tangent_of_mixture,
 )
@@ -691,6 +693,24 @@ def expand_tangents(
     for p in range(d.drag.size):
         if d.live[p] > 0.0:
             _expand_tangent(links, s, d.law[p], d.drag[p], d.series[p], order, memory, p)
+
+
+@inner
+def start_relaxing(law: Array, i: int, s: Array, d: SeriesTangents, memory: Memory) -> None:
+    """Let nothing have relaxed yet of the stress at which a spring starts: q_k = 0."""
+    sig, tilt = s[SIG], s[TILT]
+    _stress_term(law, i, s[EPS], sig, 0, memory)
+    kind, stress = law[i, CURVED], memory.series[EQ, i, 0]
+    if kind >= HELD:
+        fill_partials(memory, i, kind > HELD, kind == BACK, tilt[i], 0)
+    else:
+        _fill_tilt(law, i, memory.series[EQ], tilt, 0)
+        tilt[i, 0] *= memory.now[i, GAIN]
+    for p in range(d.drag.size):
+        change = _known_tangent(law, s, d.law[p], d.series[p], i, 0, memory, p)
+        change += tilt[i, 0] * d.series[p, EPS, i, 0] - memory.now[i, BASE]
+        start_relaxed_tangent(memory, p, i, change / memory.now[i, GAIN])
+    start_relaxed(memory, i, stress)
 
 
 # ---------------------------------------------------------------- the end of a step
