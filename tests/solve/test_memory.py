@@ -27,9 +27,7 @@ ONE, TWO = [(0.5, 2e-4)], [(0.4, 5e-5), (0.6, 1e-3)]
 IMPACT = ff.Impact(7e-3, 1.5)
 
 
-def chain(
-    springs: list[Spring], masses: list[float] | None = None, site: float = 0.0
-) -> ff.Chain:
+def chain(springs: list[Spring], masses: list[float] | None = None, site: float = 0.0) -> ff.Chain:
     heights = [1.19e-3] if len(springs) == 1 else [0.7e-3, 0.49e-3, 0.3e-3][: len(springs)]
     return ff.Chain(springs, heights, AREA, masses, site)
 
