@@ -65,8 +65,9 @@ _TOO_FAST = (
     "springs with memory are followed by explicit steps, for which {culprit} is too fast: the "
     "scene lasts {rate:.2g} of its radians or relaxation times, and has at most {steps} steps"
 )
-# Radians, or relaxation times, that one explicit step goes through at most.
-RADIANS = 3.0
+# Radians, or relaxation times, that one explicit step goes through at most; steps after which it
+# is asked how many it takes.
+RADIANS, FEW_EXPLICIT = 3.0, 20_000
 
 NO_DIRECTIONS: Directions = np.empty((0, 2), np.int64)
 NO_SWITCHES = np.empty((0, 5))
@@ -209,22 +210,22 @@ class Plan(NamedTuple):
         log: Array,
     ) -> Motion:
         """Springs with memory: by explicit steps, which must follow all that is fast."""
-        rows, heights = given[:2]
-        rate, culprit = self._fastest(given)
-        too_fast = _TOO_FAST.format(culprit=culprit, rate=rate, steps=self.max_steps)
-        if rate > RADIANS * self.max_steps:
-            raise SimulationError(too_fast)
         start = _AT_REST
         if self.top not in _RESTING:
-            start = np.zeros((1 + len(directions), len(heights)))
+            start = np.zeros((1 + len(directions), len(given[1])))
             if self.values[0] != 0.0:
-                start = self._loaded(rows, heights, directions)
+                start = self._loaded(given[0], given[1], directions)
         cache.announce(taylor.integrate_with_memory, "the solver of springs with memory")
-        ending = taylor.integrate_with_memory(
-            *given, self.margin * rtol, self.max_steps, directions, start, curves, slopes, log
-        )
-        if ending[0] in _WRONG_TOOL:
-            raise SimulationError(too_fast)
+        for most in (min(FEW_EXPLICIT, self.max_steps), self.max_steps):
+            ending = taylor.integrate_with_memory(
+                *given, self.margin * rtol, most, directions, start, curves, slopes, log
+            )
+            if ending[0] not in _WRONG_TOOL:
+                break
+            rate, culprit = self._fastest(given)
+            too_fast = _TOO_FAST.format(culprit=culprit, rate=rate, steps=self.max_steps)
+            if most == self.max_steps or rate > RADIANS * self.max_steps:
+                raise SimulationError(too_fast)
         return _motion(TAYLOR, ending, curves, slopes, log)
 
     def _fastest(self, given: scenes.SceneTuple) -> tuple[float, str]:

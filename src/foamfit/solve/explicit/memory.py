@@ -39,6 +39,7 @@ from foamfit.springs.kernels import (
     SPREAD_PLUS,
     Array,
     Branches,
+    inlined,
     inner,
     maker,
 )
@@ -213,7 +214,7 @@ def start_mixture(memory: Memory, i: int, moving: bool, eps: float) -> float:
     return s
 
 
-@inner
+@inlined
 def strain_of_mixture(memory: Memory, i: int, moving: bool, n: int) -> float:
     """Order n >= 1 of the strain of a microscale spring, but for what that of its stress adds.
 
@@ -250,7 +251,7 @@ def strain_of_mixture(memory: Memory, i: int, moving: bool, n: int) -> float:
     return snapped[n] * gap - q * below_a[n] - p * below_c[n] + parts
 
 
-@inner
+@inlined
 def finish_mixture(memory: Memory, i: int, moving: bool, n: int, s_n: float) -> None:
     """Add to the series what order n >= 1 of the stress adds."""
     row, now, m = memory.rows[i], memory.now[i], memory.series
@@ -266,7 +267,7 @@ def finish_mixture(memory: Memory, i: int, moving: bool, n: int, s_n: float) -> 
         m[BEND, i, n] += m[SCORE, i, 0] * m[DENSITY, i, n] + m[SCORE, i, n] * m[DENSITY, i, 0]
 
 
-@inner
+@inlined
 def relaxed(memory: Memory, i: int, n: int) -> float:
     """Order n of Σ z_k of a spring."""
     total = 0.0
@@ -275,7 +276,7 @@ def relaxed(memory: Memory, i: int, n: int) -> float:
     return total
 
 
-@inner
+@inlined
 def keep(memory: Memory, i: int, n: int, s_n: float) -> None:
     """Write order n of a spring's equilibrium stress, and what relaxes in the next."""
     memory.series[EQ, i, n] = s_n
@@ -369,7 +370,7 @@ def fill_partials(
             gap[n] *= at_rank
 
 
-@inner
+@inlined
 def tangent_of_mixture(memory: Memory, k: int, i: int, moving: bool, tilt: Array, n: int) -> float:
     """Order n of the derivative of (1 + Σ g) s in direction k, but for the term T_0 δε_n."""
     out, own = memory.tangents[k, 0, i], memory.directions[k, 1]
@@ -385,7 +386,7 @@ def tangent_of_mixture(memory: Memory, k: int, i: int, moving: bool, tilt: Array
     return known
 
 
-@inner
+@inlined
 def relaxed_tangent(memory: Memory, k: int, i: int, n: int) -> float:
     """Order n of the derivative of Σ z_k, and of g s at fixed s, in direction k."""
     total = 0.0
@@ -397,7 +398,7 @@ def relaxed_tangent(memory: Memory, k: int, i: int, n: int) -> float:
     return total
 
 
-@inner
+@inlined
 def keep_tangent(memory: Memory, k: int, i: int, n: int, d_eps: float, d_sig: float) -> None:
     """Go on with the derivatives of what relaxes from those of strain and stress of order n."""
     memory.tangents[k, 0, i, n] += d_eps
