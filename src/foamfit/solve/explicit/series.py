@@ -209,13 +209,9 @@ def _law_stress(law: Array, i: int, eps: Array, sig: Array, n: int) -> float:
     return k * x * law[i, INVERSE]
 
 
-@inlined
-def _stress_term(
-    law: Array, i: int, eps: Array, sig: Array, n: int, memory: Memory | None
-) -> float:
-    """Order n of a spring's stress from its strain up to order n."""
-    if memory is None:
-        return _law_stress(law, i, eps, sig, n)
+@inner
+def _remembered_stress(law: Array, i: int, eps: Array, n: int, memory: Memory) -> float:
+    """Order n of the stress of a spring in a chain with memory; see `_stress_term`."""
     moving = law[i, CURVED] > HELD
     if law[i, CURVED] < HELD:
         s_n = _law_stress(law, i, eps, memory.series[EQ], n)
@@ -229,6 +225,16 @@ def _stress_term(
 
 
 @inlined
+def _stress_term(
+    law: Array, i: int, eps: Array, sig: Array, n: int, memory: Memory | None
+) -> float:
+    """Order n of a spring's stress from its strain up to order n."""
+    if memory is None:
+        return _law_stress(law, i, eps, sig, n)
+    return _remembered_stress(law, i, eps, n, memory)
+
+
+@inlined
 def _law_strain(law: Array, i: int, eps: Array, sig: Array, n: int) -> tuple[float, float]:
     """Order n >= 1 of a strain on a branch as (known part, compliance), as `_strain_term` does."""
     k = law[i, SLOPE]
@@ -237,6 +243,21 @@ def _law_strain(law: Array, i: int, eps: Array, sig: Array, n: int) -> tuple[flo
     stiff = k + sig[i, 0]
     known = _product(eps, sig, i, n)
     return -known / stiff, (1.0 - (eps[i, 0] - law[i, ORIGIN])) / stiff
+
+
+@inner
+def _remembered_strain(
+    law: Array, i: int, eps: Array, n: int, memory: Memory
+) -> tuple[float, float]:
+    """Order n >= 1 of the strain of a spring in a chain with memory; see `_strain_term`."""
+    if law[i, CURVED] < HELD:
+        known, soft = _law_strain(law, i, eps, memory.series[EQ], n)
+    else:
+        known = strain_of_mixture(memory, i, law[i, CURVED] > HELD, n)
+        soft = memory.now[i, GIVE]
+    soft /= memory.now[i, GAIN]
+    memory.now[i, SOFT] = soft
+    return (known - soft * relaxed(memory, i, n) if soft < math.inf else known), soft
 
 
 @inlined
@@ -249,14 +270,7 @@ def _strain_term(
     """
     if memory is None:
         return _law_strain(law, i, eps, sig, n)
-    if law[i, CURVED] < HELD:
-        known, soft = _law_strain(law, i, eps, memory.series[EQ], n)
-    else:
-        known = strain_of_mixture(memory, i, law[i, CURVED] > HELD, n)
-        soft = memory.now[i, GIVE]
-    soft /= memory.now[i, GAIN]
-    memory.now[i, SOFT] = soft
-    return (known - soft * relaxed(memory, i, n) if soft < math.inf else known), soft
+    return _remembered_strain(law, i, eps, n, memory)
 
 
 @inner
