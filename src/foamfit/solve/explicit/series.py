@@ -540,7 +540,7 @@ def _known_tangent(
             known += d[EPS, i, 0] * tilt[i, n] + _product(d[EPS], tilt, i, n)
     if memory is not None:
         if law[i, CURVED] >= HELD:
-            known = tangent_of_mixture(memory, p, i, law[i, CURVED] > HELD, tilt[i], n)
+            known = tangent_of_mixture(memory, p, i, law[i, CURVED] > HELD, tilt[i, 0], n)
         memory.now[i, BASE] = relaxed_tangent(memory, p, i, n)
         known += memory.now[i, BASE]
     if law[i, DASHPOT] == 0.0 and n + 2 < tilt.shape[1]:  # a dashpot of zero: what it would take
@@ -661,7 +661,7 @@ def _expand_tangent(
             i0, i1 = springs_of(links.ends, g)
             if memory is not None:
                 for i in range(i0, i1):
-                    keep_tangent(memory, p, i, n, d[EPS, i, n], d[SIG, i, n])
+                    keep_tangent(memory, p, i, n, d[SIG, i, n])
             if i1 - i0 > 1 or (g == last and links.top == STRESS):
                 for i in range(i0, i1):
                     if law[i, DASHPOT] > 0.0:
@@ -693,7 +693,9 @@ def expand_tangents(
         else:
             kind = links.law[i, CURVED]
             if kind >= HELD:
-                fill_partials(memory, i, kind > HELD, kind == BACK, s[TILT, i], order)
+                s[TILT, i, 0] = fill_partials(
+                    memory, i, kind > HELD, kind == BACK, s[EPS, i], order
+                )
             else:
                 _fill_tilt(links.law, i, memory.series[EQ], s[TILT], order)
                 for n in range(order + 1):
@@ -710,7 +712,7 @@ def start_relaxing(law: Array, i: int, s: Array, d: SeriesTangents, memory: Memo
     _stress_term(law, i, s[EPS], sig, 0, memory)
     kind, stress = law[i, CURVED], memory.series[EQ, i, 0]
     if kind >= HELD:
-        fill_partials(memory, i, kind > HELD, kind == BACK, tilt[i], 0)
+        tilt[i, 0] = fill_partials(memory, i, kind > HELD, kind == BACK, s[EPS, i], 0)
     else:
         _fill_tilt(law, i, memory.series[EQ], tilt, 0)
         tilt[i, 0] *= memory.now[i, GAIN]
