@@ -249,12 +249,13 @@ def strain_of_mixture(memory: Memory, i: int, moving: bool, n: int) -> float:
     row, now, m = memory.rows[i], memory.now[i], memory.series
     s, below_a, below_c = m[EQ, i], m[BELOW_A, i], m[BELOW_C, i]
     p, q = now[FRACTION], now[LEFT]
+    per_a, per_c = 1.0 / (row[K0] + s[0]), 1.0 / (row[KC] + s[0])  # quotients that wait for nothing
     by_a = by_c = 0.0
     if not moving:
         for j in range(1, n):
             by_a += s[j] * below_a[n - j]
             by_c += s[j] * below_c[n - j]
-        below_a[n], below_c[n] = -by_a / (row[K0] + s[0]), -by_c / (row[KC] + s[0])
+        below_a[n], below_c[n] = -by_a * per_a, -by_c * per_c
         return -q * below_a[n] - p * below_c[n]
     snapped, pace, score = m[SNAPPED, i], m[PACE, i], m[SCORE, i]
     density, bend = m[DENSITY, i], m[BEND, i]
@@ -267,11 +268,12 @@ def strain_of_mixture(memory: Memory, i: int, moving: bool, n: int) -> float:
         by_bend += pace[j] * bend[n - j]
         products += score[j] * density[n - j]
         parts += snapped[j] * (below_a[n - j] - below_c[n - j])
-    below_a[n], below_c[n] = -by_a / (row[K0] + s[0]), -by_c / (row[KC] + s[0])
-    pace[n] = -by_s / s[0]
-    score[n] = pace[n] / n
-    snapped[n] = (pace[n] * density[0] + by_density) / n
-    density[n] = -(pace[n] * bend[0] + by_bend) / n
+    per_n = 1.0 / n
+    below_a[n], below_c[n] = -by_a * per_a, -by_c * per_c
+    pace[n] = -by_s * (1.0 / s[0])
+    score[n] = pace[n] * per_n
+    snapped[n] = (pace[n] * density[0] + by_density) * per_n
+    density[n] = -(pace[n] * bend[0] + by_bend) * per_n
     bend[n] = products
     gap = row[EPS_STAR] + below_a[0] - below_c[0]
     return snapped[n] * gap - q * below_a[n] - p * below_c[n] + parts
@@ -282,10 +284,10 @@ def finish_mixture(memory: Memory, i: int, moving: bool, n: int, s_n: float) -> 
     """Add to the series what order n >= 1 of the stress adds."""
     row, now, m = memory.rows[i], memory.now[i], memory.series
     s = m[EQ, i, 0]
-    m[BELOW_A, i, n] -= s_n * m[BELOW_A, i, 0] / (row[K0] + s)
-    m[BELOW_C, i, n] -= s_n * m[BELOW_C, i, 0] / (row[KC] + s)
+    m[BELOW_A, i, n] -= s_n * (m[BELOW_A, i, 0] / (row[K0] + s))
+    m[BELOW_C, i, n] -= s_n * (m[BELOW_C, i, 0] / (row[KC] + s))
     if moving:
-        more = s_n / (now[SCALE] * s)
+        more = s_n * (1.0 / (now[SCALE] * s))
         m[PACE, i, n] += n * more
         m[SCORE, i, n] += more
         m[SNAPPED, i, n] += m[DENSITY, i, 0] * more
@@ -308,7 +310,7 @@ def keep(memory: Memory, i: int, n: int, s_n: float) -> None:
     memory.series[EQ, i, n] = s_n
     for k in range(memory.z.shape[0]):
         g, tau = memory.rows[i, N_COLUMNS + 2 * k], memory.rows[i, N_COLUMNS + 2 * k + 1]
-        memory.z[k, i, n + 1] = -(memory.z[k, i, n] + g * s_n) / (tau * (n + 1))
+        memory.z[k, i, n + 1] = -(memory.z[k, i, n] + g * s_n) * (1.0 / (tau * (n + 1)))
 
 
 @inner
@@ -432,7 +434,8 @@ def relaxed_tangent(memory: Memory, k: int, i: int, n: int) -> float:
 @inlined
 def keep_tangent(memory: Memory, k: int, i: int, n: int, d_sig: float) -> None:
     """Write order n of the derivative of the equilibrium stress, and the next of what relaxes."""
-    d_s = memory.tangents[k, 0, i, n] = (d_sig - memory.now[i, BASE]) / memory.now[i, GAIN]
+    d_s = (d_sig - memory.now[i, BASE]) * (1.0 / memory.now[i, GAIN])  # waits for no quotient
+    memory.tangents[k, 0, i, n] = d_s
     for term in range(memory.z.shape[0]):
         g, tau = memory.rows[i, N_COLUMNS + 2 * term], memory.rows[i, N_COLUMNS + 2 * term + 1]
         dz = memory.tangents[k, 1 + term, i]
@@ -440,9 +443,9 @@ def keep_tangent(memory: Memory, k: int, i: int, n: int, d_sig: float) -> None:
         own = OWN_RELAXATION + 2 * term
         if memory.directions[k, 0] == i and memory.directions[k, 1] == own:
             flow += memory.series[EQ, i, n]
-        dz[n + 1] = -flow / (tau * (n + 1))
+        dz[n + 1] = -flow * (1.0 / (tau * (n + 1)))
         if memory.directions[k, 0] == i and memory.directions[k, 1] == own + 1:
-            dz[n + 1] -= memory.z[term, i, n + 1] / tau
+            dz[n + 1] -= memory.z[term, i, n + 1] * (1.0 / tau)
 
 
 @inner

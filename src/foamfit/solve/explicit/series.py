@@ -218,7 +218,8 @@ def _remembered_stress(law: Array, i: int, eps: Array, n: int, memory: Memory) -
     elif n == 0:
         s_n = start_mixture(memory, i, moving, eps[i, 0])
     else:
-        s_n = (eps[i, n] - strain_of_mixture(memory, i, moving, n)) / memory.now[i, GIVE]
+        s_n = eps[i, n] - strain_of_mixture(memory, i, moving, n)
+        s_n *= 1.0 / memory.now[i, GIVE]
         finish_mixture(memory, i, moving, n, s_n)
     keep(memory, i, n, s_n)
     return memory.now[i, GAIN] * s_n + relaxed(memory, i, n)
