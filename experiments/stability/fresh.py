@@ -89,6 +89,7 @@ def foam(rng: Generator, k0: float, eta: float = 0.0) -> Spec:
     near = {
         key: value * rng.uniform(0.93, 1.07) * (1.0 if key.startswith("eps") else k0 / item.k0)
         for key, value in asdict(item).items()
+        if key != "relaxation"
     }
     sigma_a = near["k0"] * near["eps_a"] / (1.0 - near["eps_a"])
     near["dsigma"] = item.dsigma / item.sigma_a * sigma_a * rng.uniform(0.93, 1.07)
