@@ -1,10 +1,10 @@
 """What energy says of an impact on undamped massless springs in series: no motion is followed.
 
-All springs carry one stress s. On the way up to the largest stress each follows its loading curve,
-on the way down its unloading curve from there, so the strains are known functions of s: the energy
-m v²/(2A) of the striker is ∫ s C ds up to the turn, C = Σ h dε/ds; what is left after it is ∫ s C ds
-on the way down, and the time of contact is ∫ C/v ds over both. The law of microscale springs is
-written out anew with SciPy's normal distribution; linear springs may be in series with them.
+All springs carry one stress s. On the way up to the largest stress each follows its loading
+curve, on the way down its unloading curve from there, so the strains are known functions of s: the
+energy m v²/(2A) of the striker is ∫ s C ds up to the turn, C = Σ h dε/ds; what is left after it is
+∫ s C ds on the way down, and the time of contact is ∫ C/v ds over both. The law of microscale
+springs is written out anew with SciPy's normal distribution; linear springs may be in series.
 """
 
 from __future__ import annotations
@@ -66,8 +66,7 @@ def _cuts(chain: Any, most: float, rising: bool) -> Array:
             at = (at - math.log(spring.sigma_plus) / spring.spread_plus) / apart
             cuts.append(math.exp(min(max(at, -600.0), 600.0)))
     cuts += list(most * np.linspace(0.0, 1.0, 12))
-    inside = np.unique([c for c in cuts if 0.0 <= c <= most])
-    return inside
+    return np.unique([c for c in cuts if 0.0 <= c <= most])
 
 
 class _Way:
@@ -92,7 +91,7 @@ class _Way:
         return total
 
     def time(self, areal: float) -> tuple[float, float]:
-        """Time from the turn to rest, and the speed there; in x = √(most - s), where v is smooth."""
+        """Time from the turn to rest, and the speed there; over x = √(most - s): v is smooth."""
         ends = np.unique(np.sqrt(self.most - self.cuts))
         energy = time = 0.0
         for low, high in pairwise(ends):
@@ -117,9 +116,7 @@ def _cumulative() -> Array:
     """Integrals from -1 to each node of the polynomial through values at the nodes."""
     fit = np.linalg.inv(np.polynomial.legendre.legvander(_X, NODES - 1))
     columns = [
-        np.polynomial.legendre.legval(
-            _X, np.polynomial.legendre.legint(fit[:, j], lbnd=-1.0)
-        )
+        np.polynomial.legendre.legval(_X, np.polynomial.legendre.legint(fit[:, j], lbnd=-1.0))
         for j in range(NODES)
     ]
     return np.array(columns).T

@@ -25,49 +25,39 @@ from typing import Any
 
 import numpy as np
 from independent import (
-    ETA,
-    EPS_A,
-    EPS_C,
-    FLAT,
+    _A,
+    _B,
+    _C,
+    _E3,
+    _E5,
+    DAMPER,
     DONE,
-    HAT_A,
-    HAT_C,
-    H,
+    ETA,
+    FLAT,
     K0,
     KC,
-    LOOSE,
+    LINE,
     MASS,
-    DAMPER,
-    STRESS,
-    MOTION,
     MOST_WORK,
+    MOTION,
     NO_STEP,
+    ONE_SIDED,
     RISEN,
+    STRESS,
     TIGHT,
     TOO_LONG,
     WHY,
     A,
-    C,
-    D,
-    E,
-    GAP,
-    LINE,
-    ONE_SIDED,
     Array,
+    H,
     Integers,
     Truth,
-    _A,
-    _B,
     _bistable,
     _bounds,
-    _C,
-    _E3,
-    _E5,
     _linear,
     _sigma,
     _slope,
     _turn,
-    over_range,
 )  # fmt: skip
 from numba import njit
 
@@ -294,7 +284,7 @@ def _over(
     y: Array, rates: Array, moving: int, branch: Integers, ranks: Array, springs: Array,
     base: float, lifts: bool, peak: float, paces: Array,
 ) -> float:  # fmt: skip
-    """By how much a state is past the end of a branch, a turn, or contact; negative if it is not."""
+    """By how much a state is past the end of a branch, a turn, or contact; negative if not."""
     worst = -math.inf
     for i in range(branch.size):
         low, high, _, _ = _ends(springs[i], branch[i], ranks[i])
