@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foamfit.errors import InputError, SimulationError
-from foamfit.solve import cache, many
+from foamfit.solve import cache, many, relaxation
 from foamfit.solve import scene as scenes
 from foamfit.solve.explicit import taylor
 from foamfit.solve.implicit import steps, vibration
@@ -61,8 +61,8 @@ _OUTCOMES = {
 
 
 _WITH_MEMORY = (
-    "microscale springs and relaxation are followed in one spring under a prescribed displacement, "
-    "and, without relaxation, dashpots and masses, under a prescribed stress; no other scene yet"
+    "a microscale spring, or one that relaxes, is only simulated alone under a prescribed "
+    "displacement, or under a prescribed stress without relaxation, dashpots and masses"
 )
 
 NO_DIRECTIONS: Directions = np.empty((0, 2), np.int64)
@@ -166,7 +166,7 @@ class Plan(NamedTuple):
         if self.memory and self.solver != CLOSED_FORM:
             raise SimulationError(_WITH_MEMORY)
         if self.solver == CLOSED_FORM:
-            return self._closed_form(rows, heights, everything, directions)
+            return self._closed_form(rows, heights, rtol, everything, directions)
         p, time = len(directions), self.time
         curves = np.empty((1 + len(heights) if everything else 2, time.size))
         slopes = np.empty((p, *curves.shape)) if p else NO_SLOPES
@@ -202,11 +202,33 @@ class Plan(NamedTuple):
         )  # fmt: skip
 
     def _closed_form(
-        self, rows: Array, heights: Array, everything: bool, directions: Directions
+        self,
+        rows: Array,
+        heights: Array,
+        rtol: float,
+        everything: bool,
+        directions: Directions,
     ) -> Motion:
         """Undamped and massless: one stress in all springs; or one spring under known motion."""
         moved, wanted = self.top == scenes.MOTION, everything or len(directions) > 0
-        if moved:
+        slopes: Slopes | None = None
+        if self.memory and moved:
+            top, fine = np.array(self.values), True
+            strain = (self.values / heights)[None, :]
+            stress, seen, pressed = relaxation.stress_along(
+                rows[0], strain[0], self.time, heights[0], rtol, directions
+            )
+            branches = seen[None, :]
+            if len(directions):
+                slopes = Slopes(np.zeros((len(directions), 1, stress.size)), pressed)
+        elif self.memory:
+            stress = np.array(self.values)
+            strain, branches, longer = relaxation.strains_along(rows, heights, stress, directions)
+            top = heights @ strain
+            fine = math.isfinite(kernels.total(top))
+            if len(directions):
+                slopes = Slopes(longer, np.zeros((len(directions), stress.size)))
+        elif moved:
             top = np.array(self.values)
             stress, strain, branches = self._stretched(rows, heights, wanted)
             fine = True
@@ -214,8 +236,7 @@ class Plan(NamedTuple):
             stress, top = np.array(self.values), np.empty(self.time.size)
             strain, branches = _new_history(len(heights) if wanted else 0, self.time.size)
             fine = kernels.strains_along(rows, heights, stress, top, strain, branches)
-        slopes: Slopes | None = None
-        if len(directions):
+        if len(directions) and slopes is None:
             slopes = Slopes(
                 *equilibrium_tangents(rows, heights, strain, branches, moved, directions)
             )
@@ -374,6 +395,7 @@ def plan(
     t: ArrayLike,
     *,
     dashpots: bool = False,
+    relaxing: bool = False,
     max_steps: int = MAX_STEPS,
 ) -> Plan:
     """Find what a scene needs: the nodes that have a state, and the least solver.
@@ -389,6 +411,8 @@ def plan(
         Samples, s, increasing.
     dashpots : bool
         Whether to reckon with a dashpot in every spring, also where it is zero.
+    relaxing : bool
+        Whether to reckon with the relaxation terms that there are, also where they are zero.
     max_steps : int
         Bound on steps; there are others on steps times springs.
 
@@ -421,7 +445,7 @@ def plan(
         inside = np.flatnonzero(chain.arrays.masses[:-1] > 0.0)
         ends = np.append(inside + 1, ends)
         masses = np.append(chain.arrays.masses[inside] / chain.area, masses)
-    relaxing = any(chain.relaxation)
+    relaxing |= any(g > 0.0 for spring in chain.springs for g, _ in spring.relaxation)
     memory = relaxing or any(spring.kind == MICROSCALE for spring in chain.springs)
     alone = top == scenes.MOTION and len(chain.springs) == 1
     damped = dashpots or chain.arrays.damped or top == scenes.VISCOUS

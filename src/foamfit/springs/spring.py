@@ -127,7 +127,8 @@ class _Law(ABC):
     def stress(self, strain: ArrayLike) -> Array:
         """Stress (Pa) along a strain history, shape (n,), from rest.
 
-        One flag is carried along the history (eqs. 2 and 3); the first sample starts with flag a.
+        One flag is carried along the history (eqs. 2 and 3), or the fraction that has snapped; the
+        first sample starts with flag a and nothing snapped.
         A single strain gives a single stress.
 
         Raises
@@ -148,12 +149,9 @@ class _Law(ABC):
             If the spring cannot carry a tension: beyond the pole of branch a (-k0), or any on a
             unilateral spring.
         """
-        from foamfit.springs import kernels
-
         history = _as_history(stress, "stress")
-        strain, none = np.empty(history.size), np.empty((0, history.size))
-        row = self.row[None, :]  # of height 1: its elongation is its strain
-        if not kernels.strains_along(row, np.ones(1), history, strain, none, none.astype(np.int64)):
+        strain = self._strain_along(history)
+        if not np.all(np.isfinite(strain)):
             at = _first(~np.isfinite(strain))
             raise SimulationError(
                 f"stress {history[at]:g} Pa (sample {at}) is a tension that the spring cannot carry"
@@ -162,17 +160,45 @@ class _Law(ABC):
 
     def tangent(self, strain: ArrayLike) -> Array:
         """Slope dσ/dε (Pa) on the branch of each sample of a strain history, shape (n,)."""
+        return self._slope_along(self._along(strain)[0]).reshape(np.shape(strain))
+
+    def branches(self, strain: ArrayLike) -> NDArray[np.str_]:
+        """Name the branch of each sample of a strain history, shape (n,).
+
+        A bistable spring is on "a", "d", "c" or "e"; a microscale spring on "a" while none of it
+        has snapped, then on "held" (what has snapped stays so), "snap-through", "snap-back" or
+        "reversible" (both at one stress); a linear spring on "line" or, out of contact, "open".
+        """
         from foamfit.springs import kernels
 
-        history, _, branches = self._along(strain)
-        return kernels.tangent_along(self.row, history, branches).reshape(np.shape(strain))
+        names = np.array(kernels.BRANCH_NAMES)[self._along(strain)[2]]
+        return names.reshape(np.shape(strain))
+
+    def _stress_along(self, strain: Array) -> tuple[Array, NDArray[np.int64]]:
+        """Stresses and branches of a strain history."""
+        from foamfit.springs import kernels
+
+        return kernels.stress_along(self.row, strain)
+
+    def _strain_along(self, stress: Array) -> Array:
+        """Strains of a stress history; not finite where the spring cannot have its stress."""
+        from foamfit.springs import kernels
+
+        strain, none = np.empty(stress.size), np.empty((0, stress.size))
+        row = self.row[None, :]  # of height 1: its elongation is its strain
+        kernels.strains_along(row, np.ones(1), stress, strain, none, none.astype(np.int64))
+        return strain
+
+    def _slope_along(self, strain: Array) -> Array:
+        """Slopes of a strain history."""
+        from foamfit.springs import kernels
+
+        return kernels.tangent_along(self.row, strain, self._stress_along(strain)[1])
 
     def _along(self, strain: ArrayLike) -> tuple[Array, Array, NDArray[np.int64]]:
         """Strains, stresses and branches of a strain history."""
-        from foamfit.springs import kernels
-
         history = _as_history(strain, "strain")
-        stress, branches = kernels.stress_along(self.row, history)
+        stress, branches = self._stress_along(history)
         if not np.all(np.isfinite(stress)):
             at = _first(~np.isfinite(stress))
             raise SimulationError(
@@ -290,13 +316,6 @@ class BistableSpring(_Law):
 
         return kernels.bistable_row(*self.seven, self.eta)
 
-    def branches(self, strain: ArrayLike) -> NDArray[np.str_]:
-        """Name the branch, "a", "d", "c" or "e", of each sample of a strain history, shape (n,)."""
-        from foamfit.springs import kernels
-
-        names = np.array(kernels.BRANCH_NAMES)[self._along(strain)[2]]
-        return names.reshape(np.shape(strain))
-
 
 @dataclass(frozen=True)
 class MicroscaleSpring(_Law):
@@ -367,6 +386,23 @@ class MicroscaleSpring(_Law):
         from foamfit.springs import kernels
 
         return kernels.microscale_row(*(getattr(self, name) for name in _numbers_of(self)))
+
+    def _stress_along(self, strain: Array) -> tuple[Array, NDArray[np.int64]]:
+        from foamfit.springs import microscale_kernels
+
+        stress, _, branches = microscale_kernels.stress_along(self.row, strain)
+        return stress, branches
+
+    def _strain_along(self, stress: Array) -> Array:
+        from foamfit.springs import microscale_kernels
+
+        return microscale_kernels.strain_along(self.row, stress)[0]
+
+    def _slope_along(self, strain: Array) -> Array:
+        from foamfit.springs import microscale_kernels
+
+        path = microscale_kernels.stress_along(self.row, strain)
+        return microscale_kernels.stress_tangents_along(self.row, strain, *path)[1]
 
 
 @dataclass(frozen=True)
