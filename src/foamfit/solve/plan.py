@@ -163,13 +163,13 @@ class Plan(NamedTuple):
         SimulationError
             If the scene has no finite answer; the message says why.
         """
-        if self.memory and self.solver != CLOSED_FORM:
-            raise SimulationError(_WITH_MEMORY)
         if self.solver == CLOSED_FORM:
             return self._closed_form(rows, heights, rtol, everything, directions)
         p, time = len(directions), self.time
         curves = np.empty((1 + len(heights) if everything else 2, time.size))
         slopes = np.empty((p, *curves.shape)) if p else NO_SLOPES
+        if self.memory:
+            return self._remembered(rows, heights, drag, rtol, curves, slopes, directions, everything)
         bounces = self.plain and not drag and self.implicit is None
         stiff = not bounces and self._is_stiff(self.given(rows, heights, drag))
         if p == 0 and not stiff and len(heights) >= LEAST_AGGREGATE and self._is_one(rows):
@@ -193,6 +193,28 @@ class Plan(NamedTuple):
             self.max_steps, directions, start, curves, slopes, log, np.zeros(2, np.int64),
         )  # fmt: skip
         return _motion(RADAU, ending, curves, slopes, log, lost)
+
+    def _remembered(
+        self,
+        rows: Array,
+        heights: Array,
+        drag: float | None,
+        rtol: float,
+        curves: Array,
+        slopes: Array,
+        directions: Directions,
+        everything: bool,
+    ) -> Motion:
+        """Springs with memory, by explicit steps."""
+        start = _AT_REST if self.top in _RESTING else np.zeros((1 + len(directions), len(heights)))
+        log = np.empty((LOGGED, 5)) if everything else NO_SWITCHES
+        cache.announce(taylor.integrate_with_memory, "the solver of springs with memory")
+        ending = taylor.integrate_with_memory(
+            rows, heights, self.ends, self.mass, self.drag if drag is None else drag, self.top,
+            self.values, self.speed, self.time, self.margin * rtol, self.max_steps, directions,
+            start, curves, slopes, log,
+        )  # fmt: skip
+        return _motion(TAYLOR, ending, curves, slopes, log)
 
     def given(self, rows: Array, heights: Array, drag: float | None = None) -> scenes.SceneTuple:
         """The scene with these springs (and onsite damping) as the compiled integrators take it."""
