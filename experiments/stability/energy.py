@@ -59,7 +59,7 @@ def _cuts(chain: Any, most: float, rising: bool) -> Array:
         if rising:
             continue
         held = math.log(most / spring.sigma_plus) / spring.spread_plus
-        cuts.append(spring.sigma_minus * math.exp(spring.spread_minus * held))
+        cuts.append(spring.sigma_minus * math.exp(min(spring.spread_minus * held, 600.0)))
         apart = 1.0 / spring.spread_minus - 1.0 / spring.spread_plus
         if apart != 0.0:
             at = math.log(spring.sigma_minus) / spring.spread_minus

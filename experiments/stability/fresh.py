@@ -500,7 +500,10 @@ def slopes_of(spec: Spec, name: str, most: int) -> tuple[Array, Array, NDArray[n
         sides = []
         for sign in (1.0, -1.0):
             other, value = moved(spec, name, 1.0 + sign * step)
-            scene = scene_from(other)
+            try:
+                scene = scene_from(other)
+            except ValueError:  # the scene is at the end of what is admissible
+                return None
             truth = follower(scene)(*scene, LOOSE, most)
             if truth.why:
                 return None

@@ -66,7 +66,8 @@ HELD, SNAP, BACK, BOTH = range(7, 11)
 # Columns of a microscale spring beside K0, KC, ETA and H.
 EPS_STAR, LOG_PLUS, WIDE_PLUS, LOG_MINUS, WIDE_MINUS = 2, 3, 4, 5, 6
 FAR = 8.0  # standard deviations beyond which the normal distribution is 0 or 1 to rounding
-NEVER = 1e300
+# What only other loops call is compiled once, as a part of them.
+inner = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
 # ------------------------------------------------------------------------------------ the law
@@ -81,7 +82,7 @@ def _microscale(spring: Any, height: float) -> list[float]:
     return row
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def _score(p: Array, branch: int, rank: float, s: float) -> tuple[float, float]:
     """Normal score of what is snapped, and the spread by which it follows ln s (0 = held)."""
     if branch == HELD:
@@ -93,7 +94,7 @@ def _score(p: Array, branch: int, rank: float, s: float) -> tuple[float, float]:
     return (math.log(s) - p[LOG_PLUS]) / p[WIDE_PLUS], p[WIDE_PLUS]
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def _mixture(p: Array, branch: int, rank: float, s: float) -> tuple[float, float]:
     """Strain of a microscale spring at a stress, and dε/ds; infinite past the pole."""
     u, wide = _score(p, branch, rank, s)
@@ -108,7 +109,7 @@ def _mixture(p: Array, branch: int, rank: float, s: float) -> tuple[float, float
     return whole * a + snapped * c, soft
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def _lag(p: Array, log_s: float) -> float:
     """Score of snap-back less that of snap-through at a stress; above 0 the spring is hysteretic.
 
@@ -123,7 +124,7 @@ def _lag(p: Array, log_s: float) -> float:
     return log_s * slope + constant
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def _meets(p: Array) -> tuple[float, bool]:
     """Stress at which both scores are the same, and whether the spring is hysteretic above it."""
     slope = 1.0 / p[WIDE_MINUS] - 1.0 / p[WIDE_PLUS]
@@ -136,7 +137,7 @@ def _meets(p: Array) -> tuple[float, bool]:
     return (math.exp(at) if at > -690.0 else -math.inf), slope > 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def _ends(p: Array, branch: int, rank: float) -> tuple[float, float, int, int]:
     """What a branch is followed between (stress or strain), and the branches beyond."""
     if branch < HELD:
@@ -159,7 +160,7 @@ def _ends(p: Array, branch: int, rank: float) -> tuple[float, float, int, int]:
 # ----------------------------------------------------------------------------- the equations
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def _rates(
     y: Array,
     out: Array,
@@ -279,7 +280,7 @@ def _rates(
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def _over(
     y: Array, rates: Array, moving: int, branch: Integers, ranks: Array, springs: Array,
     base: float, lifts: bool, peak: float, paces: Array,
@@ -302,7 +303,7 @@ def _over(
     return worst
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def _leaps(
     y: Array, y1: Array, moving: int, branch: Integers, ranks: Array, springs: Array
 ) -> bool:
@@ -317,7 +318,7 @@ def _leaps(
     return False
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def _step(
     y: Array, h: float, k: Array, y1: Array, some: Array, scale: Array, reach: Array, stress: Array,
     branch: Integers, ranks: Array, springs: Array, relax: Array, ends: Integers, mass: Array,
@@ -361,7 +362,7 @@ def _step(
     return abs(h) * norm5 / math.sqrt((norm5 + 0.01 * norm3) * size)
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def _record(
     y: Array, moving: int, branch: Integers, ranks: Array, springs: Array, times: Array, now: float,
     done: int, pressure: float, nodes: Array, base: Array,
@@ -377,12 +378,12 @@ def _record(
     return done
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def _strain(x: float, branch: int, rank: float, p: Array) -> float:
     return _mixture(p, branch, rank, x)[0] if branch >= HELD else x
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def _enter(
     y: Array, rates: Array, moving: int, branch: Integers, ranks: Array, springs: Array
 ) -> int:
