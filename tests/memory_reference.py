@@ -19,7 +19,8 @@ import foamfit as ff
 from foamfit.springs.chain import Drive
 
 Array = NDArray[np.float64]
-PLUS, MINUS, HELD, BOTH = "plus", "minus", "held", "both"
+PLUS, MINUS, HELD, BOTH, VIRGIN = "plus", "minus", "held", "both", "virgin"
+LEAST = -12.0  # rank below which a share of 2e-33 has snapped
 
 
 class Linear:
@@ -79,8 +80,7 @@ class Microscale(Linear):
     """Section 6 of the model: p in ranks, from p = 0 on."""
 
     def __init__(self, spring: Any) -> None:
-        self.spring, self.rank = spring, -math.inf
-        self.mode = PLUS if self._hysteretic(0.0, 1) else BOTH
+        self.spring, self.rank, self.mode = spring, LEAST, VIRGIN
 
     def _of(self, minus: bool) -> tuple[float, float]:
         p = self.spring
@@ -105,11 +105,10 @@ class Microscale(Linear):
     def strain(self, s: float) -> tuple[float, float]:
         p = self.spring
         middle, spread = self._of(self.mode == MINUS)
-        u, steep = self.rank, 0.0
-        if self.mode != HELD:
-            u = math.log(s / middle) / spread if s > 0.0 else -math.inf
-            if u > -30.0:
-                steep = math.exp(-0.5 * u * u) / math.sqrt(2.0 * math.pi) / (spread * s)
+        u, steep = self.rank if self.mode == HELD else -math.inf, 0.0
+        if self.mode not in (HELD, VIRGIN) and s > 0.0:  # a trial may go past the event
+            u = math.log(s / middle) / spread
+            steep = math.exp(-0.5 * u * u) / math.sqrt(2.0 * math.pi) / (spread * s)
         snapped, rest = ndtr(u), ndtr(-u)
         a, c = s / (p.k0 + s), p.eps_star + s / (p.kc + s)
         soft = rest * p.k0 / (p.k0 + s) ** 2 + snapped * p.kc / (p.kc + s) ** 2
@@ -118,30 +117,33 @@ class Microscale(Linear):
     def ends(self) -> tuple[float, float]:
         p, cross = self.spring, self._cross()
         below = p.spread_minus >= p.spread_plus  # hysteretic below the crossing
+        plus, minus = (m * math.exp(w * self.rank) for m, w in (self._of(False), self._of(True)))
         if self.mode == HELD:
-            ends = [m * math.exp(w * self.rank) for m, w in (self._of(False), self._of(True))]
-            return min(ends), ends[0]
+            return min(plus, minus), plus
+        plus, minus = (m * math.exp(w * LEAST) for m, w in (self._of(False), self._of(True)))
+        if self.mode == VIRGIN:
+            return -math.inf, plus
         if self.mode == PLUS:
             return -math.inf, cross if below else math.inf
         if self.mode == MINUS:
-            return -math.inf if below else cross, math.inf
-        return (cross, math.inf) if below else (-math.inf, cross)
+            return minus if below else max(minus, cross), math.inf
+        return (max(plus, cross), math.inf) if below else (plus, cross)
 
     def turns(self) -> int:
         return {PLUS: -1, MINUS: 1}.get(self.mode, 0)
 
     def leave(self, s: float, side: int) -> None:
-        if not self._hysteretic(s, side):
+        if self.mode in (MINUS, BOTH) and side < 0 and s != self._cross():
+            self.mode = VIRGIN
+        elif not self._hysteretic(s, side):
             self.mode = BOTH
         else:
             self.mode = PLUS if side > 0 else MINUS
 
     def turn(self, s: float) -> None:
         middle, spread = self._of(self.mode == MINUS)
-        self.rank = math.log(s / middle) / spread if s > 0.0 else -math.inf
+        self.rank = math.log(s / middle) / spread
         self.mode = HELD
-        if self.rank < -30.0:  # virgin again
-            self.__init__(self.spring)  # type: ignore[misc]
 
 
 def law_of(spring: Any) -> Linear:
@@ -290,4 +292,7 @@ def follow(
                 laws[i].leave(laws[i].ends()[0 if side < 0 else 1], side)
         if not struck and now >= t[knot + 1] and knot < t.size - 2:
             knot += 1
+            if moved:  # a dashpot feels the mean rate
+                share = (now - t[knot - 1]) / (t[knot + 1] - t[knot - 1])
+                out_s[knot] += share * (rates(now, y)[1] - out_s[knot])
     return out_w, out_s, end, events

@@ -24,29 +24,38 @@ from typing import NamedTuple
 import numpy as np
 
 from foamfit.solve.polynomial import value_at
+from foamfit.springs import microscale_kernels as micro
 from foamfit.springs.kernels import (
     BACK,
-    BOTH,
     EPS_STAR,
     HELD,
     K0,
     KC,
-    LOG_CROSS,
+    KIND,
     LOG_MINUS,
     LOG_PLUS,
     N_COLUMNS,
-    SNAP,
     SPREAD_MINUS,
     SPREAD_PLUS,
-    A,
     Array,
     Branches,
-    Row,
+    inlined,
     inner,
     maker,
-    piece,
 )
-from foamfit.springs.law import LEAST_RANK
+from foamfit.springs.law import LEAST_RANK, MICROSCALE
+from foamfit.springs.microscale_kernels import (
+    BRANCH,
+    CARRIED,
+    EPS,
+    FLEXIBILITY,
+    HIGH,
+    LOW,
+    RANK,
+    REST,
+    SIGMA,
+    STATE,
+)
 from foamfit.springs.parameters import OWN_ETA, OWN_RELAXATION
 
 # Rows of `Memory.series`: equilibrium stress s; 1 - a, 1 + eps_star - c; P; n u_n, u_n, φ, h.
@@ -54,27 +63,28 @@ EQ, BELOW_A, BELOW_C, SNAPPED, PACE, SCORE, DENSITY, BEND, N_MEMORY = range(9)
 # Rows of `Memory.partials`: the derivatives of the strain at fixed stress by the seven parameters
 # of the law, by p, and by the stress; then what these are made of.
 BY_RANK, BY_STRESS, SQUARE_A, SQUARE_C, WIDTH, STEEP, N_PARTIALS = range(7, 14)
-# Columns of `Memory.now`: equilibrium stress where the step starts; what is held, as a normal
-# score, p and 1 - p; place and scale of the normal distribution that is followed; 1 + Σ g; dε/ds
-# where the step starts, and dε/dΣ; what of a derivative of Σ is not the law's.
-STRESS, RANK, FRACTION, REST, PLACE, SCALE, GAIN, GIVE, SOFT, BASE, N_NOW = range(11)
-# A strain is past where a spring turned if it is so much larger, over itself.
+# Columns of `Memory.now`: place and scale of the normal distribution that is followed, p and 1 - p
+# where the step starts, 1 + Σ g; dε/ds there, and dε/dΣ; what of a derivative of Σ is not of s.
+PLACE, SCALE, FRACTION, LEFT, GAIN, GIVE, SOFT, BASE, N_NOW = range(9)
+# A held spring is past where it turned if its strain is, by so much of itself.
 MARGIN = 1e-13
-ROOT_HALF = math.sqrt(0.5)
-DENSITY_0 = 1.0 / math.sqrt(2.0 * math.pi)
+# So much may the normal score change in a step where P hardly changes yet.
+FAR = 2.0
 
 
 class Memory(NamedTuple):
     """What springs remember, and its series and derivatives.
 
-    rows (springs, columns) are the springs, now (springs, N_NOW) the numbers above, series
-    (N_MEMORY, springs, order + 2), z (terms, springs, order + 2) the relaxation. `partials`
-    (N_PARTIALS, springs, order + 2) are filled where derivatives are wanted; of these, in p
-    `directions` (p, 2), `ranks` (p, springs) are those of the normal scores and `tangents`
-    (p, 1 + terms, springs, order + 2) the series of ε less its change at fixed stress, and of z.
+    rows (springs, columns) are the springs, state (springs, STATE) that of the microscale ones,
+    now (springs, N_NOW) the numbers above, series (N_MEMORY, springs, order + 2), z (terms,
+    springs, order + 2) the relaxation. `partials` (N_PARTIALS, springs, order + 2) are filled where
+    derivatives are wanted; of these, in p `directions` (p, 2), `ranks` (p, springs) are those of
+    what is held and `tangents` (p, 1 + terms, springs, order + 2) the series of ε less its change
+    at fixed stress, and of z. `scratch` is (2, CARRIED).
     """
 
     rows: Array
+    state: Array
     now: Array
     series: Array
     z: Array
@@ -82,6 +92,7 @@ class Memory(NamedTuple):
     directions: Branches
     ranks: Array
     tangents: Array
+    scratch: Array
 
 
 @maker
@@ -90,6 +101,7 @@ def make_memory(rows: Array, order: int, directions: Branches) -> Memory:
     count, terms, size = rows.shape[0], (rows.shape[1] - N_COLUMNS) // 2, directions.shape[0]
     memory = Memory(
         rows,
+        np.zeros((count, STATE)),
         np.zeros((count, N_NOW)),
         np.zeros((N_MEMORY, count, order + 2)),
         np.zeros((terms, count, order + 2)),
@@ -97,190 +109,68 @@ def make_memory(rows: Array, order: int, directions: Branches) -> Memory:
         directions,
         np.zeros((size, count)),
         np.zeros((size, 1 + terms, count, order + 2)),
+        np.empty((2, CARRIED)),
     )
     for i in range(count):
         gain = 1.0
         for k in range(terms):
             gain += rows[i, N_COLUMNS + 2 * k]
         memory.now[i, GAIN] = gain
+        if rows[i, KIND] == MICROSCALE:
+            micro.begin(rows[i], memory.state[i])
     return memory
 
 
-# ---------------------------------------------------------------- the law
+# ---------------------------------------------------------------- from branch to branch
 
 
 @inner
-def _strain_and_slope(row: Row, now: Row, moving: bool, s: float) -> tuple[float, float]:
-    """Strain of a microscale spring at the stress s > 0, and its slope dε/ds."""
-    a, c, p, q, steep = 1.0 / (row[K0] + s), 1.0 / (row[KC] + s), now[FRACTION], now[REST], 0.0
-    if moving:
-        u = (math.log(s) - now[PLACE]) / now[SCALE]
-        p, q = 0.5 * math.erfc(-ROOT_HALF * u), 0.5 * math.erfc(ROOT_HALF * u)
-        steep = DENSITY_0 * math.exp(-0.5 * u * u) / (now[SCALE] * s)
-    strain = q * s * a + p * (row[EPS_STAR] + s * c)
-    gap = row[EPS_STAR] + s * (c - a)
-    return strain, q * row[K0] * a * a + p * row[KC] * c * c + gap * steep
-
-
-@piece
-def stress_of_mixture(row: Row, now: Row, moving: bool, eps: float) -> float:
-    """Stress at a strain: guarded Newton from where the last step led; infinite at the pole."""
-    s, low, high = now[STRESS], 0.0, math.inf
-    for _ in range(400):
-        value, slope = _strain_and_slope(row, now, moving, s)
-        if value > eps:
-            high = s
-        else:
-            low = s
-        trial = s - (value - eps) / slope
-        if abs(trial - s) <= 1e-10 * s:  # its error is squared
-            return trial
-        if not low < trial < high:
-            trial = 2.0 * s if high == math.inf else 0.5 * (low + high)
-            if trial in (low, high):
-                return s
-        if trial > 1e290:
-            break
-        s = trial
-    return math.inf
+def load(memory: Memory, i: int, eps: float) -> int:
+    """Load a microscale spring from rest to a strain in one go; returns its branch."""
+    row, state = memory.rows[i], memory.state[i]
+    while micro.leaves(state, eps):
+        micro.switch(row, state, eps > state[EPS])
+    micro.settle(row, state, eps)
+    return int(state[BRANCH])
 
 
 @inner
-def is_hysteretic(row: Row, log_s: float, ahead: float) -> bool:
-    """Whether snap-back of a rank lies below its snap-through, a little `ahead` (±1) of a stress.
-
-    So it is below the stress at which both meet where spread_minus >= spread_plus, else above.
-    """
-    beyond = log_s - row[LOG_CROSS]
-    if beyond == 0.0:
-        beyond = ahead
-    return beyond < 0.0 if row[SPREAD_MINUS] >= row[SPREAD_PLUS] else beyond > 0.0
-
-
-@inner
-def _limits(row: Row, branch: int, rank: float) -> tuple[float, float]:
-    """Logarithms of the stresses (low, high) at which a microscale spring leaves a branch.
-
-    Below LEAST_RANK it counts as virgin, above -LEAST_RANK as wholly snapped.
-    """
-    cross = row[LOG_CROSS]
-    steeper = row[SPREAD_MINUS] >= row[SPREAD_PLUS]  # then it is hysteretic below the crossing
-    least, most = row[LOG_PLUS] + row[SPREAD_PLUS] * LEAST_RANK, math.inf
-    if branch == A:
-        return -math.inf, least
-    if branch == HELD:
-        at_plus = row[LOG_PLUS] + row[SPREAD_PLUS] * rank
-        at_minus = row[LOG_MINUS] + row[SPREAD_MINUS] * rank
-        return min(at_plus, at_minus), (at_plus if rank < -LEAST_RANK else math.inf)
-    most = row[LOG_PLUS] - row[SPREAD_PLUS] * LEAST_RANK
-    if branch == SNAP:
-        return -math.inf, (min(most, cross) if steeper else most)
-    if branch == BACK:
-        least = row[LOG_MINUS] + row[SPREAD_MINUS] * LEAST_RANK
-        return (least if steeper else max(least, cross)), math.inf
-    return (max(least, cross) if steeper else least), (most if steeper else min(most, cross))
-
-
-@inner
-def next_branch(row: Row, branch: int, rank: float, side: int) -> int:
-    """Branch that a microscale spring enters at the end of its branch, above (1) or below (-1)."""
-    low, high = _limits(row, branch, rank)
-    at = high if side > 0 else low
-    if branch in (SNAP, BACK, BOTH) and at != row[LOG_CROSS]:
-        return HELD if side > 0 else A
-    if is_hysteretic(row, at, side):
-        return SNAP if side > 0 else BACK
-    return BOTH
-
-
-@inner
-def end_of_virgin(row: Row) -> float:
-    """Strain at which a virgin microscale spring leaves branch a."""
-    s = math.exp(_limits(row, A, 0.0)[1])
-    return s / (row[K0] + s)
-
-
-@inner
-def enter_mixture(memory: Memory, i: int, branch: int) -> tuple[float, float]:
-    """Write the branch, other than a, that a microscale spring enters; strains of its ends."""
-    row, now = memory.rows[i], memory.now[i]
-    back, rank, moving = branch == BACK, now[RANK], branch != HELD
-    now[PLACE] = row[LOG_MINUS] if back else row[LOG_PLUS]
-    now[SCALE] = row[SPREAD_MINUS] if back else row[SPREAD_PLUS]
-    now[FRACTION] = 0.5 * math.erfc(-ROOT_HALF * rank)
-    now[REST] = 0.5 * math.erfc(ROOT_HALF * rank)
+def enter_mixture(memory: Memory, i: int) -> tuple[float, float]:
+    """Prepare for the branch that a microscale spring has entered; the strains of its ends."""
+    row, state, now = memory.rows[i], memory.state[i], memory.now[i]
+    branch, low, high = int(state[BRANCH]), state[LOW], state[HIGH]
+    now[PLACE] = row[LOG_MINUS] if branch == BACK else row[LOG_PLUS]
+    now[SCALE] = row[SPREAD_MINUS] if branch == BACK else row[SPREAD_PLUS]
     for own in range(3, OWN_ETA):
         for n in range(memory.partials.shape[2]):
             memory.partials[own, i, n] = 0.0
-    low, high = _limits(row, branch, rank)
-    first, last = -math.inf, math.inf
-    if low > -math.inf:
-        first = _strain_and_slope(row, now, moving, math.exp(low))[0]
-    if high < math.inf:
-        last = _strain_and_slope(row, now, moving, math.exp(high))[0]
-    if not moving:
-        first, last = first * (1.0 - MARGIN), last * (1.0 + MARGIN)
-    return first, last
+    if branch == HELD:
+        low, high = low * (1.0 - MARGIN), high * (1.0 + MARGIN)
+    return low, high
 
 
 @inner
-def leave(memory: Memory, i: int, branch: int, side: int) -> None:
-    """Write the stress, and a full rank, with which a microscale spring leaves a branch's end."""
-    now = memory.now[i]
-    low, high = _limits(memory.rows[i], branch, now[RANK])
-    now[STRESS] = math.exp(high if side > 0 else low)
-    if branch in (SNAP, BOTH) and side > 0:
-        now[RANK] = -LEAST_RANK
-        for p in range(memory.directions.shape[0]):
-            memory.ranks[p, i] = 0.0
+def leave(memory: Memory, i: int, eps: float, up: bool, turning: bool, d_eps: Array) -> int:
+    """Let a microscale spring leave its branch, at an end or where it turns; returns the next.
 
-
-@inner
-def hold(memory: Memory, i: int, branch: int, eps: float, d: Array) -> None:
-    """Keep the rank at which a microscale spring turns, and its derivatives.
-
-    d (p, springs) holds those of the strain. Where the stress turns they do not feel when it does.
+    d_eps (p, springs) holds the derivatives of the strain. Where the stress turns, what is held
+    from then on does not feel when it does.
     """
-    row, now = memory.rows[i], memory.now[i]
-    s = stress_of_mixture(row, now, True, eps)
-    u = (math.log(s) - now[PLACE]) / now[SCALE]
-    soft = _strain_and_slope(row, now, True, s)[1]
-    p, q = 0.5 * math.erfc(-ROOT_HALF * u), 0.5 * math.erfc(ROOT_HALF * u)
-    a, c = 1.0 / (row[K0] + s), 1.0 / (row[KC] + s)
-    steep = DENSITY_0 * math.exp(-0.5 * u * u) / now[SCALE] * (row[EPS_STAR] + s * (c - a))
-    now[STRESS], now[RANK] = s, u
-    place = 5 if branch == BACK else 3
-    for k in range(memory.directions.shape[0]):
-        own = memory.directions[k, 1] if memory.directions[k, 0] == i else OWN_ETA
-        change, moved = d[k, i], 0.0
-        if own == 0:
-            change += q * s * a * a
-        elif own == 1:
-            change += p * s * c * c
-        elif own == 2:
-            change -= p
-        elif own == place:
-            moved = math.exp(-now[PLACE])
-        elif own == place + 1:
-            moved = u
-        change += steep * moved
-        memory.ranks[k, i] = (change / (soft * s) - moved) / now[SCALE]
-
-
-@inner
-def loaded_branch(memory: Memory, i: int, eps: float) -> int:
-    """Branch of a microscale spring that was loaded from rest to a strain in one go."""
-    row, now = memory.rows[i], memory.now[i]
-    if eps <= end_of_virgin(row):
-        return A
-    now[STRESS] = math.exp(_limits(row, A, 0.0)[1])
-    enter_mixture(memory, i, SNAP)
-    s = stress_of_mixture(row, now, True, eps)
-    now[STRESS] = s
-    if s >= math.exp(now[PLACE] - LEAST_RANK * now[SCALE]):
-        now[RANK] = -LEAST_RANK
-        return HELD
-    return SNAP if is_hysteretic(row, math.log(s), 1.0) else BOTH
+    row, state, now = memory.rows[i], memory.state[i], memory.now[i]
+    if turning:
+        state[FLEXIBILITY] = 0.0
+        micro.settle(row, state, eps)
+        rank, d_rank = micro.rank_now(row, state), memory.scratch[0]
+        slope = micro.tangents(
+            row, int(state[BRANCH]), rank, state[SIGMA], eps, d_rank, memory.scratch[1]
+        )
+        for k in range(memory.directions.shape[0]):
+            own = memory.directions[k, 1]
+            known = memory.directions[k, 0] == i and own < OWN_ETA
+            moved = slope * d_eps[k, i] / (now[SCALE] * state[SIGMA])
+            memory.ranks[k, i] = moved + (d_rank[own] if known else 0.0)
+    micro.switch(row, state, up)
+    return int(state[BRANCH])
 
 
 @inner
@@ -306,28 +196,25 @@ def start_relaxed_tangent(memory: Memory, p: int, i: int, change: float) -> None
 @inner
 def start_mixture(memory: Memory, i: int, moving: bool, eps: float) -> float:
     """Order 0 of a microscale spring: the stress at a strain, and all that follows from it."""
-    row, now, m = memory.rows[i], memory.now[i], memory.series
-    s = stress_of_mixture(row, now, moving, eps)
-    now[STRESS] = s
+    row, state, now, m = memory.rows[i], memory.state[i], memory.now[i], memory.series
+    micro.settle(row, state, eps)
+    s = state[SIGMA]
     below_a, below_c = row[K0] / (row[K0] + s), row[KC] / (row[KC] + s)
     m[BELOW_A, i, 0], m[BELOW_C, i, 0] = below_a, below_c
-    steep = 0.0
+    p, q, steep = state[micro.SNAPPED], state[REST], 0.0
     if moving:
         u = (math.log(s) - now[PLACE]) / now[SCALE]
-        now[FRACTION], now[REST] = 0.5 * math.erfc(-ROOT_HALF * u), 0.5 * math.erfc(ROOT_HALF * u)
-        density = DENSITY_0 * math.exp(-0.5 * u * u)
-        m[SCORE, i, 0], m[DENSITY, i, 0], m[BEND, i, 0] = u, density, u * density
-        steep = density / (now[SCALE] * s)
-    m[SNAPPED, i, 0] = now[FRACTION]
-    now[GIVE] = (
-        now[REST] * below_a / (row[K0] + s)
-        + now[FRACTION] * below_c / (row[KC] + s)
-        + (row[EPS_STAR] + below_a - below_c) * steep
-    )
+        p, q, at = micro.share(u), micro.share(-u), micro.density(u)
+        m[SCORE, i, 0], m[DENSITY, i, 0], m[BEND, i, 0] = u, at, u * at
+        steep = at / (now[SCALE] * s)
+    m[SNAPPED, i, 0] = now[FRACTION] = p
+    now[LEFT] = q
+    gap = row[EPS_STAR] + below_a - below_c
+    now[GIVE] = q * below_a / (row[K0] + s) + p * below_c / (row[KC] + s) + gap * steep
     return s
 
 
-@inner
+@inlined
 def strain_of_mixture(memory: Memory, i: int, moving: bool, n: int) -> float:
     """Order n >= 1 of the strain of a microscale spring, but for what that of its stress adds.
 
@@ -335,7 +222,7 @@ def strain_of_mixture(memory: Memory, i: int, moving: bool, n: int) -> float:
     """
     row, now, m = memory.rows[i], memory.now[i], memory.series
     s, below_a, below_c = m[EQ, i], m[BELOW_A, i], m[BELOW_C, i]
-    p, q = now[FRACTION], now[REST]
+    p, q = now[FRACTION], now[LEFT]
     by_a = by_c = 0.0
     if not moving:
         for j in range(1, n):
@@ -364,7 +251,7 @@ def strain_of_mixture(memory: Memory, i: int, moving: bool, n: int) -> float:
     return snapped[n] * gap - q * below_a[n] - p * below_c[n] + parts
 
 
-@inner
+@inlined
 def finish_mixture(memory: Memory, i: int, moving: bool, n: int, s_n: float) -> None:
     """Add to the series what order n >= 1 of the stress adds."""
     row, now, m = memory.rows[i], memory.now[i], memory.series
@@ -380,7 +267,7 @@ def finish_mixture(memory: Memory, i: int, moving: bool, n: int, s_n: float) -> 
         m[BEND, i, n] += m[SCORE, i, 0] * m[DENSITY, i, n] + m[SCORE, i, n] * m[DENSITY, i, 0]
 
 
-@inner
+@inlined
 def relaxed(memory: Memory, i: int, n: int) -> float:
     """Order n of Σ z_k of a spring."""
     total = 0.0
@@ -389,7 +276,7 @@ def relaxed(memory: Memory, i: int, n: int) -> float:
     return total
 
 
-@inner
+@inlined
 def keep(memory: Memory, i: int, n: int, s_n: float) -> None:
     """Write order n of a spring's equilibrium stress, and what relaxes in the next."""
     memory.series[EQ, i, n] = s_n
@@ -400,10 +287,14 @@ def keep(memory: Memory, i: int, n: int, s_n: float) -> None:
 
 @inner
 def longest(memory: Memory, i: int, span: float) -> float:
-    """Longest step, within `span`, over which a stress whose logarithm counts stays of one size."""
-    s = memory.series[EQ, i]
-    for _ in range(60):
-        if (abs(s[1]) + (abs(s[2]) + abs(s[3]) * span) * span) * span <= s[0]:
+    """Longest step, within `span`, over which the logarithm of a stress has a good series.
+
+    Where nearly none, or all, have snapped, the series do not show how soon the others do.
+    """
+    s, u, scale = memory.series[EQ, i], memory.series[SCORE, i, 0], memory.now[i, SCALE]
+    most = s[0] * min(1.0, scale * max(FAR, abs(u) + LEAST_RANK))
+    for _ in range(400):
+        if (abs(s[1]) + (abs(s[2]) + abs(s[3]) * span) * span) * span <= most:
             break
         span *= 0.75
     return span
@@ -413,8 +304,10 @@ def longest(memory: Memory, i: int, span: float) -> float:
 def advance_memory(memory: Memory, order: int, span: float) -> None:
     """Carry what relaxes over a step, and where the search for the stress starts."""
     for i in range(memory.now.shape[0]):
-        reached = value_at(memory.series[EQ, i], order, span)
-        memory.now[i, STRESS] = reached if reached > 0.0 else memory.now[i, STRESS]
+        if memory.state[i, BRANCH] >= HELD:
+            reached = value_at(memory.series[EQ, i], order, span)
+            memory.state[i, FLEXIBILITY] = 0.0
+            memory.state[i, SIGMA] = reached if reached > 0.0 else memory.state[i, SIGMA]
         for k in range(memory.z.shape[0]):
             memory.z[k, i, 0] = value_at(memory.z[k, i], order, span)
 
@@ -423,7 +316,9 @@ def advance_memory(memory: Memory, order: int, span: float) -> None:
 
 
 @inner
-def fill_partials(memory: Memory, i: int, moving: bool, back: bool, tilt: Array, order: int) -> None:
+def fill_partials(
+    memory: Memory, i: int, moving: bool, back: bool, tilt: Array, order: int
+) -> None:
     """Fill the derivatives of a spring's strain at fixed stress, and `tilt`, those dσ/dε."""
     row, now, m, out = memory.rows[i], memory.now[i], memory.series, memory.partials
     s, below_a, below_c = m[EQ, i], m[BELOW_A, i], m[BELOW_C, i]
@@ -433,7 +328,7 @@ def fill_partials(memory: Memory, i: int, moving: bool, back: bool, tilt: Array,
     by_place, by_scale = out[5 if back else 3, i], out[6 if back else 4, i]
     per_k0, per_kc, per_scale = 1.0 / row[K0], 1.0 / row[KC], 1.0 / now[SCALE]
     per_place = per_scale * math.exp(-now[PLACE])
-    p, q = now[FRACTION], now[REST]
+    p, q = now[FRACTION], now[LEFT]
     for n in range(order + 1):
         aa = cc = 0.0
         for j in range(n + 1):
@@ -470,15 +365,13 @@ def fill_partials(memory: Memory, i: int, moving: bool, back: bool, tilt: Array,
             known += by_stress[j] * tilt[n - j]
         tilt[n] = (now[GAIN] if n == 0 else -known) / by_stress[0]
     if not moving:
-        at_rank = DENSITY_0 * math.exp(-0.5 * now[RANK] * now[RANK])
+        at_rank = micro.density(memory.state[i, RANK])
         for n in range(order + 1):
             gap[n] *= at_rank
 
 
-@inner
-def tangent_of_mixture(
-    memory: Memory, k: int, i: int, moving: bool, tilt: Array, n: int
-) -> float:
+@inlined
+def tangent_of_mixture(memory: Memory, k: int, i: int, moving: bool, tilt: Array, n: int) -> float:
     """Order n of the derivative of (1 + Σ g) s in direction k, but for the term T_0 δε_n."""
     out, own = memory.tangents[k, 0, i], memory.directions[k, 1]
     change = 0.0
@@ -493,19 +386,19 @@ def tangent_of_mixture(
     return known
 
 
-@inner
+@inlined
 def relaxed_tangent(memory: Memory, k: int, i: int, n: int) -> float:
     """Order n of the derivative of Σ z_k, and of g s at fixed s, in direction k."""
     total = 0.0
     for term in range(memory.z.shape[0]):
         total += memory.tangents[k, 1 + term, i, n]
-        if memory.directions[k, 0] == i:
-            if memory.directions[k, 1] == OWN_RELAXATION + 2 * term:
-                total += memory.series[EQ, i, n]
+        own = OWN_RELAXATION + 2 * term
+        if memory.directions[k, 0] == i and memory.directions[k, 1] == own:
+            total += memory.series[EQ, i, n]
     return total
 
 
-@inner
+@inlined
 def keep_tangent(memory: Memory, k: int, i: int, n: int, d_eps: float, d_sig: float) -> None:
     """Go on with the derivatives of what relaxes from those of strain and stress of order n."""
     memory.tangents[k, 0, i, n] += d_eps

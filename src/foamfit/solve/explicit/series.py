@@ -30,7 +30,6 @@ from foamfit.solve.explicit.memory import (
     Memory,
     advance_memory,
     advance_memory_tangents,
-    end_of_virgin,
     enter_mixture,
     fill_partials,
     finish_mixture,
@@ -50,7 +49,6 @@ from foamfit.springs.kernels import (
     BACK,
     HELD,
     KIND,
-    A,
     Array,
     Branches,
     branch_shape,
@@ -62,6 +60,7 @@ from foamfit.springs.kernels import (
     piece,
 )
 from foamfit.springs.law import MICROSCALE
+from foamfit.springs.microscale_kernels import FIRST
 from foamfit.springs.parameters import DRAG, OWN_ETA, OWN_HEIGHT
 from foamfit.springs.sensitivities import branch_derivative
 
@@ -113,17 +112,15 @@ class SeriesTangents(NamedTuple):
 @inner
 def enter(rows: Array, i: int, branch: int, law: Array, memory: Memory | None) -> None:
     """Write the branch that spring i enters."""
-    if memory is not None:
-        if branch >= HELD:
-            law[i, CURVED] = float(branch)
-            law[i, LOW], law[i, HIGH] = enter_mixture(memory, i, branch)
-            return
+    if memory is not None and branch >= HELD:
+        law[i, CURVED] = float(branch)
+        law[i, LOW], law[i, HIGH] = enter_mixture(memory, i)
+        return
     curved, law[i, SLOPE], law[i, ORIGIN], law[i, OFFSET] = branch_shape(rows[i], branch)
     law[i, CURVED] = 1.0 if curved else 0.0
     law[i, LOW], law[i, HIGH] = interval(rows[i], branch)
-    if memory is not None:
-        if rows[i, KIND] == MICROSCALE:
-            law[i, LOW], law[i, HIGH] = -math.inf, end_of_virgin(rows[i])
+    if memory is not None and rows[i, KIND] == MICROSCALE:
+        law[i, LOW], law[i, HIGH] = -math.inf, memory.state[i, FIRST]
 
 
 @inner
@@ -299,10 +296,9 @@ def _share_elongation(
         elif flat < 0:
             flat = i
     s_n = 0.0 if flat >= 0 else rest / compliance
-    if memory is not None:
-        if flat >= 0:
-            s_n = relaxed(memory, flat, n)
-            rest -= s_n * compliance
+    if memory is not None and flat >= 0:
+        s_n = relaxed(memory, flat, n)
+        rest -= s_n * compliance
     for i in range(i0, i1):
         if law[i, DASHPOT] == 0.0:
             sig[i, n] = s_n
@@ -421,9 +417,7 @@ def is_bare(links: Links) -> bool:
 
 
 @inlined
-def expand_bare(
-    links: Links, s: Array, push: Array, order: int, memory: Memory | None
-) -> None:
+def expand_bare(links: Links, s: Array, push: Array, order: int, memory: Memory | None) -> None:
     """Fill the series of a chain that `is_bare`, as `expand` does, asking less at each order."""
     law, _, mass, drag, _ = links
     w, v, eps, sig, group = s[W], s[V], s[EPS], s[SIG], s[GROUP]

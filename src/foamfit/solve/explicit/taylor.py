@@ -13,14 +13,11 @@ import math
 import numpy as np
 
 from foamfit.solve.explicit.memory import (
-    RANK,
     Memory,
-    hold,
     leave,
-    loaded_branch,
+    load,
     longest,
     make_memory,
-    next_branch,
 )
 from foamfit.solve.explicit.series import (
     DASHPOT,
@@ -229,7 +226,9 @@ def first_turn(
             ahead = 1.0 if branches[i] == SNAP else -1.0
             for n in range(order):
                 c[n] = ahead * (n + 1) * s[EPS, i, n + 1]
-            when, where = (0.0, -1) if c[0] < 0.0 else first_crossing(c, order - 1, 0.0, math.inf, span)
+            when, where = (
+                (0.0, -1) if c[0] < 0.0 else first_crossing(c, order - 1, 0.0, math.inf, span)
+            )
             if where != 0 and (spring < 0 or when < span):
                 spring, span = i, (0.0 if when <= NOW * whole else when)
     return span, spring
@@ -439,19 +438,13 @@ def switch(
         if out == 0:
             continue
         left = branches[i]
-        if memory is None:
-            branches[i] = above(left) if out > 0 else below(left)
+        if out != TURN:
             s[EPS, i, 0] = high if out > 0 else low
-        elif out == TURN:
-            hold(memory, i, left, eps, d.series[:, EPS, :, 0])
-            branches[i] = HELD
-        else:
-            s[EPS, i, 0] = high if out > 0 else low
-            if rows[i, KIND] == MICROSCALE:
-                branches[i] = next_branch(rows[i], left, memory.now[i, RANK], out)
-                leave(memory, i, left, out)
-            else:
-                branches[i] = above(left) if out > 0 else below(left)
+        branches[i] = above(left) if out > 0 else below(left)
+        if memory is not None and rows[i, KIND] == MICROSCALE:
+            up = left == BACK if out == TURN else out > 0
+            moved = d.series[:, EPS, :, 0]
+            branches[i] = leave(memory, i, s[EPS, i, 0], up, out == TURN, moved)
         switches = log_switch(log, switches, now, i, left, branches[i], s[EPS, i, 0])
         enter(rows, i, branches[i], law, memory)
         enter_tangents(rows, i, branches[i], directions, d)
@@ -514,14 +507,12 @@ def begin(
                 if start[1 + p, i] != 0.0:
                     d.live[p] = 1.0
         law[i, DASHPOT], law[i, HEIGHT] = rows[i, ETA], heights[i]
-        if memory is not None:
-            if rows[i, KIND] == MICROSCALE:
-                branches[i] = A if start.shape[1] == 0 else loaded_branch(memory, i, start[0, i])
+        if memory is not None and rows[i, KIND] == MICROSCALE:
+            branches[i] = A if start.shape[1] == 0 else load(memory, i, start[0, i])
         enter(rows, i, branches[i], law, memory)
         enter_tangents(rows, i, branches[i], directions, d)
-        if memory is not None:
-            if start.shape[1] > 0:
-                start_relaxing(law, i, s, d, memory)
+        if memory is not None and start.shape[1] > 0:
+            start_relaxing(law, i, s, d, memory)
 
 
 @inner
