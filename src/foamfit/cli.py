@@ -458,7 +458,7 @@ def simulate(scene: Path, out: Path | None, plot: Path | None, rtol: float) -> N
         [chain]
         diameter = "5 mm"
         [[chain.springs]]               # from the base up
-        kind = "bistable"               # or "linear", "unilateral"
+        kind = "bistable"               # or "microscale", "linear", "unilateral"
         height = "1.19 mm"
         k0 = "5.5 MPa"
         kc = "82.5 MPa"
@@ -474,7 +474,9 @@ def simulate(scene: Path, out: Path | None, plot: Path | None, rtol: float) -> N
         [time]
         end = "1 ms"
         samples = 501
-    Instead of the springs, published = "foam-1/model-3" under [chain] takes a published set.
+    Instead of the springs, published = "foam-1/model-3" under [chain] takes a published set. A
+    microscale spring has k0, kc, eps_star, sigma_plus, spread_plus, sigma_minus and spread_minus;
+    it and the bistable one may relax: relaxation = [{ g = 0.5, tau = "0.2 s" }].
     """
     from foamfit.scene_file import files_of_scene, read_scene, write_response
     from foamfit.solve.simulation import simulate as run

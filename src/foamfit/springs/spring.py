@@ -383,9 +383,11 @@ class MicroscaleSpring(_Law):
     @cached_property
     def row(self) -> Row:
         """The spring as the kernels know it."""
-        from foamfit.springs import kernels
+        from foamfit.springs import microscale_kernels
 
-        return kernels.microscale_row(*(getattr(self, name) for name in _numbers_of(self)))
+        return microscale_kernels.microscale_row(
+            *(getattr(self, name) for name in _numbers_of(self))
+        )
 
     def _stress_along(self, strain: Array) -> tuple[Array, NDArray[np.int64]]:
         from foamfit.springs import microscale_kernels
