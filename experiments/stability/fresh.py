@@ -558,6 +558,7 @@ REASONS = {
     "not finite": "no longer finite",
     "flat branch under stress": "flat branch",
     "bound on steps": "the bound of",
+    "too fast for explicit steps": "are followed by explicit steps",
 }
 
 
@@ -625,7 +626,7 @@ def judged(
     try:
         found["slope"] = slope_error(spec, scene, rtol, most, known)
     except ff.SimulationError:
-        found["slope"] = math.nan
+        found["reason"] = "derivatives refused"
     if max(found["error"], np.nan_to_num(found["energy"])) > BAD or not math.isfinite(
         found["error"]
     ):
@@ -665,6 +666,7 @@ def summary(lines: pd.DataFrame) -> pd.DataFrame:
                 "largest": known.error.max(),
                 "largest energy": known.energy.max(),
                 "derivatives": int(known.slope.notna().sum()),
+                "refused derivatives": int((known.reason == "derivatives refused").sum()),
                 "wrong derivatives": int((known.slope > slope_bar(rtol)).sum()),
                 "longest s": group.seconds.max(),
             }
