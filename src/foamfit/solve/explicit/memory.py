@@ -79,8 +79,8 @@ class Memory(NamedTuple):
     now (springs, N_NOW) the numbers above, series (N_MEMORY, springs, order + 2), z (terms,
     springs, order + 2) the relaxation. `partials` (N_PARTIALS, springs, order + 2) are filled where
     derivatives are wanted; of these, in p `directions` (p, 2), `ranks` (p, springs) are those of
-    what is held and `tangents` (p, 1 + terms, springs, order + 2) the series of ε less its change
-    at fixed stress, and of z. `scratch` is (2, CARRIED).
+    what is held and `tangents` (p, 1 + terms, springs, order + 2) the series of s and z. `scratch`
+    is (2, CARRIED).
     """
 
     rows: Array
@@ -317,73 +317,78 @@ def advance_memory(memory: Memory, order: int, span: float) -> None:
 
 @inner
 def fill_partials(
-    memory: Memory, i: int, moving: bool, back: bool, tilt: Array, order: int
-) -> None:
-    """Fill the derivatives of a spring's strain at fixed stress, and `tilt`, those dσ/dε."""
+    memory: Memory, i: int, moving: bool, back: bool, eps: Array, order: int
+) -> float:
+    """Fill the derivatives of a spring's strain at fixed stress; returns the slope dΣ/dε now."""
     row, now, m, out = memory.rows[i], memory.now[i], memory.series, memory.partials
     s, below_a, below_c = m[EQ, i], m[BELOW_A, i], m[BELOW_C, i]
     snapped, score, density = m[SNAPPED, i], m[SCORE, i], m[DENSITY, i]
     square_a, square_c, width = out[SQUARE_A, i], out[SQUARE_C, i], out[WIDTH, i]
     gap, by_stress, steep = out[BY_RANK, i], out[BY_STRESS, i], out[STEEP, i]
+    by_k0, by_kc, by_star = out[0, i], out[1, i], out[2, i]
     by_place, by_scale = out[5 if back else 3, i], out[6 if back else 4, i]
-    per_k0, per_kc, per_scale = 1.0 / row[K0], 1.0 / row[KC], 1.0 / now[SCALE]
+    per_k0, per_kc, per_scale, per_s = 1.0 / row[K0], 1.0 / row[KC], 1.0 / now[SCALE], 1.0 / s[0]
     per_place = per_scale * math.exp(-now[PLACE])
-    p, q = now[FRACTION], now[LEFT]
+    p, q, star = now[FRACTION], now[LEFT], row[EPS_STAR]
+    at_rank = 1.0 if moving else micro.density(memory.state[i, RANK])
     for n in range(order + 1):
         aa = cc = 0.0
-        for j in range(n + 1):
+        for j in range((n + 1) // 2):
             aa += below_a[j] * below_a[n - j]
             cc += below_c[j] * below_c[n - j]
+        aa, cc, middle = 2.0 * aa, 2.0 * cc, n // 2
+        if n % 2 == 0:
+            aa += below_a[middle] * below_a[middle]
+            cc += below_c[middle] * below_c[middle]
         square_a[n], square_c[n] = aa, cc
-        gap[n] = below_a[n] - below_c[n]
+        gap[n] = at_rank * (below_a[n] - below_c[n] + (star if n == 0 else 0.0))
         qa, qaa, pc, pcc = q * below_a[n], q * aa, p * below_c[n], p * cc
-        out[2, i, n] = p if n == 0 else 0.0
-        if n == 0:
-            gap[0] += row[EPS_STAR]
+        by_star[n] = p if n == 0 else 0.0
+        by_stress[n] = 0.0
         if moving:
-            wide = gap[0] * density[n] if n > 0 else 0.0
+            wide = gap[0] * density[n]
             for j in range(1, n + 1):
                 qa -= snapped[j] * below_a[n - j]
                 qaa -= snapped[j] * square_a[n - j]
-                pc += snapped[j] * below_c[n - j]
                 pcc += snapped[j] * square_c[n - j]
                 wide += gap[j] * density[n - j]
-            width[n] = wide if n > 0 else gap[0] * density[0]
-            by_score, by_s = width[n] * score[0], width[n]
+            if n > 0:  # all of the strain is in these parts
+                pc = star * snapped[n] - qa - eps[n]
+            width[n] = wide
+            by_score, by_s = wide * score[0], wide
             for j in range(1, n + 1):
                 by_score += score[j] * width[n - j]
                 by_s -= s[j] * steep[n - j]
-            steep[n] = by_s / s[0]
-            out[2, i, n] = snapped[n]
-            by_place[n], by_scale[n] = -width[n] * per_place, -by_score * per_scale
-        out[0, i, n], out[1, i, n] = (qaa - qa) * per_k0, (pcc - pc) * per_kc
-        by_stress[n] = qaa * per_k0 + pcc * per_kc
-        if moving:
-            by_stress[n] += steep[n] * per_scale
-        known = 0.0
-        for j in range(1, n + 1):
-            known += by_stress[j] * tilt[n - j]
-        tilt[n] = (now[GAIN] if n == 0 else -known) / by_stress[0]
-    if not moving:
-        at_rank = micro.density(memory.state[i, RANK])
-        for n in range(order + 1):
-            gap[n] *= at_rank
+            steep[n] = by_s * per_s
+            by_star[n], by_stress[n] = snapped[n], steep[n] * per_scale
+            by_place[n], by_scale[n] = -wide * per_place, -by_score * per_scale
+        by_k0[n], by_kc[n] = (qaa - qa) * per_k0, (pcc - pc) * per_kc
+        by_stress[n] += qaa * per_k0 + pcc * per_kc
+    return now[GAIN] / by_stress[0]
 
 
 @inlined
-def tangent_of_mixture(memory: Memory, k: int, i: int, moving: bool, tilt: Array, n: int) -> float:
-    """Order n of the derivative of (1 + Σ g) s in direction k, but for the term T_0 δε_n."""
-    out, own = memory.tangents[k, 0, i], memory.directions[k, 1]
-    change = 0.0
+def tangent_of_mixture(memory: Memory, k: int, i: int, moving: bool, slope: float, n: int) -> float:
+    """Order n of the derivative of (1 + Σ g) s in direction k, but for what δε_n adds.
+
+    `slope` is dΣ/dε.
+    """
+    d_s, soft, own = (
+        memory.tangents[k, 0, i],
+        memory.partials[BY_STRESS, i],
+        memory.directions[k, 1],
+    )
+    even = odd = 0.0  # two sums at once
     if memory.directions[k, 0] == i and own < OWN_ETA:
-        change = memory.partials[own, i, n]
+        even = memory.partials[own, i, n]
     if not moving:
-        change += memory.partials[BY_RANK, i, n] * memory.ranks[k, i]
-    out[n] = -change
-    known = -tilt[0] * change
-    for j in range(n):
-        known += out[j] * tilt[n - j]
-    return known
+        odd = memory.partials[BY_RANK, i, n] * memory.ranks[k, i]
+    for j in range(1, n, 2):
+        even += soft[j] * d_s[n - j]
+        odd += soft[j + 1] * d_s[n - j - 1]
+    if n % 2 == 1:
+        even += soft[n] * d_s[0]
+    return -slope * (even + odd)
 
 
 @inlined
@@ -399,10 +404,9 @@ def relaxed_tangent(memory: Memory, k: int, i: int, n: int) -> float:
 
 
 @inlined
-def keep_tangent(memory: Memory, k: int, i: int, n: int, d_eps: float, d_sig: float) -> None:
-    """Go on with the derivatives of what relaxes from those of strain and stress of order n."""
-    memory.tangents[k, 0, i, n] += d_eps
-    d_s = (d_sig - memory.now[i, BASE]) / memory.now[i, GAIN]
+def keep_tangent(memory: Memory, k: int, i: int, n: int, d_sig: float) -> None:
+    """Write order n of the derivative of the equilibrium stress, and the next of what relaxes."""
+    d_s = memory.tangents[k, 0, i, n] = (d_sig - memory.now[i, BASE]) / memory.now[i, GAIN]
     for term in range(memory.z.shape[0]):
         g, tau = memory.rows[i, N_COLUMNS + 2 * term], memory.rows[i, N_COLUMNS + 2 * term + 1]
         dz = memory.tangents[k, 1 + term, i]

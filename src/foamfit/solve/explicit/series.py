@@ -209,13 +209,9 @@ def _law_stress(law: Array, i: int, eps: Array, sig: Array, n: int) -> float:
     return k * x * law[i, INVERSE]
 
 
-@inlined
-def _stress_term(
-    law: Array, i: int, eps: Array, sig: Array, n: int, memory: Memory | None
-) -> float:
-    """Order n of a spring's stress from its strain up to order n."""
-    if memory is None:
-        return _law_stress(law, i, eps, sig, n)
+@inner
+def _remembered_stress(law: Array, i: int, eps: Array, n: int, memory: Memory) -> float:
+    """Order n of the stress of a spring in a chain with memory; see `_stress_term`."""
     moving = law[i, CURVED] > HELD
     if law[i, CURVED] < HELD:
         s_n = _law_stress(law, i, eps, memory.series[EQ], n)
@@ -229,6 +225,16 @@ def _stress_term(
 
 
 @inlined
+def _stress_term(
+    law: Array, i: int, eps: Array, sig: Array, n: int, memory: Memory | None
+) -> float:
+    """Order n of a spring's stress from its strain up to order n."""
+    if memory is None:
+        return _law_stress(law, i, eps, sig, n)
+    return _remembered_stress(law, i, eps, n, memory)
+
+
+@inlined
 def _law_strain(law: Array, i: int, eps: Array, sig: Array, n: int) -> tuple[float, float]:
     """Order n >= 1 of a strain on a branch as (known part, compliance), as `_strain_term` does."""
     k = law[i, SLOPE]
@@ -237,6 +243,21 @@ def _law_strain(law: Array, i: int, eps: Array, sig: Array, n: int) -> tuple[flo
     stiff = k + sig[i, 0]
     known = _product(eps, sig, i, n)
     return -known / stiff, (1.0 - (eps[i, 0] - law[i, ORIGIN])) / stiff
+
+
+@inner
+def _remembered_strain(
+    law: Array, i: int, eps: Array, n: int, memory: Memory
+) -> tuple[float, float]:
+    """Order n >= 1 of the strain of a spring in a chain with memory; see `_strain_term`."""
+    if law[i, CURVED] < HELD:
+        known, soft = _law_strain(law, i, eps, memory.series[EQ], n)
+    else:
+        known = strain_of_mixture(memory, i, law[i, CURVED] > HELD, n)
+        soft = memory.now[i, GIVE]
+    soft /= memory.now[i, GAIN]
+    memory.now[i, SOFT] = soft
+    return (known - soft * relaxed(memory, i, n) if soft < math.inf else known), soft
 
 
 @inlined
@@ -249,14 +270,7 @@ def _strain_term(
     """
     if memory is None:
         return _law_strain(law, i, eps, sig, n)
-    if law[i, CURVED] < HELD:
-        known, soft = _law_strain(law, i, eps, memory.series[EQ], n)
-    else:
-        known = strain_of_mixture(memory, i, law[i, CURVED] > HELD, n)
-        soft = memory.now[i, GIVE]
-    soft /= memory.now[i, GAIN]
-    memory.now[i, SOFT] = soft
-    return (known - soft * relaxed(memory, i, n) if soft < math.inf else known), soft
+    return _remembered_strain(law, i, eps, n, memory)
 
 
 @inner
@@ -526,7 +540,7 @@ def _known_tangent(
             known += d[EPS, i, 0] * tilt[i, n] + _product(d[EPS], tilt, i, n)
     if memory is not None:
         if law[i, CURVED] >= HELD:
-            known = tangent_of_mixture(memory, p, i, law[i, CURVED] > HELD, tilt[i], n)
+            known = tangent_of_mixture(memory, p, i, law[i, CURVED] > HELD, tilt[i, 0], n)
         memory.now[i, BASE] = relaxed_tangent(memory, p, i, n)
         known += memory.now[i, BASE]
     if law[i, DASHPOT] == 0.0 and n + 2 < tilt.shape[1]:  # a dashpot of zero: what it would take
@@ -647,7 +661,7 @@ def _expand_tangent(
             i0, i1 = springs_of(links.ends, g)
             if memory is not None:
                 for i in range(i0, i1):
-                    keep_tangent(memory, p, i, n, d[EPS, i, n], d[SIG, i, n])
+                    keep_tangent(memory, p, i, n, d[SIG, i, n])
             if i1 - i0 > 1 or (g == last and links.top == STRESS):
                 for i in range(i0, i1):
                     if law[i, DASHPOT] > 0.0:
@@ -679,7 +693,9 @@ def expand_tangents(
         else:
             kind = links.law[i, CURVED]
             if kind >= HELD:
-                fill_partials(memory, i, kind > HELD, kind == BACK, s[TILT, i], order)
+                s[TILT, i, 0] = fill_partials(
+                    memory, i, kind > HELD, kind == BACK, s[EPS, i], order
+                )
             else:
                 _fill_tilt(links.law, i, memory.series[EQ], s[TILT], order)
                 for n in range(order + 1):
@@ -696,7 +712,7 @@ def start_relaxing(law: Array, i: int, s: Array, d: SeriesTangents, memory: Memo
     _stress_term(law, i, s[EPS], sig, 0, memory)
     kind, stress = law[i, CURVED], memory.series[EQ, i, 0]
     if kind >= HELD:
-        fill_partials(memory, i, kind > HELD, kind == BACK, tilt[i], 0)
+        tilt[i, 0] = fill_partials(memory, i, kind > HELD, kind == BACK, s[EPS, i], 0)
     else:
         _fill_tilt(law, i, memory.series[EQ], tilt, 0)
         tilt[i, 0] *= memory.now[i, GAIN]
