@@ -7,7 +7,6 @@ equilibrium stresses of the springs, ds/dt = (dε/dt)/(dε/ds), what relaxes, an
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -176,7 +175,7 @@ def follow(
         values = drive.stress
     elif isinstance(drive, ff.DisplacementDrive):
         values = drive.displacement
-    knot, free, pressed = 0, bool(heavy) and heavy[-1] == count - 1, not struck and not moved
+    knot, _free, pressed = 0, bool(heavy) and heavy[-1] == count - 1, not struck and not moved
 
     def rates(now: float, y: Array) -> tuple[Array, float]:
         """Derivative of the state [s, z, w and v of masses], and the base stress."""
@@ -232,7 +231,7 @@ def follow(
         y[-1] = drive.velocity
     out_w, out_s = np.zeros((count, t.size)), np.zeros(t.size)
     now, events, done, end = float(t[0]), 0, 0, math.nan
-    scale = max(getattr(s, "k0") for s in chain.springs)
+    scale = max(s.k0 for s in chain.springs)
     atol = np.concatenate([
         np.full(count + len(terms), tol * scale * 1e-2), np.full(2 * len(heavy), tol * 1e-3)
     ])  # fmt: skip
@@ -241,30 +240,25 @@ def follow(
         for i, law in enumerate(laws):
             if law.turns() * rates(now, y)[0][i] > 0.0:
                 law.turn(y[i])
-        checks: list[Any] = []
-        what: list[tuple[int, int]] = []
-
-        def add(check: Callable[[float, Array], float], way: float, i: int, side: int) -> None:
-            check.terminal, check.direction = True, way  # type: ignore[attr-defined]
-            checks.append(check)
-            what.append((i, side))
-
+        found: list[Any] = []  # function, direction, spring, side
         for i, law in enumerate(laws):
             low, high = law.ends()
             if low > -math.inf:
-                add(lambda x, y, i=i, at=low: y[i] - at, -1.0, i, -1)
+                found.append((lambda x, y, i=i, at=low: y[i] - at, -1.0, i, -1))
             if high < math.inf:
-                add(lambda x, y, i=i, at=high: y[i] - at, 1.0, i, 1)
+                found.append((lambda x, y, i=i, at=high: y[i] - at, 1.0, i, 1))
             if law.turns():
-                add(lambda x, y, i=i: rates(x, y)[0][i], law.turns(), i, 0)
+                found.append((lambda x, y, i=i: rates(x, y)[0][i], law.turns(), i, 0))
         if struck and now > 0.0:
-            add(lambda x, y: rates(x, y)[1], -1.0, -1, 0)
+            found.append((lambda x, y: rates(x, y)[1], -1.0, -1, 0))
+        for check, way, _, _ in found:
+            check.terminal, check.direction = True, way
         limit = 0.02 * (t[-1] - t[0])
         if struck and now == 0.0:  # the base stress starts at zero
             stop = 1e-3 * float(t[-1])
         run = solve_ivp(
             lambda x, y: rates(x, y)[0], (now, stop), y, method, rtol=max(tol, 3e-14), atol=atol,
-            events=checks or None, dense_output=True, max_step=limit,
+            events=[check for check, *_ in found] or None, dense_output=True, max_step=limit,
         )  # fmt: skip
         assert run.success, run.message
         reached = float(run.t[-1])
@@ -275,10 +269,10 @@ def follow(
             out_s[done] = rates(float(t[done]), state)[1]
             done += 1
         now, y = reached, run.y[:, -1].copy()
-        hit = [k for k, found in enumerate(run.t_events or []) if len(found)]
+        hit = [k for k, at in enumerate(run.t_events or []) if len(at)]
         for k in hit if run.status == 1 else []:
             events += 1
-            i, side = what[k]
+            i, side = found[k][2:]
             if i < 0:
                 end = now
                 strain = [law.strain(x)[0] for law, x in zip(laws, y[:count], strict=True)]

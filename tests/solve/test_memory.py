@@ -84,7 +84,8 @@ SCENES: dict[str, tuple[ff.Chain, Drive]] = {
     "motion of two, relaxing": (chain([relaxing(FOAM), relaxing(MICRO, TWO)]), MOVED),
     "motion of two, bistable": (chain([relaxing(BISTABLE), relaxing(MICRO)]), MOVED),
     "motion of two, one damped": (chain([relaxing(FOAM), damped(MICRO, 200.0)]), MOVED),
-    "motion of two, both damped": (chain([damped(relaxing(FOAM), 200.0), damped(MICRO, 200.0)]), MOVED),
+    "motion of two, both damped": (
+        chain([damped(relaxing(FOAM), 200.0), damped(MICRO, 200.0)]), MOVED),
     "motion of two, interior mass": (chain([LINEAR, relaxing(MICRO)], [1e-3, 0.0]), MOVED),
     "stress, relaxing": (chain([relaxing(MICRO)]), stress(2e6)),
     "stress, dashpot": (chain([damped(MICRO, 200.0)]), stress(2e6)),
@@ -137,3 +138,117 @@ def with_value(given: ff.Chain, name: str, value: float) -> ff.Chain:
     else:
         springs[i] = replace(springs[i], **{short: value})
     return ff.Chain(springs, heights, AREA, given.masses, site)
+
+
+# The others differ in little; all are within the error that is asked for.
+QUICK = [
+    "impact, sharp", "impact, wide", "impact, hysteretic below", "impact, hysteretic above",
+    "impact, reversible", "impact, sharp and wholly snapped", "impact, bistable relaxing, dashpot",
+    "impact on two microscale", "impact, one of two damped",
+    "impact, interior mass, two microscale", "impact on three", "motion of two, bistable",
+    "motion of two, both damped", "stress, relaxing", "stress on two, one damped",
+    "stress, viscous top",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_a_motion_is_as_exact_as_asked_for(name: str) -> None:
+    given, drive = SCENES[name]
+    moved, pressed, end, _ = follow(given, drive, TIME)
+    for rtol in (1e-4, 1e-6, 1e-8):
+        got = ff.simulate(given, drive, TIME, rtol)
+        assert difference(pressed, got.base_stress) < rtol
+        assert max(map(difference, moved, got.displacement)) < rtol
+        assert got.method == "Taylor series"
+        if not np.isnan(end):
+            assert got.contact_end == pytest.approx(end, rel=rtol)
+
+
+EXACT = [
+    "impact, two terms, dashpot, onsite damper", "impact, wide", "impact, hysteretic below",
+    "impact, hysteretic above", "impact, bistable relaxing", "impact on three",
+    "motion of two, relaxing", "motion of two, both damped", "motion of two, interior mass",
+    "stress on two, one damped", "stress, viscous top",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_derivatives_by_all_parameters_are_those_of_differences(name: str) -> None:
+    given, drive = SCENES[name]
+    names = [n for n in names_of(given) if value_of(given, n) != 0.0]
+    run = ff.simulate(given, drive, TIME, 1e-10, sensitivities=names)
+    away = np.abs(TIME - (run.contact_end or -1.0)) > 6e-5  # at the end of contact they jump
+    for short in names:
+        value = value_of(given, short)
+        step = 1e-4 * value
+        near = [
+            ff.simulate(with_value(given, short, value + k * step), drive, TIME, 1e-10)
+            for k in (-2, -1, 1, 2)
+        ]
+        for what in ("displacement", "base_stress"):
+            low, lower, higher, high = (getattr(r, what) for r in near)
+            wanted = (low - 8.0 * lower + 8.0 * higher - high) / (12.0 * step)
+            got = getattr(run.sensitivities[short], what)
+            size = max(np.abs(got).max(), 1e-5 * np.abs(getattr(run, what)).max() / abs(value))
+            assert np.abs(wanted - got)[..., away].max() < 1e-6 * size, (short, what)
+
+
+@pytest.mark.parametrize("moved", [True, False])
+def test_a_chain_may_start_loaded(moved: bool) -> None:
+    """It starts in equilibrium, as if brought there quickly and held: nothing has relaxed yet."""
+    given = chain([relaxing(MICRO), relaxing(BISTABLE), FOAM])
+    shape = 0.3 + 0.5 * np.sin(np.linspace(0.0, 6.0, TIME.size))
+    drive: Drive = ff.DisplacementDrive(4e-4 * shape) if moved else ff.StressDrive(1.2e6 * shape)
+    names = [n for n in names_of(given) if value_of(given, n) != 0.0]
+    run = ff.simulate(given, drive, TIME, 1e-10, sensitivities=names)
+    strain = np.diff(run.displacement[:, 0], prepend=0.0) / given.heights
+    loaded = [s.stress(np.array([0.0, e]))[-1] for s, e in zip(given.springs, strain, strict=True)]
+    assert loaded == pytest.approx([run.base_stress[0]] * 3, rel=1e-12)
+    for short in names:
+        value = value_of(given, short)
+        low, high = (
+            ff.simulate(with_value(given, short, value * k), drive, TIME, 1e-10)
+            for k in (1.0 - 3e-5, 1.0 + 3e-5)
+        )
+        for what in ("displacement", "base_stress"):
+            wanted = (getattr(high, what) - getattr(low, what)) / (6e-5 * value)
+            got = getattr(run.sensitivities[short], what)
+            size = max(np.abs(got).max(), 1e-4 * np.abs(getattr(run, what)).max() / abs(value))
+            assert np.abs(wanted - got).max() < 2e-6 * size, (short, what)
+
+
+def test_contact_ends_where_the_whole_stress_does() -> None:
+    """Relaxation takes it to zero while the law still presses."""
+    given = chain([relaxing(MICRO)])
+    run = ff.simulate(given, IMPACT, TIME, 1e-8)
+    assert run.contact_end is not None
+    last = int(np.searchsorted(TIME, run.contact_end)) - 1
+    strain = run.displacement[0, : last + 1] / given.height
+    assert MICRO.stress(strain)[-1] > 0.1 * run.base_stress.max()
+    assert run.base_stress[last] < 0.1 * run.base_stress.max()
+
+
+def test_a_wholly_snapped_spring_without_spread_is_on_branch_c() -> None:
+    run = ff.simulate(chain([SHARP]), ff.Impact(7e-3, 4.0), TIME, 1e-10)
+    strain = run.displacement[0] / 1.19e-3
+    snapped = run.base_stress > 1.01 * SHARP.sigma_plus
+    x = strain[snapped] - SHARP.eps_star
+    assert snapped.sum() > 3
+    assert run.base_stress[snapped] == pytest.approx(SHARP.kc * x / (1.0 - x), rel=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("given", "drive", "culprit"),
+    [
+        (chain([relaxing(MICRO, [(0.5, 1e-12)])]), IMPACT, "s1_tau1 = 1e-12 s"),
+        (chain([LINEAR, relaxing(MICRO, [(0.5, 1e-11)])]), MOVED, "s2_tau1 = 1e-11 s"),
+        (chain([damped(MICRO, 1e-7), FOAM]), MOVED, "dashpot"),
+        (chain([MICRO, FOAM], [1e-18, 0.0]), IMPACT, "light mass"),
+    ],
+)
+def test_what_explicit_steps_cannot_follow_is_refused_by_name(
+    given: ff.Chain, drive: Drive, culprit: str
+) -> None:
+    with pytest.raises(ff.SimulationError, match="too fast") as refused:
+        ff.simulate(given, drive, TIME)
+    assert culprit in str(refused.value)

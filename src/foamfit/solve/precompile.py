@@ -64,7 +64,8 @@ def _calls() -> dict[Any, tuple[Any, ...]]:
         for module, names in was.items():
             for name, loop in names.items():
                 if hasattr(loop, "py_func"):
-                    setattr(module, name, plain(loop, module is taylor))
+                    own = loop.targetoptions.get("inline") != "always"  # else a part of another
+                    setattr(module, name, plain(loop, own and module is taylor))
         with np.errstate(all="ignore"):
             _run("impact")
             _run("impact", eta=50.0)

@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from foamfit.solve.polynomial import value_at
+from foamfit.solve.polynomial import first_crossing, value_at
 from foamfit.springs import microscale_kernels as micro
 from foamfit.springs.kernels import (
     BACK,
@@ -35,6 +35,7 @@ from foamfit.springs.kernels import (
     LOG_MINUS,
     LOG_PLUS,
     N_COLUMNS,
+    SNAP,
     SPREAD_MINUS,
     SPREAD_PLUS,
     Array,
@@ -42,6 +43,7 @@ from foamfit.springs.kernels import (
     inlined,
     inner,
     maker,
+    piece,
 )
 from foamfit.springs.law import LEAST_RANK, MICROSCALE
 from foamfit.springs.microscale_kernels import (
@@ -68,6 +70,8 @@ BY_RANK, BY_STRESS, SQUARE_A, SQUARE_C, WIDTH, STEEP, N_PARTIALS = range(7, 14)
 PLACE, SCALE, FRACTION, LEFT, GAIN, GIVE, SOFT, BASE, N_NOW = range(9)
 # A held spring is past where it turned if its strain is, by so much of itself.
 MARGIN = 1e-13
+# A spring that turns within so small a part of a step turns at its start.
+NOW = 1e-8
 # So much may the normal score change in a step where P hardly changes yet.
 FAR = 2.0
 
@@ -171,6 +175,28 @@ def leave(memory: Memory, i: int, eps: float, up: bool, turning: bool, d_eps: Ar
             memory.ranks[k, i] = moved + (d_rank[own] if known else 0.0)
     micro.switch(row, state, up)
     return int(state[BRANCH])
+
+
+@piece
+def first_turn(
+    branches: Branches, eps: Array, order: int, span: float, c: Array
+) -> tuple[float, int]:
+    """First time within `span` at which a spring that snaps turns, and which; c is scratch.
+
+    After a kink it may have turned already.
+    """
+    spring, whole = -1, span
+    for i in range(branches.size):
+        if branches[i] == SNAP or branches[i] == BACK:
+            ahead = 1.0 if branches[i] == SNAP else -1.0
+            for n in range(order):
+                c[n] = ahead * (n + 1) * eps[i, n + 1]
+            when, where = (
+                (0.0, -1) if c[0] < 0.0 else first_crossing(c, order - 1, 0.0, math.inf, span)
+            )
+            if where != 0 and (spring < 0 or when < span):
+                spring, span = i, (0.0 if when <= NOW * whole else when)
+    return span, spring
 
 
 @inner

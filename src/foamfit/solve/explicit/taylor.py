@@ -14,6 +14,7 @@ import numpy as np
 
 from foamfit.solve.explicit.memory import (
     Memory,
+    first_turn,
     leave,
     load,
     longest,
@@ -74,7 +75,6 @@ from foamfit.springs.kernels import (
     ETA,
     HELD,
     KIND,
-    SNAP,
     A,
     Array,
     Branches,
@@ -92,8 +92,6 @@ from foamfit.springs.law import MICROSCALE
 
 # Strains closer than this to the end of a branch are at it.
 CLOSE = 1e-13
-# A spring that turns within so small a part of a step turns at its start.
-NOW = 1e-8
 # Side on which a spring leaves its branch where its strain turns.
 TURN = 2
 MOST_ORDERS = 24
@@ -210,28 +208,6 @@ def first_switch(law: Array, s: Array, order: int, span: float) -> tuple[float, 
         if where != 0 and (spring < 0 or when < span):
             span, spring, side = when, i, where
     return span, spring, side
-
-
-@piece
-def first_turn(
-    branches: Branches, s: Array, order: int, span: float, c: Array
-) -> tuple[float, int]:
-    """First time within `span` at which a spring that snaps turns, and which; c is scratch.
-
-    After a kink it may have turned already.
-    """
-    spring, whole = -1, span
-    for i in range(branches.size):
-        if branches[i] == SNAP or branches[i] == BACK:
-            ahead = 1.0 if branches[i] == SNAP else -1.0
-            for n in range(order):
-                c[n] = ahead * (n + 1) * s[EPS, i, n + 1]
-            when, where = (
-                (0.0, -1) if c[0] < 0.0 else first_crossing(c, order - 1, 0.0, math.inf, span)
-            )
-            if where != 0 and (spring < 0 or when < span):
-                spring, span = i, (0.0 if when <= NOW * whole else when)
-    return span, spring
 
 
 @inner
@@ -605,7 +581,7 @@ def _integrated(
                 span = longest(memory, i, span) if branches[i] > HELD else span
         span, spring, side = first_switch(law, s, order, span)
         if memory is not None:
-            span, turning = first_turn(branches, s, order, span, c)
+            span, turning = first_turn(branches, s[EPS], order, span, c)
             if turning >= 0:
                 spring, side = turning, TURN
         leaves = False
