@@ -33,7 +33,7 @@ LAWS = [
 H, AREA = 20e-3, 1e-3
 TURNS = [0.0, 0.5, 0.1, 0.6, 0.05, 0.7, 0.3, 0.4, 0.0]
 TERMS = [(0.7, 0.05), (0.2, 0.4)]
-# Fresh scenes of all drives, some of which were wrong or refused when they were first drawn.
+# Fresh scenes of all drives.
 FRESH = {
     "microscale": (0, 1, 2, 4, 11),
     "relaxation": (0, 1, 2, 11),
