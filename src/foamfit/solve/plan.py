@@ -221,7 +221,7 @@ class Plan(NamedTuple):
             ending = taylor.integrate_with_memory(
                 *given, self.margin * rtol, most, directions, start, curves, slopes, log
             )
-            if ending[0] not in _WRONG_TOOL:
+            if ending[0] not in _STIFF:
                 break
             rate, culprit = self._fastest(given)
             too_fast = _TOO_FAST.format(culprit=culprit, rate=rate, steps=self.max_steps)
