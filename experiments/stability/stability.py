@@ -316,6 +316,23 @@ def memory_table(lines: pd.DataFrame) -> str:
     return "\n".join([head, *body])
 
 
+def memory_wrong(lines: pd.DataFrame) -> str:
+    """Name the fresh scenes of springs with memory that are wrong, or refused though judged."""
+    known = lines[lines.family.isin(fresh.MEMORY) & (lines.judge == "judged")]
+    groups = {
+        f"over {fresh.BAD:g} rtol at one rtol at least": known[known.outcome == "failure"],
+        "with a wrong derivative": known[known.outcome == "wrong derivative"],
+        "refused at one rtol at least": known[known.outcome == "refused"],
+        "derivatives refused at one rtol at least": known[known.reason == "derivatives refused"],
+    }
+    named = [
+        f"- {what} ({group.scene.nunique()}): {', '.join(group.scene.unique())}"
+        for what, group in groups.items()
+        if len(group)
+    ]
+    return "\n".join(named) or "None is wrong, and none that is judged is refused."
+
+
 def page(lines: pd.DataFrame, rows: pd.DataFrame, drawn: pd.DataFrame) -> str:
     """Write the README of the study."""
     answers = lines[lines.outcome == "answer"]
@@ -350,6 +367,7 @@ def page(lines: pd.DataFrame, rows: pd.DataFrame, drawn: pd.DataFrame) -> str:
         largest_independent=_number(answers.independent.max()),
         fresh=fresh_table(drawn[~drawn.family.isin(fresh.MEMORY)]),
         memory=memory_table(drawn),
+        memory_wrong=memory_wrong(drawn),
         fresh_scenes=f"{drawn.scene.nunique():,}",
         fresh_judged=f"{drawn[drawn.judge == 'judged'].scene.nunique():,}",
         fresh_seed=fresh.SEED,
