@@ -72,8 +72,11 @@ PLACE, SCALE, FRACTION, LEFT, GAIN, GIVE, SOFT, BASE, N_NOW = range(9)
 MARGIN = 1e-13
 # A spring that turns within so small a part of a step turns at its start.
 NOW = 1e-8
-# So much may the normal score change in a step where P hardly changes yet.
-FAR = 2.0
+# Beyond this normal score P is 0 or 1 to rounding. Within it the score u may change in a step by so
+# much over u as its series have orders, times a share (they are those of exp(-u²/2), whose terms
+# fall only from the order u δu on), and by so much at most.
+FAR = 8.0
+SHARE_OF_ORDER, MOST_SCORE = 0.7, 3.0
 
 
 class Memory(NamedTuple):
@@ -314,18 +317,39 @@ def keep(memory: Memory, i: int, n: int, s_n: float) -> None:
 
 
 @inner
-def longest(memory: Memory, i: int, span: float) -> float:
+def longest(memory: Memory, i: int, order: int, span: float) -> float:
     """Longest step, within `span`, over which the logarithm of a stress has a good series.
 
-    Where nearly none, or all, have snapped, the series do not show how soon the others do.
+    Where nearly none, or all, have snapped, the series do not show how soon the others do: a step
+    from beyond `FAR` ends there.
     """
-    s, u, scale = memory.series[EQ, i], memory.series[SCORE, i, 0], memory.now[i, SCALE]
-    most = s[0] * min(1.0, scale * max(FAR, abs(u) + LEAST_RANK))
+    s, u, scale = memory.series[EQ, i], abs(memory.series[SCORE, i, 0]), memory.now[i, SCALE]
+    within = min(MOST_SCORE, SHARE_OF_ORDER * order / u) if u > 0.0 else MOST_SCORE
+    most = s[0] * min(0.8, scale * max(within, u - FAR))
     for _ in range(400):
-        if (abs(s[1]) + (abs(s[2]) + abs(s[3]) * span) * span) * span <= most:
+        moved = 0.0
+        for n in range(order, 0, -1):
+            moved = (moved + abs(s[n])) * span
+        if moved <= most:
             break
         span *= 0.75
     return span
+
+
+@inner
+def strain_at(memory: Memory, i: int, moving: bool, s: float) -> tuple[float, float]:
+    """Strain of a mixture at a stress (NaN where its law ends), and its slope dε/ds."""
+    row, state, now = memory.rows[i], memory.state[i], memory.now[i]
+    p, q, steep = state[micro.SNAPPED], state[REST], 0.0
+    if moving:
+        if not s > 0.0:
+            return math.nan, math.nan
+        u = (math.log(s) - now[PLACE]) / now[SCALE]
+        p, q, steep = micro.share(u), micro.share(-u), micro.density(u) / (now[SCALE] * s)
+    one, two = 1.0 / (row[K0] + s), 1.0 / (row[KC] + s)
+    soft = q * row[K0] * one * one + p * row[KC] * two * two
+    gap = row[EPS_STAR] + s * (two - one)
+    return q * (s * one) + p * (row[EPS_STAR] + s * two), soft + gap * steep
 
 
 @inner

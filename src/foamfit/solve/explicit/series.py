@@ -40,6 +40,7 @@ from foamfit.solve.explicit.memory import (
     start_mixture,
     start_relaxed,
     start_relaxed_tangent,
+    strain_at,
     strain_of_mixture,
     tangent_of_mixture,
 )
@@ -725,6 +726,92 @@ def start_relaxing(law: Array, i: int, s: Array, d: SeriesTangents, memory: Memo
 
 
 # ---------------------------------------------------------------- the end of a step
+
+
+@inner
+def share_a_stress(law: Array, ends: Branches, i: int, j: int, memory: Memory) -> bool:
+    """Whether two springs bear one stress, without dashpot or relaxation."""
+    plain = law[i, DASHPOT] == 0.0 and law[j, DASHPOT] == 0.0
+    plain = plain and memory.now[i, GAIN] == 1.0 and memory.now[j, GAIN] == 1.0
+    for g in range(ends.size if plain else 0):
+        first, last = springs_of(ends, g)
+        if first <= i < last:
+            return bool(first <= j < last)
+    return False
+
+
+@inner
+def _own_strain(law: Array, i: int, stress: float, memory: Memory) -> tuple[float, float]:
+    """Strain of a spring under a stress on the branch that it is on, and its slope dε/dΣ."""
+    gain, k = memory.now[i, GAIN], law[i, SLOPE]
+    s = (stress - relaxed(memory, i, 0)) / gain
+    if law[i, CURVED] >= HELD:
+        eps, soft = strain_at(memory, i, law[i, CURVED] > HELD, s)
+        return eps, soft / gain
+    if law[i, CURVED] == 0.0:
+        return law[i, ORIGIN] + (s - law[i, OFFSET]) / k, 1.0 / (k * gain)
+    stiff = k + s
+    return law[i, ORIGIN] + s / stiff, k / (stiff * stiff * gain)
+
+
+@inner
+def _share_under(
+    law: Array, i0: int, i1: int, eps: Array, stress: float, memory: Memory
+) -> tuple[float, float, float]:
+    """Give the undamped springs of a group a stress; elongation, its size, and compliance."""
+    total = size = compliance = 0.0
+    for i in range(i0, i1):
+        if law[i, DASHPOT] == 0.0:
+            own, soft = _own_strain(law, i, stress, memory)
+            eps[i, 0] = own
+            total += law[i, HEIGHT] * own
+            size += law[i, HEIGHT] * abs(own)
+            compliance += law[i, HEIGHT] * soft
+    return total, size, compliance
+
+
+@piece
+def settle_together(
+    links: Links, s: Array, order: int, span: float, push: Array, memory: Memory
+) -> None:
+    """Bring the undamped springs of each group to one stress, at the elongation that they share.
+
+    A spring that is nearly rigid, or about to snap all at once, feels the least difference of
+    stress; without this, truncation of the strains lets their stresses part.
+    """
+    law, eps = links.law, s[EPS]
+    for g in range(links.ends.size):
+        i0, i1 = springs_of(links.ends, g)
+        stressed = g == links.ends.size - 1 and links.top == STRESS
+        if i1 - i0 == 1 and not stressed:
+            continue
+        rest, free = s[W, g, 0] - (s[W, g - 1, 0] if g > 0 else 0.0), 0
+        for i in range(i0, i1):
+            if law[i, DASHPOT] > 0.0:
+                rest -= law[i, HEIGHT] * eps[i, 0]
+            elif law[i, CURVED] == 0.0 and not law[i, SLOPE] > 0.0:
+                free = -links.law.shape[0]  # a flat branch has no strain of its own
+            else:
+                free += 1
+        if free <= 0:
+            continue
+        stress = push[0] + push[1] * span if stressed else value_at(s[GROUP, g], order, span)
+        for i in range(i0, i1):
+            s[TILT, i, 0] = eps[i, 0]
+        found = False
+        for _ in range(20):
+            total, size, compliance = _share_under(law, i0, i1, eps, stress, memory)
+            found = stressed or abs(total - rest) <= 4e-16 * (size + abs(rest))
+            if found or not math.isfinite(total):
+                break
+            step = (total - rest) / compliance
+            found = abs(total - rest) <= 1e-14 * size and abs(step) <= 1e-15 * abs(stress)
+            if found:
+                break
+            stress -= step
+        if not (found and math.isfinite(total)):
+            for i in range(i0, i1):
+                eps[i, 0] = s[TILT, i, 0]
 
 
 @inner

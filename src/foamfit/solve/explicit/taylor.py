@@ -42,6 +42,8 @@ from foamfit.solve.explicit.series import (
     expand_tangents,
     is_bare,
     make_series,
+    settle_together,
+    share_a_stress,
     slope_now,
     springs_of,
     start_relaxing,
@@ -399,14 +401,23 @@ def switch(
     side: int,
     log: Array,
     switches: int,
+    ends: Branches,
     memory: Memory | None,
 ) -> int:
     """Change the branch of a spring, and of all that end theirs at the same time; counts them."""
+    turned = branches[spring]
     for i in range(branches.size):
         low, high, eps = law[i, LOW], law[i, HIGH], s[EPS, i, 0]
         out = 0
         if i == spring:
             out = side
+        elif (
+            memory is not None
+            and side == TURN
+            and branches[i] == turned
+            and share_a_stress(law, ends, i, spring, memory)
+        ):
+            out = TURN  # the stress turns for both
         elif eps >= high - CLOSE and slope_at(s[EPS, i], order, span) > 0.0:
             out = 1
         elif eps <= low + CLOSE and slope_at(s[EPS, i], order, span) < 0.0:
@@ -578,7 +589,7 @@ def _integrated(
             return NOT_FINITE, now, step, switches
         if memory is not None:
             for i in range(count):
-                span = longest(memory, i, span) if branches[i] > HELD else span
+                span = longest(memory, i, order, span) if branches[i] > HELD else span
         span, spring, side = first_switch(law, s, order, span)
         if memory is not None:
             span, turning = first_turn(branches, s[EPS], order, span, c)
@@ -624,11 +635,15 @@ def _integrated(
         if not math.isfinite(total):
             return NOT_FINITE, now, step, switches
         settle(links, s, memory)
+        if memory is not None:
+            settle_together(links, s, order, span, push, memory)
         if spring >= 0:
             switches = switch(
                 rows, branches, law, s, d, directions, order, span, now, spring, side, log,
-                switches, memory,
+                switches, ends, memory,
             )  # fmt: skip
+            if memory is not None:
+                settle_together(links, s, order, span, push, memory)
     return TOO_MANY_STEPS, now, max_steps, switches
 
 
