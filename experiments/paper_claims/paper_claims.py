@@ -580,7 +580,7 @@ def main() -> None:
         draw_ratios(ratio_readings(), HERE / "ratios.png")
         draw_energy(HERE / "energy.png")
     page = (HERE / "page.template.md").read_text(encoding="utf-8")
-    values = of_oscillation() | of_literal() | of_ratios() | of_energy()
+    values = of_oscillation() | of_literal() | of_ratios() | of_energy() | of_microscale()
     (HERE / "README.md").write_text(subscripts(page.format(**values)), encoding="utf-8")
     print(f"wrote {HERE / 'README.md'} and its figures")
 
@@ -752,6 +752,49 @@ def of_energy() -> dict[str, Any]:
         ),
         "table_energy": "\n".join(lines).replace("| -", "| −"),
         "table_work": "\n".join(works),
+    }
+
+
+def microscale_row(name: str) -> dict[str, float]:
+    """How far the branches of a published spring are from what snapping micro-springs make.
+
+    Slopes in MPa at A1; the least fraction of snapped micro-springs that branch d stands for, and
+    by how much the fraction on branch e falls with the stress anywhere.
+    """
+    spring = ff.published[name].bistable
+    k0, kc, eps_star = spring.k0, spring.kc, spring.eps_star
+
+    def fraction(first: float, last: float, sigma: float, eps: float, slope: float) -> Array:
+        stress = np.linspace(first, last, 20001)
+        on_a, on_c = stress / (k0 + stress), eps_star + stress / (kc + stress)
+        return (eps + (stress - sigma) / slope - on_a) / (on_c - on_a)
+
+    low = spring.sigma_hat_a
+    assert low is not None
+    plus = fraction(
+        spring.sigma_a, spring.sigma_hat_c, spring.sigma_a, spring.eps_a, spring.kh_plus
+    )
+    minus = fraction(low, spring.sigma_c, spring.sigma_c, spring.eps_c, spring.kh_minus)
+    return {
+        "d": spring.kh_plus / 1e6,
+        "a": k0 / (1 - spring.eps_a) ** 2 / 1e6,
+        "least": float(plus.min()),
+        "falls": float(-np.minimum(np.diff(minus), 0.0).sum()),
+    }
+
+
+def of_microscale() -> dict[str, Any]:
+    """Table of the fifth claim."""
+    rows = {name: microscale_row(name) for name in (MODEL_1, MODEL_2, MODEL_3, FOAM_2)}
+    lines = [
+        f"| {name} | {row['d']:.1f} | {row['a']:.1f} | {100 * row['least']:.1f} "
+        f"| {'yes' if row['falls'] == 0.0 else 'no'} |"
+        for name, row in rows.items()
+    ]
+    return {
+        "too_stiff_least": min(row["d"] / row["a"] for row in rows.values()),
+        "too_stiff_most": max(row["d"] / row["a"] for row in rows.values()),
+        "table_microscale": "\n".join(lines).replace("| -", "| −"),
     }
 
 

@@ -11,6 +11,7 @@ from typing import Any
 _HOME = {
     "BistableSpring": "springs.spring",
     "LinearSpring": "springs.spring",
+    "MicroscaleSpring": "springs.spring",
     "Chain": "springs.chain",
     "Impact": "springs.chain",
     "StressDrive": "springs.chain",

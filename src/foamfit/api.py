@@ -64,6 +64,8 @@ def fit(
     time_shift : bool
         Whether the time by which the motion channel is late against the force is fitted too, as
         the parameter time_shift (s).
+    relaxation : int
+        Relaxation terms of every bistable and microscale spring: s1_g1, s1_tau1, …
     loss : str
         "linear" (least squares), or one that gives way to large residuals: "soft_l1", "huber",
         "cauchy"; see `fitting.objective.soften`.

@@ -213,13 +213,14 @@ def _fixes(
 
 
 def _params(
-    measurement: Measurement, model: str, drive: str | None, time_shift: bool,
+    measurement: Measurement, model: str, search: dict[str, Any],
     fix: dict[str, float], vary: tuple[str, ...],
 ) -> lmfit.Parameters | None:  # fmt: skip
     """Return the parameters of a model as --fix and --vary want them; None for auto."""
     from foamfit.fitting.curves import check_time_shift, choose_drive
     from foamfit.fitting.problem import make_params
 
+    drive, time_shift = search["drive"], search["time_shift"]
     if time_shift:
         check_time_shift(measurement, drive or choose_drive(measurement))
     if model == "auto":
@@ -228,7 +229,9 @@ def _params(
                 "--fix and --vary belong to one model; name it instead of --model auto"
             )
         return None
-    params = make_params(measurement, model, drive, time_shift=time_shift)
+    params = make_params(
+        measurement, model, drive, time_shift=time_shift, relaxation=search["relaxation"]
+    )
     for name in (*fix, *vary):
         if name not in params:
             raise InputError(
@@ -283,6 +286,10 @@ def _interval_method(profile: bool, bootstrap: int | None, mcmc: int | None) -> 
 @click.option("--interior-mass", is_flag=True, help="Put the specimen's mass between the springs.")
 @click.option("--time-shift", is_flag=True, help="Fit how late the motion is against the force.")
 @click.option(
+    "--relaxation", type=click.IntRange(min=0), default=0, show_default=True, metavar="N",
+    help="Relaxation terms of every bistable and microscale spring.",
+)  # fmt: skip
+@click.option(
     "--loss", type=click.Choice(["linear", "soft_l1", "huber", "cauchy"]), default="linear",
     show_default=True, help="All but linear weigh large residuals less.",
 )  # fmt: skip
@@ -313,6 +320,7 @@ def fit(
     Examples:
         foamfit fit TEST.csv
         foamfit fit TEST.csv --model auto
+        foamfit fit TEST.csv --model microscale --relaxation 1
         foamfit fit TEST.csv --drive displacement --out results/today
         foamfit fit TEST.csv --model linear+bistable --fix s1_k0=60e6
     """
@@ -326,7 +334,7 @@ def fit(
         folder = _result_folder(out, test, specimen, model)
         from foamfit import api
 
-        params = _params(measurement, model, search["drive"], search["time_shift"], fix, vary)
+        params = _params(measurement, model, search, fix, vary)
         compile_rest()
         with _progress(quiet or as_json) as progress:
             result = api.fit(

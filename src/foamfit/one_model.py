@@ -27,7 +27,7 @@ from foamfit.fitting.search import (
     what_stopped,
 )
 from foamfit.results import Fit
-from foamfit.springs.parameters import split_name
+from foamfit.springs.parameters import HYSTERETIC, split_name
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
 from foamfit.trust.covariance import AT_LIMIT
@@ -54,6 +54,7 @@ class Keywords(TypedDict, total=False):
     weights: Mapping[str, float] | None
     interior_mass: bool
     time_shift: bool
+    relaxation: int
     loss: str
     intervals: str
     draws: int | None
@@ -73,6 +74,7 @@ class Options:
     weights: Mapping[str, float] | None = None
     interior_mass: bool = False
     time_shift: bool = False
+    relaxation: int = 0
     loss: str = "linear"
     intervals: str = "auto"
     draws: int | None = None
@@ -107,7 +109,7 @@ class Options:
         """Make the problem of one model ready."""
         return make_problem(
             measurement, model, self.drive, params, self.weights, self.interior_mass,
-            time_shift=self.time_shift, loss=self.loss,
+            time_shift=self.time_shift, loss=self.loss, relaxation=self.relaxation,
         )  # fmt: skip
 
 
@@ -270,29 +272,42 @@ def _on_limits(best: BestPoint, cost: float) -> BestPoint:
 
 
 def _ordered(problem: Problem, values: Array) -> Array:
-    """Order springs that can be exchanged by their σ_a, the softest at the base.
+    """Order springs that can be exchanged by where they start to snap, the softest at the base.
 
     Two springs can be exchanged if they are of one kind and the curves stay the same, so never
     across a mass inside whose displacement is counted; the foam of the paper buckles first at its
     base.
     """
+    for kind in HYSTERETIC:
+        values = _ordered_of_kind(problem, values, kind)
+    return values
+
+
+def _ordered_of_kind(problem: Problem, values: Array, kind: str) -> Array:
+    """Order the springs of one kind; see `_ordered`."""
     model = problem.model
-    bistable = [i for i, kind in enumerate(model.kinds) if kind == "bistable"]
+    own = [i for i, other in enumerate(model.kinds) if other == kind]
     held = [split_name(name) for name in model.names if not problem.params[name].vary]
-    if any(spring in bistable and short not in ("eta", "height") for spring, short in held):
+    if any(spring in own and short not in ("eta", "height") for spring, short in held):
         return values
     nodes = [
         n for name, n in problem.objective.interior.items() if name in problem.objective.counted
     ]
 
-    def order(spring: int) -> tuple[int, float]:
+    def onset(spring: int) -> float:
+        """σ_a, or the median snap-through stress, Pa."""
+        if kind == "microscale":
+            return float(values[model.index[f"s{spring + 1}_sigma_plus"]])
         k0, eps_a = (values[model.index[f"s{spring + 1}_{short}"]] for short in ("k0", "eps_a"))
-        return sum(node <= spring for node in nodes), float(k0 * eps_a / (1.0 - eps_a))
+        return float(k0 * eps_a / (1.0 - eps_a))
 
-    ranked = sorted(bistable, key=order)
-    if ranked == bistable:
+    def order(spring: int) -> tuple[int, float]:
+        return sum(node <= spring for node in nodes), onset(spring)
+
+    ranked = sorted(own, key=order)
+    if ranked == own:
         return values
-    moved, sources = values.copy(), dict(zip(bistable, ranked, strict=True))
+    moved, sources = values.copy(), dict(zip(own, ranked, strict=True))
     for name in model.names:
         place, short = split_name(name)
         if place in sources:

@@ -74,7 +74,7 @@ class Switch:
     """A change of branch in the fitted response: which spring, when, and where on the curves."""
 
     spring: int  # 1 at the base
-    source: str  # "a", "d", "c", "e"
+    source: str  # "a", "d", "c", "e", or "snap-through", … of a microscale spring
     target: str
     time: float | None  # s
     displacement: float  # of the top, m
@@ -193,6 +193,7 @@ class Fit:
     noise: dict[str, dict[str, Any]] = field(default_factory=dict)  # of each counted curve
     intervals: Intervals | None = None
     ladder: Ladder | None = None
+    relaxation: int = 0  # terms of each hysteretic spring
 
     @property
     def bistable_springs(self) -> dict[str, BistableSpring]:
@@ -210,6 +211,7 @@ class Fit:
                 "data_sha256": self.measurement.data_sha256,
                 "data": asdict(self.measurement.rows) | {"notes": self.measurement.notes},
                 "model": self.model,
+                "relaxation": self.relaxation,
                 "drive": self.drive,
                 "seed": self.seed,
                 "status": self.status,

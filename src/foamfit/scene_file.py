@@ -18,15 +18,20 @@ from foamfit.errors import InputError
 from foamfit.files import write_file
 from foamfit.solve.simulation import Response
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
-from foamfit.springs.parameters import BISTABLE_NAMES, KINDS, LINEAR_NAMES
+from foamfit.springs.parameters import HYSTERETIC, KINDS, names_of
 from foamfit.springs.published import published
-from foamfit.springs.spring import BistableSpring, LinearSpring, Spring
+from foamfit.springs.spring import BistableSpring, LinearSpring, MicroscaleSpring, Spring
 
 Made = TypeVar("Made")
 
 _EXAMPLES = {  # key: SI unit and an example
     "eps_a": ("", "0.14"),
     "eps_c": ("", "0.31"),
+    "eps_star": ("", "0.08"),
+    "spread_plus": ("", "0.4"),
+    "spread_minus": ("", "0.8"),
+    "g": ("", "0.5"),
+    "tau": ("s", "0.2 s"),
     "eta": ("Pa*s", "100 Pa*s"),
     "dsigma": ("Pa", "-0.18 MPa"),
     "height": ("m", "1 mm"),
@@ -112,12 +117,33 @@ def _spring(where: str, given: dict[str, Any]) -> Spring:
     kind = given.get("kind")
     if kind not in KINDS:
         raise InputError(f"{where} kind = {kind!r}; it must be one of {', '.join(KINDS)}.")
-    names = BISTABLE_NAMES if kind == "bistable" else LINEAR_NAMES
-    check_keys(where, given, ["kind", "height", "mass", *names])
-    values = {name: _number(where, given, name) for name in names if name != "eta" or name in given}
+    names = names_of(kind)
+    terms = ["relaxation"] if kind in HYSTERETIC else []
+    check_keys(where, given, ["kind", "height", "mass", *names, *terms])
+    values: dict[str, Any] = {
+        name: _number(where, given, name) for name in names if name != "eta" or name in given
+    }
+    if kind not in HYSTERETIC:
+        return _made(where, LinearSpring, **values, unilateral=kind == "unilateral")
+    values["relaxation"] = _relaxation(where, given.get("relaxation", []))
     if kind == "bistable":
         return _made(where, BistableSpring, **values)
-    return _made(where, LinearSpring, **values, unilateral=kind == "unilateral")
+    return _made(where, MicroscaleSpring, **values)
+
+
+def _relaxation(where: str, given: Any) -> list[tuple[float, float]]:
+    """Read the relaxation terms of a spring, tables with g and tau."""
+    if not isinstance(given, list) or not all(isinstance(term, dict) for term in given):
+        raise InputError(
+            f"{where} relaxation = {given!r} must be a list of terms like "
+            '[{ g = 0.5, tau = "0.2 s" }].'
+        )
+    terms = []
+    for k, term in enumerate(given, start=1):
+        here = f"{where} relaxation term {k}:"
+        check_keys(here, term, ["g", "tau"])
+        terms.append((_number(here, term, "g"), _number(here, term, "tau")))
+    return terms
 
 
 def _drive(path: Path, document: dict[str, Any]) -> tuple[Drive, Array]:

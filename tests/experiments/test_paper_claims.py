@@ -217,3 +217,18 @@ def test_page_is_the_filled_template() -> None:
         assert (FOLDER / figure).is_file()
     assert claims.subscripts(claims.of_ratios()["table_ratios"]) in page
     assert claims.of_energy()["table_energy"] in page
+
+
+# -------------------------------------------------------------------------- 5: the microscale
+
+
+@pytest.mark.parametrize(
+    ("name", "slope", "bound"),
+    [(MODEL_1, 14.3, 7.4), (MODEL_2, 14.3, 7.4), (MODEL_3, 6.8, 4.7), (FOAM_2, 34.5, 16.0)],
+)
+def test_no_published_branch_d_is_made_by_snapping(name: str, slope: float, bound: float) -> None:
+    row = claims.microscale_row(name)
+    assert row["d"] == pytest.approx(slope, abs=0.05)
+    assert row["a"] == pytest.approx(bound, abs=0.05)
+    assert row["least"] < -1e-3
+    assert row["falls"] == 0.0

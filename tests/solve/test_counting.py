@@ -106,8 +106,7 @@ def test_a_closed_form_scene_takes_no_step(counts: dict[str, dict[str, Any]], na
     assert scene["solver"] == "closed form"
     assert scene["steps"] == 0
     used = {key for key in scene if key.startswith("calls in ")}
-    as_one = {"calls in many", "calls in polynomial"} if name == "mixed, displacement" else set()
-    assert used == {"calls in plan", "calls in kernels"} | as_one
+    assert used == {"calls in plan", "calls in kernels"}
     assert "masses read" not in scene
 
 

@@ -1,7 +1,8 @@
 """The coordinates of the search: a box in which every point is an admissible chain.
 
-Logarithms of the stiffnesses and of ε_a, the drop Δσ/σ_a, the place of ε_c between ε_a and one,
-slopes and damping over the scales of the test, a time shift over the largest one.
+Logarithms of the stiffnesses, of ε_a, of snap stresses, spreads and relaxation times; the drop
+Δσ/σ_a; the places of ε_c between ε_a and one and of ε_* between its least and one; slopes, damping
+and shares of relaxation over the scales of the test, a time shift over the largest one.
 """
 
 from __future__ import annotations
@@ -15,10 +16,38 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
+from foamfit.springs.law import least_eps_star
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import split_name
 
 LAST_STRAIN = 0.999
+# Parameters whose coordinate is a logarithm, besides the relaxation times.
+LOGARITHMIC = (
+    "k0", "kc", "eps_a", "sigma_plus", "sigma_minus", "spread_plus", "spread_minus"
+)  # fmt: skip
+
+
+def is_share(short: str) -> bool:
+    """Whether a parameter is the share g of a relaxation term."""
+    return family(short) == "g"
+
+
+def is_time(short: str) -> bool:
+    """Whether a parameter is the time τ of a relaxation term."""
+    return family(short) == "tau"
+
+
+def is_logarithmic(short: str) -> bool:
+    """Whether the coordinate of a parameter is its logarithm."""
+    return short in LOGARITHMIC or is_time(short)
+
+
+def family(short: str) -> str:
+    """Name of a parameter without the number of its relaxation term: "g1" is "g"."""
+    for name in ("g", "tau"):
+        if short.startswith(name) and short.removeprefix(name).isdigit():
+            return name
+    return short
 
 
 @dataclass(frozen=True)
@@ -72,6 +101,8 @@ class Scales:
         if short == "dsigma":
             eps_a = values[f"s{spring + 1}_eps_a"]
             return values[f"s{spring + 1}_k0"] * eps_a / (1.0 - eps_a)
+        if short == "eps_star" or is_share(short):
+            return max(abs(values[name]), 0.1)
         return abs(values[name]) or 1.0
 
 
@@ -85,19 +116,27 @@ def scale_in_words(name: str, value: float, scale: float) -> str:
         "kh_plus": "a tenth of the largest stress over strain",
         "kh_minus": "a tenth of the largest stress over strain",
         "dsigma": "σ_a",
-    }.get(split_name(name)[1], "its value")
+        "eps_star": "0.1",
+    }.get(split_name(name)[1], "0.1" if is_share(split_name(name)[1]) else "its value")
 
 
-# Coordinates of the box: lowest and highest. Stiffnesses are over the largest stress, slopes over
-# stress/strain, all of the test.
+# Coordinates of the box: lowest and highest. Stiffnesses and stresses are over the largest stress,
+# slopes over stress/strain, relaxation times over the time under load, all of the test.
 BOX = {
     "k0": (np.log(1e-3), np.log(1e4)),
     "kc": (np.log(1e-2), np.log(1e5)),
     "eps_a": (np.log(1e-3), np.log(0.95)),
     "eps_c": (0.002, 1.0),
+    "eps_star": (0.0, 1.0),
     "dsigma": (0.0, 0.999),
     "kh_plus": (0.0, 50.0),
     "kh_minus": (0.0, 50.0),
+    "sigma_plus": (np.log(1e-3), np.log(30.0)),
+    "sigma_minus": (np.log(1e-4), np.log(30.0)),
+    "spread_plus": (np.log(1e-3), np.log(5.0)),
+    "spread_minus": (np.log(1e-3), np.log(5.0)),
+    "g": (0.0, 10.0),
+    "tau": (np.log(1e-4), np.log(30.0)),
     "eta": (0.0, 10.0),
     "height": (0.02, 0.98),
     "time_shift": (-1.0, 1.0),
@@ -124,7 +163,7 @@ class Space:
     def coordinates(self) -> list[tuple[int, str, int]]:
         """Place, short name, place of the spring's first parameter; what others need is first."""
         out, shorts = [], list(BOX)
-        for name in sorted(self.free, key=lambda name: shorts.index(split_name(name)[1])):
+        for name in sorted(self.free, key=lambda name: shorts.index(family(split_name(name)[1]))):
             spring, short = split_name(name)
             first = self.model.index[f"s{spring + 1}_k0"] if spring >= 0 else -1
             # The nuisance stands last.
@@ -134,25 +173,29 @@ class Space:
     @cached_property
     def box(self) -> tuple[Array, Array]:
         """Lowest and highest coordinates, (n_free,) each."""
-        pairs = np.array([BOX[short] for _, short, _ in self.coordinates])
+        pairs = np.array([BOX[family(short)] for _, short, _ in self.coordinates])
         return pairs[:, 0], pairs[:, 1]
 
     def _unit(self, short: str) -> float:
+        """What a parameter is measured in, SI."""
         scales = self.scales
-        others = {"height": scales.height, "eta": scales.eta}
-        others["time_shift"] = LARGEST_SHIFT * scales.duration
-        return others.get(short, scales.slope)
+        units = {"height": scales.height, "eta": scales.eta, "tau": scales.duration}
+        units |= dict.fromkeys(("k0", "kc", "sigma_plus", "sigma_minus"), scales.stress)
+        units |= dict.fromkeys(("kh_plus", "kh_minus"), scales.slope)
+        units["time_shift"] = LARGEST_SHIFT * scales.duration
+        return units.get(family(short), 1.0)
 
     def encode(self, values: Array) -> Array:
         """Coordinates of a vector of parameters, moved into the box."""
         out = np.empty(len(self.coordinates))
         for j, (i, short, first) in enumerate(self.coordinates):
-            if short in ("k0", "kc"):
-                out[j] = np.log(max(values[i], 1e-300) / self.scales.stress)
-            elif short == "eps_a":
-                out[j] = np.log(max(values[i], 1e-300))
+            if is_logarithmic(short):
+                out[j] = np.log(max(values[i], 1e-300) / self._unit(short))
             elif short == "eps_c":
                 out[j] = (values[i] - values[first + 3]) / (LAST_STRAIN - values[first + 3])
+            elif short == "eps_star":
+                least = least_eps_star(values[first], values[first + 1])
+                out[j] = (values[i] - least) / (LAST_STRAIN - least)
             elif short == "dsigma":
                 out[j] = -values[i] / _stress_at_a1(values, first)
             else:
@@ -175,13 +218,12 @@ class Space:
 
     def _value(self, u: float, short: str, first: int, values: Array) -> float:
         """Parameter of a coordinate, whatever its limits; what it needs of `values` is there."""
-        if short in ("k0", "kc"):
-            return float(np.exp(u)) * self.scales.stress
-        if short == "eps_a":
-            return float(np.exp(u))
-        if short == "eps_c":
-            eps_a = float(values[first + 3])
-            return eps_a + u * (LAST_STRAIN - eps_a)
+        if is_logarithmic(short):
+            return float(np.exp(u)) * self._unit(short)
+        if short in ("eps_c", "eps_star"):
+            least = least_eps_star(values[first], values[first + 1])
+            least = least if short == "eps_star" else float(values[first + 3])
+            return least + u * (LAST_STRAIN - least)
         return -u * _stress_at_a1(values, first) if short == "dsigma" else u * self._unit(short)
 
     def slopes(self, point: Array, values: Array) -> Array:
@@ -191,8 +233,15 @@ class Space:
         """
         moves = np.zeros((values.size, point.size))
         for j, (i, short, first) in enumerate(self.coordinates):
-            if short in ("k0", "kc", "eps_a"):
+            if is_logarithmic(short):
                 moves[i, j] = values[i]
+            elif short == "eps_star":
+                k0, kc = float(values[first]), float(values[first + 1])
+                least = least_eps_star(k0, kc)
+                if least > 0.0:  # its derivative by the logarithm of kc/k0
+                    rise = 0.25 * (1.0 - least * least)
+                    moves[i] = (1.0 - point[j]) * rise * (moves[first + 1] / kc - moves[first] / k0)
+                moves[i, j] = LAST_STRAIN - least
             elif short == "eps_c":
                 moves[i] = (1.0 - point[j]) * moves[first + 3]
                 moves[i, j] = LAST_STRAIN - values[first + 3]

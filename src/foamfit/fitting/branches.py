@@ -10,16 +10,15 @@ from numpy.typing import NDArray
 from foamfit.fitting.objective import Simulated
 from foamfit.fitting.problem import Problem
 from foamfit.springs import kernels
-from foamfit.springs.parameters import BRANCHES, split_name
+from foamfit.springs.parameters import BRANCHES, HYSTERETIC, split_name
 
 FLIGHT = "free flight"
 
 
 def visited(problem: Problem, simulated: Simulated) -> dict[str, tuple[str, ...]]:
     """Branches that each spring went through, in the order of the first visit."""
-    seen = {
-        i: ["a" if kind == "bistable" else "line"] for i, kind in enumerate(problem.model.kinds)
-    }
+    kinds = problem.model.kinds
+    seen = {i: ["a" if kind in HYSTERETIC else "line"] for i, kind in enumerate(kinds)}
     for _, spring, _, entered, _ in simulated.motion.switches:
         name = kernels.BRANCH_NAMES[int(entered)]
         if name not in seen[int(spring)]:
@@ -33,16 +32,16 @@ def unreached(problem: Problem, simulated: Simulated) -> dict[str, str]:
     out = {}
     for name in problem.model.names:
         spring, short = split_name(name)
-        branch = BRANCHES.get(short)
-        bistable = branch and problem.model.kinds[spring] == "bistable"
-        if branch and bistable and branch not in seen[f"s{spring + 1}"]:
+        branch = BRANCHES.get(problem.model.kinds[spring], {}).get(short) if spring >= 0 else None
+        if branch and branch not in seen[f"s{spring + 1}"]:
             out[name] = branch
     return out
 
 
 def _states(problem: Problem, simulated: Simulated) -> list[tuple[int, dict[int, str]]]:
-    """Samples from which on the bistable springs (0 at the base) are on these branches."""
-    state = {i: "a" for i, kind in enumerate(problem.model.kinds) if kind == "bistable"}
+    """Samples from which on the hysteretic springs (0 at the base) are on these branches."""
+    kinds = problem.model.kinds
+    state = {i: "a" for i, kind in enumerate(kinds) if kind in HYSTERETIC}
     out = [(0, dict(state))]
     for when, spring, _, entered, _ in simulated.motion.switches:
         if int(spring) in state:
@@ -55,7 +54,7 @@ def _states(problem: Problem, simulated: Simulated) -> list[tuple[int, dict[int,
 class Section:
     """Samples `start` to `stop` (excluded) in which no spring changes its branch.
 
-    `branches` names those of the bistable springs from the base up, joined by a dot: "d" or "a·c".
+    `branches` names those of the hysteretic springs from the base up, joined by a dot: "d", "a·c".
     """
 
     branches: str

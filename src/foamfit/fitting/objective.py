@@ -32,7 +32,7 @@ from foamfit.solve.plan import plan as make_plan
 from foamfit.springs import kernels
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.springs.model import Model
-from foamfit.springs.spring import LinearSpring
+from foamfit.springs.spring import LinearSpring, MicroscaleSpring, Spring
 
 # What a residual is, in units of the curve's scale, where a simulation failed.
 PENALTY = 10.0
@@ -41,6 +41,8 @@ NOWHERE = np.empty(0, np.int64)
 # measured foam closer than 1 % of its range: noise far below that must not let one channel outweigh
 # the other by what is an error of the model in both.
 MODEL_ERROR = 0.005
+# A spring of a kind, whatever its numbers, where that is more than a linear one to the solver.
+_ANY_SPRING: dict[str, Spring] = {"microscale": MicroscaleSpring(1.0, 1.0, 0.0, 1.0, 1.0, 1.0, 1.0)}
 # A trial that needs more steps than this is too stiff to be worth waiting for.
 MAX_STEPS = 20_000
 
@@ -156,7 +158,7 @@ class Objective:
         """
         specimen = self.measurement.specimen
         count = len(self.model.kinds)
-        springs = [LinearSpring(1.0)] * count
+        springs = [_ANY_SPRING.get(kind, LinearSpring(1.0)) for kind in self.model.kinds]
         heights = [specimen.height / count] * count
         masses = [0.0] * count
         if self.interior_mass and count > 1 and isinstance(loading, Impact):
@@ -167,7 +169,10 @@ class Objective:
                 )
             masses = [specimen.mass / (count - 1)] * (count - 1) + [0.0]
         chain = Chain(springs, heights, specimen.area, masses)
-        return make_plan(chain, loading, self.time, dashpots=damped, max_steps=MAX_STEPS)
+        return make_plan(
+            chain, loading, self.time, dashpots=damped, relaxing=self.model.relaxation > 0,
+            max_steps=MAX_STEPS,
+        )  # fmt: skip
 
     def _measured(self) -> dict[str, Array]:
         """Measured curves that the drive leaves free."""

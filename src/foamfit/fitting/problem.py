@@ -12,7 +12,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError
-from foamfit.fitting.box import LARGEST_SHIFT, Scales, Space
+from foamfit.fitting.box import LARGEST_SHIFT, LAST_STRAIN, Scales, Space, family, is_share
 from foamfit.fitting.curves import check_interior, choose_drive, default_weights
 from foamfit.fitting.objective import Objective
 from foamfit.springs.model import Model
@@ -25,6 +25,7 @@ def make_params(
     drive: str | None = None,
     *,
     time_shift: bool = False,
+    relaxation: int = 0,
 ) -> lmfit.Parameters:
     """Parameters of a model for a test, with bounds from its scales; change them, then `fit`.
 
@@ -42,16 +43,22 @@ def make_params(
         "impact", "stress" or "displacement"; see `fitting.curves.choose_drive`.
     time_shift : bool
         Whether the time by which the motion channel is late is a parameter too.
+    relaxation : int
+        Relaxation terms of every hysteretic spring of a model that is given by its name.
 
     Returns
     -------
     lmfit.Parameters
         Values in SI, named s1_k0 … site_eta.
     """
-    model = Model.parse(model) if isinstance(model, str) else model
+    model = Model.parse(model, relaxation) if isinstance(model, str) else model
     drive = choose_drive(measurement) if drive is None else drive
     scales = Scales.of(measurement)
     stress, slope = scales.stress, scales.slope
+    if model.relaxation and measurement.time is None:
+        raise InputError(
+            f"{measurement.name}: relaxation needs a time column; give one, or leave relaxation out"
+        )
     guess = {
         "k0": (3.0 * slope, 1e-3 * stress, 1e4 * stress),
         "kc": (20.0 * slope, 1e-2 * stress, 1e5 * stress),
@@ -60,6 +67,13 @@ def make_params(
         "eps_c": (0.8 * scales.strain, 2e-3, 0.999),
         "kh_plus": (slope, 0.0, 100.0 * slope),
         "kh_minus": (0.3 * slope, 0.0, 100.0 * slope),
+        "eps_star": (0.8, 0.0, LAST_STRAIN),
+        "sigma_plus": (0.5 * stress, 1e-3 * stress, 30.0 * stress),
+        "spread_plus": (0.4, 1e-3, 5.0),
+        "sigma_minus": (0.2 * stress, 1e-4 * stress, 30.0 * stress),
+        "spread_minus": (0.7, 1e-3, 5.0),
+        "g": (0.2, 0.0, 10.0),
+        "tau": (0.05 * scales.duration, 1e-4 * scales.duration, 30.0 * scales.duration),
         "eta": (0.0, 0.0, 10.0 * scales.eta),
     }
     params = lmfit.Parameters()
@@ -68,7 +82,7 @@ def make_params(
         spring, short = split_name(name)
         if short == "height":
             continue
-        value, low, high = guess[short]
+        value, low, high = guess[family(short)]
         vary = short != "eta" or (drive == "impact" and (spring >= 0) == (count == 1))
         params.add(name, value=value, min=low, max=high, vary=vary)
     _add_heights(params, measurement, model)
@@ -214,12 +228,15 @@ def _check_held(params: lmfit.Parameters) -> None:
         wanted, fine = {
             "eps_a": ("between 0 and 1", 0.0 < value < 1.0),
             "eps_c": ("between 0 and 1", 0.0 < value < 1.0),
+            "eps_star": ("at least 0 and less than 1", 0.0 <= value < 1.0),
             "dsigma": ("zero or negative", value <= 0.0),
             "kh_plus": ("zero or positive", value >= 0.0),
             "kh_minus": ("zero or positive", value >= 0.0),
             "eta": ("zero or positive", value >= 0.0),
             "time_shift": ("finite", bool(np.isfinite(value))),
         }.get(short, ("positive", value > 0.0))
+        if is_share(short):
+            wanted, fine = "zero or positive", value >= 0.0
         if not fine:
             raise InputError(f"{name} = {value:g} is not admissible: it must be {wanted}")
 
@@ -234,12 +251,13 @@ def make_problem(
     *,
     time_shift: bool = False,
     loss: str = "linear",
+    relaxation: int = 0,
 ) -> Problem:
     """Make a problem ready; see `foamfit.fit` for the arguments.
 
     Raises InputError if the test cannot feed the drive or a parameter is unknown, by its name.
     """
-    model = Model.parse(model_name)
+    model = Model.parse(model_name, relaxation)
     drive = choose_drive(measurement) if drive is None else drive
     count = len(model.kinds)
     check_interior(measurement, count)

@@ -16,9 +16,11 @@ from scipy.stats import qmc
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.fitting import levenberg
-from foamfit.fitting.box import BOX, Scales, Space
+from foamfit.fitting.box import BOX, LAST_STRAIN, Scales, Space, family
 from foamfit.fitting.curves import smoothed
 from foamfit.fitting.objective import Objective
+from foamfit.springs.law import least_eps_star
+from foamfit.springs.parameters import HYSTERETIC
 
 Progress = Callable[[float, str], None]
 
@@ -170,17 +172,44 @@ def _stiffness_between(rise: float, low: float, high: float) -> float:
     return float((b + np.sqrt(discriminant)) / (2.0 * rise))
 
 
+def read_microscale(loop: Loop, marks: Array, scales: Scales) -> Array:
+    """Read a microscale spring off a loop, given where on it its snap stresses are taken to lie.
+
+    `marks` (7,) in [0, 1]: the initial slope over that at a twentieth of the largest strain, k_c
+    over the largest stress, the place of ε_* above its least, the strains at which the median
+    micro-springs snap through and back, and the two spreads. Returned are k0 … spread_minus, and a
+    dashpot of zero (SI).
+    """
+    last = float(np.max(loop.strain))
+    first = max(loop.at(0.05 * last, loading=True), 0.002 * scales.stress) / (0.05 * last)
+    k0, kc = first * 10.0 ** (1.2 * marks[0] - 0.4), scales.stress * 10.0 ** (2.3 * marks[1] - 0.5)
+    least = least_eps_star(k0, kc)
+    return np.array(
+        [
+            k0,
+            kc,
+            least + 0.5 * marks[2] * (LAST_STRAIN - least),
+            max(loop.at((0.2 + 0.8 * marks[3]) * last, loading=True), 0.02 * scales.stress),
+            10.0 ** (1.2 * marks[4] - 1.0),
+            max(loop.at((0.2 + 0.7 * marks[5]) * last, loading=False), 0.01 * scales.stress),
+            10.0 ** (1.2 * marks[6] - 1.0),
+            0.0,
+        ]
+    )
+
+
 def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> list[Array]:
     """Vectors of parameters read off the measured loop, from a Latin hypercube of marks.
 
-    Linear springs take a share of the largest displacement; each bistable spring is then read off
+    Linear springs take a share of the largest displacement; each hysteretic spring is then read off
     what is left, with marks of its own.
     """
     assert loop.displacement is not None
     assert loop.stress is not None
-    kinds, index = space.model.kinds, space.model.index
-    count = len(kinds)
-    marks = qmc.LatinHypercube(7 * count, rng=rng).random(CURVE_STARTS)
+    kinds, index, terms = space.model.kinds, space.model.index, space.model.relaxation
+    count, micro = len(kinds), kinds.count("microscale")
+    relaxing = 2 * terms * sum(kind in HYSTERETIC for kind in kinds)
+    marks = qmc.LatinHypercube(7 * count + 2 * micro + relaxing, rng=rng).random(CURVE_STARTS)
     starts = []
     for mark in marks:
         values = space.values.copy()
@@ -194,26 +223,38 @@ def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> l
             heights = np.maximum(values[given], 1e-3 * space.scales.height)
         motion = loop.displacement.copy()
         for i, kind in enumerate(kinds):
-            if kind != "bistable":
+            if kind not in HYSTERETIC:
                 share = 10.0 ** (-3.0 + 2.7 * mark[7 * i + 6])
                 k0 = heights[i] * space.scales.stress / (share * motion.max())
                 values[index[f"s{i + 1}_k0"]] = k0
                 motion = motion - heights[i] * loop.stress / k0
-        soft = sum(h for h, kind in zip(heights, kinds, strict=True) if kind == "bistable")
+        soft = sum(h for h, kind in zip(heights, kinds, strict=True) if kind in HYSTERETIC)
+        own, rest = Loop(motion / soft, loop.stress), iter(mark[7 * count :])
         for i, kind in enumerate(kinds):
-            if kind == "bistable":
-                first = index[f"s{i + 1}_k0"]
-                own = Loop(motion / soft, loop.stress)
-                values[first : first + 8] = read_spring(own, mark[7 * i : 7 * i + 5], space.scales)
+            if kind not in HYSTERETIC:
+                continue
+            first, places = index[f"s{i + 1}_k0"], mark[7 * i : 7 * i + 5]
+            if kind == "microscale":
+                places = np.append(places, [next(rest), next(rest)])
+                values[first : first + 8] = read_microscale(own, places, space.scales)
+            else:
+                values[first : first + 8] = read_spring(own, places, space.scales)
+            for at in range(first + 8, first + 8 + 2 * terms, 2):
+                values[at] = 10.0 ** (1.5 * next(rest) - 1.5)
+                values[at + 1] = space.scales.duration * 10.0 ** (2.0 * next(rest) - 2.5)
         starts.append(space.encode(values))
     return starts
 
 
 def box_starts(space: Space, rng: np.random.Generator, count: int) -> list[Array]:
     """Latin hypercube over the inner part of the box, whatever the curve looks like."""
-    inner = {"kh_plus": (0.0, 4.0), "kh_minus": (0.0, 4.0), "eta": (0.0, 0.3)}
-    inner |= {"time_shift": (-0.3, 0.3)} | dict.fromkeys(("k0", "kc"), tuple(np.log([0.3, 300.0])))
-    low, high = np.array([inner.get(short, BOX[short]) for _, short, _ in space.coordinates]).T
+    inner = {"kh_plus": (0.0, 4.0), "kh_minus": (0.0, 4.0), "eta": (0.0, 0.3), "g": (0.0, 1.0)}
+    inner |= {"time_shift": (-0.3, 0.3), "tau": tuple(np.log([0.002, 1.0]))}
+    inner |= dict.fromkeys(("k0", "kc"), tuple(np.log([0.3, 300.0])))
+    inner |= dict.fromkeys(("sigma_plus", "sigma_minus"), tuple(np.log([0.02, 1.0])))
+    inner |= dict.fromkeys(("spread_plus", "spread_minus"), tuple(np.log([0.05, 2.0])))
+    shorts = [family(short) for _, short, _ in space.coordinates]
+    low, high = np.array([inner.get(short, BOX[short]) for short in shorts]).T
     return list(low + (high - low) * qmc.LatinHypercube(low.size, rng=rng).random(count))
 
 
@@ -356,7 +397,7 @@ def _scan_vibration(tracker: Tracker, space: Space, start: Array) -> list[tuple[
     out: list[tuple[float, Array]] = []
     for spring, kind in enumerate(space.model.kinds, start=1):
         name = f"s{spring}_k0"
-        if kind == "bistable" or name not in space.free:
+        if kind in HYSTERETIC or name not in space.free:
             continue
         at = space.model.index[name]
         for factors in (STIFFER, 1.0 / STIFFER):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Mapping
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -53,7 +54,7 @@ def plot_loop(measurement: Measurement, values: Mapping[str, float]) -> Figure:
         ax.set(xlabel="strain (–)", ylabel="stress (MPa)")
         ax.plot(strain, measured / MPA, "o", ms=2.6, mfc="white", mec=GREY, mew=0.5)
         try:
-            spring = BistableSpring(**values)
+            spring = BistableSpring(**dict[str, Any](values))
             off = math.sqrt(float(np.mean((spring.stress(strain) - measured) ** 2)))
             told = f"misfit {off / float(np.ptp(measured)):.1%} of the range"
             there = np.linspace(0.0, strain.max(), 200)

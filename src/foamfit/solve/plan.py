@@ -11,13 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
-from foamfit.solve import cache, many
+from foamfit.solve import cache, many, relaxation
 from foamfit.solve import scene as scenes
 from foamfit.solve.explicit import taylor
 from foamfit.solve.implicit import steps, vibration
 from foamfit.springs import kernels
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
-from foamfit.springs.law import BISTABLE
+from foamfit.springs.law import BISTABLE, MICROSCALE
 from foamfit.springs.parameters import OWN_ETA, OWN_HEIGHT
 from foamfit.springs.sensitivities import equilibrium_tangents
 from foamfit.springs.spring import as_samples
@@ -58,6 +58,11 @@ _OUTCOMES = {
     "branch (strain 1 on branch a, 1 + eps_star on branch c)",
 }
 
+
+_WITH_MEMORY = (
+    "a microscale spring, or one that relaxes, is only simulated alone under a prescribed "
+    "displacement, or under a prescribed stress without relaxation, dashpots and masses"
+)
 
 NO_DIRECTIONS: Directions = np.empty((0, 2), np.int64)
 NO_SWITCHES = np.empty((0, 5))
@@ -116,6 +121,8 @@ class Plan(NamedTuple):
         Whether one mass bounces once: it has neither dashpot nor damper, nor a mass inside.
     implicit : bool or None
         Whether to take implicit steps; None = where explicit ones are the wrong tool.
+    memory : bool
+        Whether a spring keeps more than its branch: microscale springs and relaxation.
     """
 
     solver: str
@@ -132,6 +139,7 @@ class Plan(NamedTuple):
     max_explicit: int
     plain: bool = False
     implicit: bool | None = None
+    memory: bool = False
 
     def run(
         self,
@@ -154,8 +162,10 @@ class Plan(NamedTuple):
         SimulationError
             If the scene has no finite answer; the message says why.
         """
+        if self.memory and self.solver != CLOSED_FORM:
+            raise SimulationError(_WITH_MEMORY)
         if self.solver == CLOSED_FORM:
-            return self._closed_form(rows, heights, everything, directions)
+            return self._closed_form(rows, heights, rtol, everything, directions)
         p, time = len(directions), self.time
         curves = np.empty((1 + len(heights) if everything else 2, time.size))
         slopes = np.empty((p, *curves.shape)) if p else NO_SLOPES
@@ -193,11 +203,33 @@ class Plan(NamedTuple):
         )  # fmt: skip
 
     def _closed_form(
-        self, rows: Array, heights: Array, everything: bool, directions: Directions
+        self,
+        rows: Array,
+        heights: Array,
+        rtol: float,
+        everything: bool,
+        directions: Directions,
     ) -> Motion:
         """Undamped and massless: one stress in all springs; or one spring under known motion."""
         moved, wanted = self.top == scenes.MOTION, everything or len(directions) > 0
-        if moved:
+        slopes: Slopes | None = None
+        if self.memory and moved:
+            top, fine = np.array(self.values), True
+            strain = (self.values / heights)[None, :]
+            stress, seen, pressed = relaxation.stress_along(
+                rows[0], strain[0], self.time, heights[0], rtol, directions
+            )
+            branches = seen[None, :]
+            if len(directions):
+                slopes = Slopes(np.zeros((len(directions), 1, stress.size)), pressed)
+        elif self.memory:
+            stress = np.array(self.values)
+            strain, branches, longer = relaxation.strains_along(rows, heights, stress, directions)
+            top = heights @ strain
+            fine = math.isfinite(kernels.total(top))
+            if len(directions):
+                slopes = Slopes(longer, np.zeros((len(directions), stress.size)))
+        elif moved:
             top = np.array(self.values)
             stress, strain, branches = self._stretched(rows, heights)
             fine = True
@@ -205,8 +237,7 @@ class Plan(NamedTuple):
             stress, top = np.array(self.values), np.empty(self.time.size)
             strain, branches = _new_history(len(heights) if wanted else 0, self.time.size)
             fine = kernels.strains_along(rows, heights, stress, top, strain, branches)
-        slopes: Slopes | None = None
-        if len(directions):
+        if len(directions) and slopes is None:
             slopes = Slopes(
                 *equilibrium_tangents(rows, heights, strain, branches, moved, directions)
             )
@@ -337,20 +368,29 @@ def _time(t: ArrayLike) -> Array:
 
 
 def plan(
-    chain: Chain, drive: Drive, t: ArrayLike, *, dashpots: bool = False, max_steps: int = MAX_STEPS
+    chain: Chain,
+    drive: Drive,
+    t: ArrayLike,
+    *,
+    dashpots: bool = False,
+    relaxing: bool = False,
+    max_steps: int = MAX_STEPS,
 ) -> Plan:
     """Find what a scene needs: the nodes that have a state, and the least solver.
 
     Parameters
     ----------
     chain : Chain
-        Only its heights, area, masses, site damping and which springs have a dashpot count.
+        Only its heights, area, masses, site damping and which springs have a dashpot,
+        relaxation terms or the microscale law count.
     drive : Impact, StressDrive or DisplacementDrive
         How it is loaded.
     t : (n_t,) array
         Samples, s, increasing.
     dashpots : bool
         Whether to reckon with a dashpot in every spring, also where it is zero.
+    relaxing : bool
+        Whether to reckon with the relaxation terms that there are, also where they are zero.
     max_steps : int
         Bound on steps; there are others on steps times springs.
 
@@ -383,10 +423,13 @@ def plan(
         inside = np.flatnonzero(chain.arrays.masses[:-1] > 0.0)
         ends = np.append(inside + 1, ends)
         masses = np.append(chain.arrays.masses[inside] / chain.area, masses)
+    relaxing |= any(g > 0.0 for spring in chain.springs for g, _ in spring.relaxation)
+    memory = relaxing or any(spring.kind == MICROSCALE for spring in chain.springs)
+    alone = top == scenes.MOTION and len(chain.springs) == 1
     damped = dashpots or chain.arrays.damped or top == scenes.VISCOUS
     if len(ends) > 1 or above > 0.0:
         solver = SECOND_ORDER
-    elif damped and not (top == scenes.MOTION and len(chain.springs) == 1):
+    elif (damped or relaxing or (memory and top == scenes.MOTION)) and not alone:
         solver = FIRST_ORDER
     else:
         solver = CLOSED_FORM
@@ -408,4 +451,5 @@ def plan(
         max_steps=most,
         max_explicit=min(most, explicit),
         plain=speed > 0.0 and len(ends) == 1 and not damped and chain.site_damping == 0.0,
+        memory=memory,
     )

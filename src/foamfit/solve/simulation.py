@@ -27,8 +27,8 @@ from foamfit.solve.plan import (
 )
 from foamfit.springs import kernels
 from foamfit.springs.chain import Chain, Drive, check_scene
-from foamfit.springs.law import BISTABLE
-from foamfit.springs.parameters import DRAG, KINDS, OWN_HEIGHT, direction
+from foamfit.springs.law import BISTABLE, MICROSCALE
+from foamfit.springs.parameters import DRAG, KINDS, OWN_HEIGHT, OWN_RELAXATION, direction
 from foamfit.springs.spring import as_number
 
 _UNRESOLVED = (
@@ -180,8 +180,9 @@ def _difference(one: Array, other: Array) -> float:
 def _distance_to_pole(rows: Array, heights: Array, displacement: Array) -> float:
     """Least distance, in strain, of a spring on branch c from its end at 1 + ε_*."""
     strain = np.diff(displacement, axis=0, prepend=0.0).max(axis=1) / heights
-    bistable = (rows[:, kernels.KIND] == BISTABLE) & (strain > rows[:, kernels.EPS_C])
-    return float(np.where(bistable, 1.0 - (strain - rows[:, kernels.EPS_STAR]), 1.0).min())
+    kind = rows[:, kernels.KIND]
+    near = (kind == MICROSCALE) | (kind == BISTABLE) & (strain > rows[:, kernels.EPS_C])
+    return float(np.where(near, 1.0 - (strain - rows[:, kernels.EPS_STAR]), 1.0).min())
 
 
 def _hard(scene: Plan, rows: Array, heights: Array) -> bool:
@@ -273,7 +274,8 @@ def simulate(
     rtol : float
         Wanted error of displacement and base stress relative to their range.
     sensitivities : sequence of str
-        Parameters by which the response is differentiated: s1_k0 … s2_eta, s1_height, site_eta.
+        Parameters by which the response is differentiated: s1_k0 … s2_eta, s1_height, site_eta,
+        and s1_g1, s1_tau1, … of relaxation terms.
 
     Returns
     -------
@@ -293,12 +295,18 @@ def simulate(
     directions = NO_DIRECTIONS
     if sensitivities:
         kinds = tuple(KINDS[spring.kind] for spring in chain.springs)
-        wanted = [direction(kinds, name) for name in sensitivities]
+        wanted = [direction(kinds, name, chain.relaxation) for name in sensitivities]
         longer = any(what == OWN_HEIGHT for _, what in wanted)
         if longer and chain.site_damping > 0.0:  # the onsite damper acts over the whole height
             wanted.append((-1, DRAG))
         directions = np.array(wanted)
-    scene = plan(chain, drive, t, dashpots=any(name.endswith("_eta") for name in sensitivities))
+    scene = plan(
+        chain,
+        drive,
+        t,
+        dashpots=any(name.endswith("_eta") for name in sensitivities),
+        relaxing=any(what >= OWN_RELAXATION for _, what in directions),
+    )
     motion = _verified(scene, chain.arrays.rows, chain.arrays.heights, rtol, directions)
     return Response(
         time=scene.time,

@@ -13,7 +13,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError
-from foamfit.springs.spring import BistableSpring, LinearSpring, Spring, as_number, as_samples
+from foamfit.springs.spring import (
+    BistableSpring,
+    LinearSpring,
+    MicroscaleSpring,
+    Spring,
+    as_number,
+    as_samples,
+)
 
 
 def _finite(value: object, name: str, least: float, strict: bool) -> float:
@@ -39,8 +46,9 @@ def _listed(values: Any, name: str, wanted: str) -> tuple[Any, ...]:
 class ChainArrays(NamedTuple):
     """A chain as the kernels know it.
 
-    rows (n_springs, columns) are the springs, heights (m) and masses (kg) are (n_springs,), top
-    (1,) is the number of springs; `heavy` tells whether there are masses inside, `damped` dashpots.
+    rows (n_springs, columns) are the springs, all with room for as many relaxation terms as the one
+    with the most has; heights (m) and masses (kg) are (n_springs,), top (1,) is the number of
+    springs; `heavy` tells whether there are masses inside, `damped` dashpots.
     """
 
     rows: Array
@@ -57,7 +65,7 @@ class Chain:
 
     Parameters
     ----------
-    springs : sequence of BistableSpring or LinearSpring
+    springs : sequence of BistableSpring, MicroscaleSpring or LinearSpring
         Base first.
     heights : sequence of float
         Height h_i of each spring, m.
@@ -89,15 +97,15 @@ class Chain:
         site_damping: float = 0.0,
     ) -> None:
         """Check and freeze the chain."""
-        springs = _listed(springs, "springs", "BistableSpring or LinearSpring")
+        springs = _listed(springs, "springs", "BistableSpring, MicroscaleSpring or LinearSpring")
         n = len(springs)
         if n == 0:
             raise InputError("springs is empty: a chain needs at least one spring")
         for i, spring in enumerate(springs, start=1):
-            if not isinstance(spring, BistableSpring | LinearSpring):
+            if not isinstance(spring, BistableSpring | MicroscaleSpring | LinearSpring):
                 raise InputError(
                     f"springs: spring {i} is a {type(spring).__name__}; "
-                    "it must be a BistableSpring or a LinearSpring"
+                    "it must be a BistableSpring, a MicroscaleSpring or a LinearSpring"
                 )
         heights = _listed(heights, "heights", "numbers")
         masses = _listed([0.0] * n if masses is None else masses, "masses", "numbers")
@@ -119,10 +127,23 @@ class Chain:
         return math.fsum(self.heights)
 
     @cached_property
+    def relaxation(self) -> tuple[int, ...]:
+        """Number of relaxation terms of each spring."""
+        return tuple(len(spring.relaxation) for spring in self.springs)
+
+    @cached_property
     def arrays(self) -> ChainArrays:
         """The chain as the kernels know it."""
+        from foamfit.springs import kernels
+
+        room = max(self.relaxation)
         return ChainArrays(
-            rows=np.array([spring.row for spring in self.springs]),
+            rows=np.array(
+                [
+                    kernels.relaxing(spring.row, spring.relaxation, room) if room else spring.row
+                    for spring in self.springs
+                ]
+            ),
             heights=np.array(self.heights),
             masses=np.array(self.masses),
             top=np.array([len(self.springs)]),

@@ -8,6 +8,7 @@ spring is on is its whole memory: a and d belong to the paper's flag a, c and e 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,16 @@ from numba import njit
 from numpy.typing import NDArray
 
 from foamfit.arrays import Array as Array
-from foamfit.springs.law import BISTABLE, LINEAR, UNILATERAL, admissible, derived_points
+from foamfit.springs.law import (
+    BISTABLE,
+    LINEAR,
+    MICROSCALE,
+    UNILATERAL,
+    admissible,
+    crossing,
+    derived_points,
+    least_eps_star,
+)
 
 Row = Array
 Branches = NDArray[np.int64]
@@ -45,12 +55,24 @@ piece = njit(**_COUNTLESS, cache=True)
 KIND, K0, KC, EPS_A, EPS_C, KH_PLUS, KH_MINUS, ETA = range(8)
 SIGMA_A, SIGMA_C, EPS_STAR, EPS_HAT_A, EPS_HAT_C, SIGMA_HAT_A, SIGMA_HAT_C, N_COLUMNS = range(8, 16)
 
-# Branches: of the bistable spring, of a linear one, and of a unilateral one out of contact.
-A, D, C, E, LINE, OPEN = range(6)
-BRANCH_NAMES = ("a", "d", "c", "e", "line", "open")
+# A microscale spring has in place of most of them the logarithms of sigma_plus and sigma_minus, the
+# spreads, and the logarithm of the stress where both laws of snapping meet (see `law.crossing`).
+LOG_PLUS, SPREAD_PLUS, LOG_MINUS, SPREAD_MINUS, LOG_CROSS = EPS_A, EPS_C, KH_PLUS, KH_MINUS, SIGMA_A
+# After the columns follow the relaxation terms: g of term k (from 0) in N_COLUMNS + 2 k, its time τ
+# in the next; g = 0, τ = inf where a spring has fewer than others. Without any, rows end before.
+
+# Branches: of the bistable spring, of a linear one, and of a unilateral one out of contact; of the
+# microscale spring (virgin, it is on A): the snapped fraction p is held, p = P₊, p = P₋ > P₊, and
+# p = P₊ = P₋.
+A, D, C, E, LINE, OPEN, HELD, SNAP, BACK, BOTH = range(10)
+BRANCH_NAMES = (
+    "a", "d", "c", "e", "line", "open", "held", "snap-through", "snap-back", "reversible",
+)  # fmt: skip
 
 _derived_points = inner(derived_points)
 _admissible = inner(admissible)
+_least_eps_star = inner(least_eps_star)
+_crossing = inner(crossing)
 
 
 @compiled
@@ -92,18 +114,64 @@ def fill_linear(row: Row, k0: float, eta: float, unilateral: bool) -> bool:
 
 
 @compiled
+def fill_microscale(
+    row: Row,
+    k0: float,
+    kc: float,
+    eps_star: float,
+    sigma_plus: float,
+    spread_plus: float,
+    sigma_minus: float,
+    spread_minus: float,
+    eta: float,
+) -> bool:
+    """Write a microscale spring into `row`; false, and nothing written, if not admissible."""
+    stiff = 0.0 < k0 < math.inf and 0.0 < kc < math.inf
+    plus = 0.0 < sigma_plus < math.inf and 0.0 < spread_plus < math.inf
+    minus = 0.0 < sigma_minus < math.inf and 0.0 < spread_minus < math.inf
+    if not (stiff and plus and minus and eta >= 0.0):
+        return False
+    if not _least_eps_star(k0, kc) <= eps_star < math.inf:
+        return False
+    row[KIND] = MICROSCALE
+    row[K0], row[KC], row[EPS_STAR], row[ETA] = k0, kc, eps_star, eta
+    row[LOG_PLUS], row[SPREAD_PLUS] = math.log(sigma_plus), spread_plus
+    row[LOG_MINUS], row[SPREAD_MINUS] = math.log(sigma_minus), spread_minus
+    row[LOG_CROSS] = _crossing(row[LOG_PLUS], spread_plus, row[LOG_MINUS], spread_minus)
+    return True
+
+
+@inner
+def _fill_relaxation(row: Row, terms: Array) -> bool:
+    """Write g and τ of relaxation terms, and none after them; false if one is not admissible."""
+    for k in range(N_COLUMNS, row.size, 2):
+        row[k], row[k + 1] = 0.0, math.inf
+    for k in range(0, terms.size, 2):
+        if not (0.0 <= terms[k] < math.inf and 0.0 < terms[k + 1] < math.inf):
+            return False
+        row[N_COLUMNS + k], row[N_COLUMNS + k + 1] = terms[k], terms[k + 1]
+    return True
+
+
+@compiled
 def fill_rows(kinds: Branches, values: Array, rows: Array) -> bool:
     """Write the springs of a flat vector of parameters into `rows`; false if one is not admissible.
 
-    A bistable spring takes eight values (k0 … kh_minus, eta), a linear one two (k0, eta).
+    A bistable or microscale spring takes its own eight values, then g and τ of every relaxation
+    term that rows have room for; a linear one takes two (k0, eta).
     """
-    at = 0
+    at, more = 0, rows.shape[1] - N_COLUMNS
     for i in range(kinds.size):
-        if kinds[i] == BISTABLE:
+        if kinds[i] == BISTABLE or kinds[i] == MICROSCALE:
             p = values[at : at + 8]
-            fine = fill_bistable(rows[i], p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7])
-            at += 8
+            if kinds[i] == BISTABLE:
+                fine = fill_bistable(rows[i], p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7])
+            else:
+                fine = fill_microscale(rows[i], p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7])
+            fine = _fill_relaxation(rows[i], values[at + 8 : at + 8 + more]) and fine
+            at += 8 + more
         else:
+            _fill_relaxation(rows[i], values[:0])
             fine = fill_linear(rows[i], values[at], values[at + 1], kinds[i] == UNILATERAL)
             at += 2
         if not fine:
@@ -116,6 +184,20 @@ def bistable_row(*parameters: float) -> Row:
     row = np.zeros(N_COLUMNS)
     fill_bistable(row, *parameters)
     return row
+
+
+def microscale_row(*parameters: float) -> Row:
+    """Make the row of an admissible microscale spring from k0 … spread_minus, eta (SI)."""
+    row = np.zeros(N_COLUMNS)
+    fill_microscale(row, *parameters)
+    return row
+
+
+def relaxing(row: Row, terms: Sequence[tuple[float, float]], room: int) -> Row:
+    """Append relaxation terms (g, τ) to a row, with room for so many."""
+    out = np.tile([0.0, math.inf], room)
+    out[: 2 * len(terms)] = np.array(terms).ravel()
+    return np.concatenate([row, out])
 
 
 def linear_row(k0: float, eta: float, unilateral: bool) -> Row:
@@ -224,7 +306,7 @@ def below(branch: int) -> int:
 @inner
 def first_branch(row: Row) -> int:
     """Branch of a spring at rest."""
-    return A if row[KIND] == BISTABLE else LINE
+    return A if row[KIND] == BISTABLE or row[KIND] == MICROSCALE else LINE
 
 
 @inner

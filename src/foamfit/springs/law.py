@@ -1,4 +1,4 @@
-"""The formulas of the seven-parameter law (eqs. 2, 4 and 5), each written once.
+"""The formulas of the seven-parameter law (eqs. 2, 4 and 5) and of the microscale law, each once.
 
 Plain Python on numbers: `springs.spring` calls it as it stands, `springs.kernels` compiles it.
 """
@@ -8,7 +8,10 @@ from __future__ import annotations
 import math
 
 # The kinds of spring that the kernels tell apart.
-BISTABLE, LINEAR, UNILATERAL = 0, 1, 2
+BISTABLE, LINEAR, UNILATERAL, MICROSCALE = 0, 1, 2, 3
+# Below this rank (in standard normal scores) a microscale spring counts as virgin: so few, a share
+# of 5e-17, have snapped.
+LEAST_RANK = -8.3
 
 
 def derived_points(
@@ -81,3 +84,23 @@ def admissible(
         and 0.0 <= kh_plus < math.inf
         and 0.0 <= kh_minus < math.inf
     )
+
+
+def least_eps_star(k0: float, kc: float) -> float:
+    """Least ε_* of a microscale spring: with it branch c lies at or beyond branch a everywhere.
+
+    It is the largest σ/(k0+σ) - σ/(kc+σ), that at σ = √(k0 kc), or zero.
+    """
+    one, other = math.sqrt(k0), math.sqrt(kc)
+    return max(0.0, (other - one) / (other + one))
+
+
+def crossing(log_plus: float, spread_plus: float, log_minus: float, spread_minus: float) -> float:
+    """Logarithm of the stress where snap-through and snap-back of one rank are at one stress.
+
+    The side on which the spring is hysteretic (snap-back below snap-through) is below it where
+    spread_minus >= spread_plus, else above it; ±inf where they never meet.
+    """
+    if spread_minus == spread_plus:
+        return math.inf if log_minus < log_plus else -math.inf
+    return log_plus + spread_plus * ((log_plus - log_minus) / (spread_minus - spread_plus))

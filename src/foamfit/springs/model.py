@@ -1,8 +1,8 @@
 """The parameters of a model: one flat vector, and how it becomes springs.
 
 A model names its springs from the base up, joined by "+": "bistable", "linear+bistable", … Its
-parameters are one flat vector in SI: for each spring its own (prefix s1_, s2_, …), then the heights
-of a chain, then `site_eta`.
+parameters are one flat vector in SI: for each spring its own (prefix s1_, s2_, …) with those of its
+relaxation terms, then the heights of a chain, then `site_eta`.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from foamfit.arrays import Array
 from foamfit.errors import InputError
 from foamfit.springs import kernels
 from foamfit.springs.chain import Chain
-from foamfit.springs.parameters import KINDS, direction, names_of
-from foamfit.springs.spring import BistableSpring, LinearSpring, Spring
+from foamfit.springs.parameters import HYSTERETIC, KINDS, direction, names_of
+from foamfit.springs.spring import BistableSpring, LinearSpring, MicroscaleSpring, Spring
 
 
 @dataclass(frozen=True)
@@ -28,20 +28,25 @@ class Model:
     Parameters
     ----------
     kinds : tuple of str
-        "bistable", "linear" or "unilateral" (linear without tension) for each spring.
+        "bistable", "microscale", "linear" or "unilateral" (linear without tension) for each spring.
+    relaxation : int
+        Number of relaxation terms of every hysteretic (bistable or microscale) spring.
     """
 
     kinds: tuple[str, ...]
+    relaxation: int = 0
 
     @classmethod
-    def parse(cls, name: str) -> Model:
+    def parse(cls, name: str, relaxation: int = 0) -> Model:
         """Read a model's name, for example "linear+bistable".
 
         Raises
         ------
         InputError
-            If a spring in it is unknown.
+            If a spring in it is unknown, or the number of relaxation terms is none.
         """
+        if type(relaxation) is not int or relaxation < 0:
+            raise InputError(f"relaxation = {relaxation!r} must be a whole number, 0 = none")
         if not isinstance(name, str):
             raise InputError(f"model = {name!r} must be a text like 'linear+bistable'")
         kinds = tuple(part.strip() for part in name.split("+"))
@@ -51,7 +56,7 @@ class Model:
                     f"model '{name}': '{kind}' is not a spring; "
                     f"join {', '.join(KINDS)} by '+', from the base up"
                 )
-        return cls(kinds)
+        return cls(kinds, relaxation)
 
     @property
     def name(self) -> str:
@@ -64,7 +69,7 @@ class Model:
         names = [
             f"s{i}_{short}"
             for i, kind in enumerate(self.kinds, start=1)
-            for short in names_of(kind)
+            for short in names_of(kind, self.relaxation)
         ]
         if len(self.kinds) > 1:
             names += [f"s{i}_height" for i in range(1, len(self.kinds) + 1)]
@@ -78,7 +83,8 @@ class Model:
     @cached_property
     def directions(self) -> NDArray[np.int64]:
         """Direction of the derivative by each parameter, (n, 2)."""
-        return np.array([direction(self.kinds, name) for name in self.names])
+        terms = (self.relaxation,) * len(self.kinds)
+        return np.array([direction(self.kinds, name, terms) for name in self.names])
 
     @cached_property
     def _codes(self) -> NDArray[np.int64]:
@@ -86,7 +92,7 @@ class Model:
 
     def rows(self, values: Array) -> Array | None:
         """Springs as the kernels know them, (n_springs, columns); None if one is not admissible."""
-        rows = np.zeros((len(self.kinds), kernels.N_COLUMNS))
+        rows = np.zeros((len(self.kinds), kernels.N_COLUMNS + 2 * self.relaxation))
         return rows if kernels.fill_rows(self._codes, values, rows) else None
 
     def heights(self, values: Array, total: float) -> Array:
@@ -105,9 +111,14 @@ class Model:
         springs: list[Spring] = []
         at = 0
         for kind in self.kinds:
-            if kind == "bistable":
-                springs.append(BistableSpring(*map(float, values[at : at + 8])))
-                at += 8
+            if kind in HYSTERETIC:
+                make = BistableSpring if kind == "bistable" else MicroscaleSpring
+                own, more = map(float, values[at : at + 8]), values[at + 8 :]
+                terms = [
+                    (float(more[2 * k]), float(more[2 * k + 1])) for k in range(self.relaxation)
+                ]
+                springs.append(make(*own, relaxation=terms))
+                at += 8 + 2 * self.relaxation
             else:
                 k0, eta = map(float, values[at : at + 2])
                 springs.append(LinearSpring(k0, eta, kind == "unilateral"))

@@ -1,41 +1,74 @@
 """Parameters by their names: units, the branches that show them, and directions of derivatives.
 
 A direction is what a derivative is taken by: a spring (0 at the base) and one of its own parameters
-in the order of BISTABLE_NAMES, or its height; or no spring (-1) and the onsite damping of the top.
+in the order of BISTABLE_NAMES or MICROSCALE_NAMES, or its height, or a number of a relaxation term;
+or no spring (-1) and the onsite damping of the top.
 """
 
 from __future__ import annotations
 
 from foamfit.errors import InputError
 
-# Parameters of the two kinds of spring, in their order; a linear spring takes what it has of them.
+# Parameters of the kinds of spring, in their order; a linear spring takes what it has of them.
 BISTABLE_NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus", "eta")
+MICROSCALE_NAMES = (
+    "k0", "kc", "eps_star", "sigma_plus", "spread_plus", "sigma_minus", "spread_minus", "eta",
+)  # fmt: skip
 LINEAR_NAMES = ("k0", "eta")
-# Kinds of spring in the name of a model, in the order of the kernels' BISTABLE, LINEAR, UNILATERAL.
-KINDS = ("bistable", "linear", "unilateral")
-# What a direction changes, besides the parameters k0 … kh_minus of a spring (0 … 6).
-OWN_ETA, OWN_HEIGHT, DRAG = 7, 8, 9
+# Kinds of spring in the name of a model, in the order of the kernels' BISTABLE, LINEAR, UNILATERAL,
+# MICROSCALE; those that may relax.
+KINDS = ("bistable", "linear", "unilateral", "microscale")
+HYSTERETIC = ("bistable", "microscale")
+# What a direction changes, besides the seven parameters of a spring's law (0 … 6). From
+# OWN_RELAXATION on: the strength g_k of term k = 1, 2, … is OWN_RELAXATION + 2 (k-1), its time τ_k
+# the number after it.
+OWN_ETA, OWN_HEIGHT, DRAG, OWN_RELAXATION = 7, 8, 9, 10
 
-UNITS = {name: "" if name.startswith("eps") else "Pa" for name in BISTABLE_NAMES} | {
+UNITS = {
+    name: "" if name.startswith(("eps", "spread")) else "Pa"
+    for name in BISTABLE_NAMES + MICROSCALE_NAMES
+} | {
     "eta": "Pa s",
     "height": "m",
     "time_shift": "s",
+    "g": "",
+    "tau": "s",
 }
-# The branches of which a test must have reached one for the parameter to leave a trace in it.
+# By kind of spring, the branches of which a test must have reached one for the parameter to leave a
+# trace in it.
 BRANCHES = {
-    "k0": "a",
-    "eps_a": "d",
-    "kh_plus": "d",
-    "kc": "c",
-    "eps_c": "e",
-    "dsigma": "e",
-    "kh_minus": "e",
+    "bistable": {
+        "k0": "a",
+        "eps_a": "d",
+        "kh_plus": "d",
+        "kc": "c",
+        "eps_c": "e",
+        "dsigma": "e",
+        "kh_minus": "e",
+    },
+    "microscale": {
+        "k0": "a",
+        "sigma_plus": "snap-through",
+        "spread_plus": "snap-through",
+        "kc": "snap-through",
+        "eps_star": "snap-through",
+        "sigma_minus": "snap-back",
+        "spread_minus": "snap-back",
+    },
 }
 
 
-def names_of(kind: str) -> tuple[str, ...]:
-    """Names of the own parameters of a kind of spring."""
-    return BISTABLE_NAMES if kind == "bistable" else LINEAR_NAMES
+def relaxation_names(terms: int) -> tuple[str, ...]:
+    """Names of the parameters of so many relaxation terms: g1, tau1, g2, …"""
+    return tuple(f"{name}{k}" for k in range(1, terms + 1) for name in ("g", "tau"))
+
+
+def names_of(kind: str, relaxation: int = 0) -> tuple[str, ...]:
+    """Names of the own parameters of a kind of spring that has so many relaxation terms, if any."""
+    if kind not in HYSTERETIC:
+        return LINEAR_NAMES
+    law = BISTABLE_NAMES if kind == "bistable" else MICROSCALE_NAMES
+    return law + relaxation_names(relaxation)
 
 
 def split_name(name: str) -> tuple[int, str]:
@@ -47,12 +80,17 @@ def split_name(name: str) -> tuple[int, str]:
 
 
 def unit_of(name: str) -> str:
-    """Unit of a parameter, SI; "" for a strain."""
-    return UNITS[split_name(name)[1]]
+    """Unit of a parameter, SI; "" for a pure number."""
+    short = split_name(name)[1]
+    return UNITS[short if short in UNITS else short.rstrip("0123456789")]
 
 
-def direction(kinds: tuple[str, ...], name: str) -> tuple[int, int]:
+def direction(
+    kinds: tuple[str, ...], name: str, relaxation: tuple[int, ...] = ()
+) -> tuple[int, int]:
     """Direction of the derivative by a parameter of springs of these kinds.
+
+    `relaxation` has the number of relaxation terms of each spring; left out, there are none.
 
     Raises
     ------
@@ -67,8 +105,12 @@ def direction(kinds: tuple[str, ...], name: str) -> tuple[int, int]:
         spring = known.index(prefix)
         if short == "height":
             return spring, OWN_HEIGHT
-        if short in names_of(kinds[spring]):
-            return spring, BISTABLE_NAMES.index(short)
+        kind, terms = kinds[spring], relaxation[spring] if relaxation else 0
+        if short in names_of(kind):
+            law = MICROSCALE_NAMES if kind == "microscale" else BISTABLE_NAMES
+            return spring, law.index(short)
+        if short in names_of(kind, terms):
+            return spring, OWN_RELAXATION + relaxation_names(terms).index(short)
     raise InputError(
         f"sensitivities: '{name}' is not a parameter of this chain; give names like s1_k0, "
         "s2_height or site_eta"

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 from foamfit.springs.chain import Chain
+from foamfit.springs.parameters import KINDS
 from foamfit.springs.spring import BistableSpring, LinearSpring, Spring
 
 MPA, MM, MG = 1e6, 1e-3, 1e-6
@@ -173,8 +174,8 @@ def _line(cells: tuple[str, ...], widths: tuple[int, ...]) -> str:
 
 def _published_row(item: PublishedSet, spring: Spring, height: float) -> tuple[str, ...]:
     h = f"{height / MM:.3f}"
-    if isinstance(spring, LinearSpring):
-        kind = "unilateral" if spring.unilateral else "linear"
+    if not isinstance(spring, BistableSpring):
+        kind = KINDS[spring.kind]
         return (item.name, kind, f"{spring.k0 / MPA:g}", "", "", "", "", h, "", "", "")
     return (
         item.name,

@@ -1,22 +1,32 @@
-"""One mesoscopic spring: the seven-parameter bistable law (eqs. 1-5) and the linear spring."""
+"""One mesoscopic spring: the bistable law (eqs. 1-5), the microscale law and the linear spring."""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
-from foamfit.springs.law import BISTABLE, LINEAR, UNILATERAL, derived_points
+from foamfit.springs.law import (
+    BISTABLE,
+    LINEAR,
+    MICROSCALE,
+    UNILATERAL,
+    derived_points,
+    least_eps_star,
+)
 
 if TYPE_CHECKING:
     from foamfit.springs.kernels import Row
+
+Relaxation = Sequence[tuple[float, float]]  # frozen to a tuple of tuples
 
 
 def _require(holds: bool, name: str, value: float, wanted: str) -> None:
@@ -70,6 +80,29 @@ def _freeze_numbers(spring: object, *names: str) -> None:
             _require(value >= 0, name, value, "zero or positive")
 
 
+def _freeze_terms(spring: object, given: Any) -> None:
+    """Make the relaxation terms of a spring pairs of finite floats of the right sign."""
+    wanted = "relaxation must be a sequence of pairs (g, tau in s)"
+    try:
+        pairs = [tuple(pair) for pair in given]
+    except TypeError:
+        raise InputError(wanted) from None
+    if any(len(pair) != 2 for pair in pairs):
+        raise InputError(wanted)
+    terms = []
+    for k, (g, tau) in enumerate(pairs, start=1):
+        g, tau = as_number(g, f"g{k}"), as_number(tau, f"tau{k}")
+        _require(0 <= g < math.inf, f"g{k}", g, "finite and zero or positive")
+        _require(0 < tau < math.inf, f"tau{k}", tau, "finite and positive")
+        terms.append((g, tau))
+    object.__setattr__(spring, "relaxation", tuple(terms))
+
+
+def _numbers_of(spring: Any) -> tuple[str, ...]:
+    """Names of the fields of a spring that are numbers."""
+    return tuple(item.name for item in fields(spring) if item.name != "relaxation")
+
+
 def _as_history(values: ArrayLike, name: str) -> Array:
     history = np.ascontiguousarray(as_samples(values, name))
     if history.ndim > 1:
@@ -94,7 +127,8 @@ class _Law(ABC):
     def stress(self, strain: ArrayLike) -> Array:
         """Stress (Pa) along a strain history, shape (n,), from rest.
 
-        One flag is carried along the history (eqs. 2 and 3); the first sample starts with flag a.
+        One flag is carried along the history (eqs. 2 and 3), or the fraction that has snapped; the
+        first sample starts with flag a and nothing snapped.
         A single strain gives a single stress.
 
         Raises
@@ -115,12 +149,9 @@ class _Law(ABC):
             If the spring cannot carry a tension: beyond the pole of branch a (-k0), or any on a
             unilateral spring.
         """
-        from foamfit.springs import kernels
-
         history = _as_history(stress, "stress")
-        strain, none = np.empty(history.size), np.empty((0, history.size))
-        row = self.row[None, :]  # of height 1: its elongation is its strain
-        if not kernels.strains_along(row, np.ones(1), history, strain, none, none.astype(np.int64)):
+        strain = self._strain_along(history)
+        if not np.all(np.isfinite(strain)):
             at = _first(~np.isfinite(strain))
             raise SimulationError(
                 f"stress {history[at]:g} Pa (sample {at}) is a tension that the spring cannot carry"
@@ -129,17 +160,45 @@ class _Law(ABC):
 
     def tangent(self, strain: ArrayLike) -> Array:
         """Slope dσ/dε (Pa) on the branch of each sample of a strain history, shape (n,)."""
+        return self._slope_along(self._along(strain)[0]).reshape(np.shape(strain))
+
+    def branches(self, strain: ArrayLike) -> NDArray[np.str_]:
+        """Name the branch of each sample of a strain history, shape (n,).
+
+        A bistable spring is on "a", "d", "c" or "e"; a microscale spring on "a" while none of it
+        has snapped, then on "held" (what has snapped stays so), "snap-through", "snap-back" or
+        "reversible" (both at one stress); a linear spring on "line" or, out of contact, "open".
+        """
         from foamfit.springs import kernels
 
-        history, _, branches = self._along(strain)
-        return kernels.tangent_along(self.row, history, branches).reshape(np.shape(strain))
+        names = np.array(kernels.BRANCH_NAMES)[self._along(strain)[2]]
+        return names.reshape(np.shape(strain))
+
+    def _stress_along(self, strain: Array) -> tuple[Array, NDArray[np.int64]]:
+        """Stresses and branches of a strain history."""
+        from foamfit.springs import kernels
+
+        return kernels.stress_along(self.row, strain)
+
+    def _strain_along(self, stress: Array) -> Array:
+        """Strains of a stress history; not finite where the spring cannot have its stress."""
+        from foamfit.springs import kernels
+
+        strain, none = np.empty(stress.size), np.empty((0, stress.size))
+        row = self.row[None, :]  # of height 1: its elongation is its strain
+        kernels.strains_along(row, np.ones(1), stress, strain, none, none.astype(np.int64))
+        return strain
+
+    def _slope_along(self, strain: Array) -> Array:
+        """Slopes of a strain history."""
+        from foamfit.springs import kernels
+
+        return kernels.tangent_along(self.row, strain, self._stress_along(strain)[1])
 
     def _along(self, strain: ArrayLike) -> tuple[Array, Array, NDArray[np.int64]]:
         """Strains, stresses and branches of a strain history."""
-        from foamfit.springs import kernels
-
         history = _as_history(strain, "strain")
-        stress, branches = kernels.stress_along(self.row, history)
+        stress, branches = self._stress_along(history)
         if not np.all(np.isfinite(stress)):
             at = _first(~np.isfinite(stress))
             raise SimulationError(
@@ -171,6 +230,9 @@ class BistableSpring(_Law):
         k_h-, slope of the snap-back branch e, C2→A2, Pa.
     eta : float
         η, dashpot in parallel, Pa·s.
+    relaxation : sequence of pairs of float
+        Relaxation terms (g, τ in s) in parallel; left out = none. What follows the law along a
+        history (`stress`, `strain`) is the equilibrium, without them.
 
     Raises
     ------
@@ -186,10 +248,12 @@ class BistableSpring(_Law):
     kh_plus: float
     kh_minus: float
     eta: float = 0.0
+    relaxation: Relaxation = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
         """Refuse what is not admissible, by name."""
-        _freeze_numbers(self, *(item.name for item in fields(self)))
+        _freeze_numbers(self, *_numbers_of(self))
+        _freeze_terms(self, self.relaxation)
         _require(0 < self.eps_a < 1, "eps_a", self.eps_a, "between 0 and 1")
         past = f"greater than eps_a = {self.eps_a:g}"
         _require(self.eps_c > self.eps_a, "eps_c", self.eps_c, past)
@@ -252,12 +316,93 @@ class BistableSpring(_Law):
 
         return kernels.bistable_row(*self.seven, self.eta)
 
-    def branches(self, strain: ArrayLike) -> NDArray[np.str_]:
-        """Name the branch, "a", "d", "c" or "e", of each sample of a strain history, shape (n,)."""
+
+@dataclass(frozen=True)
+class MicroscaleSpring(_Law):
+    """Micro-springs in series whose snap stresses are spread log-normally, with a dashpot.
+
+    Its state is the fraction p of them that has snapped. With P₊ and P₋ the fractions whose
+    snap-through and snap-back stress lies below σ (P₋ no less than P₊, both 0 in tension),
+
+        p ← min(max(p, P₊(σ)), P₋(σ))          along the history of σ, from p = 0,
+        ε = (1-p) σ/(k0+σ) + p (eps_star + σ/(kc+σ)).
+
+    Parameters
+    ----------
+    k0 : float
+        First slope of branch a, at zero stress, Pa.
+    kc : float
+        First slope of the densified branch c, at zero stress, Pa.
+    eps_star : float
+        Strain at which branch c starts from zero stress.
+    sigma_plus : float
+        Snap-through stress of the middle rank, Pa.
+    spread_plus : float
+        Standard deviation of the logarithm of the snap-through stress.
+    sigma_minus : float
+        Snap-back stress of the middle rank, Pa.
+    spread_minus : float
+        Standard deviation of the logarithm of the snap-back stress.
+    eta : float
+        η, dashpot in parallel, Pa·s.
+    relaxation : sequence of pairs of float
+        Relaxation terms (g, τ in s) in parallel; left out = none. What follows the law along a
+        history (`stress`, `strain`) is the equilibrium, without them.
+
+    Raises
+    ------
+    ValueError
+        If a parameter is not admissible; the message names it.
+    """
+
+    k0: float
+    kc: float
+    eps_star: float
+    sigma_plus: float
+    spread_plus: float
+    sigma_minus: float
+    spread_minus: float
+    eta: float = 0.0
+    relaxation: Relaxation = field(default=(), kw_only=True)
+
+    def __post_init__(self) -> None:
+        """Refuse what is not admissible, by name."""
+        _freeze_numbers(self, *_numbers_of(self))
+        _freeze_terms(self, self.relaxation)
+        for name in ("sigma_plus", "spread_plus", "sigma_minus", "spread_minus"):
+            _require(getattr(self, name) > 0, name, getattr(self, name), "positive")
+        least = least_eps_star(self.k0, self.kc)
+        wanted = f"at least {least:.9g}, so that branch c lies beyond branch a at every stress"
+        _require(self.eps_star >= least, "eps_star", self.eps_star, wanted)
+
+    @property
+    def kind(self) -> int:
+        """The kind of spring that the kernels know."""
+        return MICROSCALE
+
+    @cached_property
+    def row(self) -> Row:
+        """The spring as the kernels know it."""
         from foamfit.springs import kernels
 
-        names = np.array(kernels.BRANCH_NAMES)[self._along(strain)[2]]
-        return names.reshape(np.shape(strain))
+        return kernels.microscale_row(*(getattr(self, name) for name in _numbers_of(self)))
+
+    def _stress_along(self, strain: Array) -> tuple[Array, NDArray[np.int64]]:
+        from foamfit.springs import microscale_kernels
+
+        stress, _, branches = microscale_kernels.stress_along(self.row, strain)
+        return stress, branches
+
+    def _strain_along(self, stress: Array) -> Array:
+        from foamfit.springs import microscale_kernels
+
+        return microscale_kernels.strain_along(self.row, stress)[0]
+
+    def _slope_along(self, strain: Array) -> Array:
+        from foamfit.springs import microscale_kernels
+
+        path = microscale_kernels.stress_along(self.row, strain)
+        return microscale_kernels.stress_tangents_along(self.row, strain, *path)[1]
 
 
 @dataclass(frozen=True)
@@ -299,5 +444,10 @@ class LinearSpring(_Law):
 
         return kernels.linear_row(self.k0, self.eta, self.unilateral)
 
+    @property
+    def relaxation(self) -> Relaxation:
+        """Relaxation terms: a linear spring has none."""
+        return ()
 
-Spring = BistableSpring | LinearSpring
+
+Spring = BistableSpring | MicroscaleSpring | LinearSpring

@@ -80,6 +80,7 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         insight=insight,
         stopped=record.stopped,
         loss=objective.loss,
+        relaxation=problem.model.relaxation,
         noise=_noise(best),
         intervals=intervals,
     )

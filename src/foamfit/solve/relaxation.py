@@ -1,0 +1,429 @@
+"""Springs that remember more than their branch, in closed form: microscale ones, and relaxation.
+
+Under a known motion one spring may relax, too. Term k adds q_k to the stress σ of equilibrium,
+dq_k/dt = -q_k/τ_k + g_k dσ/dt, from q_k = 0. With q_k = g_k (σ + y_k) no derivative of σ is needed:
+dy/dt = -(y + σ)/τ, or over a time h
+
+    y(h) = exp(-x) y(0) - x ∫₀¹ exp(-x (1-r)) σ(r h) dr,        x = h/τ.
+
+The strain is linear between samples, so that the spring goes through pieces of one branch each, on
+which σ is a smooth function of time. There it is taken for the cubic through its values at the four
+Lobatto nodes, and the integral of that is exact for any x. Derivatives by parameters follow from
+those of σ at the same nodes. A step on which the cubic bends too much is halved.
+"""
+
+# mypy: disallow-untyped-decorators=False, warn-return-any=False
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from foamfit.springs import kernels
+from foamfit.springs import microscale_kernels as micro
+from foamfit.springs.kernels import (
+    HELD,
+    KIND,
+    N_COLUMNS,
+    Array,
+    Branches,
+    Row,
+    above,
+    below,
+    branch_shape,
+    compiled,
+    first_branch,
+    inner,
+    interval,
+    slope_on,
+    stress_on,
+)
+from foamfit.springs.law import MICROSCALE
+from foamfit.springs.microscale_kernels import (
+    BRANCH,
+    CARRIED,
+    CURVATURE,
+    EPS,
+    FLEXIBILITY,
+    HIGH,
+    LOW,
+    OF_STRAIN,
+    SIGMA,
+    STATE,
+)
+from foamfit.springs.parameters import OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
+from foamfit.springs.sensitivities import branch_derivative, equilibrium_tangents
+
+# The nodes on [0, 1], and the coefficients of 1, r, r², r³ in the Lagrange polynomials on them.
+_NODES = (0.0, 0.5 - math.sqrt(0.05), 0.5 + math.sqrt(0.05), 1.0)
+NODES = np.array(_NODES)
+LAGRANGE = np.linalg.inv(np.vander(NODES, increasing=True))
+# The slopes of these polynomials at both ends.
+SLOPES = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 1.0, 2.0, 3.0]]) @ LAGRANGE
+_BEND = 0.25 * math.sqrt(5.0)
+# What the estimated error of a step is multiplied by; the cubic does better than it says.
+MARGIN = 2.0
+# The least step, as a share of the time between two samples.
+LEAST_PACE = 1e-9
+# Columns of the table of a term: its step h, exp(-x), the weights of the four nodes, their
+# derivatives by x, and what the cubic leaves out of higher polynomials.
+STEP, DECAY, WEIGHT, BY_X, OF_FOURTH, OF_FIFTH, OF_SIXTH, TABLE = 0, 1, 2, 6, 10, 11, 12, 13
+
+
+@inner
+def _begin(row: Row, state: Array) -> None:
+    """Set the state of a spring at rest."""
+    micro.begin(row, state)
+    if row[KIND] != MICROSCALE:
+        state[BRANCH] = first_branch(row)
+        state[LOW], state[HIGH] = interval(row, first_branch(row))
+
+
+@inner
+def _leaves(row: Row, state: Array, eps: float) -> bool:
+    """Whether a spring leaves its branch before it reaches a strain."""
+    if row[KIND] == MICROSCALE:
+        return micro.leaves(state, eps)
+    return eps > state[HIGH] if eps > state[EPS] else eps < state[LOW]
+
+
+@inner
+def _switch(row: Row, state: Array, up: bool) -> None:
+    """Go over to the next branch, at the end of this one or where the strain turns."""
+    if row[KIND] == MICROSCALE:
+        micro.switch(row, state, up)
+        if state[BRANCH] > HELD:  # the slope that it starts with
+            sigma = state[SIGMA]
+            micro.settle(row, state, state[EPS])
+            state[SIGMA] = sigma
+        return
+    branch = int(state[BRANCH])
+    state[EPS] = state[HIGH] if up else state[LOW]
+    branch = above(branch) if up else below(branch)
+    state[BRANCH] = branch
+    state[LOW], state[HIGH] = interval(row, branch)
+    state[SIGMA] = stress_on(row, branch, state[EPS])
+
+
+@inner
+def _settle(row: Row, state: Array, eps: float) -> None:
+    """Bring a spring to a strain that lies on its branch."""
+    if row[KIND] == MICROSCALE:
+        micro.settle(row, state, eps)
+    else:
+        state[EPS], state[SIGMA] = eps, stress_on(row, int(state[BRANCH]), eps)
+
+
+@inner
+def _tangents(row: Row, state: Array, d_rank: Array, out: Array) -> None:
+    """Fill the derivatives of the stress at a strain; see `microscale_kernels.tangents`."""
+    branch, eps = int(state[BRANCH]), state[EPS]
+    if row[KIND] == MICROSCALE:
+        rank = micro.rank_now(row, state)
+        micro.tangents(row, branch, rank, state[SIGMA], eps, d_rank, out)
+        return
+    slope = slope_on(row, branch, eps)
+    curved, _, x0, _ = branch_shape(row, branch)
+    x = eps - x0
+    factor = x / (1.0 - x) if curved else x
+    for own in range(OF_STRAIN):
+        dk, dx0, ds0 = branch_derivative(row, branch, own)
+        out[own] = factor * dk - slope * dx0 + ds0
+    out[OF_STRAIN] = slope * eps
+
+
+@inner
+def _moments(x: float, out: Array) -> None:
+    """Fill J_m = ∫₀¹ exp(-x (1-r)) r^m dr for m = 0 … 4."""
+    if x > 1.0:
+        out[0] = -math.expm1(-x) / x
+        for m in range(1, 5):
+            out[m] = (1.0 - m * out[m - 1]) / x
+        return
+    term = total = 0.2
+    for k in range(1, 30):
+        term *= -x / (5.0 + k)
+        total += term
+        if abs(term) < 1e-17:
+            break
+    out[4] = total
+    for m in range(4, 0, -1):
+        out[m - 1] = (1.0 - x * out[m]) / m
+
+
+@inner
+def _tabulate(h: float, tau: float, moments: Array, table: Array) -> None:
+    """Fill the table of a term for steps of the length h."""
+    x = h / tau
+    _moments(x, moments)
+    table[STEP], table[DECAY] = h, math.exp(-x)
+    for i in range(4):
+        value = change = 0.0
+        for m in range(4):
+            value += LAGRANGE[m, i] * moments[m]
+            change += LAGRANGE[m, i] * (moments[m + 1] - moments[m])
+        table[WEIGHT + i], table[BY_X + i] = value, change
+    # The Legendre polynomials P4, P5, P6 look on the nodes like P2, like 0.72 P1 + 0.28 P3, like
+    # 0.44 P0 + 0.56 P2. The difference in the integral, as it adds up while an error lasts:
+    # through 1/(1 - exp(-x)) steps.
+    linear = 2.0 * moments[1] - moments[0]
+    fourth = 70.0 * moments[4] - 140.0 * moments[3] + 84.0 * moments[2] - 14.0 * moments[1]
+    table[OF_FOURTH] = abs(fourth) / moments[0]
+    table[OF_FIFTH] = min(0.72 * linear / moments[0], 25.0 / x)
+    table[OF_SIXTH] = min(0.44, 39.0 / x)
+
+
+@inner
+def _truncation(
+    row: Row, nodes: Array, table: Array, span: float, begins: float, ends_with: float
+) -> float:
+    """Estimate what the cubic through four nodes does to the stress of all terms in the end.
+
+    Its Legendre coefficients are taken to fall on as they have begun; where the slopes at the ends
+    are known (not 0), the fourth is at least what they want.
+    """
+    ends, inside = 0.25 * (nodes[3] - nodes[0]), _BEND * (nodes[2] - nodes[1])
+    one, three = abs(ends + inside), abs(ends - inside)
+    two = abs(nodes[0] + nodes[3] - nodes[1] - nodes[2]) / 2.4
+    if one + two + three == 0.0:
+        return 0.0
+    if one > 0.0:
+        three = max(three, 0.5 * two * two / one)
+    fall = 1.0
+    if three < two < one:
+        fall = max(three / two, two / one)
+    error = 0.0
+    for k in range(table.shape[0]):
+        lasting = min(1.0, span / row[N_COLUMNS + 2 * k + 1])
+        more = table[k, OF_FOURTH] + fall * (table[k, OF_FIFTH] + fall * table[k, OF_SIXTH])
+        error += row[N_COLUMNS + 2 * k] * lasting * more
+    fourth = three * fall
+    if begins != 0.0 and ends_with != 0.0:
+        for i in range(4):
+            begins -= SLOPES[0, i] * nodes[i]
+            ends_with -= SLOPES[1, i] * nodes[i]
+        fourth = max(fourth, (abs(begins) + abs(ends_with)) / 14.0)
+    return fourth * error
+
+
+@compiled
+def relaxed_along(
+    row: Row, eps: Array, t: Array, rtol: float, derive: bool
+) -> tuple[Array, Branches, Array, Array, Array]:
+    """Stress of a spring and of its relaxation terms along a history of its strain.
+
+    Parameters
+    ----------
+    row : array
+        The spring with its terms.
+    eps, t : (n,) arrays
+        Strains and times, s.
+    rtol : float
+        Wanted error over the largest stress.
+    derive : bool
+        Whether to fill the derivatives too.
+
+    Returns
+    -------
+    tuple of arrays
+        Stress (n,), Pa, infinite from the end of a branch on; branches (n,); derivatives of the
+        stress (8 or 0, n) by k0 … kh_minus or spread_minus, and by the logarithm of the strain; by
+        the g of every term (terms, n), and by its τ (terms or 0, n).
+    """
+    n, terms, size = eps.size, (row.size - N_COLUMNS) // 2, CARRIED if derive else 0
+    sigma, branches = np.empty(n), np.empty(n, np.int64)
+    by, by_g, by_tau = (
+        np.empty((size, n)),
+        np.empty((terms, n)),
+        np.empty((terms if derive else 0, n)),
+    )
+    state, nodes = np.empty(STATE), np.empty(4)
+    table, moments = np.zeros((terms, TABLE)), np.empty(5)
+    y, y_tau, d_y = np.zeros(terms), np.zeros(terms), np.zeros((terms, CARRIED))
+    d_rank, d_nodes = np.zeros(CARRIED), np.zeros((4, CARRIED))
+    _begin(row, state)
+    largest, span, entered = 0.0, t[n - 1] - t[0], True
+    for j in range(n):
+        before, start, done = state[EPS], j == 0, 0.0
+        while True:
+            up, leaving = eps[j] > state[EPS], _leaves(row, state, eps[j])
+            if leaving and row[KIND] == MICROSCALE and micro.turned(state, up):
+                _switch(row, state, up)
+                entered = True
+                continue
+            end = (state[HIGH] if up else state[LOW]) if leaving else eps[j]
+            until = 1.0
+            if leaving:
+                until = min(max((end - before) / (eps[j] - before), done), 1.0)
+            if start:  # from rest to the first sample in no time
+                _settle(row, state, end)
+                done, entered = until, True
+            if derive and entered:
+                _tangents(row, state, d_rank, d_nodes[3])
+                entered = False
+            pace = until - done
+            at, first = done, state[EPS]
+            while done < until:
+                pace = min(pace, until - done)
+                last = pace == until - done
+                nodes[0], origin = state[SIGMA], state[EPS]
+                flexibility, curvature = state[FLEXIBILITY], state[CURVATURE]
+                for i in range(1, 4):
+                    way = (done + pace * NODES[i] - at) / (until - at)
+                    _settle(row, state, end if last and i == 3 else first + way * (end - first))
+                    nodes[i] = state[SIGMA]
+                if not abs(nodes[3]) < math.inf:
+                    break
+                largest = max(largest, abs(nodes[3]))
+                h = pace * (t[j] - t[j - 1])
+                for k in range(terms):
+                    if not abs(h - table[k, STEP]) <= 1e-13 * h:
+                        _tabulate(h, row[N_COLUMNS + 2 * k + 1], moments, table[k])
+                error, begins, ends_with = 0.0, 0.0, 0.0
+                if pace > LEAST_PACE:
+                    if flexibility > 0.0 and state[FLEXIBILITY] > 0.0:
+                        begins = (state[EPS] - origin) / flexibility
+                        ends_with = (state[EPS] - origin) / state[FLEXIBILITY]
+                    error = _truncation(row, nodes, table, span, begins, ends_with)
+                if MARGIN * error > rtol * largest:
+                    state[EPS], state[SIGMA] = origin, nodes[0]
+                    state[FLEXIBILITY], state[CURVATURE] = flexibility, curvature
+                    pace *= 0.5
+                    continue
+                if derive:
+                    d_nodes[0] = d_nodes[3]
+                    here = state[SIGMA], state[EPS]
+                    for i in range(1, 4):
+                        way = (done + pace * NODES[i] - at) / (until - at)
+                        state[EPS] = first + way * (end - first)
+                        state[SIGMA] = nodes[i]
+                        _tangents(row, state, d_rank, d_nodes[i])
+                    state[SIGMA], state[EPS] = here
+                for k in range(terms):
+                    tau = row[N_COLUMNS + 2 * k + 1]
+                    x, decay, total, change = h / tau, table[k, DECAY], 0.0, 0.0
+                    for i in range(4):
+                        total += table[k, WEIGHT + i] * nodes[i]
+                        change += table[k, BY_X + i] * nodes[i]
+                    if derive:
+                        by_x = -decay * y[k] - total - x * change
+                        y_tau[k] = decay * y_tau[k] - by_x * x / tau
+                        for c in range(CARRIED):
+                            total_c = 0.0
+                            for i in range(4):
+                                total_c += table[k, WEIGHT + i] * d_nodes[i, c]
+                            d_y[k, c] = decay * d_y[k, c] - x * total_c
+                    y[k] = decay * y[k] - x * total
+                done = until if last else done + pace
+                pace *= 2.0
+            if not abs(state[SIGMA]) < math.inf:
+                sigma[j:], branches[j:] = math.inf, int(state[BRANCH])
+                return sigma, branches, by, by_g, by_tau
+            if leaving:
+                _switch(row, state, up)
+                entered = True
+                continue
+            if state[EPS] != end:  # so near the end of a branch that no time is left
+                _settle(row, state, end)
+                if derive:
+                    _tangents(row, state, d_rank, d_nodes[3])
+            break
+        if start:
+            for k in range(terms):
+                y[k] = -state[SIGMA]
+                for c in range(size):
+                    d_y[k, c] = -d_nodes[3, c]
+        total = state[SIGMA]
+        for k in range(terms):
+            by_g[k, j] = state[SIGMA] + y[k]
+            total += row[N_COLUMNS + 2 * k] * by_g[k, j]
+            if derive:
+                by_tau[k, j] = row[N_COLUMNS + 2 * k] * y_tau[k]
+        for c in range(size):
+            by[c, j] = d_nodes[3, c]
+            for k in range(terms):
+                by[c, j] += row[N_COLUMNS + 2 * k] * (d_nodes[3, c] + d_y[k, c])
+        sigma[j], branches[j] = total, int(state[BRANCH])
+    return sigma, branches, by, by_g, by_tau
+
+
+def stress_along(
+    row: Row, eps: Array, t: Array, height: float, rtol: float, directions: Branches
+) -> tuple[Array, Branches, Array]:
+    """Stress of one spring (without its dashpot) along a history of its strain.
+
+    Parameters
+    ----------
+    row : array
+        A spring of any kind, with any number of relaxation terms.
+    eps, t : (n,) arrays
+        Strains and times, s.
+    height : float
+        Height of the spring, m.
+    rtol : float
+        Wanted error over the largest stress.
+    directions : (p, 2) array
+        See `springs.parameters`.
+
+    Returns
+    -------
+    tuple of arrays
+        Stress (n,), Pa; branches (n,); derivatives of the stress at a fixed elongation (p, n).
+    """
+    own = directions[:, 1]
+    terms = row[N_COLUMNS::2]
+    out = np.zeros((len(own), eps.size))
+    if row[KIND] == MICROSCALE and not terms.any() and not (own >= OWN_RELAXATION).any():
+        stress, ranks, branches = micro.stress_along(row, eps)
+        if len(own) == 0:
+            return stress, branches, out
+        by, _ = micro.stress_tangents_along(row, eps, stress, ranks, branches)
+        by_g = by_tau = by[:0]
+    else:
+        stress, branches, by, by_g, by_tau = relaxed_along(row, eps, t, rtol, len(own) > 0)
+    for p, what in enumerate(own):
+        if what < OWN_ETA:
+            out[p] = by[what]
+        elif what == OWN_HEIGHT:
+            out[p] = by[OF_STRAIN] / -height
+        elif what >= OWN_RELAXATION:
+            term, of_tau = divmod(what - OWN_RELAXATION, 2)
+            out[p] = by_tau[term] if of_tau else by_g[term]
+    return stress, branches, out
+
+
+def strains_along(
+    rows: Array, heights: Array, sigma: Array, directions: Branches
+) -> tuple[Array, Branches, Array]:
+    """Strains of springs in series, which do not relax, along a history of their stress.
+
+    Returns
+    -------
+    tuple of arrays
+        Strains, -inf where a spring cannot have its stress, and branches (springs, n); derivatives
+        of the displacements above the springs (p, springs, n), m.
+    """
+    count, n = len(rows), sigma.size
+    strain, branches = np.empty((count, n)), np.empty((count, n), np.int64)
+    longer = np.zeros((len(directions), count, n))
+    for i, row in enumerate(rows):
+        mine = np.flatnonzero(directions[:, 0] == i)
+        own, here = directions[mine, 1], slice(i, i + 1)
+        if row[KIND] == MICROSCALE:
+            strain[i], ranks, branches[i] = micro.strain_along(row, sigma)
+            if len(own):
+                by = micro.strain_tangents_along(row, sigma, ranks, branches[i])
+                for p, what in zip(mine, own, strict=True):
+                    law = heights[i] * by[what] if what < OWN_ETA else 0.0
+                    longer[p, i:] = strain[i] if what == OWN_HEIGHT else law
+            continue
+        kernels.strains_along(
+            rows[here], heights[here], sigma, np.empty(n), strain[here], branches[here]
+        )
+        if len(own):
+            local = np.column_stack([np.zeros_like(own), own])
+            by, _ = equilibrium_tangents(
+                rows[here], heights[here], strain[here], branches[here], False, local
+            )
+            longer[mine, i:] = by
+    return strain, branches, longer

@@ -1,0 +1,426 @@
+"""The compiled microscale law: one spring followed along a history, and its derivatives.
+
+Its memory is the rank w up to which micro-springs have snapped, in standard normal scores: the
+snapped fraction is p = Φ(w). With u₊ = (ln σ - ln sigma_plus)/spread_plus and u₋ likewise (both -∞
+in tension), w ← min(max(w, u₊), max(u₊, u₋)). So Φ is never inverted, and 1 - p = Φ(-w) keeps all
+its digits. Stress and strain grow together along any history, so that a branch ends at a strain as
+well as at a stress: the path of a spring is walked from end to end of its branches.
+"""
+
+# mypy: disallow-untyped-decorators=False, warn-return-any=False
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from foamfit.springs.kernels import (
+    BACK,
+    BOTH,
+    EPS_STAR,
+    HELD,
+    K0,
+    KC,
+    LOG_CROSS,
+    LOG_MINUS,
+    LOG_PLUS,
+    SNAP,
+    SPREAD_MINUS,
+    SPREAD_PLUS,
+    A,
+    Array,
+    Branches,
+    Row,
+    compiled,
+    inner,
+)
+from foamfit.springs.law import LEAST_RANK
+
+# The state of a walk: branch, rank, p, 1 - p, strain, stress, the strains and stresses at which the
+# branch ends, and dε/dσ, d²ε/dσ² where the stress was last sought. Then what stays: strain and
+# stress where snap-through and snap-back meet, where the first micro-spring snaps, and where the
+# last one has snapped back.
+BRANCH, RANK, SNAPPED, REST, EPS, SIGMA, LOW, HIGH, SIGMA_LOW, SIGMA_HIGH = range(10)
+FLEXIBILITY, CURVATURE, MEET, SIGMA_MEET, FIRST, SIGMA_FIRST, LAST, SIGMA_LAST = range(10, 18)
+STATE = 18
+# Derivatives that are carried: by k0 … spread_minus, and by (the logarithm of) the strain itself.
+OF_STRAIN, CARRIED = 7, 8
+# A step of Halley's method so small, in widths over which the law bends, is the last: what it
+# leaves is about its cube.
+NEAR = 3e-6
+_ROOT_HALF, _ROOT_TURN = math.sqrt(0.5), 1.0 / math.sqrt(2.0 * math.pi)
+
+
+@inner
+def share(rank: float) -> float:
+    """Φ, the share of all ranks that lies below one."""
+    return 0.5 * math.erfc(-_ROOT_HALF * rank)
+
+
+@inner
+def density(rank: float) -> float:
+    """Φ', the density of ranks."""
+    return _ROOT_TURN * math.exp(-0.5 * rank * rank)
+
+
+@inner
+def strain_of(row: Row, p: float, rest: float, sigma: float) -> float:
+    """Strain at which the share p has snapped, and the share `rest` = 1 - p has not."""
+    return rest * (sigma / (row[K0] + sigma)) + p * (row[EPS_STAR] + sigma / (row[KC] + sigma))
+
+
+@inner
+def held_stress(row: Row, p: float, rest: float, eps: float) -> float:
+    """Stress at which so many have snapped, the inverse of `strain_of`: one root of a quadratic."""
+    k0, kc, beyond = row[K0], row[KC], eps - p * row[EPS_STAR]
+    a, product = 1.0 - beyond, beyond * k0 * kc
+    if not a > 0.0:
+        return math.inf
+    b = rest * kc + p * k0 - beyond * (k0 + kc)
+    root = math.sqrt(b * b + 4.0 * a * product)
+    return 2.0 * product / (b + root) if b >= 0.0 else (root - b) / (2.0 * a)
+
+
+@inner
+def _strain_between(row: Row, log: float, spread: float, sigma: float) -> float:
+    """Strain at a stress at which rank and stress belong together; see `_along_law`."""
+    if sigma == math.inf:
+        return 1.0 + row[EPS_STAR]
+    if not sigma > 0.0:
+        return -math.inf
+    rank = (math.log(sigma) - log) / spread
+    return strain_of(row, share(rank), share(-rank), sigma)
+
+
+@inner
+def begin(row: Row, state: Array) -> None:
+    """Set the state of a spring that never bore anything."""
+    state[:] = 0.0
+    state[BRANCH], state[RANK], state[REST] = A, -math.inf, 1.0
+    plus, minus = row[LOG_PLUS], row[LOG_MINUS]
+    state[SIGMA_MEET] = math.exp(row[LOG_CROSS])
+    state[MEET] = _strain_between(row, plus, row[SPREAD_PLUS], state[SIGMA_MEET])
+    least = plus + row[SPREAD_PLUS] * LEAST_RANK
+    state[SIGMA_FIRST] = math.exp(least)
+    state[FIRST] = strain_of(row, 0.0, 1.0, state[SIGMA_FIRST])
+    state[SIGMA_LAST] = math.exp(min(least, minus + row[SPREAD_MINUS] * LEAST_RANK))
+    state[LAST] = strain_of(row, 0.0, 1.0, state[SIGMA_LAST])
+    _enter(row, state, A)
+
+
+@inner
+def _hysteretic_below(row: Row) -> bool:
+    """Whether snap-back lies below snap-through under the stress at which both meet, or above."""
+    return row[SPREAD_MINUS] >= row[SPREAD_PLUS]
+
+
+@inner
+def _enter(row: Row, state: Array, branch: int) -> None:
+    """Enter a branch at the strain and stress where the spring is."""
+    below = _hysteretic_below(row)
+    state[BRANCH] = branch
+    state[LOW], state[SIGMA_LOW] = -math.inf, -math.inf
+    state[HIGH], state[SIGMA_HIGH] = math.inf, math.inf
+    if branch == A:
+        state[RANK], state[SNAPPED], state[REST] = -math.inf, 0.0, 1.0
+        state[HIGH], state[SIGMA_HIGH] = state[FIRST], state[SIGMA_FIRST]
+    elif branch == SNAP:
+        if below:
+            state[HIGH], state[SIGMA_HIGH] = state[MEET], state[SIGMA_MEET]
+    else:
+        state[LOW], state[SIGMA_LOW] = state[LAST], state[SIGMA_LAST]
+        met = below if branch == BOTH else not below
+        if met and state[MEET] > state[LOW]:
+            state[LOW], state[SIGMA_LOW] = state[MEET], state[SIGMA_MEET]
+        if branch == BOTH and not below:
+            state[HIGH], state[SIGMA_HIGH] = state[MEET], state[SIGMA_MEET]
+    state[FLEXIBILITY] = 0.0
+
+
+@inner
+def _hold(row: Row, state: Array, up: bool) -> None:
+    """Hold the rank that has been reached, where the strain turns (upwards or downwards)."""
+    if up:
+        rank = (math.log(state[SIGMA]) - row[LOG_MINUS]) / row[SPREAD_MINUS]
+    else:
+        rank = (math.log(state[SIGMA]) - row[LOG_PLUS]) / row[SPREAD_PLUS]
+    p, rest = share(rank), share(-rank)
+    state[BRANCH], state[RANK], state[SNAPPED], state[REST] = HELD, rank, p, rest
+    state[FLEXIBILITY] = 0.0
+    if up:
+        state[LOW], state[SIGMA_LOW] = state[EPS], state[SIGMA]
+        sigma = math.exp(row[LOG_PLUS] + row[SPREAD_PLUS] * rank)
+        state[SIGMA_HIGH] = max(sigma, state[SIGMA])
+        state[HIGH] = max(strain_of(row, p, rest, sigma), state[EPS])
+    else:
+        state[HIGH], state[SIGMA_HIGH] = state[EPS], state[SIGMA]
+        sigma = math.exp(row[LOG_MINUS] + row[SPREAD_MINUS] * rank)
+        state[SIGMA_LOW] = min(sigma, state[SIGMA])
+        state[LOW] = min(strain_of(row, p, rest, sigma), state[EPS])
+
+
+@inner
+def turned(state: Array, up: bool) -> bool:
+    """Whether a spring that snaps, or snaps back, is now moved the other way."""
+    return state[BRANCH] == BACK if up else state[BRANCH] == SNAP
+
+
+@inner
+def switch(row: Row, state: Array, up: bool) -> None:
+    """Go over from the end of a branch, or from where the strain turns, to the next branch."""
+    branch = int(state[BRANCH])
+    if turned(state, up):
+        _hold(row, state, up)
+        return
+    end = HIGH if up else LOW
+    state[EPS], state[SIGMA] = state[end], state[end + SIGMA_LOW - LOW]
+    if branch == HELD:
+        _enter(row, state, SNAP if up else BACK)
+    elif branch == A:
+        below = _hysteretic_below(row)
+        _enter(row, state, SNAP if (state[SIGMA] < state[SIGMA_MEET]) == below else BOTH)
+    elif branch == SNAP:
+        _enter(row, state, BOTH)
+    elif state[SIGMA] == state[SIGMA_LAST]:
+        _enter(row, state, A)
+    elif branch == BACK:
+        _enter(row, state, BOTH)
+    else:
+        _enter(row, state, SNAP if up else BACK)
+
+
+@inner
+def stress_in(row: Row, state: Array, eps: float) -> float:
+    """Stress at a strain on the branch that the spring is on; infinite if it cannot have any."""
+    branch = int(state[BRANCH])
+    if branch == A:
+        return row[K0] * eps / (1.0 - eps) if eps < 1.0 else math.inf
+    if branch == HELD:
+        return held_stress(row, state[SNAPPED], state[REST], eps)
+    if branch == BACK:
+        return _along_law(row, state, eps, row[LOG_MINUS], row[SPREAD_MINUS])
+    return _along_law(row, state, eps, row[LOG_PLUS], row[SPREAD_PLUS])
+
+
+@inner
+def _along_law(row: Row, state: Array, eps: float, log: float, spread: float) -> float:
+    """Stress at a strain where p = Φ((ln σ - log)/spread), to rounding.
+
+    Halley's method from the parabola through the point before, inside a bracket. The strain lies
+    between those of branches a and c.
+    """
+    k0, kc, star = row[K0], row[KC], row[EPS_STAR]
+    if not eps < 1.0 + star:
+        return math.inf
+    low, high = 0.0, k0 * eps / (1.0 - eps) if eps < 1.0 else math.inf
+    high *= 1.0 + 1e-15
+    if eps > star:
+        low = kc * (eps - star) / (1.0 - (eps - star)) * (1.0 - 1e-15)
+    sigma, slope = state[SIGMA], state[FLEXIBILITY]
+    if slope > 0.0:
+        step = (eps - state[EPS]) / slope
+        sigma += step * (1.0 - 0.5 * step * state[CURVATURE] / slope)
+    if not low < sigma < high:
+        sigma = 0.5 * (low + high) if high < math.inf else max(2.0 * low, k0)
+    for _ in range(200):
+        rank = (math.log(sigma) - log) / spread
+        one, two = 1.0 / (k0 + sigma), 1.0 / (kc + sigma)
+        p = share(rank)
+        rest = share(-rank) if rank > 0.0 else 1.0 - p
+        gap = star + sigma * (two - one)  # of branch c to branch a
+        miss = rest * (sigma * one) + p * (star + sigma * two) - eps
+        rate = density(rank) / (spread * sigma)
+        on_a, on_c = k0 * one * one, kc * two * two
+        slope = rest * on_a + p * on_c + rate * gap
+        bend = 2.0 * (rate * (on_c - on_a) - rest * on_a * one - p * on_c * two)
+        bend -= rate * gap * (rank / spread + 1.0) / sigma
+        state[FLEXIBILITY], state[CURVATURE] = slope, bend
+        if miss > 0.0:
+            high = sigma
+        else:
+            low = sigma
+        step = miss / slope
+        share_of = 1.0 - 0.5 * step * bend / slope
+        if 0.5 < share_of < 2.0:
+            step /= share_of
+        new = sigma - step
+        if abs(step) <= NEAR * sigma * min(spread, 1.0) and low <= new <= high:
+            state[FLEXIBILITY] += bend * (new - sigma)
+            return new
+        if not low < new < high:
+            new = math.sqrt(low * high) if 0.0 < low < high < math.inf else 0.5 * (low + high)
+            if high == math.inf:
+                new = 2.0 * sigma
+            if not low < new < high:  # neighbouring numbers: nothing lies between them
+                return sigma
+        sigma = new
+    return sigma
+
+
+@inner
+def settle(row: Row, state: Array, eps: float) -> None:
+    """Bring a spring to a strain that lies on its branch."""
+    sigma = stress_in(row, state, eps)
+    state[EPS], state[SIGMA] = eps, sigma
+
+
+@inner
+def leaves(state: Array, eps: float) -> bool:
+    """Whether a spring leaves its branch before it reaches a strain."""
+    up = eps > state[EPS]
+    if eps == state[EPS]:
+        return False
+    return turned(state, up) or (eps > state[HIGH] if up else eps < state[LOW])
+
+
+@inner
+def rank_now(row: Row, state: Array) -> float:
+    """The rank up to which micro-springs have snapped."""
+    branch = int(state[BRANCH])
+    if branch in (A, HELD):
+        return state[RANK]
+    if branch == BACK:
+        return (math.log(state[SIGMA]) - row[LOG_MINUS]) / row[SPREAD_MINUS]
+    return (math.log(state[SIGMA]) - row[LOG_PLUS]) / row[SPREAD_PLUS]
+
+
+@compiled
+def stress_along(row: Row, eps: Array) -> tuple[Array, Array, Branches]:
+    """Stress, rank and branch of one microscale spring along a strain history, from rest."""
+    sigma, rank = np.empty(eps.size), np.empty(eps.size)
+    branches, state = np.empty(eps.size, np.int64), np.empty(STATE)
+    begin(row, state)
+    for j in range(eps.size):
+        while leaves(state, eps[j]):
+            switch(row, state, eps[j] > state[EPS])
+        settle(row, state, eps[j])
+        sigma[j], rank[j] = state[SIGMA], rank_now(row, state)
+        branches[j] = int(state[BRANCH])
+        if not sigma[j] < math.inf:  # past the end of branch c: nothing follows
+            sigma[j:] = math.inf
+            branches[j:], rank[j:] = branches[j], rank[j]
+            break
+    return sigma, rank, branches
+
+
+@compiled
+def strain_along(row: Row, sigma: Array) -> tuple[Array, Array, Branches]:
+    """Strain, rank and branch of one microscale spring along a stress history, from rest.
+
+    The strain is -inf where the spring cannot carry the tension.
+    """
+    eps, ranks = np.empty(sigma.size), np.empty(sigma.size)
+    branches, branch, rank = np.empty(sigma.size, np.int64), A, -math.inf
+    for j in range(sigma.size):
+        plus = minus = -math.inf
+        if sigma[j] > 0.0:
+            log = math.log(sigma[j])
+            plus = (log - row[LOG_PLUS]) / row[SPREAD_PLUS]
+            minus = (log - row[LOG_MINUS]) / row[SPREAD_MINUS]
+        most = max(plus, minus)
+        if rank < plus:
+            rank, branch = plus, SNAP if minus > plus else BOTH
+        elif rank > most:
+            rank, branch = most, BACK if minus > plus else BOTH
+        elif plus < rank < most or branch == (BACK if rank == plus else SNAP):
+            branch = HELD  # also at an end of the held stresses that it has not passed
+        if rank < LEAST_RANK:
+            rank, branch = -math.inf, A
+        eps[j] = -math.inf
+        if sigma[j] > -row[K0]:
+            eps[j] = strain_of(row, share(rank), share(-rank), sigma[j])
+        branches[j], ranks[j] = branch, rank
+    return eps, ranks, branches
+
+
+# ---------------------------------------------------------------- derivatives
+
+
+@inner
+def tangents(
+    row: Row, branch: int, rank: float, sigma: float, eps: float, d_rank: Array, out: Array
+) -> float:
+    """Fill the derivatives of the stress at a strain; returns the slope dσ/dε.
+
+    They are by k0 … spread_minus, and by the logarithm of the strain. `d_rank`, the same of the
+    rank, is brought up to date where the spring moves.
+    """
+    k0, kc, star = row[K0], row[KC], row[EPS_STAR]
+    one, two = 1.0 / (k0 + sigma), 1.0 / (kc + sigma)
+    if branch == A:
+        for c in range(CARRIED):
+            d_rank[c] = out[c] = 0.0
+        slope = 1.0 / (k0 * one * one)
+        out[0] = slope * sigma * one * one
+        out[OF_STRAIN] = slope * eps
+        return slope
+    p, rest = share(rank), share(-rank)
+    weight = density(rank) * (star + sigma * (two - one))  # dε/dw
+    flexible = rest * k0 * one * one + p * kc * two * two
+    if branch == HELD:
+        slope = 1.0 / flexible
+        for c in range(CARRIED):
+            out[c] = -slope * weight * d_rank[c]
+        out[0] += slope * rest * sigma * one * one
+        out[1] += slope * p * sigma * two * two
+        out[2] -= slope * p
+        out[OF_STRAIN] += slope * eps
+        return slope
+    back = branch == BACK
+    spread = row[SPREAD_MINUS] if back else row[SPREAD_PLUS]
+    first = 5 if back else 3
+    by_log = -math.exp(-(row[LOG_MINUS] if back else row[LOG_PLUS])) / spread
+    slope = 1.0 / (flexible + weight / (spread * sigma))
+    for c in range(CARRIED):
+        out[c] = d_rank[c] = 0.0
+    d_rank[first], d_rank[first + 1] = by_log, -rank / spread
+    out[0] = slope * rest * sigma * one * one
+    out[1] = slope * p * sigma * two * two
+    out[2] = -slope * p
+    out[first], out[first + 1] = -slope * weight * by_log, slope * weight * rank / spread
+    out[OF_STRAIN] = slope * eps
+    for c in range(CARRIED):
+        d_rank[c] += out[c] / (spread * sigma)
+    return slope
+
+
+@compiled
+def stress_tangents_along(
+    row: Row, eps: Array, sigma: Array, ranks: Array, branches: Branches
+) -> tuple[Array, Array]:
+    """Derivatives of the stress (8, n) along a strain history, and the slope dσ/dε (n,).
+
+    See `tangents` for what they are by.
+    """
+    out, slope = np.empty((CARRIED, eps.size)), np.empty(eps.size)
+    now, d_rank = np.empty(CARRIED), np.zeros(CARRIED)
+    for j in range(eps.size):
+        slope[j] = tangents(row, branches[j], ranks[j], sigma[j], eps[j], d_rank, now)
+        for c in range(CARRIED):
+            out[c, j] = now[c]
+    return out, slope
+
+
+@compiled
+def strain_tangents_along(row: Row, sigma: Array, ranks: Array, branches: Branches) -> Array:
+    """Derivatives of the strain (7, n) along a stress history by k0 … spread_minus."""
+    out, d_rank = np.zeros((OF_STRAIN, sigma.size)), np.zeros(4)
+    for j in range(sigma.size):
+        branch, rank, s = branches[j], ranks[j], sigma[j]
+        one, two = 1.0 / (row[K0] + s), 1.0 / (row[KC] + s)
+        p = share(rank)
+        if branch == A:
+            d_rank[:] = 0.0
+        elif branch == BACK:
+            d_rank[:2] = 0.0
+            d_rank[2] = -math.exp(-row[LOG_MINUS]) / row[SPREAD_MINUS]
+            d_rank[3] = -rank / row[SPREAD_MINUS]
+        elif branch != HELD:
+            d_rank[2:] = 0.0
+            d_rank[0] = -math.exp(-row[LOG_PLUS]) / row[SPREAD_PLUS]
+            d_rank[1] = -rank / row[SPREAD_PLUS]
+        out[0, j], out[1, j], out[2, j] = -share(-rank) * s * one * one, -p * s * two * two, p
+        weight = density(rank) * (row[EPS_STAR] + s * (two - one))
+        for c in range(4):
+            out[3 + c, j] = weight * d_rank[c]
+    return out

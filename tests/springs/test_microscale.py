@@ -1,0 +1,235 @@
+"""The microscale law against root finding on the law anew, and any other laws of snapping."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+from scipy.stats import norm, weibull_min
+
+import foamfit as ff
+from foamfit.springs import microscale_kernels
+from foamfit.springs.microscale import follow_fractions, follow_strain, fractions_of
+
+SHOE = ff.MicroscaleSpring(5.5e5, 2.5e5, 0.08, 1.3e5, 0.4, 5.5e4, 0.77)
+SPRINGS = {
+    "shoe foam": SHOE,
+    "narrow": ff.MicroscaleSpring(5e5, 1e6, 0.2, 1e5, 1e-3, 4e4, 2e-3),
+    "wide": ff.MicroscaleSpring(5e5, 5e5, 0.0, 2e5, 2.0, 5e4, 2.0),
+    "reversible at low ranks": ff.MicroscaleSpring(5e5, 4e6, 0.6, 1e5, 1.2, 5e4, 0.1),
+    "reversible at high ranks": ff.MicroscaleSpring(5e5, 1e5, 0.3, 1e5, 0.01, 6e4, 1.0),
+    "reversible everywhere": ff.MicroscaleSpring(5e5, 2.5e5, 0.08, 1e5, 0.3, 2e5, 0.3),
+    "hard to snap": ff.MicroscaleSpring(5e5, 2.5e5, 0.08, 6e5, 0.2, 3e5, 0.3),
+}
+EACH = pytest.mark.parametrize("spring", SPRINGS.values(), ids=SPRINGS)
+TURNS = (0.0, 0.5, 0.3, 0.4, 0.15, 0.45, 0.7, -0.05, 0.25, 0.1, 0.9)
+
+
+def walk(turns: tuple[float, ...] = TURNS, between: int = 5) -> np.ndarray:
+    """Samples from turning point to turning point."""
+    return np.concatenate(
+        [[turns[0]]] + [np.linspace(a, b, between + 1)[1:] for a, b in itertools.pairwise(turns)]
+    )
+
+
+def snapped(spring: ff.MicroscaleSpring, p: float, sigma: float) -> float:
+    if sigma <= 0.0:
+        return 0.0
+    plus = norm.cdf(np.log(sigma / spring.sigma_plus) / spring.spread_plus)
+    minus = norm.cdf(np.log(sigma / spring.sigma_minus) / spring.spread_minus)
+    return float(min(max(p, plus), max(plus, minus)))
+
+
+def strain_of(spring: ff.MicroscaleSpring, p: float, sigma: float) -> float:
+    on_a = sigma / (spring.k0 + sigma)
+    return (1 - p) * on_a + p * (spring.eps_star + sigma / (spring.kc + sigma))
+
+
+def by_root_finding(spring: ff.MicroscaleSpring, strain: np.ndarray) -> np.ndarray:
+    p, out = 0.0, []
+    for eps in strain:
+
+        def miss(sigma: float, eps: float = eps, p: float = p) -> float:
+            return strain_of(spring, snapped(spring, p, sigma), sigma) - eps
+
+        high = spring.k0
+        while miss(high) < 0:
+            high *= 2
+        out.append(brentq(miss, -0.9 * spring.k0, high, xtol=1e-300, rtol=1e-15, maxiter=300))
+        p = snapped(spring, p, out[-1])
+    return np.array(out)
+
+
+@EACH
+def test_stress_is_that_of_root_finding_through_reversals(spring: ff.MicroscaleSpring) -> None:
+    strain = walk() * min(1.0, 0.9 * (1.0 + spring.eps_star))
+    want = by_root_finding(spring, strain)
+    got = spring.stress(strain)
+    np.testing.assert_allclose(got, want, rtol=2e-12, atol=1e-12 * np.abs(want).max())
+
+
+@EACH
+def test_strain_is_the_law_written_anew_and_the_inverse(spring: ff.MicroscaleSpring) -> None:
+    stress = walk(TURNS, 20) * 5e5
+    want, p = [], 0.0
+    for sigma in stress:
+        p = snapped(spring, p, sigma)
+        want.append(strain_of(spring, p, sigma))
+    got = spring.strain(stress)
+    np.testing.assert_allclose(got, want, rtol=0, atol=3e-15)
+    np.testing.assert_allclose(spring.stress(got), stress, rtol=1e-12, atol=1e-9)
+
+
+def test_branches_of_a_loop_with_an_inner_loop() -> None:
+    strain = [0.0, 0.3, 0.2, 0.25, 0.1, 0.15, 0.3, 0.6, -0.1, 0.3]
+    assert SHOE.branches(strain).tolist() == [
+        "a", "snap-through", "held", "held", "snap-back", "held", "snap-through", "snap-through",
+        "a", "snap-through",
+    ]  # fmt: skip
+    other = SPRINGS["reversible everywhere"].branches(strain)
+    assert set(other.tolist()) == {"a", "reversible"}
+    narrow = SPRINGS["narrow"]
+    assert SHOE.stress(-0.1) == pytest.approx(-5.5e5 * 0.1 / 1.1, rel=1e-15)
+    np.testing.assert_array_equal(narrow.branches([0.1, 0.3, 0.25]), ["a", "snap-through", "held"])
+
+
+@EACH
+def test_the_stress_comes_back_to_where_it_turned(spring: ff.MicroscaleSpring) -> None:
+    """Return-point memory, of an inner loop and of one inside it, whatever was done within."""
+    scale = min(1.0, 0.9 * (1.0 + spring.eps_star))
+    strain = np.array([0.6, 0.2, 0.5, 0.3, 0.4, 0.3, 0.5, 0.2, 0.6, 0.8]) * scale
+    stress = spring.stress(strain)
+    np.testing.assert_allclose(stress[[8, 7, 6, 5]], stress[[0, 1, 2, 3]], rtol=3e-14)
+    straight = spring.stress([0.6 * scale, 0.8 * scale])
+    np.testing.assert_allclose(stress[[0, 9]], straight, rtol=3e-14)
+
+
+def test_a_test_that_snaps_little_tells_nothing_of_higher_ranks() -> None:
+    strain = walk((0.0, 0.2, 0.05, 0.15, 0.0))
+    spring = replace(SPRINGS["hard to snap"], sigma_plus=1.2e6)
+    other = replace(spring, kc=9.9e5, eps_star=0.3, sigma_minus=1e5)
+    np.testing.assert_allclose(other.stress(strain), 5e5 * strain / (1 - strain), rtol=1e-15)
+    assert set(spring.branches(strain)) == {"a"}
+
+
+@pytest.mark.parametrize("beyond", [0.0, 1e-9, 1.0])
+def test_strain_past_the_pole_is_refused(beyond: float) -> None:
+    with pytest.raises(ff.SimulationError, match=r"sample 2.*1 \+ eps_star"):
+        SHOE.stress([0.0, 0.9, 1.08 + beyond, 0.0])
+    assert np.isfinite(SHOE.stress([0.0, 1.08 - 1e-12, 0.0])).all()
+    with pytest.raises(ff.SimulationError, match=r"stress -550000 Pa \(sample 1\)"):
+        SHOE.strain([0.0, -5.5e5])
+
+
+@EACH
+def test_slope_is_that_of_the_stress(spring: ff.MicroscaleSpring) -> None:
+    """On the way that the strain goes, a third into each leg."""
+    turns = np.array(TURNS) * min(1.0, 0.9 * (1.0 + spring.eps_star))
+    for k in range(1, turns.size):
+        here = turns[k - 1] + (turns[k] - turns[k - 1]) / 3
+        step = np.sign(turns[k] - turns[k - 1]) * 1e-7
+        path = [*turns[:k], here - step, here, here + step]
+        stress, slope = spring.stress(path), spring.tangent(path)
+        rough = (stress[-1] - stress[-3]) / (2 * step)
+        assert slope[-2] == pytest.approx(rough, rel=3e-3 if spring.spread_plus < 0.1 else 1e-6)
+
+
+NAMES = ("k0", "kc", "eps_star", "sigma_plus", "spread_plus", "sigma_minus", "spread_minus")
+
+
+def check_derivative(
+    spring: ff.MicroscaleSpring, name: str, history: np.ndarray, of: str, got: np.ndarray
+) -> None:
+    """Compare with a central difference of fourth order."""
+    value = getattr(spring, name)
+    size = 2e-4 * value * min(1.0, spring.spread_plus, spring.spread_minus)
+    at = [getattr(replace(spring, **{name: value + k * size}), of)(history) for k in (-2, -1, 1, 2)]
+    want = (at[0] - 8 * at[1] + 8 * at[2] - at[3]) / (12 * size)
+    rounding = 1e-14 * np.abs(at[0]).max() / size
+    assert np.abs(got - want).max() <= 1e-6 * np.abs(want).max() + rounding, name
+
+
+@pytest.mark.parametrize(
+    "spring", [SHOE, SPRINGS["reversible at low ranks"], SPRINGS["reversible at high ranks"]]
+)
+def test_derivatives_along_histories(spring: ff.MicroscaleSpring) -> None:
+    """By every own parameter, also where the rank is held that a turning point left behind."""
+    strain = walk(TURNS, 7)[1:]
+    path = microscale_kernels.stress_along(spring.row, strain)
+    assert {6, 7, 8} <= set(path[2].tolist())
+    by, slope = microscale_kernels.stress_tangents_along(spring.row, strain, *path)
+    stress = walk((0.0, 3e5, 2e4, 1.51e5, 5.1e4, 4e5, -1e4, 2e5), 7)[1:]
+    _, ranks, branches = microscale_kernels.strain_along(spring.row, stress)
+    inverse = microscale_kernels.strain_tangents_along(spring.row, stress, ranks, branches)
+    for own, name in enumerate(NAMES):
+        check_derivative(spring, name, strain, "stress", by[own])
+        check_derivative(spring, name, stress, "strain", inverse[own])
+    at = [spring.stress(strain * (1 + k * 1e-5)) for k in (-2, -1, 1, 2)]
+    want = (at[0] - 8 * at[1] + 8 * at[2] - at[3]) / 12e-5
+    assert np.abs(by[7] - want).max() <= 1e-6 * np.abs(want).max()
+    np.testing.assert_allclose(slope, spring.tangent(strain), rtol=0)
+
+
+def test_the_held_rank_at_the_end_of_its_stresses_is_held() -> None:
+    """Snapped back to rank 0 at sigma_minus, a spring is held up to sigma_plus, and there."""
+    spring = SPRINGS["reversible at low ranks"]
+    stress = np.array([3e5, 5e4, 1e5])
+    _, ranks, branches = microscale_kernels.strain_along(spring.row, stress)
+    assert (ranks[1:] == 0.0).all()
+    assert branches.tolist() == [7, 8, 6]
+
+
+# ------------------------------------------------------------------------ any other laws
+
+
+def test_log_normal_laws_are_those_of_the_spring() -> None:
+    stress = walk(TURNS, 20) * 4e5
+
+    def law(median: float, spread: float) -> object:
+        return lambda s: norm.cdf(np.log(np.maximum(s, 1e-300) / median) / spread)
+
+    plus, minus = law(1.3e5, 0.4), law(5.5e4, 0.77)
+    got = follow_strain(stress, 5.5e5, 2.5e5, 0.08, plus, minus)  # type: ignore[arg-type]
+    np.testing.assert_allclose(got, SHOE.strain(stress), rtol=0, atol=1e-14)
+
+
+def test_weibull_laws_make_inner_loops() -> None:
+    plus, minus = weibull_min(3.0, scale=2e5).cdf, weibull_min(1.2, scale=8e4).cdf
+    got = follow_fractions([0, 2e5, 1e5, 2e5, 1e5, 3e4, 0], plus, minus)
+    turned, low = plus(2e5), minus(3e4)
+    assert minus(1e5) > turned
+    np.testing.assert_allclose(got, [0, turned, turned, turned, turned, low, 0], rtol=1e-15)
+
+
+@pytest.mark.parametrize("law", [lambda s: -s, lambda s: 1 - s / 1e6, lambda s: s * np.nan])
+def test_what_is_no_law_of_snapping_is_refused(law: object) -> None:
+    with pytest.raises(ff.InputError, match=r"^minus is no law of snapping: at .* Pa"):
+        follow_fractions([0.0, 1e5], lambda s: s / 1e6, law)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "spring",
+    [
+        ff.BistableSpring(5e5, 1e6, -3e4, 0.12, 0.35, 2e5, 1.2e5),
+        ff.BistableSpring(5.5e6, 82.5e6, -0.2e6, 0.14, 0.31, 5e6, 2.2e6),
+        ff.BistableSpring(5.5e6, 82.5e6, -0.2e6, 0.14, 0.31, 0.0, 2.2e6),
+    ],
+)
+def test_full_loops_of_the_bistable_law_come_of_its_micro_springs(
+    spring: ff.BistableSpring,
+) -> None:
+    top = 1.3 * spring.sigma_hat_c
+    low = spring.sigma_hat_a
+    assert low is not None
+    stress = walk((0.0, top, min(1.2 * low, 0.0), top, 0.0), 301)
+    got = follow_strain(stress, spring.k0, spring.kc, spring.eps_star, *fractions_of(spring))
+    np.testing.assert_allclose(got, spring.strain(stress), rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", list(ff.published))
+def test_no_published_spring_has_micro_springs(name: str) -> None:
+    with pytest.raises(ff.InputError, match=r"^kh_plus = .* is too stiff a branch"):
+        fractions_of(ff.published[name].bistable)
