@@ -237,7 +237,7 @@ def test_a_column_may_number_the_cycles(tmp_path):
     assert "Cycle 10 (number 2 in the file) of 3 is used" in cycles(test)
     assert "before cycle 10" in {item.why for item in accounted(test).dropped}
     assert read_test(path).cycle == 1
-    with pytest.raises(InputError, match="cycle 2 cannot be taken: .* 3 of the cycles 1 to 100"):
+    with pytest.raises(InputError, match=r"cycle 2 cannot be taken: .* 3 of the cycles 1 to 100"):
         read_test(path, cycle=2)
 
 
