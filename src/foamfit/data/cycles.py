@@ -18,9 +18,12 @@ from foamfit.text import engineering, percent
 # rest, what counts as unloading, and a cycle that is named for being small.
 _TURN, _REST, _UNLOADED, _SMALLER = 0.05, 0.35, 0.1, 0.9
 # Share of the range of the displacement that is lowest between cycles; shares of the peak stress
-# from which a later cycle is in contact (the misfit of shoe foams hardly depends on it from 0.5 to
-# 2 %), and from which it is said that it never was without load.
+# that are a load at all, and from which it is said that a later cycle never was without load.
 _LOWEST, _LOADED, _STILL_LOADED = 0.02, 0.01, 0.05
+# Standard errors above its level between the cycles from which the stress of a later one shows
+# contact, and the least and largest share of its rise that this may be (the misfit of shoe foams
+# hardly depends on it there).
+_ERRORS, _CONTACT = 4.0, (0.002, 0.02)
 
 
 @dataclass(frozen=True)
@@ -128,22 +131,25 @@ def find_reload(record: Record, cycles: list[Cycle], cycle: Cycle, noise: NoiseL
     """Find the contact of a later cycle.
 
     The specimen is free or least loaded at the lowest displacements between the cycles. Contact is
-    where the moving mean of the stress is above the level there by a hundredth of its rise. A
-    level below zero is the sensor's: a foam does not pull its platen for long.
+    where the moving mean of the stress is above the level there by `_ERRORS` of its standard
+    errors, but by 0.2 to 2 % of its rise. A level below zero is the sensor's: a foam does not pull
+    its platen for long.
     """
     w, stress, top = record.displacement, record.stress, cycle.top
     assert w is not None  # it has cycles
     before = slice(cycles[cycle.place - 1].top, top)
     lowest = w[before] <= w[before].min() + _LOWEST * np.ptp(w)
     free = float(np.median(stress[before][lowest]))
-    n = top - cycle.first
-    quiet = noise.time * (noise.sigma / (_LOADED / 4 * float(stress[top] - free))) ** 2
-    mean = smooth(stress, max(1, n // 100, int(min(quiet, n // 12))))
-    level = free + _LOADED * float(mean[top] - free)
+    width = max(1, (top - cycle.first) // 100)
+    mean = smooth(stress, width)
+    error = noise.sigma * min(1.0, noise.time / width) ** 0.5
+    rise = float(mean[top]) - free
+    level = free + float(np.clip(_ERRORS * error, _CONTACT[0] * rise, _CONTACT[1] * rise))
     idle = np.flatnonzero(mean[cycle.first : top] <= level)
     last = cycle.first + (int(idle[-1]) if idle.size else 0)
-    rise = float(mean[last + 1] - mean[last])
-    share = float(np.clip((level - mean[last]) / rise, 0.0, 1.0)) if idle.size and rise > 0 else 0.0
+    ahead = float(mean[last + 1] - mean[last])
+    there = idle.size > 0 and ahead > 0.0
+    share = float(np.clip((level - mean[last]) / ahead, 0.0, 1.0)) if there else 0.0
 
     def passed(values: Array) -> float:
         return float(values[last] + share * (values[last + 1] - values[last]))

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 SCHEMA = 1
 # Cycles that are fitted together at most; of more the first and others at equal ratios are taken.
 MOST_TOGETHER = 6
+CTRL_C = "not fitted, because Ctrl-C ended the command before"
 CURVES = ("stress_time", "displacement_time", "stress_strain")
 ENERGY = "dissipated_energy"
 
@@ -231,10 +232,22 @@ def fit_cycles(
             )
         except (InputError, SimulationError) as error:
             refused[number] = str(error)
+        except KeyboardInterrupt:
+            if not results:
+                raise
+            refused[number] = CTRL_C
+        if refused.get(number) is CTRL_C or _interrupted(results.get(number)):
+            refused |= dict.fromkeys(wanted[i + 1 :], CTRL_C)
+            break
     found = CycleFits(first.name, model, first.cycles, results, refused)
     if not together:
         return found
     return _fit_together(found, chosen, lambda done, what: report(share + 0.3 * done, what))
+
+
+def _interrupted(result: FitResult | None) -> bool:
+    """Whether Ctrl-C has ended a fit; what it had found is its result."""
+    return result is not None and result.stopped == "Ctrl-C"
 
 
 def _fit_together(found: CycleFits, options: Options, progress: Progress) -> CycleFits:
@@ -251,18 +264,21 @@ def _fit_together(found: CycleFits, options: Options, progress: Progress) -> Cyc
     if why is not None:
         sentence = f"The cycles are not fitted together, because {why}."
         return replace(found, sentences=(sentence,))
-    numbers = _spread(list(fitted))
+    numbers = spread(list(fitted))
     problems = [
         options.problem(fitted[n].measurement, fitted[n].model, fitted[n].params.copy())
         for n in numbers
     ]
     vectors = [p.vector(fitted[n].params) for p, n in zip(problems, numbers, strict=True)]
-    selection = select_own([Group(tuple(problems), tuple(vectors))], progress=progress)
+    try:
+        selection = select_own([Group(tuple(problems), tuple(vectors))], progress=progress)
+    except KeyboardInterrupt:  # the fits of the cycles are not given up for it
+        return replace(found, sentences=("The fit of the cycles together was ended by Ctrl-C.",))
     together = replace(found, selection=selection, together=numbers)
     return replace(together, sentences=tuple(_sentences(together, selection)))
 
 
-def _spread(numbers: list[int]) -> tuple[int, ...]:
+def spread(numbers: list[int]) -> tuple[int, ...]:
     """At most `MOST_TOGETHER` of the cycles, at about equal ratios of their numbers."""
     if len(numbers) <= MOST_TOGETHER:
         return tuple(numbers)

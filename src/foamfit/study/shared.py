@@ -132,7 +132,7 @@ def select_own(groups: Sequence[Group], *, progress: Progress | None = None) -> 
     """
     tell = progress or (lambda *_: None)
     names = groups[0].problems[0].free()
-    steps, chosen = [_step(groups, (), [group.starts for group in groups])], 0
+    steps, chosen = [step_of(groups, ())], 0
     rounds = len(names) * (len(names) + 1) / 2
     while len(steps[-1].own) < len(names) and chosen == len(steps) - 1:
         now = steps[-1]
@@ -142,12 +142,12 @@ def select_own(groups: Sequence[Group], *, progress: Progress | None = None) -> 
         for name in rest:
             done = sum(len(names) - i for i in range(len(steps) - 1)) + len(trials)
             tell(min(done / rounds, 1.0), f"shared or own: {name}")
-            trials.append(_step(groups, (*now.own, name), near, TRIAL))
+            trials.append(step_of(groups, (*now.own, name), near, TRIAL))
         found = min(trials, key=lambda step: step.bic)
         starts = [
             [list(fit.values), *group.starts] for fit, group in zip(found.fits, groups, strict=True)
         ]
-        steps.append(_step(groups, found.own, starts))
+        steps.append(step_of(groups, found.own, starts))
         chosen += steps[-1].bic < now.bic
     n_alone = sum(len(names) * len(group.problems) for group in groups)
     alone = sum(group.alone for group in groups)
@@ -157,11 +157,15 @@ def select_own(groups: Sequence[Group], *, progress: Progress | None = None) -> 
     return Selection(tuple(steps), chosen, n_eff, alone, n_alone, bic)
 
 
-def _step(
-    groups: Sequence[Group], own: tuple[str, ...], starts: Sequence[list[list[Array]]],
-    iterations: int | None = None,
+def step_of(
+    groups: Sequence[Group], own: tuple[str, ...],
+    starts: Sequence[list[list[Array]]] | None = None, iterations: int | None = None,
 ) -> Step:  # fmt: skip
-    """Fit all groups with these own parameters."""
+    """Fit all groups with these own parameters.
+
+    `starts` holds those of each group, as `fit_together` takes them; by default `Group.starts`.
+    """
+    starts = [group.starts for group in groups] if starts is None else starts
     limit = {} if iterations is None else {"iterations": iterations}
     fits = tuple(
         fit_together(group.problems, own, start, **limit)
