@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.data.contact import smooth
-from foamfit.data.measurement import NoiseLevel, Record
+from foamfit.data.measurement import Record
 from foamfit.data.noise import noise_level
 from foamfit.errors import InputError
 from foamfit.text import engineering, percent
@@ -20,10 +20,9 @@ _TURN, _REST, _UNLOADED, _SMALLER = 0.05, 0.35, 0.1, 0.9
 # Share of the range of the displacement that is lowest between cycles; shares of the peak stress
 # that are a load at all, and from which it is said that a later cycle never was without load.
 _LOWEST, _LOADED, _STILL_LOADED = 0.02, 0.01, 0.05
-# Standard errors above its level between the cycles from which the stress of a later one shows
-# contact, and the least and largest share of its rise that this may be (the misfit of shoe foams
-# hardly depends on it there).
-_ERRORS, _CONTACT = 4.0, (0.002, 0.02)
+# Share of its peak stress up to which the rise of a later cycle is taken for straight, the fewest
+# samples of it, and the places that are tried for its foot.
+_EARLY, _FEWEST, _PLACES = 0.1, 5, 400
 
 
 @dataclass(frozen=True)
@@ -111,11 +110,11 @@ def cut_to_cycle(record: Record, cycles: list[Cycle], cycle: Cycle) -> tuple[Rec
 
 @dataclass(frozen=True)
 class Reload:
-    """Contact of a later cycle: where its stress rises from, and falls back to, no load.
+    """Contact of a later cycle: where its stress rises from no load, and falls back to it.
 
-    `first` and `end` are samples of the whole record, `time` (s, or samples), `displacement` (m)
-    and those of masses inside are read where the stress passes the level, `offset` (Pa) is what
-    the sensor shows without load, and `level` is the stress (Pa) above it that counts as contact.
+    `first` and `end` are samples of the whole record; `time` (s, or samples), `displacement` (m)
+    and those of masses inside are at the start of contact. `offset` (Pa) is what the sensor shows
+    without load, and `level` is the stress (Pa) above it at which contact ends.
     """
 
     first: int
@@ -127,29 +126,28 @@ class Reload:
     level: float
 
 
-def find_reload(record: Record, cycles: list[Cycle], cycle: Cycle, noise: NoiseLevel) -> Reload:
+def find_reload(record: Record, cycles: list[Cycle], cycle: Cycle) -> Reload:
     """Find the contact of a later cycle.
 
     The specimen is free or least loaded at the lowest displacements between the cycles. Contact is
-    where the moving mean of the stress is above the level there by `_ERRORS` of its standard
-    errors, but by 0.2 to 2 % of its rise. A level below zero is the sensor's: a foam does not pull
-    its platen for long.
+    where a straight line through the early rise meets the level there: the hinge of least squares
+    from the rest up to a small share of the peak, so that noise does not shift it. A level below
+    zero is the sensor's: a foam does not pull its platen for long.
     """
     w, stress, top = record.displacement, record.stress, cycle.top
     assert w is not None  # it has cycles
     before = slice(cycles[cycle.place - 1].top, top)
     lowest = w[before] <= w[before].min() + _LOWEST * np.ptp(w)
     free = float(np.median(stress[before][lowest]))
-    width = max(1, (top - cycle.first) // 100)
-    mean = smooth(stress, width)
-    error = noise.sigma * min(1.0, noise.time / width) ** 0.5
+    mean = smooth(stress, max(1, (top - cycle.first) // 100))
     rise = float(mean[top]) - free
-    level = free + float(np.clip(_ERRORS * error, _CONTACT[0] * rise, _CONTACT[1] * rise))
-    idle = np.flatnonzero(mean[cycle.first : top] <= level)
-    last = cycle.first + (int(idle[-1]) if idle.size else 0)
-    ahead = float(mean[last + 1] - mean[last])
-    there = idle.size > 0 and ahead > 0.0
-    share = float(np.clip((level - mean[last]) / ahead, 0.0, 1.0)) if there else 0.0
+    early = cycle.first + int(np.argmax(mean[cycle.first : top + 1] >= free + _EARLY * rise))
+    part = slice(cycle.first, max(early, cycle.first + _FEWEST) + 1)
+    displacement = _hinge(w[part], stress[part] - free)
+    last = min(part.start + int(np.flatnonzero(w[part] <= displacement)[-1]), top - 1)
+    ahead = float(w[last + 1] - w[last])
+    share = (displacement - float(w[last])) / ahead if ahead > 0.0 else 0.0
+    level = free + _LOADED * rise
 
     def passed(values: Array) -> float:
         return float(values[last] + share * (values[last + 1] - values[last]))
@@ -159,11 +157,22 @@ def find_reload(record: Record, cycles: list[Cycle], cycle: Cycle, noise: NoiseL
         first=last + (share > 0.0),
         end=top + int(back[0]) + 1 if back.size else cycle.end,
         time=passed(record.instants),
-        displacement=passed(w),
+        displacement=displacement,
         interior={node: passed(values) for node, values in record.interior.items()},
         offset=min(free, 0.0),
         level=level - min(free, 0.0),
     )
+
+
+def _hinge(w: Array, stress: Array) -> float:
+    """Displacement up to which a stress is zero, and from which it rises as a straight line."""
+    every = slice(None, None, 1 + w.size // 1000)
+    w, stress = w[every], stress[every]
+    places = np.linspace(float(w.min()), float(w.max()), _PLACES, endpoint=False)
+    beyond = np.maximum(w - places[:, None], 0.0)
+    slopes = beyond @ stress / np.maximum(np.sum(beyond**2, axis=1), 1e-300)
+    left = np.sum((stress - slopes[:, None] * beyond) ** 2, axis=1)
+    return float(places[int(np.argmin(left))])
 
 
 def cut_to_reload(record: Record, cycle: Cycle, at: Reload, zero: float, height: float) -> tuple[

@@ -90,7 +90,7 @@ def condition(
     record = done(remove_offset(record, resting, levels["stress"]))
     start_strain = 0.0
     if chosen is not None and chosen.place:  # not the first: it has a contact of its own
-        at = find_reload(record, cycles, chosen, levels["stress"])
+        at = find_reload(record, cycles, chosen)
         notes += cut_to_cycle(record, cycles, chosen)[1]
         record = done(cut_to_reload(record, chosen, at, start.zero, specimen.height))
         start_strain = (at.displacement - start.zero) / specimen.height

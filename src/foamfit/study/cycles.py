@@ -319,9 +319,10 @@ def _sentences(found: CycleFits, selection: Selection) -> Iterator[str]:
             changes.append(f"{name} {_change(values[0], values[-1])}")
         yield f"From cycle {found.together[0]} to {last}: {listed(changes)}."
     yield (
-        f"A parameter is of each cycle where BIC falls by it, with {selection.n_eff} effective "
-        "samples: the stretches in which a cycle's own fit lies on one side of its curve, for what "
-        "is left there is an error of the law and no noise."
+        f"A parameter gets one value per cycle where this lowers BIC, counted with "
+        f"{selection.n_eff} effective samples: the stretches in which a cycle's own fit lies on "
+        "one side of its curve, because what that fit leaves is an error of the law rather than "
+        "noise."
     )
 
 
