@@ -23,6 +23,8 @@ _HOME = {
     "published": "springs.published",
     "Measurement": "data.measurement",
     "read_test": "data.csv_file",
+    "CycleFits": "study.cycles",
+    "fit_cycles": "study.cycles",
     "FitResult": "api",
     "fit": "api",
     "make_params": "fitting.problem",

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     from foamfit.api import FitResult
     from foamfit.data.measurement import Measurement
+    from foamfit.study.cycles import CycleFits
 
 # Exit codes: the input or the call is wrong; no acceptable fit; a defect (EX_SOFTWARE of
 # sysexits.h). The number of a signal that ended the command is added to the last.
@@ -121,6 +122,10 @@ _TEST = click.argument("test", metavar="TEST.csv", type=_FILE)
 _SPECIMEN = click.option(
     "--specimen", metavar="FILE.toml", type=_FILE,
     help="Specimen, striker, columns, noise, window, data. Default: TEST.toml beside the CSV.",
+)  # fmt: skip
+_CYCLE = click.option(
+    "--cycle", metavar="N|all",
+    help="Cycle of a slow record: a number, several as 1,2,10, or all. Default: the first.",
 )  # fmt: skip
 _PLOT = click.option("--plot", type=_FILE, help="Also draw a PNG, PDF or SVG.")
 _DRIVE = click.option(
@@ -267,6 +272,7 @@ def _interval_method(profile: bool, bootstrap: int | None, mcmc: int | None) -> 
 @main.command()
 @_TEST
 @_SPECIMEN
+@_CYCLE
 @click.option(
     "--model", default="bistable", show_default=True,
     help="Springs from the base up; auto takes the simplest that holds.",
@@ -305,12 +311,15 @@ def _interval_method(profile: bool, bootstrap: int | None, mcmc: int | None) -> 
     "--verbose", is_flag=True, help="Print the checklist, reasons, notes and all models too."
 )
 def fit(
-    test: Path, specimen: Path | None, model: str, out: Path | None,
+    test: Path, specimen: Path | None, cycle: str | None, model: str, out: Path | None,
     fix: dict[str, float], vary: tuple[str, ...],
     profile: bool, bootstrap: int | None, mcmc: int | None,
     as_json: bool, quiet: bool, verbose: bool, **search: Any,
 ) -> int:  # fmt: skip
     """Identify the parameters of TEST.csv and write a result folder.
+
+    With several cycles the folder holds one result folder for each, cycles.csv, cycles.png and
+    cycles.json: what changes from cycle to cycle, by one fit of them together.
 
     Exit code 0: a fit was made; 1: the input or the call is wrong; 2: no acceptable fit was found
     (what was found is written); 70: a defect of foamfit; 130 and 143: ended by Ctrl-C before
@@ -321,27 +330,39 @@ def fit(
         foamfit fit TEST.csv
         foamfit fit TEST.csv --model auto
         foamfit fit TEST.csv --model microscale --relaxation 1
+        foamfit fit TEST.csv --model microscale --relaxation 1 --cycle all
         foamfit fit TEST.csv --drive displacement --out results/today
         foamfit fit TEST.csv --model linear+bistable --fix s1_k0=60e6
     """
     from foamfit.data.csv_file import read_test
     from foamfit.springs.model import Model
 
-    intervals = _interval_method(profile, bootstrap, mcmc)
+    search["intervals"] = _interval_method(profile, bootstrap, mcmc)
+    search["draws"] = mcmc if bootstrap is None else bootstrap
     model = "auto" if model.strip() == "auto" else Model.parse(model).name
+    alone, several = _cycles(cycle)
     with _compiling(quiet or as_json) as compile_rest:
-        measurement = read_test(test, specimen)
+        measurement = read_test(test, specimen, alone)
         folder = _result_folder(out, test, specimen, model)
         from foamfit import api
 
         params = _params(measurement, model, search, fix, vary)
         compile_rest()
+        tell = None if quiet else lambda told: say(f"foamfit: {told}", err=True)
         with _progress(quiet or as_json) as progress:
-            result = api.fit(
-                measurement, model=model, params=params, progress=progress, **search,
-                intervals=intervals, draws=mcmc if bootstrap is None else bootstrap,
-                tell=None if quiet else lambda told: say(f"foamfit: {told}", err=True),
-            )  # fmt: skip
+            if several is not None:
+                from foamfit.study.cycles import fit_cycles
+
+                found = fit_cycles(
+                    test, specimen, cycles=several or None, model=model, progress=progress,
+                    params=lambda one: _params(one, model, search, fix, vary), tell=tell, **search,
+                )  # fmt: skip
+            else:
+                result = api.fit(
+                    measurement, model=model, params=params, progress=progress, tell=tell, **search
+                )
+        if several is not None:
+            return _tell_cycles(found, folder, as_json, quiet)
         try:
             with without_ctrl_c():
                 result.save(folder)
@@ -355,6 +376,40 @@ def fit(
         say(f"foamfit: no acceptable fit was found; see {folder}", err=True)
         return NOT_ACCEPTABLE
     return 0
+
+
+def _cycles(text: str | None) -> tuple[int | None, tuple[int, ...] | None]:
+    """Read --cycle: the one cycle that is named, or the several that are ("all" names none)."""
+    if text is None or text.strip().lower() == "all":
+        return None, None if text is None else ()
+    parts = text.split(",")
+    if not all(part.strip().isdecimal() and int(part) > 0 for part in parts):
+        raise InputError(f"--cycle {text!r} must be a number from 1 up, several as 1,2,10, or all")
+    numbers = tuple(int(part) for part in parts)
+    return (None, numbers) if len(numbers) > 1 else (numbers[0], None)
+
+
+def _tell_cycles(found: CycleFits, folder: Path, as_json: bool, quiet: bool) -> int:
+    """Write and print the fits of several cycles; returns the exit code."""
+    import json
+
+    from foamfit.report.cycles import cycles_text
+
+    content = found.to_json_dict()
+    content["cycles"] = {n: one.to_json_dict() for n, one in sorted(found.results.items())}
+    shown = json.dumps(content, allow_nan=False) if as_json else cycles_text(found)
+    try:
+        with without_ctrl_c():
+            found.save(folder)
+    finally:  # the numbers are not lost with the folder
+        if as_json or not quiet:
+            say(shown)
+    if not quiet and not as_json:
+        say(f"\nwritten to {folder}: open {folder / 'cycles.png'}")
+    good = [n for n, one in found.results.items() if one.status != "failed"]
+    if not good:
+        say(f"foamfit: no acceptable fit of any cycle was found; see {folder}", err=True)
+    return 0 if good else NOT_ACCEPTABLE
 
 
 def _tell_result(result: FitResult, as_json: bool, quiet: bool, verbose: bool) -> None:

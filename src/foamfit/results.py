@@ -213,7 +213,13 @@ class Fit:
                 "foamfit": version("foamfit"),
                 "test": self.measurement.name,
                 "data_sha256": self.measurement.data_sha256,
-                "data": asdict(self.measurement.rows) | {"notes": self.measurement.notes},
+                "data": asdict(self.measurement.rows)
+                | {
+                    "cycle": self.measurement.cycle,
+                    "cycles": len(self.measurement.cycles),
+                    "start_strain": self.measurement.start_strain,
+                    "notes": self.measurement.notes,
+                },
                 "model": self.model,
                 "relaxation": self.relaxation,
                 "drive": self.drive,

@@ -406,7 +406,10 @@ def test_refuses_too_few_rows(tmp_path):
         (SPECIMEN + '[striker]\nmass = "7 mm"\n', ["[striker] mass", "7 g"]),
         (SPECIMEN + '[noise]\nstress = "-1 Pa"\n', ["[noise] stress", "positive"]),
         (SPECIMEN + "[window]\ncycle = 0\n", ["[window] cycle", "from 1"]),
-        (SPECIMEN + "[window]\ncycle = 2\n", ["the file has 1"]),
+        (
+            SPECIMEN + "[window]\ncycle = 2\n",
+            ["cycle 2 cannot be taken", "the file has cycle 1 alone"],
+        ),
         (SPECIMEN + '[window]\nstart = "1 s"\n', ["[window]", "0 samples"]),
         (SPECIMEN + '[columns]\nforce = "Load"\n', ["[columns] force"]),
         (SPECIMEN + '[columns]\nforc = { column = "F" }\n', ["no key 'forc'", "force"]),

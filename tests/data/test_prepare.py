@@ -11,7 +11,6 @@ from scipy.signal import lfilter
 
 from conftest import EXPERIMENTS
 from foamfit import read_test
-from foamfit.data.cycles import select_cycle
 from foamfit.data.measurement import Record, Specimen, Striker, Window
 from foamfit.data.noise import noise_level
 from foamfit.data.outliers import fill_staircase
@@ -329,12 +328,11 @@ def test_a_mass_inside_that_starts_at_zero_keeps_its_zero():
     )
 
 
-def test_a_later_cycle_keeps_the_zero_of_a_mass_inside():
+def test_a_later_cycle_starts_at_zero_inside_too():
     record = cycles()
     half = replace(record, interior={1: 0.5 * record.displacement + 7e-3})
-    inside = condition(half, SPECIMEN, window=Window(cycle=3)).interior[1]
-    assert inside.max() == pytest.approx(0.5e-3, rel=2e-3)
-    assert inside[-1] == pytest.approx(1e-5, abs=3e-6)  # not zero: the foam has set
+    later = condition(half, SPECIMEN, window=Window(cycle=3))
+    np.testing.assert_allclose(later.interior[1], 0.5 * later.displacement, atol=2e-9)
 
 
 def test_a_staircase_of_a_camera_becomes_its_ramp():
@@ -372,16 +370,72 @@ def cycles(n=3, hold=50):
 @pytest.mark.parametrize("cycle", [1, 2, 3])
 def test_one_cycle_of_a_slow_test_is_kept(cycle):
     conditioned = condition(cycles(), SPECIMEN, window=Window(cycle=cycle))
+    assert (conditioned.cycle, conditioned.cycles) == (cycle, (1, 2, 3))
     assert 440 <= len(conditioned.stress) <= 510
     assert conditioned.time[0] == pytest.approx(0, abs=0.011)
-    # the zero is that of the first contact, in every cycle
-    assert conditioned.displacement.max() == pytest.approx(1e-3, rel=1e-3)
-    assert conditioned.displacement[-1] == pytest.approx(2e-5, abs=6e-6)
     assert any(f"Cycle {cycle} of 3" in note for note in conditioned.notes)
 
 
+def preconditioned(set_strain, offset=0.0, noise=0.0, n=4, held=1.0, lowest=0.0):
+    """Triangles of 1 mm on a foam of 10 mm that bears nothing below its set; MPa over mm."""
+    corners = [0.0, *(level for _ in range(n) for level in (1e-3, lowest))]
+    w = np.interp(np.arange(200 * (len(corners) - 1) + 1) / 200, np.arange(len(corners)), corners)
+    number = np.maximum(np.arange(w.size) - 1, 0) // 400
+    gone = 1e-2 * np.asarray(set_strain)[number]
+    stress = 1e9 * np.maximum(w - gone, 0.0) + offset
+    stress += noise * np.random.default_rng(0).standard_normal(w.size)
+    return Record(0.01 * np.arange(w.size), stress, w - 5e-3)
+
+
+SPECIMEN_10 = Specimen(1e-2, 1e-4)
+
+
+@pytest.mark.parametrize("noise", [0.0, 5e3])
+@pytest.mark.parametrize("cycle", [2, 3, 4])
+def test_a_later_cycle_starts_at_its_own_contact(cycle, noise):
+    sets = [0.0, 0.01, 0.015, 0.02]
+    test = condition(preconditioned(sets, noise=noise), SPECIMEN_10, window=Window(cycle=cycle))
+    gone = sets[cycle - 1]
+    assert test.start_strain == pytest.approx(
+        gone, abs=1.5e-3
+    )  # contact is a hundredth of the peak
+    # time, displacement and stress are zero there, and the tail without contact is cut
+    assert abs(test.time[0]) <= 0.011
+    assert abs(test.displacement[0]) < 1.1e-5
+    assert test.stress[0] < 0.04 * test.stress.max()
+    assert test.displacement.max() == pytest.approx(1e-3 - 1e-2 * gone, rel=0.02)
+    assert test.displacement[-1] < 2e-5
+    assert test.displacement.min() > -2e-5
+    whys = {item.why for item in condition_count(test)}
+    assert {"before contact starts", "after contact ends"} <= whys
+    (told,) = [note for note in test.notes if "start strain" in note]
+    assert f"Contact of cycle {cycle} starts" in told
+
+
+def condition_count(test):
+    """What was dropped of the rows, all of them accounted for."""
+    assert test.rows.rows == test.rows.used + sum(item.rows for item in test.rows.dropped)
+    return test.rows.dropped
+
+
+def test_a_stress_below_zero_between_the_cycles_is_the_offset_of_the_sensor():
+    record = preconditioned([0.0, 0.01, 0.01, 0.01], offset=-2e4)
+    first = condition(record, SPECIMEN_10)
+    later = condition(record, SPECIMEN_10, window=Window(cycle=2))
+    assert first.stress.max() - later.stress.max() == pytest.approx(1e5 - 2e4 - 0.0, rel=0.3)
+    assert later.stress.min() > -1.0
+    assert any("-20 kPa, is taken off as the sensor's offset" in note for note in later.notes)
+
+
+def test_a_specimen_that_stays_under_load_between_the_cycles_is_told():
+    record = preconditioned([0.0] * 4, lowest=1e-4)  # a tenth of the peak
+    later = condition(record, SPECIMEN_10, window=Window(cycle=2))
+    assert any("stays under load between the cycles" in note for note in later.notes)
+    assert later.stress.max() == pytest.approx(1e6)
+
+
 def test_a_cycle_that_is_not_there_is_refused():
-    with pytest.raises(InputError, match="the file has 3"):
+    with pytest.raises(InputError, match="cycle 4 cannot be taken: the file has cycles 1 to 3;"):
         condition(cycles(), SPECIMEN, window=Window(cycle=4))
     with pytest.raises(InputError, match="slow tests"):
         run(impact(), cycle=2)
@@ -389,8 +443,7 @@ def test_a_cycle_that_is_not_there_is_refused():
 
 def test_a_slow_test_without_unloading_says_so():
     record = cycles(1).rows(slice(0, 300))
-    _, notes = select_cycle(record, 1)
-    assert any("no unloading" in note for note in notes)
+    assert any("no unloading" in note for note in condition(record, SPECIMEN).notes)
 
 
 def test_the_approach_of_a_slow_test_is_cut():

@@ -216,11 +216,29 @@ def test_cycles_of_any_amplitude_are_counted(tmp_path, tops, cycle, count):
     test = read_test(write(tmp_path, lines, SPECIMEN + f"[window]\ncycle = {cycle}\n"))
     accounted(test)
     assert f"Cycle {cycle} of {count} is used" in cycles(test)
-    assert test.displacement.max() == pytest.approx(1e-3 * tops[cycle - 1], rel=0.03)
+    reached = test.displacement.max() + 10e-3 * test.start_strain
+    assert reached == pytest.approx(1e-3 * tops[cycle - 1], rel=0.03)
     small = [note for note in test.notes if "of the largest displacement" in note]
     assert len(small) == (tops[cycle - 1] < 4.0)
     assert all("[window] cycle = " in note for note in small)
     assert not any("reverses" in note for note in test.notes)
+
+
+def test_a_column_may_number_the_cycles(tmp_path):
+    displacement = triangles([4.0, 4.0, 4.0])
+    number = np.repeat([1, 10, 100], 160)  # of which a machine has recorded three
+    number = np.append(number, 100)
+    clock = np.arange(float(displacement.size))
+    header = HEADER + ",Total Cycles"
+    lines = table(clock, 0.5 * displacement, displacement, number, header=header)
+    path = write(tmp_path, lines, SPECIMEN + '[columns]\ncycle = { column = "Total Cycles" }\n')
+    test = read_test(path, cycle=10)
+    assert (test.cycle, test.cycles) == (10, (1, 10, 100))
+    assert "Cycle 10 (number 2 in the file) of 3 is used" in cycles(test)
+    assert "before cycle 10" in {item.why for item in accounted(test).dropped}
+    assert read_test(path).cycle == 1
+    with pytest.raises(InputError, match=r"cycle 2 cannot be taken: .* 3 of the cycles 1 to 100"):
+        read_test(path, cycle=2)
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ NOTEBOOKS = ROOT / "notebooks"
 LISTED = (
     "fit_a_new_test.ipynb",
     "fitted_against_published.ipynb",
+    "what_changes_by_cycle.ipynb",
     "turn_the_parameters.ipynb",
 )
 

@@ -74,6 +74,8 @@ def _clear_time(table: Table, columns: list[int]) -> list[int]:
 
 def si_factor(table: Table, channel: str, header: Header, given: Column | None) -> float:
     """Return what the numbers of a column are multiplied by to be SI."""
+    if channel == "cycle":  # counted; pint takes "Cycles" in a header for a unit of angle
+        return 1.0
     right, where = example(channel), f"{table.path}: column {header.text!r}"
     given = given or _NONE
     unit = given.unit if given.unit is not None else header.unit

@@ -27,7 +27,9 @@ from foamfit.errors import InputError
 from foamfit.text import engineering, percent
 
 
-def read_test(path: str | Path, specimen: str | Path | None = None) -> Measurement:
+def read_test(
+    path: str | Path, specimen: str | Path | None = None, cycle: int | None = None
+) -> Measurement:
     """Read a test file and its TOML, check both and condition the data.
 
     Parameters
@@ -36,6 +38,10 @@ def read_test(path: str | Path, specimen: str | Path | None = None) -> Measureme
         The table: CSV, separated by commas, semicolons or tabs, one row per sample.
     specimen : str or Path, optional
         The TOML; without it, the file beside the table that ends in ``.toml``.
+    cycle : int, optional
+        Number of the cycle of a slow test; without it that of ``[window]`` in the TOML, or else the
+        first. A later cycle starts at its own contact: the strain that the foam has not recovered
+        by then is taken off, and is the measurement's `start_strain`.
 
     Returns
     -------
@@ -52,6 +58,7 @@ def read_test(path: str | Path, specimen: str | Path | None = None) -> Measureme
     text = read_text(path, "the CSV file of a test")
     toml = Path(specimen) if specimen is not None else path.with_suffix(".toml")
     settings = read_settings(toml, path, channels=CHANNELS)
+    window = settings.window if cycle is None else replace(settings.window, cycle=cycle)
     table = find_table(text, {column.column for column in settings.columns.values()})
     columns = assign_columns(table, settings.columns, toml)
     record, notes = _record(table, columns, settings)
@@ -60,7 +67,7 @@ def read_test(path: str | Path, specimen: str | Path | None = None) -> Measureme
             record,
             settings.specimen,
             striker=settings.striker,
-            window=settings.window,
+            window=window,
             advice=partial(sign_advice, table, columns, settings),
         )
     except InputError as error:
@@ -137,8 +144,9 @@ def _to_record(numbers: dict[str, Array], settings: Settings, notes: list[str]) 
         elif node:
             inside[node] = values
     return Record(
-        numbers.get("time"), stress, displacement, numbers.get("velocity"), acceleration, inside
-    )
+        numbers.get("time"), stress, displacement, numbers.get("velocity"), acceleration, inside,
+        cycle=numbers.get("cycle"),
+    )  # fmt: skip
 
 
 def _announced(table: Table, count: int) -> list[str]:

@@ -29,6 +29,7 @@ CHANNELS = {
     "strain": Channel("", "%", ("strain", "eps", "epsilon")),
     "acceleration": Channel("m/s**2", "m/s^2", ("acceleration", "accel", "deceleration")),
     "velocity": Channel("m/s", "m/s", ("velocity", "speed")),
+    "cycle": Channel("", "", ()),  # the number of the cycle, where [columns] names such a column
 }
 _WORDS = {word for channel in CHANNELS.values() for word in channel.words}
 # Words that name the displacement where nothing better does: a machine's travel, or a gap.

@@ -149,7 +149,7 @@ class Window:
 
     start: float = -np.inf
     end: float = np.inf
-    cycle: int = 1
+    cycle: int | None = None  # the first one
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,9 +160,9 @@ class Record:
     deceleration in m/s² (like the stress that causes it, it is positive in compression). `interior`
     holds the displacement of masses inside in m, 1 for the one above spring 1. `excess` is what the
     file has beyond the straight line that bridges an outlier, 0 elsewhere, for each channel that
-    has outliers. `clipped` marks the samples at which the force is clipped. `numbers` holds the row
-    number in the file of each sample (None: they count from 1), and `dropped` the rows of the file
-    that were left out so far.
+    has outliers. `clipped` marks the samples at which the force is clipped. `cycle` is the number
+    of the cycle, where a column counts them. `numbers` holds the row number in the file of each
+    sample (None: they count from 1), and `dropped` the rows of the file that were left out so far.
     """
 
     time: Array | None
@@ -173,6 +173,7 @@ class Record:
     interior: dict[int, Array] = field(default_factory=dict)
     excess: dict[str, Array] = field(default_factory=dict)
     clipped: NDArray[np.bool_] | None = None
+    cycle: Array | None = None
     numbers: NDArray[np.int64] | None = None
     dropped: tuple[Dropped, ...] = ()
 
@@ -266,6 +267,11 @@ class Measurement:
         for the file's own.
     count : RowCount or None
         The rows of the file; None if the test was not read from one.
+    cycle, cycles
+        Number of the cycle that is used, and those of all cycles in the record, in its order.
+    start_strain : float
+        Strain of a later cycle, counted from the first contact, at which its own contact starts:
+        what the foam had not recovered. It is taken off.
     """
 
     name: str
@@ -283,6 +289,9 @@ class Measurement:
     outliers: dict[str, Outliers] = field(default_factory=dict)
     contact: str = "file"
     count: RowCount | None = None
+    cycle: int = 1
+    cycles: tuple[int, ...] = (1,)
+    start_strain: float = 0.0
 
     @property
     def rows(self) -> RowCount:

@@ -7,13 +7,19 @@ thing that it changed or left out.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.data.contact import cut_to_contact, find_start, remove_offset, smooth, zero_interior
-from foamfit.data.cycles import inner_reversals, select_cycle
+from foamfit.data.cycles import (
+    choose_cycle,
+    cut_to_cycle,
+    cut_to_reload,
+    find_cycles,
+    find_reload,
+    inner_reversals,
+)
 from foamfit.data.measurement import (
     INTEGRATED,
     MEASURED,
@@ -71,21 +77,26 @@ def condition(
     check_signs(record, advice)
     held = noise_of_held(record)
     record = done(fill_staircase(record))
-    if impact and window.cycle != 1:
+    if impact and window.cycle not in (None, 1):
         raise InputError("[window] cycle is for slow tests; for an impact give start and end.")
-    first = record if impact else select_cycle(record, 1)[0]
+    cycles = [] if impact else find_cycles(record)
+    chosen = choose_cycle(cycles, window.cycle) if cycles else None
+    first = cut_to_cycle(record, cycles, cycles[0])[0] if cycles else record
     levels = held | {c: estimated_noise(v) for c, v in first.curves().items() if c not in held}
     start = find_start(first, levels, striker if impact else None)
     # Before a slow test nothing shows that the specimen is free.
     resting = start.rest(first) if impact or start.free else 0
     record = done(zero_interior(record, first, start, levels))
     record = done(remove_offset(record, resting, levels["stress"]))
-    if not impact:
-        record = done(select_cycle(record, window.cycle))
-    if window.cycle > 1:  # a later cycle keeps the zero of the first, when the foam was fresh
-        start = replace(start, how=f"with cycle {window.cycle}", time=None, at_zero=False)
-        resting = 0
-    record = done(cut_to_contact(record, start, impact, levels["stress"]))
+    start_strain = 0.0
+    if chosen is not None and chosen.place:  # not the first: it has a contact of its own
+        at = find_reload(record, cycles, chosen)
+        notes += cut_to_cycle(record, cycles, chosen)[1]
+        record = done(cut_to_reload(record, chosen, at, start.zero, specimen.height))
+        start_strain = (at.displacement - start.zero) / specimen.height
+    else:
+        record = done(cut_to_cycle(record, cycles, chosen)) if chosen else record
+        record = done(cut_to_contact(record, start, impact, levels["stress"]))
     record, motion = integrate_motion(record, specimen, striker or Striker())
     if motion != MEASURED:
         notes.append(f"The file has no displacement: the motion is {motion}.")
@@ -106,8 +117,11 @@ def condition(
         notes=tuple(notes),
         interior=record.interior,
         outliers=outliers,
-        contact=start.by,
+        contact="stress" if chosen is not None and chosen.place else start.by,
         count=count_rows(whole, outliers, block),
+        cycle=chosen.number if chosen else 1,
+        cycles=tuple(cycle.number for cycle in cycles) or (1,),
+        start_strain=start_strain,
     )
 
 

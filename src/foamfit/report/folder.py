@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +20,13 @@ from foamfit.report.plots import plot_fit
 from foamfit.results import SCHEMA, Curves, Fit, ParameterEstimate, plain
 from foamfit.trust.intervals import Intervals
 
-# All that `save_result` may write.
+# All that `save_result` may write, and what `report.cycles.save_cycles` writes beside the folder of
+# each cycle.
 RESULT_FILES = (
     "fit.json", "parameters.csv", "curves.csv", "profiles.csv", "ladder.csv", "fit.png",
     "fit.pdf", "report.html",
 )  # fmt: skip
+CYCLES_FILES = ("cycles.json", "cycles.csv", "cycles.png")
 
 
 def save_result(result: Fit, folder: str | Path) -> Path:
@@ -33,11 +36,16 @@ def save_result(result: Fit, folder: str | Path) -> Path:
     it cannot be written, and nothing is changed then. ``profiles.csv`` is written where there are
     profiles, ``ladder.csv`` where there is a ladder. Returns the folder.
     """
+    return save_whole(folder, lambda fresh: write_result(result, fresh))
+
+
+def save_whole(folder: str | Path, write: Callable[[Path], None]) -> Path:
+    """Let `write` fill a new folder, which replaces an older result at the end; returns it."""
     folder = Path(folder)
     check_target(folder)
     try:
         with replacing(folder.resolve()) as fresh:
-            _write(result, fresh)
+            write(fresh)
             check_target(folder)  # what has been put there in the meantime stays
     except OSError as error:
         raise InputError(
@@ -77,7 +85,7 @@ def _check_replaceable(folder: Path, place: Path) -> None:
     if place.is_mount():
         raise InputError(f"{folder} is a mount point and cannot be replaced; name a folder in it")
     there = sorted(place.iterdir())
-    if there and not _is_of_fit(place / "fit.json"):
+    if there and not any(_is_of_fit(place / name) for name in ("fit.json", "cycles.json")):
         raise InputError(
             f"{folder} is not empty and holds no foamfit result (no fit.json of foamfit), so it is "
             "not replaced; choose a new or an empty folder"
@@ -92,7 +100,12 @@ def _check_replaceable(folder: Path, place: Path) -> None:
 
 def is_written(path: Path) -> bool:
     """Whether something in a result folder is what a fit writes there."""
-    return path.name in RESULT_FILES and path.is_file() and not path.is_symlink()
+    if path.is_symlink():
+        return False
+    if re.fullmatch(r"cycle-\d+", path.name) and path.is_dir():
+        within = list(path.iterdir())
+        return all(inner.name in RESULT_FILES and is_written(inner) for inner in within)
+    return path.name in (*RESULT_FILES, *CYCLES_FILES) and path.is_file()
 
 
 def _is_of_fit(path: Path) -> bool:
@@ -130,16 +143,17 @@ def load_result(folder: str | Path) -> dict[str, Any]:
     return content
 
 
-def _write(result: Fit, folder: Path) -> None:
+def write_result(result: Fit, folder: Path) -> None:
+    """Write all files of a result into a folder that is there."""
     text = json.dumps(result.to_json_dict(), indent=2, ensure_ascii=False, allow_nan=False)
     # A name that is no UTF-8 keeps its bytes as an escape of JSON.
     (folder / "fit.json").write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
-    _write_table(folder / "parameters.csv", _parameter_rows(result.parameters))
-    _write_table(folder / "curves.csv", _curve_rows(result.curves, result.measurement.outliers))
+    write_table(folder / "parameters.csv", _parameter_rows(result.parameters))
+    write_table(folder / "curves.csv", _curve_rows(result.curves, result.measurement.outliers))
     if result.intervals is not None and result.intervals.profiles:
-        _write_table(folder / "profiles.csv", _profile_rows(result.intervals))
+        write_table(folder / "profiles.csv", _profile_rows(result.intervals))
     if result.ladder is not None:
-        _write_table(folder / "ladder.csv", result.ladder.rows())
+        write_table(folder / "ladder.csv", result.ladder.rows())
     figure = plot_fit(result)
     with laid_out(figure):
         png, pdf = image(figure, "png"), image(figure, "pdf")
@@ -149,7 +163,8 @@ def _write(result: Fit, folder: Path) -> None:
     (folder / "report.html").write_text(page, encoding="utf-8", errors="replace")
 
 
-def _write_table(path: Path, rows: Iterable[Iterable[object]]) -> None:
+def write_table(path: Path, rows: Iterable[Iterable[object]]) -> None:
+    """Write rows of cells as CSV."""
     with path.open("w", encoding="utf-8", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows(rows)
 

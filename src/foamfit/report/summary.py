@@ -41,6 +41,12 @@ def summary_text(result: Fit, *, verbose: bool = False) -> str:
         one = result.ladder.chosen
         tried = counted(len(result.ladder.rungs), "model")
         paragraphs.append(f"chosen of {tried} tried: {one.name}: {one.why}")
+    if len(m.cycles) > 1:
+        gone = f", start strain {percent(m.start_strain)}" if m.cycle != m.cycles[0] else ""
+        paragraphs.append(
+            f"cycle {m.cycle} of {len(m.cycles)} in the record{gone}: {m.rows.used} of "
+            f"{m.rows.rows} rows used, the others cut (--cycle all fits each)"
+        )
     lines = _paragraphs(paragraphs)
     lines += ["", *_table(rows), "", *_paragraphs(conclusions(result)), ""]
     if verbose:

@@ -1,0 +1,211 @@
+"""The folder of a record's cycles: a result folder for each, a table, a picture, a summary."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from foamfit.report.figures import BLUE, GREY, VERMILION, drawing, image
+from foamfit.report.folder import save_whole, write_result, write_table
+from foamfit.text import aligned, percent, wrapped
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from foamfit.study.cycles import CycleFits
+
+COLUMNS, PANEL = 4, (1.85, 1.5)  # of the picture; inches
+MOST_LOOPS = 12
+FAR = 20  # a last cycle that is so many times the first is drawn on a logarithmic axis
+
+
+def save_cycles(found: CycleFits, folder: str | Path) -> Path:
+    """Write the folder whole, replacing an older result at the end; returns it."""
+
+    def write(fresh: Path) -> None:
+        for number, result in found.results.items():
+            (fresh / f"cycle-{number}").mkdir()
+            write_result(result, fresh / f"cycle-{number}")
+        write_table(fresh / "cycles.csv", found.rows())
+        text = json.dumps(found.to_json_dict(), indent=2, ensure_ascii=False, allow_nan=False)
+        (fresh / "cycles.json").write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
+        (fresh / "cycles.png").write_bytes(image(plot_cycles(found), "png", 200))
+
+    return save_whole(folder, write)
+
+
+# ------------------------------------------------------------------------------- in words
+
+
+def cycles_text(found: CycleFits) -> str:
+    """Return what the command prints of the cycles of a record."""
+    n = len(found.recorded)
+    fitted = f"{len(found.results)} of {n} {'cycle' if n == 1 else 'cycles'} fitted"
+    lines = [f"{found.test}: {found.model}: {fitted}", ""]
+    lines += _table(found)
+    for number, why in sorted(found.refused.items()):
+        lines += ["", *wrapped(f"cycle {number}: {why}")]
+    if found.selection is not None:
+        lines += ["", "fitted together, what each cycle has of its own:"]
+        lines += _steps(found)
+    for sentence in found.sentences:
+        lines += ["", *wrapped(sentence)]
+    return "\n".join(lines)
+
+
+def _table(found: CycleFits) -> list[str]:
+    names = [n for n in found.names if any(r.parameters[n].vary for r in found.results.values())]
+    rows = [["cycle", "start strain", "misfit", *(name.removeprefix("s1_") for name in names)]]
+    for number, one in sorted(found.results.items()):
+        off = one.misfit.get("stress_strain") or one.misfit.get("stress_time")
+        cells = [f"{one.parameters[name].value:.3g}" for name in names]
+        strain = percent(one.measurement.start_strain)
+        rows.append([str(number), strain, "–" if off is None else percent(off), *cells])
+    if len(names) > 12:  # a chain: the table is in cycles.csv
+        rows = [row[:3] for row in rows]
+    return aligned(rows)
+
+
+def _steps(found: CycleFits) -> list[str]:
+    assert found.selection is not None
+    content = found.to_json_dict()["together"]
+    rows = [["", "of each cycle", "parameters", "BIC", *(f"misfit {n}" for n in found.together)]]
+    last = content["alone"] | {"own": ["all (each alone)"], "chosen": False}
+    for step in (*content["steps"], last):
+        own = ", ".join(name.removeprefix("s1_") for name in step["own"]) or "nothing"
+        off = [percent(m) if m is not None else "–" for m in step["misfit"].values()]
+        mark = "*" if step["chosen"] else ""
+        rows.append([mark, own, str(step["n_vary"]), f"{step['bic']:.1f}", *off])
+    return aligned(rows)
+
+
+# ------------------------------------------------------------------------------- the picture
+
+
+def plot_cycles(found: CycleFits) -> Figure:
+    """Draw the loops laid over each other, and start strain, energy, misfit, parameters by cycle.
+
+    Bars are 95 % intervals; a hollow mark is a parameter that its cycle does not determine well.
+    Lines are the fit of several cycles together: level where the parameter is shared.
+    """
+    results = dict(sorted(found.results.items()))
+    varied = [n for n in found.names if any(r.parameters[n].vary for r in results.values())]
+    panels = 3 + len(varied)
+    rows = 2 + max(0, -(-(panels - 2 * (COLUMNS - 2)) // COLUMNS))
+    with drawing(COLUMNS * PANEL[0], rows * PANEL[1] + 0.35) as figure:
+        grid = figure.add_gridspec(rows, COLUMNS)
+        _loops(figure.add_subplot(grid[:2, :2]), found)
+        places = [(i, j) for i in range(rows) for j in range(COLUMNS) if i > 1 or j > 1]
+        axes = [figure.add_subplot(grid[place]) for place in places[:panels]]
+        if results:
+            _by_cycle(axes[0], {n: 100 * r.measurement.start_strain for n, r in results.items()})
+            energy = {n: r.energy.get("dissipated_energy") for n, r in results.items()}
+            _by_cycle(axes[1], {n: e / 1e3 for n, e in energy.items() if e is not None})
+            off = {n: r.misfit.get("stress_strain") for n, r in results.items()}
+            _by_cycle(axes[2], {n: 100 * m for n, m in off.items() if m is not None})
+        titles = ("start strain (%)", "dissipated (kJ/m³)", "misfit of the loop (%)")
+        for ax, title in zip(axes[:3], titles, strict=True):
+            ax.set_title(title)
+        for ax, name in zip(axes[3:], varied, strict=True):
+            _parameter(ax, found, name)
+        for ax in axes:
+            _axis(ax, sorted(results))
+        told = "points: each cycle alone with 95 % interval, hollow if weak or not determined"
+        told += "; lines: fitted together" if found.selection is not None else ""
+        title = f"{found.test} · {found.model}\n{told}"
+        figure.suptitle(title, x=0.01, ha="left", fontsize=8)
+    return figure
+
+
+def _loops(ax: Axes, found: CycleFits) -> None:
+    """Measured loops over each other, from light to dark; the first and the last one fitted."""
+    import matplotlib
+
+    there = [
+        n for n, r in sorted(found.results.items()) if r.curves.measured_displacement is not None
+    ]
+    keep = np.unique(np.geomspace(1, max(len(there), 1), MOST_LOOPS).astype(int)) - 1
+    shown = [there[i] for i in keep if i < len(there)]
+    colours = matplotlib.colormaps["viridis_r"](np.linspace(0.1, 0.95, max(len(shown), 1)))
+    for number, colour in zip(shown, colours, strict=False):
+        result = found.results[number]
+        curves, height = result.curves, result.measurement.specimen.height
+        assert curves.measured_displacement is not None
+        strain = curves.measured_displacement / height + result.measurement.start_strain
+        measured, fitted = curves.measured_stress, curves.stress_along
+        if measured is not None:
+            label = f"cycle {number}"
+            ax.plot(strain, measured / 1e3, color=colour, linewidth=0.9, label=label)
+        if fitted is not None and number in (shown[0], shown[-1]):
+            ax.plot(strain, fitted / 1e3, ":", color="black", linewidth=0.8)
+    ax.set_xlabel("strain from the first contact")
+    ax.set_ylabel("stress (kPa)")
+    ax.set_title("measured; first and last fitted (dotted)")
+    if shown:
+        ax.legend(loc="upper left", fontsize=6.5, handlelength=1.2, labelspacing=0.25)
+
+
+def _by_cycle(ax: Axes, values: dict[int, float]) -> None:
+    ax.plot(list(values), list(values.values()), "o-", color=BLUE, markersize=3, linewidth=0.8)
+
+
+def _short(name: str, found: CycleFits) -> str:
+    """Name of a parameter, without the spring where there is one alone."""
+    return name if "+" in found.model else name.removeprefix("s1_")
+
+
+def _scale(values: Sequence[float], unit: str) -> tuple[float, str]:
+    """Factor and unit in which values are drawn."""
+    largest = max((abs(value) for value in values), default=0.0)
+    if unit == "Pa":
+        return (1e-6, "MPa") if largest >= 1e6 else (1e-3, "kPa")
+    return 1.0, unit
+
+
+def _parameter(ax: Axes, found: CycleFits, name: str) -> None:
+    """One parameter with its 95 % intervals against the cycle."""
+    points = [
+        (n, r.parameters[name]) for n, r in sorted(found.results.items()) if name in r.parameters
+    ]
+    unit = points[0][1].unit
+    factor, shown = _scale([p.value for _, p in points], unit)
+    ax.set_title(_short(name, found) + (f" ({shown})" if shown else ""))
+    for number, p in points:
+        sure = p.state == "determined"
+        if p.ci95 is not None and np.all(np.isfinite(p.ci95)):
+            ax.plot([number] * 2, [factor * end for end in p.ci95], color=GREY, linewidth=0.8)
+        face = BLUE if sure else "white"
+        ax.plot(number, factor * p.value, "o", color=BLUE, markerfacecolor=face, markersize=3.5)
+    if found.selection is not None:
+        best = found.selection.best.fits[0]
+        if name in (*best.shared, *best.own):
+            values = factor * np.array(best.value(name))
+            ax.plot(found.together, values, color=VERMILION, linewidth=0.9, zorder=0)
+    _limit(ax, factor, [p for _, p in points], found, name)
+
+
+def _limit(ax: Axes, factor: float, points: Sequence[Any], found: CycleFits, name: str) -> None:
+    """Let wide intervals run out of the panel rather than flatten the values."""
+    values = [factor * p.value for p in points]
+    if found.selection is not None and name in found.selection.best.fits[0].shared:
+        values += [factor * v for v in found.selection.best.fits[0].value(name)]
+    ends = [factor * end for p in points for end in (p.ci95 or ()) if np.isfinite(end)]
+    low, high = min(values), max(values)
+    room = max(1.5 * (high - low), 0.25 * max(abs(low), abs(high)), 1e-12)
+    ax.set_ylim(
+        max(min([low, *ends]), low - room) - 0.06 * room,
+        min(max([high, *ends]), high + room) + 0.06 * room,
+    )
+
+
+def _axis(ax: Axes, numbers: Sequence[int]) -> None:
+    ax.set_xlabel("cycle")
+    if numbers and numbers[-1] >= FAR * numbers[0]:
+        ax.set_xscale("log")
+    elif len(numbers) <= 8:
+        ax.set_xticks(list(numbers))

@@ -1,0 +1,1 @@
+"""Several tests or cycles: each fitted on its own, and together."""

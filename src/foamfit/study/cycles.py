@@ -1,0 +1,334 @@
+"""The cycles of one record: each fitted on its own, then together, to see what changes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Unpack
+
+import lmfit
+import numpy as np
+
+from foamfit.api import FitResult, fit
+from foamfit.data.csv_file import read_test
+from foamfit.data.measurement import Measurement
+from foamfit.errors import InputError, SimulationError
+from foamfit.one_model import Keywords, Options, Progress
+from foamfit.results import plain
+from foamfit.study.shared import Group, Selection, select_own
+from foamfit.text import counted, listed, percent
+from foamfit.trust.intervals import Announce
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+SCHEMA = 1
+# Cycles that are fitted together at most; of more the first and others at equal ratios are taken.
+MOST_TOGETHER = 6
+CTRL_C = "not fitted, because Ctrl-C ended the command before"
+CURVES = ("stress_time", "displacement_time", "stress_strain")
+ENERGY = "dissipated_energy"
+
+Params = Callable[[Measurement], lmfit.Parameters | None]
+
+
+@dataclass(frozen=True, eq=False)
+class CycleFits:
+    """Fits of the cycles of one record.
+
+    Attributes
+    ----------
+    test, model
+        Names of the test and of the model.
+    recorded : tuple of int
+        Numbers of all cycles in the record.
+    results : dict of int to FitResult
+        The fit of each cycle that could be read and fitted.
+    refused : dict of int to str
+        Why the others could not, one sentence each.
+    selection : Selection or None
+        Which parameters change from cycle to cycle; `together` holds the numbers of its cycles.
+    sentences : tuple of str
+        What the fit of several cycles says, or why there is none.
+    """
+
+    test: str
+    model: str
+    recorded: tuple[int, ...]
+    results: dict[int, FitResult]
+    refused: dict[int, str]
+    selection: Selection | None = None
+    together: tuple[int, ...] = ()
+    sentences: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the parameters of any fit, in their order."""
+        return list(dict.fromkeys(name for one in self.results.values() for name in one.parameters))
+
+    def rows(self) -> Iterator[list[object]]:
+        """Rows of cycles.csv, the header first: SI, one row for each cycle, empty = not there."""
+        head = [
+            "cycle", "start_strain", "peak_strain", "peak_stress", ENERGY,
+            *(f"misfit_{name}" for name in CURVES), "status", "error",
+        ]  # fmt: skip
+        parts = "", "_stderr", "_lo", "_hi", "_state"
+        yield [*head, *(f"{name}{part}" for name in self.names for part in parts)]
+        for number in sorted({*self.results, *self.refused}):
+            one = self.results.get(number)
+            if one is None:
+                blank = [None] * (5 * len(self.names))
+                yield [number, *[None] * 7, "refused", self.refused[number], *blank]
+                continue
+            m = one.measurement
+            strain = None if m.displacement is None else float(m.displacement.max())
+            cells: list[object] = [
+                number,
+                m.start_strain,
+                None if strain is None else strain / m.specimen.height,
+                None if m.stress is None else float(m.stress.max()),
+                one.energy.get(ENERGY),
+                *(one.misfit.get(name) for name in CURVES),
+                one.status,
+                None,
+            ]
+            for name in self.names:
+                p = one.parameters.get(name)
+                if p is None:
+                    cells += [None] * 5
+                else:
+                    cells += [p.value, p.stderr, *(p.ci95 or (None, None)), p.state]
+            yield [plain(cell) for cell in cells]
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """The rows of cycles.csv, indexed by the cycle."""
+        import pandas as pd
+
+        head, *rows = self.rows()
+        return pd.DataFrame(rows, columns=[str(name) for name in head]).set_index("cycle")
+
+    def to_json_dict(self) -> dict[str, Any]:
+        """Return the content of cycles.json: what was fitted together, in plain types and SI."""
+        content: dict[str, Any] = {
+            "schema": SCHEMA,
+            "foamfit": version("foamfit"),
+            "test": self.test,
+            "model": self.model,
+            "recorded": self.recorded,
+            "fitted": sorted(self.results),
+            "refused": self.refused,
+            "sentences": self.sentences,
+            "together": None if self.selection is None else self._together(self.selection),
+        }
+        return dict(plain(content))
+
+    def _together(self, selection: Selection) -> dict[str, Any]:
+        best = selection.best.fits[0]
+        return {
+            "cycles": self.together,
+            "effective_samples": selection.n_eff,
+            "own": best.own,
+            "shared": best.shared,
+            "parameters": {name: best.value(name) for name in best.own}
+            | {name: best.value(name)[0] for name in best.shared},
+            "steps": [
+                {
+                    "own": step.own,
+                    "n_vary": step.n_vary,
+                    "bic": step.bic,
+                    "misfit": dict(zip(self.together, _misfits(step.fits[0].misfits), strict=True)),
+                    "explained": selection.explained(step),
+                    "chosen": step is selection.best,
+                }
+                for step in selection.steps
+            ],
+            "alone": {
+                "n_vary": selection.n_alone,
+                "bic": selection.bic_alone,
+                "misfit": {n: _misfits([self.results[n].misfit])[0] for n in self.together},
+            },
+        }
+
+    def save(self, folder: str | Path) -> Path:
+        """Write ``cycle-<n>/``, cycles.csv, cycles.png and cycles.json whole; returns the folder.
+
+        An older result there is replaced as a whole, at the end.
+        """
+        from foamfit.report.cycles import save_cycles
+
+        return save_cycles(self, folder)
+
+
+def _misfits(found: Sequence[dict[str, float | None]]) -> list[float | None]:
+    """The one misfit that tells most of each fit: of the loop, else of the stress."""
+    names = ("stress_strain", "stress_time", "displacement_time")
+    return [next((one[n] for n in names if one.get(n) is not None), None) for one in found]
+
+
+def fit_cycles(
+    path: str | Path,
+    specimen: str | Path | None = None,
+    *,
+    cycles: Sequence[int] | None = None,
+    model: str = "bistable",
+    together: bool = True,
+    params: Params | None = None,
+    progress: Progress | None = None,
+    tell: Announce | None = None,
+    **options: Unpack[Keywords],
+) -> CycleFits:
+    """Fit cycles of a record in turn, then together, and choose what changes by cycle.
+
+    A later cycle starts at its own contact; its start strain is taken off (see `read_test`).
+    Together, all parameters are shared at first; those that change from cycle to cycle are chosen
+    by evidence, see `foamfit.study.shared.select_own`.
+
+    Parameters
+    ----------
+    path, specimen
+        The record and its TOML, as for `read_test`.
+    cycles : sequence of int, optional
+        Numbers of the cycles; all by default.
+    model, tell, options
+        As for `foamfit.fit`.
+    together : bool
+        Whether they are fitted together, too (at most `MOST_TOGETHER` of them).
+    params : callable, optional
+        Gives the parameters of each cycle's measurement, as `foamfit.make_params` does.
+    progress : callable, optional
+        Told the fraction done and what is going on.
+
+    Returns
+    -------
+    CycleFits
+        A cycle that cannot be read or fitted is in `refused` with its sentence.
+
+    Raises
+    ------
+    InputError
+        If the record or an option cannot be used at all.
+    """
+    chosen = Options(**options)
+    report = progress or (lambda *_: None)
+    first = read_test(path, specimen)
+    wanted = first.cycles if cycles is None else tuple(dict.fromkeys(cycles))
+    if not wanted:
+        raise InputError("no cycle is named; name one or leave cycles out for all")
+    results, refused = dict[int, FitResult](), dict[int, str]()
+    share = 0.7 if together and len(wanted) > 1 else 1.0
+    for i, number in enumerate(wanted):
+
+        def told(done: float, what: str, i: int = i, number: int = number) -> None:
+            report(share * (i + done) / len(wanted), f"cycle {number}: {what}")
+
+        try:
+            test = first if number == first.cycle else read_test(path, specimen, number)
+            given = None if params is None else params(test)
+            results[number] = fit(
+                test, model=model, params=given, progress=told, tell=tell, **options
+            )
+        except (InputError, SimulationError) as error:
+            refused[number] = str(error)
+        except KeyboardInterrupt:
+            if not results:
+                raise
+            refused[number] = CTRL_C
+        if refused.get(number) is CTRL_C or _interrupted(results.get(number)):
+            refused |= dict.fromkeys(wanted[i + 1 :], CTRL_C)
+            break
+    found = CycleFits(first.name, model, first.cycles, results, refused)
+    if not together:
+        return found
+    return _fit_together(found, chosen, lambda done, what: report(share + 0.3 * done, what))
+
+
+def _interrupted(result: FitResult | None) -> bool:
+    """Whether Ctrl-C has ended a fit; what it had found is its result."""
+    return result is not None and result.stopped == "Ctrl-C"
+
+
+def _fit_together(found: CycleFits, options: Options, progress: Progress) -> CycleFits:
+    """Add the fit of several cycles at once, where there can be one."""
+    fitted = {n: one for n, one in sorted(found.results.items()) if one.status != "failed"}
+    models = {one.model for one in fitted.values()}
+    why = None
+    if len(fitted) < 2:
+        why = "fewer than two cycles have a fit"
+    elif len(models) > 1:
+        why = f"they have different models ({listed(sorted(models))})"
+    elif any(one.stopped for one in fitted.values()):
+        why = "a fit was stopped before its end"
+    if why is not None:
+        sentence = f"The cycles are not fitted together, because {why}."
+        return replace(found, sentences=(sentence,))
+    numbers = spread(list(fitted))
+    problems = [
+        options.problem(fitted[n].measurement, fitted[n].model, fitted[n].params.copy())
+        for n in numbers
+    ]
+    vectors = [p.vector(fitted[n].params) for p, n in zip(problems, numbers, strict=True)]
+    try:
+        selection = select_own([Group(tuple(problems), tuple(vectors))], progress=progress)
+    except KeyboardInterrupt:  # the fits of the cycles are not given up for it
+        return replace(found, sentences=("The fit of the cycles together was ended by Ctrl-C.",))
+    together = replace(found, selection=selection, together=numbers)
+    return replace(together, sentences=tuple(_sentences(together, selection)))
+
+
+def spread(numbers: list[int]) -> tuple[int, ...]:
+    """At most `MOST_TOGETHER` of the cycles, at about equal ratios of their numbers."""
+    if len(numbers) <= MOST_TOGETHER:
+        return tuple(numbers)
+    wanted = np.geomspace(numbers[0], numbers[-1], MOST_TOGETHER)
+    there = np.array(numbers)
+    nearest = [numbers[int(np.argmin(np.abs(there - at)))] for at in wanted]
+    return tuple(dict.fromkeys(nearest))
+
+
+def _sentences(found: CycleFits, selection: Selection) -> Iterator[str]:
+    """What the fit of several cycles says."""
+    best, first = selection.best, selection.steps[0]
+    cycles = listed(str(n) for n in found.together)
+
+    def shown(step: Any) -> str:
+        off = [m for m in _misfits(step.fits[0].misfits) if m is not None]
+        return f"{percent(min(off))} to {percent(max(off))}"
+
+    alone = [m for m in _misfits([found.results[n].misfit for n in found.together]) if m]
+    each = f"{percent(min(alone))} to {percent(max(alone))}" if alone else "nothing"
+    if not best.own:
+        yield (
+            f"One set of {first.n_vary} parameters describes the cycles {cycles} (misfit "
+            f"{shown(first)}; each cycle alone {each}): there is no evidence of a change."
+        )
+    else:
+        yield (
+            f"From cycle to cycle ({cycles}) {listed(best.own)} "
+            f"{'changes' if len(best.own) == 1 else 'change'}, the other "
+            f"{counted(len(best.fits[0].shared), 'parameter')} may be shared: misfit {shown(best)} "
+            f"with {best.n_vary} parameters, against {shown(first)} with {first.n_vary} where all "
+            f"are shared and {each} with {selection.n_alone} where none is."
+        )
+        last = found.together[-1]
+        changes = []
+        for name in best.own:
+            values = best.fits[0].value(name)
+            changes.append(f"{name} {_change(values[0], values[-1])}")
+        yield f"From cycle {found.together[0]} to {last}: {listed(changes)}."
+    yield (
+        f"A parameter gets one value per cycle where this lowers BIC, counted with "
+        f"{selection.n_eff} effective samples: the stretches in which a cycle's own fit lies on "
+        "one side of its curve, because what that fit leaves is an error of the law rather than "
+        "noise."
+    )
+
+
+def _change(before: float, after: float) -> str:
+    """Say how a value changes, as "falls by 12 %" or "from 0 to 0.3"."""
+    if abs(before) < 1e-3 * abs(after) or before == 0.0:
+        return f"goes from {before:.3g} to {after:.3g}"
+    ratio = after / before - 1.0
+    return f"{'rises' if ratio > 0.0 else 'falls'} by {percent(abs(ratio))}"

@@ -1,0 +1,181 @@
+"""Which parameters several tests share: chosen by evidence, one parameter after the other.
+
+Groups of tests are looked at together, as the cycles of several specimens: each group is one fit
+with shared parameters of its own, and all groups have the same parameters shared.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from foamfit.arrays import Array
+from foamfit.fitting.problem import Problem
+from foamfit.fitting.together import Together, fit_together
+
+Progress = Callable[[float, str], None]
+
+# Blocks of a curve that can show an error of the law: noise averages out in them.
+BLOCKS = 50
+# Steps of the descents that only rank the candidates, and the vectors that more than one test's
+# shared parameters start from.
+TRIAL, MOST_STARTS = 12, 4
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Tests that share parameters, and the vector of parameters that each one's own fit found."""
+
+    problems: tuple[Problem, ...]
+    vectors: tuple[Array, ...]
+
+    @property
+    def starts(self) -> list[list[Array]]:
+        """Where the fits of the group start: at the own fits, and at that of one test for all."""
+        n = len(self.vectors)
+        chosen = np.unique(np.linspace(0, n - 1, min(n, MOST_STARTS)).astype(int))
+        return [list(self.vectors), *([self.vectors[i]] * n for i in chosen)]
+
+    @cached_property
+    def n_eff(self) -> int:
+        """Effective samples of the curves: see `effective_samples`."""
+        pairs = zip(self.problems, self.vectors, strict=True)
+        return sum(effective_samples(problem, values) for problem, values in pairs)
+
+    @cached_property
+    def alone(self) -> float:
+        """Sum of squares of the own fits: what is left where nothing is shared."""
+        pairs = zip(self.problems, self.vectors, strict=True)
+        return float(sum(np.sum(p.objective.residual(values) ** 2) for p, values in pairs))
+
+
+def effective_samples(problem: Problem, values: Array) -> int:
+    """Stretches of the curves of a test in which its own fit lies on one side.
+
+    What the own fit leaves is mostly an error of the law, which is no noise: one stretch on one
+    side, whatever its samples, says one thing. Counted over `BLOCKS` means of each curve.
+    """
+    residual, count = problem.objective.residual(values), 0
+    for part in np.split(residual, np.cumsum(problem.objective.sizes)[:-1]):
+        blocks = np.array_split(part, min(BLOCKS, part.size))
+        signs = np.sign([float(np.mean(block)) for block in blocks])
+        count += 1 + int(np.count_nonzero(np.diff(signs)))
+    return count
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """A choice of own parameters: the fit of each group, and the evidence for it."""
+
+    own: tuple[str, ...]
+    fits: tuple[Together, ...]
+    bic: float
+
+    @property
+    def cost(self) -> float:
+        """Sum of squares of all groups."""
+        return sum(fit.cost for fit in self.fits)
+
+    @property
+    def n_vary(self) -> int:
+        """Parameters that vary in all groups."""
+        return sum(fit.n_vary for fit in self.fits)
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """The way from all parameters shared to those that each test has of its own.
+
+    `steps` ends with the chosen one, or with one more that the evidence is against; `chosen` is its
+    place. `alone` is the sum of squares of the own fits, with `n_alone` parameters.
+    """
+
+    steps: tuple[Step, ...]
+    chosen: int
+    n_eff: int
+    alone: float
+    n_alone: int
+    bic_alone: float
+
+    @property
+    def best(self) -> Step:
+        """The chosen step."""
+        return self.steps[self.chosen]
+
+    def explained(self, step: Step) -> float:
+        """Share of what sharing everything costs that a step wins back."""
+        worst = self.steps[0].cost
+        return (worst - step.cost) / max(worst - self.alone, 1e-300)
+
+
+def select_own(groups: Sequence[Group], *, progress: Progress | None = None) -> Selection:
+    """Choose which parameters each test has of its own, by forward selection.
+
+    Begins with all parameters shared. In each step every shared parameter is tried as an own one,
+    and that of the lowest BIC is taken, as long as BIC falls: BIC = n_eff ln(χ²/n) + k ln(n_eff),
+    summed over the groups, where n_eff is that of `effective_samples`.
+
+    Parameters
+    ----------
+    groups : sequence of Group
+        Of one model, with the same parameters varying.
+    progress : callable, optional
+        Told the fraction done and what is going on.
+
+    Returns
+    -------
+    Selection
+    """
+    tell = progress or (lambda *_: None)
+    names = groups[0].problems[0].free()
+    steps, chosen = [step_of(groups, ())], 0
+    rounds = len(names) * (len(names) + 1) / 2
+    while len(steps[-1].own) < len(names) and chosen == len(steps) - 1:
+        now = steps[-1]
+        near = [[list(fit.values)] for fit in now.fits]
+        rest = [name for name in names if name not in now.own]
+        trials = list[Step]()
+        for name in rest:
+            done = sum(len(names) - i for i in range(len(steps) - 1)) + len(trials)
+            tell(min(done / rounds, 1.0), f"shared or own: {name}")
+            trials.append(step_of(groups, (*now.own, name), near, TRIAL))
+        found = min(trials, key=lambda step: step.bic)
+        starts = [
+            [list(fit.values), *group.starts] for fit, group in zip(found.fits, groups, strict=True)
+        ]
+        steps.append(step_of(groups, found.own, starts))
+        chosen += steps[-1].bic < now.bic
+    n_alone = sum(len(names) * len(group.problems) for group in groups)
+    alone = sum(group.alone for group in groups)
+    bic = sum(_bic(group, group.alone, len(names) * len(group.problems)) for group in groups)
+    tell(1.0, "done")
+    n_eff = sum(group.n_eff for group in groups)
+    return Selection(tuple(steps), chosen, n_eff, alone, n_alone, bic)
+
+
+def step_of(
+    groups: Sequence[Group], own: tuple[str, ...],
+    starts: Sequence[list[list[Array]]] | None = None, iterations: int | None = None,
+) -> Step:  # fmt: skip
+    """Fit all groups with these own parameters.
+
+    `starts` holds those of each group, as `fit_together` takes them; by default `Group.starts`.
+    """
+    starts = [group.starts for group in groups] if starts is None else starts
+    limit = {} if iterations is None else {"iterations": iterations}
+    fits = tuple(
+        fit_together(group.problems, own, start, **limit)
+        for group, start in zip(groups, starts, strict=True)
+    )
+    bic = sum(_bic(group, fit.cost, fit.n_vary) for group, fit in zip(groups, fits, strict=True))
+    return Step(own, fits, bic)
+
+
+def _bic(group: Group, cost: float, n_vary: int) -> float:
+    n = sum(problem.objective.n_data for problem in group.problems)
+    n_eff = max(group.n_eff, 2)
+    return n_eff * math.log(max(cost, 1e-12 * n) / n) + n_vary * math.log(n_eff)

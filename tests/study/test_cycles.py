@@ -1,0 +1,279 @@
+"""The cycles of a record: each on its own, then together, and their folder."""
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import foamfit as ff
+from conftest import DATA, needs_data, without_pictures
+from foamfit.cli import main
+from foamfit.report import cycles as cycles_report
+
+HEIGHT, AREA = 10e-3, 1e-4
+FRESH = ff.BistableSpring(
+    k0=5.5e6, kc=20e6, dsigma=-0.3e6, eps_a=0.14, eps_c=0.27, kh_plus=2e6, kh_minus=2.2e6
+)
+# What changes from cycle to cycle, and nothing else: where snapping starts, and the start strain.
+ONSETS, SETS = (0.14, 0.11, 0.10), (0.0, 0.02, 0.03)
+
+
+def springs():
+    return [replace(FRESH, eps_a=onset) for onset in ONSETS]
+
+
+@pytest.fixture(scope="module")
+def record(tmp_path_factory) -> Path:
+    """A synthetic record of three cycles on a foam whose snapping starts earlier each time."""
+    strain, stress = [], []
+    for spring, gone in zip(springs(), SETS, strict=True):
+        up = np.linspace(0.0, 0.38, 150)
+        one = np.concatenate([up, up[::-1][1:-1]])
+        strain.append(one)
+        along = np.maximum(one - gone, 0.0)
+        pressed = spring.stress(along)
+        stress.append(np.where(one > gone, np.maximum(pressed, 0.0), 0.0))
+    strain, stress = (np.concatenate([*parts, [0.0]]) for parts in (strain, stress))
+    stress = stress + 500.0 * np.random.default_rng(0).standard_normal(stress.size)
+    path = tmp_path_factory.mktemp("record") / "synthetic.csv"
+    lines = ["time (s),stress (MPa),displacement (mm)"]
+    lines += [
+        f"{0.01 * i:.2f},{1e-6 * s:.6f},{1e3 * HEIGHT * e:.6f}"
+        for i, (e, s) in enumerate(zip(strain, stress, strict=True))
+    ]
+    path.write_text("\n".join(lines) + "\n")
+    toml = f'[specimen]\nheight = "{1e3 * HEIGHT} mm"\narea = "{1e6 * AREA} mm^2"\n'
+    path.with_suffix(".toml").write_text(toml)
+    return path
+
+
+@pytest.fixture(scope="module")
+def found(record):
+    return ff.fit_cycles(record, cycles=(1, 2, 3, 7), starts=4, intervals="local")
+
+
+def test_each_cycle_is_fitted_from_its_own_contact(found):
+    assert found.recorded == (1, 2, 3)
+    assert list(found.results) == [1, 2, 3]
+    for result, onset, gone in zip(found.results.values(), ONSETS, SETS, strict=True):
+        assert result.measurement.start_strain == pytest.approx(gone, abs=1e-3)
+        assert result.params["s1_eps_a"].value == pytest.approx(onset, abs=2e-3)
+        assert result.misfit["stress_strain"] < 0.01
+
+
+def test_a_cycle_that_is_not_there_is_a_row_with_its_sentence(found):
+    assert list(found.refused) == [7]
+    assert "cycle 7 cannot be taken: the file has cycles 1 to 3" in found.refused[7]
+    row = found.table.loc[7]
+    assert row["status"] == "refused"
+    assert row["error"] == found.refused[7]
+    assert np.isnan(row["s1_k0"])
+
+
+def test_what_changes_by_cycle_is_found(found):
+    selection = found.selection
+    assert found.together == (1, 2, 3)
+    first, second = selection.steps[:2]
+    assert (first.own, second.own) == ((), ("s1_eps_a",))
+    assert selection.explained(second) > 0.9  # the rest is where contact is found in each cycle
+    assert "s1_eps_a" in selection.best.own
+    assert selection.bic_alone > selection.best.bic
+    best = selection.best.fits[0]
+    assert best.n_vary == len(best.shared) + 3 * len(best.own)
+    assert best.value("s1_eps_a") == pytest.approx(ONSETS, abs=2e-3)
+    assert len(set(best.value("s1_dsigma"))) == 1  # one value for all, not one share of σ_a
+    told = " ".join(found.sentences)
+    assert "may be shared: misfit" in told
+    assert "From cycle 1 to 3: s1_eps_a falls by" in told
+
+
+def test_cycles_together_are_spread_over_a_long_record():
+    from foamfit.study.cycles import MOST_TOGETHER, spread
+
+    numbers = [*range(1, 51), *range(60, 1001, 10)]
+    chosen = spread(numbers)
+    assert len(chosen) == MOST_TOGETHER
+    assert (chosen[0], chosen[-1]) == (1, 1000)
+    assert set(chosen) <= set(numbers)
+    assert spread([2, 5]) == (2, 5)
+
+
+def test_one_cycle_has_nothing_to_be_together_with(record):
+    alone = ff.fit_cycles(record, cycles=(2,), starts=2, intervals="local")
+    assert alone.selection is None
+    assert alone.sentences == (
+        "The cycles are not fitted together, because fewer than two cycles have a fit.",
+    )
+
+
+@pytest.mark.parametrize("at", ["reading", "fit", "together"])
+def test_ctrl_c_keeps_what_was_found(record, monkeypatch, at):
+    from foamfit.study import cycles
+
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    tried, real = [], cycles.fit
+
+    def fit(*words, **options):
+        tried.append(1)
+        if at == "fit" and len(tried) == 2:  # as a fit says it that has been interrupted
+            return replace(real(*words, **options), stopped="Ctrl-C")
+        if at == "reading" and len(tried) == 2:
+            raise KeyboardInterrupt
+        return real(*words, **options)
+
+    monkeypatch.setattr(cycles, "fit", fit)
+    if at == "together":
+        monkeypatch.setattr(cycles, "select_own", interrupted)
+    kept = ff.fit_cycles(record, starts=1, intervals="local")
+    assert list(kept.results) == {"reading": [1], "fit": [1, 2], "together": [1, 2, 3]}[at]
+    assert all("Ctrl-C" in why for why in kept.refused.values())
+    assert len(kept.results) + len(kept.refused) == 3
+    assert kept.selection is None
+    assert "together" in kept.sentences[0]
+
+
+# -------------------------------------------------------------------------------- the folder
+
+
+def test_the_folder_holds_every_cycle_and_replaces_an_older_one(found, tmp_path, monkeypatch):
+    without_pictures(monkeypatch)
+    monkeypatch.setattr(cycles_report, "plot_cycles", lambda _: None)
+    monkeypatch.setattr(cycles_report, "image", lambda *_: b"\x89PNG")
+    folder = tmp_path / "out"
+    found.results[1].save(folder)  # of a fit of one cycle
+    found.save(folder)
+    names = {path.name for path in folder.iterdir()}
+    assert names == {"cycle-1", "cycle-2", "cycle-3", "cycles.csv", "cycles.json", "cycles.png"}
+    assert json.loads((folder / "cycle-2" / "fit.json").read_text())["data"]["cycle"] == 2
+    with (folder / "cycles.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["cycle"] for row in rows] == ["1", "2", "3", "7"]
+    assert float(rows[2]["start_strain"]) == found.results[3].measurement.start_strain
+    assert float(rows[0]["s1_k0"]) == found.results[1].parameters["s1_k0"].value
+    assert rows[0]["s1_k0_state"] == "determined"
+    assert float(rows[1]["dissipated_energy"]) > 0.0
+    content = json.loads((folder / "cycles.json").read_text())
+    assert "s1_eps_a" in content["together"]["own"]
+    assert [step["chosen"] for step in content["together"]["steps"]].count(True) == 1
+    assert content["refused"]["7"] == found.refused[7]
+    found.save(folder)
+    found.results[1].save(folder)
+    assert "cycles.csv" not in {path.name for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize("place", ["mine.txt", "cycle-2/mine.txt"])
+def test_what_foamfit_did_not_write_is_not_replaced(found, tmp_path, monkeypatch, place):
+    without_pictures(monkeypatch)
+    monkeypatch.setattr(cycles_report, "plot_cycles", lambda _: None)
+    monkeypatch.setattr(cycles_report, "image", lambda *_: b"\x89PNG")
+    found.save(tmp_path / "out")
+    (tmp_path / "out" / place).write_text("mine")
+    with pytest.raises(ff.InputError, match="did not write"):
+        found.save(tmp_path / "out")
+    assert (tmp_path / "out" / place).read_text() == "mine"
+
+
+def test_the_picture_has_a_panel_for_each_parameter(found):
+    figure = cycles_report.plot_cycles(found)
+    titles = [ax.get_title() for ax in figure.axes]
+    assert titles[1:4] == ["start strain (%)", "dissipated (kJ/m³)", "misfit of the loop (%)"]
+    assert {"eps_a", "kh_plus (MPa)"} <= set(titles)
+    onset = next(ax for ax in figure.axes if ax.get_title() == "eps_a")
+    low, high = onset.get_ylim()
+    assert low < 0.1 < 0.14 < high
+
+
+# -------------------------------------------------------------------------------- the command
+
+
+def run(*words):
+    return CliRunner().invoke(main, [str(word) for word in words])
+
+
+@pytest.mark.parametrize("cycle", ["0", "x", "1,,2", "-1", "1.5", ""])
+def test_what_is_no_cycle_is_refused(record, tmp_path, cycle):
+    result = run("fit", record, "--cycle", cycle, "--out", tmp_path / "out")
+    assert result.exit_code == 1
+    assert "must be a number from 1 up, several as 1,2,10, or all" in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_cycle_that_the_record_lacks_is_refused(record, tmp_path):
+    result = run("fit", record, "--cycle", "9", "--out", tmp_path / "out")
+    assert result.exit_code == 1
+    assert "cycle 9 cannot be taken: the file has cycles 1 to 3" in result.stderr
+
+
+def test_one_cycle_is_fitted_as_any_test(record, tmp_path, monkeypatch):
+    without_pictures(monkeypatch)
+    result = run("fit", record, "--cycle", 2, "--starts", 2, "--out", tmp_path / "out")
+    assert result.exit_code == 0
+    assert "cycle 2 of 3 in the record, start strain" in result.stdout
+    content = json.loads((tmp_path / "out" / "fit.json").read_text())
+    assert content["data"]["start_strain"] == pytest.approx(0.02, abs=1e-3)
+    assert any("Contact of cycle 2 starts" in note for note in content["data"]["notes"])
+
+
+def test_all_cycles_are_fitted_in_turn(record, tmp_path, monkeypatch):
+    without_pictures(monkeypatch)
+    monkeypatch.setattr(cycles_report, "plot_cycles", lambda _: None)
+    monkeypatch.setattr(cycles_report, "image", lambda *_: b"\x89PNG")
+    words = ("fit", record, "--cycle", "all", "--starts", 2, "--out", tmp_path / "out")
+    result = run(*words, "--fix", "s1_kc=20e6")
+    assert result.exit_code == 0
+    assert "3 of 3 cycles fitted" in result.stdout
+    assert "fitted together, what each cycle has of its own:" in result.stdout
+    assert (tmp_path / "out" / "cycle-3" / "fit.json").is_file()
+    assert json.loads((tmp_path / "out" / "cycles.json").read_text())["fitted"] == [1, 2, 3]
+
+
+def test_json_holds_every_cycle(record, tmp_path, monkeypatch):
+    without_pictures(monkeypatch)
+    monkeypatch.setattr(cycles_report, "plot_cycles", lambda _: None)
+    monkeypatch.setattr(cycles_report, "image", lambda *_: b"\x89PNG")
+    words = ("--starts", 1, "--json", "--out", tmp_path / "out")
+    result = run("fit", record, "--cycle", "1,9", *words)
+    assert result.exit_code == 0
+    content = json.loads(result.stdout)
+    assert list(content["cycles"]) == ["1"]
+    assert list(content["refused"]) == ["9"]
+    # nothing but refusals: what there is to say is written, and there is no acceptable fit
+    result = run("fit", record, "--cycle", "8,9", *words)
+    assert result.exit_code == 2
+    assert "no acceptable fit of any cycle" in result.stderr
+
+
+# -------------------------------------------------------------------------------- measured foam
+
+
+@needs_data
+def test_three_cycles_of_a_shoe_foam_share_all_but_snap_through_and_relaxation(tmp_path):
+    """Measurements: arXiv:2602.12694."""
+    from foamfit.one_model import Options
+    from foamfit.study.shared import Group, step_of
+
+    toml = tmp_path / "specimen.toml"
+    toml.write_text(
+        '[specimen]\nheight = "9.903 mm"\ndiameter = "7.667 mm"\n'
+        '[columns]\ndisplacement = { column = "Gap (um)", counts_down = true }\n'
+    )
+    path = DATA / "shoe-foam-twins" / "new-heel-comp-1_raw.txt"
+    options = {"model": "microscale", "relaxation": 1, "intervals": "local"}
+    found = ff.fit_cycles(path, toml, cycles=(1, 2, 4), together=False, **options)
+    assert found.recorded == (1, 2, 3, 4, 5, 6)
+    strains = found.table["start_strain"]
+    assert strains[1] == 0.0
+    assert 0.005 < strains[2] < strains[4] < 0.03
+    assert all(off < 0.0065 for off in found.table["misfit_stress_strain"])
+    fits = list(found.results.values())
+    problems = [Options(relaxation=1).problem(r.measurement, r.model, r.params) for r in fits]
+    group = Group(tuple(problems), tuple(p.vector() for p in problems))
+    step = step_of([group], ("s1_sigma_plus", "s1_spread_plus", "s1_g1"))
+    assert step.n_vary == 15
+    assert all(one["stress_strain"] < 0.011 for one in step.fits[0].misfits)
