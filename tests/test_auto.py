@@ -22,11 +22,17 @@ from foamfit.fitting.branches import branch_of_samples
 from foamfit.fitting.problem import make_problem
 from foamfit.report.page import render_report
 from foamfit.report.summary import summary_text
-from foamfit.trust import evidence
+from foamfit.springs.model import Model
+from foamfit.trust import evidence, prediction
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.residual_tests import find_structure, neighbours_test, runs_test
 
 HEIGHT, AREA = 1.2e-3, 1.9635e-5
+
+
+def groups(*names, relaxation=0):
+    """Models to compare, each a group of its own."""
+    return tuple((Model.parse(name, relaxation),) for name in names)
 
 
 # ---------------------------------------------------------------- runs test
@@ -208,7 +214,7 @@ def test_a_clear_structure_is_found(name):
 
 def test_two_bistable_springs_are_told_from_fewer(monkeypatch):
     """With all starts, which two springs need; for time, without the model of a linear spring."""
-    monkeypatch.setattr(auto, "LADDER", ("bistable", *auto.LADDER[2:]))
+    monkeypatch.setattr(auto, "LADDER", groups("bistable", "bistable+bistable"))
     test = impact([SOFT, STIFF], HALVES, velocity=4.5)
     result = ff.fit(test, model="auto")
     assert result.ladder.chosen.name == "bistable+bistable without damping"
@@ -226,8 +232,10 @@ def test_a_linear_spring_in_series_adds_combinations_and_no_evidence():
     for result in (one, chain):
         problem = make_problem(loop, result.model, result.drive, result.params, None, False)
         both.append(evidence.Tried(result, "none", BestPoint(problem, problem.vector()), 0.0))
-    best, found = evidence.choose(both)
-    assert best == 0
+    decision = evidence.choose(both)
+    found = decision.criteria
+    assert decision.best == 0
+    assert not decision.by_prediction
     varied = [sum(item.vary for item in result.parameters.values()) for result in (one, chain)]
     assert varied == [7, 9]
     assert found[0].rank == 7
@@ -240,8 +248,8 @@ def test_a_linear_spring_in_series_adds_combinations_and_no_evidence():
 def test_only_models_that_the_test_allows_are_tried(monkeypatch):
     tried = []
 
-    def identify(_, model, *__):
-        tried.append(model)
+    def identify(_, model, __, options, *___):
+        tried.append((model, options.relaxation))
         raise ff.SimulationError("not now")
 
     def models(test):
@@ -249,21 +257,25 @@ def test_only_models_that_the_test_allows_are_tried(monkeypatch):
         tried.clear()
         with pytest.raises(ff.SimulationError) as caught:
             ff.fit(test, model="auto")
-        told = str(caught.value).split("no rung could be tried: ")[1].split("; ")
+        told = str(caught.value).split("no model could be tried: ")[1].split("; ")
         return list(dict.fromkeys(tried)), [why for why in told if not why.endswith("not now")]
 
     monkeypatch.setattr(one_model, "identify", identify)
-    monkeypatch.setattr(auto, "WITHOUT_EVIDENCE", len(auto.LADDER) + 1)
+    all_of_them = [(model.name, model.relaxation) for group in auto.LADDER for model in group]
     _, test = synthetic_impact()
-    assert models(test) == (list(auto.LADDER), [])
+    assert models(test) == (all_of_them, [])
     given = replace(test, specimen=replace(test.specimen, heights=(0.6e-3, 0.59e-3)))
     allowed, skipped = models(given)
-    assert allowed == ["bistable", "linear+bistable", "bistable+bistable"]
+    assert allowed == [one for one in all_of_them if one[0].count("+") < 2]
     assert skipped == ["linear+bistable+bistable: [specimen] heights are those of 2 springs"]
     allowed, skipped = models(replace(test, interior={1: test.displacement * 0.4}))
-    assert allowed == list(auto.LADDER[1:])
-    assert len(skipped) == 1
-    assert "motion was measured" in skipped[0]
+    assert allowed == [one for one in all_of_them if "+" in one[0]]
+    assert len(skipped) == 4
+    assert all("motion was measured" in why for why in skipped)
+    _, loop = synthetic_loop()
+    allowed, skipped = models(replace(loop, time=None))
+    assert allowed == [one for one in all_of_them if one[1] == 0]
+    assert skipped[0] == "bistable with relaxation: relaxation needs a time column"
     with pytest.raises(ff.InputError, match="no model of the ladder"):
         ff.fit(replace(test, interior={5: test.displacement}), model="auto")
 
@@ -305,7 +317,7 @@ def test_outliers_leave_the_ladder_standing():
     at = test.time[left_out]
     spikes = {"stress": Outliers(left_out, at, stress[left_out])}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(auto, "LADDER", auto.LADDER[:1])
+        patch.setattr(auto, "LADDER", groups("bistable"))
         result = ff.fit(replace(test, stress=stress, outliers=spikes), model="auto", starts=4)
     assert any("have a structure" in text for text in result.warnings)
 
@@ -334,7 +346,7 @@ def test_an_interrupted_ladder_keeps_what_is_done(wavy, monkeypatch):
 
     monkeypatch.setattr(auto.one_model, "identify", interrupted)
     result = ff.fit(wavy, model="auto", starts=2)
-    assert [rung.model for rung in result.ladder.rungs] == ["bistable"]
+    assert [rung.name for rung in result.ladder.rungs] == ["bistable"]
     assert (result.stopped, result.ladder.stopped) == ("Ctrl-C", "Ctrl-C")
     assert result.status == "warnings"
     assert "stopped by Ctrl-C" in result.warnings[0]
@@ -355,6 +367,7 @@ def test_the_time_limit_is_shared_over_the_rungs(wavy, monkeypatch):
         return original(measurement, model, params, replace(options, max_time=None), progress)
 
     monkeypatch.setattr(auto.one_model, "identify", watched)
+    monkeypatch.setattr(auto, "predicted_misfit", lambda *_: 0.1)  # it looks at the timer too
     result = ff.fit(wavy, model="auto", starts=2, max_time=2.5)
     assert given == [1.5, 0.5]
     assert len(result.ladder.rungs) == 2
@@ -378,11 +391,11 @@ def test_a_rung_that_cannot_be_simulated_is_left_out(wavy, monkeypatch):
         return original(measurement, model, *rest)
 
     monkeypatch.setattr(auto.one_model, "identify", failing)
-    monkeypatch.setattr(auto, "LADDER", auto.LADDER[:2])
+    monkeypatch.setattr(auto, "LADDER", groups("bistable", "linear+bistable"))
     result = ff.fit(wavy, model="auto", starts=2)
     assert result.ladder.skipped == ("linear+bistable: none could be simulated",)
-    monkeypatch.setattr(auto, "LADDER", auto.LADDER[1:2])
-    with pytest.raises(ff.SimulationError, match="no rung could be tried"):
+    monkeypatch.setattr(auto, "LADDER", groups("linear+bistable"))
+    with pytest.raises(ff.SimulationError, match="no model could be tried"):
         ff.fit(wavy, model="auto", starts=2)
 
 
@@ -393,7 +406,7 @@ def test_a_rung_that_cannot_be_simulated_is_left_out(wavy, monkeypatch):
 def climbed(wavy):
     """Two models, neither of which reaches the noise."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(auto, "LADDER", auto.LADDER[:2])
+        patch.setattr(auto, "LADDER", groups("bistable", "linear+bistable"))
         return ff.fit(wavy, model="auto", starts=4)
 
 
@@ -402,14 +415,14 @@ def test_what_remains_is_said(climbed):
     assert "residuals of stress_strain have a structure of" in warning
     size = float(warning.split("structure of ")[1].split(" %")[0])
     assert size == pytest.approx(5 / np.sqrt(2), rel=0.25)  # what the springs follow of it is less
-    assert climbed.ladder.ended == "the top of the ladder was reached"
+    assert climbed.ladder.ended == "there are no richer ones that this test allows"
 
 
 def test_undetermined_parameters_of_the_chosen_model_are_named(climbed):
     """A loop that never closes leaves branches c and e out of every model."""
     _, test = synthetic_impact(velocity=1.75)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(auto, "LADDER", auto.LADDER[:1])
+        patch.setattr(auto, "LADDER", groups("bistable"))
         result = ff.fit(test, model="auto", starts=4)
     (sentence,) = [text for text in result.ladder.cautions if "does not determine" in text]
     assert "s1_kc" in sentence
