@@ -39,6 +39,7 @@ import foamfit as ff
 from foamfit.auto import LADDER
 from foamfit.data.measurement import Measurement, Specimen, Striker
 from foamfit.fitting.problem import make_params
+from foamfit.results import rung_name
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
@@ -46,6 +47,8 @@ from real_foams import SHOE_FOAM  # noqa: E402
 
 HEIGHT, AREA, MASS, SAMPLES = 1.2e-3, 1.9635e-5, 7e-3, 401
 CLEAR_MISFIT, CLEAR_DAMPING = 0.5, 0.05
+# The models of linear and bistable springs, from the simplest up.
+MODELS = ("bistable", "linear+bistable", "bistable+bistable", "linear+bistable+bistable")
 STRUCTURES = [
     ("bistable", False),
     ("bistable", True),
@@ -155,8 +158,8 @@ def random_test(
 
 
 def simpler(model: str, damped: bool) -> list[tuple[str, bool]]:
-    """Models of the ladder that are simpler than one."""
-    ladder = [(name, with_) for name in LADDER for with_ in (False, True)]
+    """Models of linear and bistable springs that are simpler than one."""
+    ladder = [(name, with_) for name in MODELS for with_ in (False, True)]
     return ladder[: ladder.index((model, damped))]
 
 
@@ -350,7 +353,12 @@ def foam_table(table: pd.DataFrame) -> str:
 def picture(table: pd.DataFrame, path: Path) -> None:
     """Counts of chosen against true structure, clear and unclear tests side by side."""
     truths = [name_of(*one) for one in STRUCTURES]
-    models = [name_of(name, with_) for name in LADDER for with_ in (False, True)]
+    models = [
+        rung_name(model.name, damping, model.relaxation)
+        for group in LADDER
+        for model in group
+        for damping in ("without", "with")
+    ]
     models = [name for name in models if name in truths or (table["chosen"] == name).any()]
     figure = Figure(figsize=(8.4, 4.3), layout="constrained")
     FigureCanvasAgg(figure)
