@@ -366,7 +366,7 @@ def _why(i: int, tried: Sequence[Tried], decision: Decision) -> str:
     best, one = decision.best, tried[i]
     if (ruler := decision.ruled_out_by[i]) is not None:
         fewer = tried[ruler].varied < one.varied
-        told = "more closely with fewer" if fewer else f"{WORSE:g} times as closely with as many"
+        told = "more closely with fewer" if fewer else f"over {WORSE:g} times better with as many"
         return f"not considered: {tried[ruler].name} follows the curves {told} parameters"
     if decision.by_prediction:
         return _why_by_prediction(i, tried, decision)

@@ -10,6 +10,7 @@ are predicted with the state in which the test enters them.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -45,7 +46,7 @@ def predicted_misfit(best: BestPoint, deadline: float | None = None) -> float:
     SearchStoppedError
         If the time (`time.monotonic`) is past the deadline.
     """
-    problem, objective = best.problem, best.problem.objective
+    problem, objective = best.problem, replace(best.problem.objective)  # with counts of its own
     space, tracker = problem.space(), Tracker(objective, deadline)
     block = np.arange(objective.time.size) * BLOCKS // objective.time.size
     of_sample = np.concatenate([block[objective.kept(name)] for name in objective.counted])
