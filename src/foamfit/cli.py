@@ -275,7 +275,7 @@ def _interval_method(profile: bool, bootstrap: int | None, mcmc: int | None) -> 
 @_CYCLE
 @click.option(
     "--model", default="bistable", show_default=True,
-    help="Springs from the base up; auto takes the simplest that holds.",
+    help="Springs from the base up; auto compares models, takes the simplest that holds.",
 )  # fmt: skip
 @_DRIVE
 @click.option("--out", type=_FILE, help="Result folder. Default: fits/<test>/<model>.")
@@ -293,7 +293,7 @@ def _interval_method(profile: bool, bootstrap: int | None, mcmc: int | None) -> 
 @click.option("--time-shift", is_flag=True, help="Fit how late the motion is against the force.")
 @click.option(
     "--relaxation", type=click.IntRange(min=0), default=0, show_default=True, metavar="N",
-    help="Relaxation terms of every bistable and microscale spring.",
+    help="Relaxation terms of every bistable and microscale spring; auto tries one by itself.",
 )  # fmt: skip
 @click.option(
     "--loss", type=click.Choice(["linear", "soft_l1", "huber", "cauchy"]), default="linear",

@@ -149,9 +149,18 @@ def identify(
     if tracker.best_values is None:
         raise SimulationError(
             f"{measurement.name}: none of the {problem.objective.evaluations} sets of parameters "
-            "that were tried could be simulated; check the drive, the heights and the bounds"
+            f"that were tried could be simulated; {_why_not(problem)}"
         )
     return Found(problem, tracker, record)
+
+
+def _why_not(problem: Problem) -> str:
+    """Why the values that a search begins with cannot be simulated."""
+    try:
+        problem.objective.simulate(problem.vector())
+    except SimulationError as error:
+        return str(error)
+    return "check the drive, the heights and the bounds"
 
 
 def judge(found: Found, choice: Choice, announce: Announce) -> tuple[Fit, BestPoint]:

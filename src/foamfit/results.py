@@ -98,14 +98,17 @@ class Check:
     fatal: bool = False  # Whether a "no" means that no acceptable fit was found
 
 
-def rung_name(model: str, damping: str) -> str:
-    """Model and damping in words."""
-    return model if damping == "none" else f"{model} {damping} damping"
+def rung_name(model: str, damping: str, relaxation: int = 0) -> str:
+    """Model, relaxation and damping in words."""
+    if not relaxation:
+        return model if damping == "none" else f"{model} {damping} damping"
+    rest = {"with": " and damping", "without": ", without damping"}.get(damping, "")
+    return f"{model} with relaxation{rest}"
 
 
 @dataclass(frozen=True)
 class Rung:
-    """One model of the ladder and the evidence for it."""
+    """One model that was tried and the evidence for it."""
 
     model: str  # Springs from the base up
     # "with", "without" (every dashpot held at zero) or "none" where the drive has none to vary.
@@ -128,31 +131,42 @@ class Rung:
     weak: tuple[str, ...]
     seconds: float  # Run time
     stopped: str | None  # What ended the search before its time
-    chosen: bool  # Whether the result is that of this rung
+    chosen: bool  # Whether the result is that of this model
     why: str  # Why it was chosen or not
+    relaxation: int = 0  # Terms of each hysteretic spring
+    # RMS over the range, all counted curves together, of samples that were held back in blocks;
+    # None where the time did not allow it.
+    predicted_misfit: float | None = None
+    # By what share that is below the one of `gain_over`; None where that is none.
+    gain: float | None = None
+    # The model that was the best of those with no more parameters; None of the first.
+    gain_over: str | None = None
 
     @property
     def name(self) -> str:
-        """Model and damping in words."""
-        return rung_name(self.model, self.damping)
+        """Model, relaxation and damping in words."""
+        return rung_name(self.model, self.damping, self.relaxation)
 
 
 @dataclass(frozen=True)
 class Ladder:
-    """The rungs that were tried, and what the comparison says."""
+    """The models that were tried, and what the comparison says."""
 
-    rungs: tuple[Rung, ...]  # From the simplest up
+    rungs: tuple[Rung, ...]  # In the order in which they were tried, from the simplest up
     n_eff: float  # Effective samples that AICc and BIC use
-    noise_from: str  # The rung of the least chi-square: its residuals are taken for the noise
+    noise_from: str  # The model of the least chi-square: its residuals are taken for the noise
     ended: str  # Why the comparison ended
     stopped: str | None  # "the time limit" or "Ctrl-C" if that ended it
-    skipped: tuple[str, ...]  # Rungs that could not be tried, and why
+    skipped: tuple[str, ...]  # Models that could not be tried, and why
     sentences: tuple[str, ...]  # What the comparison says
     cautions: tuple[str, ...]  # Those of them that are warnings
+    # Whether models were compared by what they predict, because none reaches the noise; else by
+    # AICc and BIC.
+    by_prediction: bool = False
 
     @property
     def chosen(self) -> Rung:
-        """The rung whose result was taken."""
+        """The model whose result was taken."""
         return next(rung for rung in self.rungs if rung.chosen)
 
     def rows(self) -> Iterator[list[object]]:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 
 from foamfit.data.measurement import interior_channel
 from foamfit.report.readable import Readable, readable
-from foamfit.results import Fit, Ladder, ParameterEstimate
+from foamfit.results import Fit, Ladder, ParameterEstimate, Rung
 from foamfit.text import aligned, counted, listed, percent, wrapped
 
 CURVES = {
@@ -17,8 +17,7 @@ CURVES = {
 }
 ANSWERS = {True: "yes", False: "no", None: "–"}
 LADDER = (
-    "", "model", "damping", "misfit %", "χ²", "rank", "n_eff", "AICc", "BIC", "runs p", "lag p",
-    "n.d.", "s",
+    "", "model", "with", "misfit %", "pred. %", "gain %", "rank", "AICc", "BIC", "p", "n.d.", "s",
 )  # fmt: skip
 # Lines that the terminal has for the warnings and for the rows that are not used.
 WARNING_LINES, ROW_LINES = 4, 2
@@ -191,7 +190,9 @@ def ladder_cells(ladder: Ladder) -> list[tuple[str, ...]]:
     """Return the models of a ladder as text, in the columns of `LADDER`.
 
     The misfits are those of the curves in time where there are any, else that of stress-strain;
-    "rank" is rank over parameters varied, "n.d." parameters not determined over weak ones.
+    "pred." is the predicted misfit, "gain" by how much it is below that of the best model with no
+    more parameters; "rank" is rank over parameters varied, "p" the smaller p-value of the two tests
+    of the residuals, "n.d." parameters not determined over weak ones.
     """
     cells = list[tuple[str, ...]]()
     for one in ladder.rungs:
@@ -200,14 +201,26 @@ def ladder_cells(ladder: Ladder) -> list[tuple[str, ...]]:
         shown = shown or [off for off in one.misfit.values() if off is not None]
         cells.append(
             (
-                "→" if one.chosen else "", one.model, one.damping,
-                " ".join(percent(off).removesuffix(" %") for off in shown), f"{one.chisqr:.4g}",
-                f"{one.rank}/{one.n_vary}", _whole(one.n_eff), _whole(one.aicc),
-                _whole(one.bic), _p(one.runs_p), _p(one.neighbours_p),
+                "→" if one.chosen else "", one.model, _with(one),
+                " ".join(percent(off).removesuffix(" %") for off in shown),
+                _percents(one.predicted_misfit),
+                "–" if one.gain is None else _whole(100.0 * one.gain),
+                f"{one.rank}/{one.n_vary}", _whole(one.aicc), _whole(one.bic),
+                _p(min(one.runs_p, one.neighbours_p)),
                 f"{len(one.not_determined)}/{len(one.weak)}", f"{one.seconds:.1f}",
             )
         )  # fmt: skip
     return cells
+
+
+def _with(one: Rung) -> str:
+    """Return what a model has besides its springs."""
+    has = (["relaxation"] if one.relaxation else []) + ["damping"] * (one.damping == "with")
+    return "both" if len(has) == 2 else has[0] if has else "–"
+
+
+def _percents(value: float | None) -> str:
+    return "–" if value is None else percent(value).removesuffix(" %")
 
 
 def _whole(value: float) -> str:
