@@ -193,6 +193,31 @@ class Ladder:
             yield [rung.model, rung.damping, *(rung.misfit.get(name) for name in curves), *told]
 
 
+def snapping_of(chain: Chain, strain: Array | None, stress: Array | None) -> dict[str, Snapping]:
+    """How each microscale spring snaps along an overall strain and a base stress (Pa).
+
+    A single spring's snapping follows from its strain. In a chain it follows from the stress, if
+    all springs are in equilibrium under it, else there is none.
+    """
+    out, springs = {}, chain.springs
+    plain = not any(spring.eta or spring.relaxation for spring in springs)
+    for i, spring in enumerate(springs, start=1):
+        if not isinstance(spring, MicroscaleSpring):
+            continue
+        own = stress if plain else None
+        if len(springs) == 1:
+            own = None if strain is None else np.asarray(spring.stress(strain))
+        if own is not None and np.all(np.isfinite(own)):
+            fraction = follow_fractions(own, spring.snapped_below, spring.left_below)
+            out[f"s{i}"] = Snapping(fraction, own)
+    return out
+
+
+def law_in_words(model: str, relaxation: int) -> str:
+    """Model and relaxation in words."""
+    return f"{model} with {counted(relaxation, 'relaxation term')}" if relaxation else model
+
+
 @dataclass(frozen=True, eq=False)
 class Fit:
     """Everything that a fit found."""
@@ -240,9 +265,7 @@ class Fit:
     @property
     def law(self) -> str:
         """The model and its relaxation in words."""
-        if not self.relaxation:
-            return self.model
-        return f"{self.model} with {counted(self.relaxation, 'relaxation term')}"
+        return law_in_words(self.model, self.relaxation)
 
     @cached_property
     def strain(self) -> Array | None:
@@ -253,23 +276,9 @@ class Fit:
 
     @cached_property
     def snapping(self) -> dict[str, Snapping]:
-        """How each microscale spring snapped.
-
-        A single spring's follows from its strain. In a chain it follows from the stress if nothing
-        else bears any, else there is none.
-        """
-        out, springs = {}, self.chain.springs
+        """How each microscale spring snapped, where that is known; see `snapping_of`."""
         stress = self.curves.measured_stress if self.drive == "stress" else self.curves.stress
-        plain = self.drive != "impact" and not any(s.eta or s.relaxation for s in springs)
-        for name, spring in self.microscale_springs.items():
-            if len(springs) == 1:
-                own = None if self.strain is None else np.asarray(spring.stress(self.strain))
-            else:
-                own = stress if plain else None
-            if own is not None and np.all(np.isfinite(own)):
-                fraction = follow_fractions(own, spring.snapped_below, spring.left_below)
-                out[name] = Snapping(fraction, own)
-        return out
+        return snapping_of(self.chain, self.strain, None if self.drive == "impact" else stress)
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of ``fit.json``: SI, plain types, null for what is not there."""

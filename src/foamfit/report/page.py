@@ -166,9 +166,9 @@ def _snapping(result: Fit, name: str, spring: MicroscaleSpring) -> Iterator[Poin
     total = sum(g for g, _ in spring.relaxation)
     for k, (g, tau) in enumerate(spring.relaxation, start=1):
         factor, unit = readable_unit(tau, "s")
-        share = "share of a sudden change of stress that relaxes, and the time to 1/e"
-        told = f"{percent(g / (1.0 + total))} in {number(tau / factor)}"
-        yield ("g", f"{k}/(1+g)"), share, told, unit
+        time = f"{number(tau / factor)} {unit}"
+        share = f"g/(1+Σg), share of a sudden change of stress that relaxes, with τ = {time}"
+        yield ("g", str(k)), share, number(g / (1.0 + total)), "–"
 
 
 def _energies(energy: dict[str, Any]) -> Iterator[tuple[str, str]]:

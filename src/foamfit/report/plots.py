@@ -35,6 +35,7 @@ POINTS = {
 # Where the name of a point stands, in points from it: beside its curve, off the others.
 IN_LOOP = {"A1": (-4, 5), "C1": (-5, 3), "C2": (5, -3), "A2": (4, -7), "σ₊": (-4, 5), "σ₋": (5, -5)}
 IN_TIME = {"A1": (5, -4), "C1": (-5, 3), "C2": (5, 3), "A2": (5, 4), "σ₊": (5, -4), "σ₋": (5, 4)}
+LIGHT = {"a": (-4.0, 3.0), "c": (5.0, -4.0)}  # of branches that are drawn lightly
 IN_WORDS = {"snap-through": (-6.0, 6.0), "held": (-6.0, 4.0), "snap-back": (7.0, -6.0)}
 BESIDE = {"a": (-6, 4), "d": (-6, 4), "c": (7, -3), "e": (4, -7)}  # points from the branch
 MARKERS = 60  # of a measured curve: more of them blot
@@ -57,10 +58,11 @@ def plot_fit(result: Fit, path: str | Path | None = None) -> Figure:
             _draw(ax, panel)
             _mark_outliers(ax, panel, result)
             labels = _Labels(ax, panel)
+            if panel.key == "stress_strain":
+                _draw_law(labels, result)
             _mark_switches(labels, panel, result)
             if panel.key == "stress_strain":
                 _name_branches(labels, panel, result)
-                _draw_law(ax, labels, result)
         _head(figure, result)
     return save(figure, path)
 
@@ -326,24 +328,22 @@ def _halves(panel: _Panel, result: Fit) -> Iterator[tuple[str, float, float]]:
                 yield name, float(fitted.x[sample]), float(fitted.y[sample])
 
 
-def _draw_law(ax: Axes, labels: _Labels, result: Fit) -> None:
+def _draw_law(labels: _Labels, result: Fit) -> None:
     """Draw branches a and c of the only spring, if it is microscale, and its equilibrium."""
     if len(result.chain.springs) > 1 or not result.microscale_springs:
         return
-    spring = result.microscale_springs["s1"]
+    spring, ax = result.microscale_springs["s1"], labels.ax
     (left, right), (low, top) = ax.get_xlim(), ax.get_ylim()
     ax.set(xlim=(left, right), ylim=(low, top))  # the branches go on beyond
     stress = np.linspace(0.0, top * labels.fy, 200)
     on_a = stress / (spring.k0 + stress)
     on_c = spring.eps_star + stress / (spring.kc + stress)
-    for name, strain in (("a", on_a), ("c", on_c)):
-        ax.plot(strain, stress / labels.fy, color="0.72", lw=0.7, zorder=1.5)
-        inside = np.flatnonzero(strain < right)
-        if not inside.size:  # branch c may lie beyond all that the test reached
-            continue
-        place = inside[int(0.9 * (inside.size - 1))]
-        at = np.array([strain[place], stress[place] / labels.fy])
-        labels.write(name, at, (-4, 3), color=GREY, style="italic", fontsize=7)
+    for name, strain, along in (("a", on_a, 0.9), ("c", on_c, 0.5)):
+        line = np.column_stack((strain, stress / labels.fy))[strain < right]
+        if len(line):  # branch c may lie beyond all that the test reached
+            ax.plot(*line.T, color="0.72", lw=0.7, zorder=1.5)
+            at = line[int(along * (len(line) - 1))]
+            labels.write(name, at, LIGHT[name], color=GREY, style="italic", fontsize=7)
     if spring.relaxation and "s1" in result.snapping and result.strain is not None:
         equilibrium = result.snapping["s1"].stress
         ax.plot(
@@ -385,7 +385,7 @@ def _name_branches(labels: _Labels, panel: _Panel, result: Fit) -> None:
     for branch, start, end in _first_visits(result, fitted):
         x, y = fitted.x[start : end + 1] / labels.fx, fitted.y[start : end + 1] / labels.fy
         middle = _evenly(x, y, 3)[1]
-        if branch in BESIDE:
+        if branch in BESIDE and result.bistable_springs:
             labels.ax.annotate(
                 branch, (x[middle], y[middle]), BESIDE[branch], textcoords="offset points",
                 ha="center", va="center", zorder=6, **style,
