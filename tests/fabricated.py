@@ -21,7 +21,7 @@ SPRING = BistableSpring(
 )
 MICRO = MicroscaleSpring(
     k0=4.4e5, kc=4.9e5, eps_star=0.29, sigma_plus=1.06e5, spread_plus=0.44, sigma_minus=7.9e4,
-    spread_minus=0.7, relaxation=[(0.6, 0.25)],
+    spread_minus=0.7, relaxation=[(0.5, 0.25)],
 )  # fmt: skip
 UNITS = {
     "eps_a": "",
@@ -191,7 +191,7 @@ def microscale_result(**changed: Any) -> FitResult:
         at(200, "snap-through", "held"), at(back, "held", "snap-back"),
     )  # fmt: skip
     values = {name: getattr(MICRO, name) for name in MICROSCALE_NAMES}
-    values |= {"g1": 0.6, "tau1": 0.25}
+    values |= {"g1": 0.5, "tau1": 0.25}
     made = {f"s1_{name}": estimate(f"s1_{name}", value) for name, value in values.items()}
     made["s1_eta"] = result().parameters["s1_eta"]
     base = result()

@@ -22,8 +22,8 @@ FILES = {"fit.json", "parameters.csv", "curves.csv", "report.html", "fit.png", "
 KEYS = {
     "schema", "foamfit", "test", "data_sha256", "model", "drive", "seed", "status", "warnings",
     "notes", "checklist", "data",
-    "parameters", "derived", "visited", "misfit", "weights", "statistics", "energy", "runtime_s",
-    "stopped", "loss", "noise", "outliers",
+    "parameters", "relaxation", "derived", "visited", "misfit", "weights", "statistics", "energy",
+    "runtime_s", "stopped", "loss", "noise", "outliers",
 }  # fmt: skip
 
 

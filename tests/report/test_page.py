@@ -233,19 +233,18 @@ def test_the_terminal_says_why_a_parameter_is_not_determined() -> None:
 def test_what_a_microscale_spring_snapped_and_relaxes_is_told() -> None:
     words = Page(render_report(fabricated.microscale_result())).words
     assert "microscale model with 1 relaxation term, displacement drive" in words
-    assert (
-        "95 % of the micro-springs snap in this test, at 212.5 kPa and a strain of 0.6000" in words
-    )
+    snapped = "96 % of the micro-springs snap in this test, at 230.8 kPa and a strain of 0.6000"
+    assert snapped in words
     assert "what the others would do is extrapolated" in words
-    assert "changes 1.600 times as much as in equilibrium, and relaxes: 38 % of it" in words
+    assert "changes 1.500 times as much as in equilibrium, and relaxes: 33 % of it" in words
     assert "time constant of 250 ms" in words
     assert "68 % snap through between 68.27 and 164.6 kPa 106.0 kPa" in words
-    assert "relaxes, with τ = 250.0 ms 0.3750" in words
+    assert "relaxes, with τ = 250.0 ms 0.3333" in words
     assert "snap-back · micro-springs snap back" in words
     assert "not reached" not in words
     assert "A1 and C1" not in words
     assert "s1_sigma_plus σ +" in words
-    assert "s1_tau1 τ 1 250.0 ± 3.0 ms" in words
+    assert "s1_tau1 τ 1,1 250.0 ± 3.0 ms" in words
 
 
 def test_all_that_snaps_leaves_nothing_to_extrapolate() -> None:

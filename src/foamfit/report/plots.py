@@ -276,13 +276,15 @@ class _Labels:
         self.ax.plot(*places.T, "o", ms=3.2, color="black", zorder=5)
         self.marks += [places, places]
 
-    def write(self, name: str, at: Array, wanted: tuple[float, float], **style: Any) -> None:
-        """Write a name beside a place."""
+    def write(
+        self, name: str, at: Array, wanted: tuple[float, float], *, stay: bool = False, **style: Any
+    ) -> None:
+        """Write a name beside a place; `stay`: on no other side of it than is wanted."""
         from matplotlib.patheffects import withStroke
 
         avoid = np.concatenate([np.empty((0, 2)), *self.curves, *self.marks])
         anchor, avoid = (at - self.corner) * self.span, (avoid - self.corner) * self.span
-        offset = _free_offset(anchor, name, wanted, avoid, self.taken)
+        offset = _free_offset(anchor, name, wanted, avoid, self.taken, stay=stay)
         self.ax.annotate(
             name, tuple(at), offset, textcoords="offset points", zorder=6,
             ha="left" if offset[0] > 0 else "right", va="center",
@@ -304,9 +306,9 @@ def _mark_switches(labels: _Labels, panel: _Panel, result: Fit) -> None:
 
 def _switches(panel: _Panel, result: Fit) -> Iterator[tuple[str, float, float]]:
     """Give the points where a bistable spring changes its branch: name and place, SI."""
-    bistable = result.bistable_springs
+    micro = result.microscale_springs
     for switch in result.switches:
-        if f"s{switch.spring}" not in bistable:
+        if f"s{switch.spring}" in micro:
             continue
         point = POINTS.get((switch.source, switch.target), f"{switch.source}→{switch.target}")
         name = f"s{switch.spring} {point}" if len(result.chain.springs) > 1 else point
@@ -353,7 +355,13 @@ def _draw_law(labels: _Labels, result: Fit) -> None:
 
 
 def _free_offset(
-    anchor: Array, name: str, wanted: tuple[float, float], avoid: Array, taken: list[Array]
+    anchor: Array,
+    name: str,
+    wanted: tuple[float, float],
+    avoid: Array,
+    taken: list[Array],
+    *,
+    stay: bool = False,
 ) -> tuple[float, float]:
     """Return where a name stands beside its anchor: on no other name, on little of the curves.
 
@@ -362,7 +370,8 @@ def _free_offset(
     x, y = wanted
     size, best, found = np.array([4.2 * len(name), 9.0]), math.inf, (wanted, np.zeros(4))
     for factor in (1.0, 2.5, 4.0):
-        for dx, dy in ((x, factor * y), (-x, -factor * y), (x, -factor * y), (-x, factor * y)):
+        sides = ((x, factor * y), (-x, -factor * y), (x, -factor * y), (-x, factor * y))
+        for dx, dy in sides[:1] if stay else sides:
             low = np.add(anchor, (dx - (size[0] if dx < 0 else 0.0), dy - 0.5 * size[1]))
             high = low + size
             names = sum(bool(np.all((low < b[2:]) & (b[:2] < high))) for b in taken)
@@ -392,7 +401,7 @@ def _name_branches(labels: _Labels, panel: _Panel, result: Fit) -> None:
             )  # fmt: skip
         elif branch in IN_WORDS:
             at = np.array([x[middle], y[middle]])
-            labels.write(branch, at, IN_WORDS[branch], fontsize=7, **style)
+            labels.write(branch, at, IN_WORDS[branch], stay=True, fontsize=7, **style)
 
 
 def _first_visits(result: Fit, fitted: _Line) -> Iterator[tuple[str, int, int]]:

@@ -188,9 +188,9 @@ def _inner_loops(best: BestPoint) -> list[str]:
     if not loops or total == 0.0:
         return []
     ends = [(first, min(stop, squares.size - 1)) for first, stop in loops]
-    spans = [f"samples {first} to {stop}" for first, stop in ends]
+    spans = [f"from sample {first} to {stop}" for first, stop in ends]
     if test.time is not None:
-        spans = [f"{engineering(test.time[a], 's')} to {engineering(test.time[b], 's')}"
+        spans = [f"from {engineering(test.time[a], 's')} to {engineering(test.time[b], 's')}"
                  for a, b in ends]  # fmt: skip
     return [
         f"The motion turns back below its peak ({listed(spans)}): these {percent(inside.mean())} "
