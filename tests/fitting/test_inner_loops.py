@@ -51,6 +51,16 @@ def test_microscale_springs_follow_inner_loops_to_the_noise() -> None:
     for name in ("k0", "sigma_plus", "spread_plus", "sigma_minus", "spread_minus"):
         assert micro.parameters[f"s1_{name}"].value == pytest.approx(getattr(SPRING, name), rel=0.1)
     assert not any("inner loops" in note for note in micro.notes)
+    (visited,) = (check for check in micro.checklist if check.key == "visited")
+    assert (visited.answer, visited.sentence) == (True, "a, snap-through and snap-back were.")
+
+
+def test_snap_back_that_was_not_reached_is_told() -> None:
+    up = record((0.0, 0.6))
+    fit = ff.fit(up, model="microscale", starts=2, intervals="local")
+    (visited,) = (check for check in fit.checklist if check.key == "visited")
+    assert (visited.answer, visited.sentence) == (False, "Not visited: snap-back of s1.")
+    assert fit.parameters["s1_sigma_minus"].why == "branch snap-back of spring 1 was never reached"
 
 
 def test_a_bistable_fit_says_what_partial_unloading_leaves() -> None:

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from importlib.metadata import version
 from typing import Any
 
+from foamfit.fitting.branches import covered
 from foamfit.report.figures import DPI, image
 from foamfit.report.identifiability_plots import plot_insight, plot_profiles
 from foamfit.report.plots import origin_word, plot_fit, plot_residuals
@@ -38,8 +39,9 @@ MARKS = {
     "bistable": "A1 and C1 are where the spring starts to snap and has snapped on loading; C2 and "
     "A2 where it starts to snap back and has recovered on unloading.",
     "microscale": "σ₊ and σ₋ are where half of the micro-springs have snapped on loading, and "
-    "where half have snapped back on unloading; thin grey are the elastic branch a, on which none "
-    "has snapped, and the densified branch c, on which all have.",
+    "where half have snapped back on unloading. Of a single spring also its branches are drawn, "
+    "thin and grey: the elastic branch a, on which none has snapped, and the densified branch c, "
+    "on which all have.",
 }
 POINTS = (  # attribute of the spring, symbol and its index, meaning, unit
     ("sigma_a", ("σ", "a"), "stress at A1, where snapping starts", "Pa"),
@@ -183,7 +185,7 @@ def _visited(result: Fit) -> dict[str, list[tuple[str, str, bool]]]:
     """Return the branches of each spring, what they are, and whether it went through them."""
     return {
         f"s{i}": [
-            (branch, meaning, branch in result.visited.get(f"s{i}", ()))
+            (branch, meaning, branch in covered(result.visited.get(f"s{i}", ())))
             for branch, meaning in BRANCHES.get(KINDS[spring.kind], {}).items()
         ]
         for i, spring in enumerate(result.chain.springs, start=1)

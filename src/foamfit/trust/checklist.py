@@ -13,7 +13,7 @@ import numpy as np
 from foamfit.data.energy import EnergyAudit
 from foamfit.data.measurement import INTEGRATED
 from foamfit.errors import InputError
-from foamfit.fitting.branches import visited
+from foamfit.fitting.branches import covered, visited
 from foamfit.fitting.curves import check_time_shift
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.search import SearchRecord
@@ -235,7 +235,7 @@ def _visited(e: Findings) -> _Answer:
     kinds = e.best.problem.model.kinds
     wanted = [tuple(dict.fromkeys(BRANCHES.get(kind, {}).values())) for kind in kinds]
     absent = {
-        spring: [branch for branch in branches if branch not in seen]
+        spring: [branch for branch in branches if branch not in covered(seen)]
         for branches, (spring, seen) in zip(
             wanted, visited(e.best.problem, e.best.simulated).items(), strict=True
         )
