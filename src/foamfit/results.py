@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from importlib.metadata import version
 from typing import Any
 
@@ -14,7 +15,9 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.springs.chain import Chain
-from foamfit.springs.spring import BistableSpring
+from foamfit.springs.microscale import follow_fractions
+from foamfit.springs.spring import BistableSpring, MicroscaleSpring
+from foamfit.text import counted
 from foamfit.trust.identifiability import Insight
 from foamfit.trust.intervals import Intervals
 
@@ -71,6 +74,33 @@ class Correlation:
 
     names: tuple[str, ...]
     matrix: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Snapping:
+    """How many of its micro-springs a microscale spring snapped along the fitted curves."""
+
+    fraction: Array  # that has snapped, one per sample
+    stress: Array  # of the spring in equilibrium, Pa
+
+    @property
+    def turn(self) -> int:
+        """Sample at which most have snapped."""
+        return int(np.argmax(self.fraction))
+
+    @property
+    def most(self) -> float:
+        """Largest fraction that has snapped; the test tells nothing of the ranks above."""
+        return float(self.fraction[self.turn])
+
+    @property
+    def halves(self) -> tuple[int | None, int | None]:
+        """Samples from which on half have snapped, and half have snapped back; None if never."""
+        turn, snapped = self.turn, self.fraction >= 0.5
+        if not snapped[turn]:
+            return None, None
+        back = np.flatnonzero(~snapped[turn:])
+        return int(np.argmax(snapped)), turn + int(back[0]) if back.size else None
 
 
 @dataclass(frozen=True)
@@ -181,6 +211,31 @@ class Ladder:
             yield [rung.model, rung.damping, *(rung.misfit.get(name) for name in curves), *told]
 
 
+def snapping_of(chain: Chain, strain: Array | None, stress: Array | None) -> dict[str, Snapping]:
+    """How each microscale spring snaps along an overall strain and a base stress (Pa).
+
+    A single spring's snapping follows from its strain. In a chain it follows from the stress, if
+    all springs are in equilibrium under it, else there is none.
+    """
+    out, springs = {}, chain.springs
+    plain = not any(spring.eta or spring.relaxation for spring in springs)
+    for i, spring in enumerate(springs, start=1):
+        if not isinstance(spring, MicroscaleSpring):
+            continue
+        own = stress if plain else None
+        if len(springs) == 1:
+            own = None if strain is None else np.asarray(spring.stress(strain))
+        if own is not None and np.all(np.isfinite(own)):
+            fraction = follow_fractions(own, spring.snapped_below, spring.left_below)
+            out[f"s{i}"] = Snapping(fraction, own)
+    return out
+
+
+def law_in_words(model: str, relaxation: int) -> str:
+    """Model and relaxation in words."""
+    return f"{model} with {counted(relaxation, 'relaxation term')}" if relaxation else model
+
+
 @dataclass(frozen=True, eq=False)
 class Fit:
     """Everything that a fit found."""
@@ -219,6 +274,30 @@ class Fit:
         springs = enumerate(self.chain.springs, start=1)
         return {f"s{i}": one for i, one in springs if isinstance(one, BistableSpring)}
 
+    @property
+    def microscale_springs(self) -> dict[str, MicroscaleSpring]:
+        """The microscale springs of the chain by their prefix, "s1" at the base."""
+        springs = enumerate(self.chain.springs, start=1)
+        return {f"s{i}": one for i, one in springs if isinstance(one, MicroscaleSpring)}
+
+    @property
+    def law(self) -> str:
+        """The model and its relaxation in words."""
+        return law_in_words(self.model, self.relaxation)
+
+    @cached_property
+    def strain(self) -> Array | None:
+        """Overall strain along the fitted curves; None if neither simulated nor measured."""
+        c = self.curves
+        moved = c.displacement if c.displacement is not None else c.measured_displacement
+        return None if moved is None else moved / self.measurement.specimen.height
+
+    @cached_property
+    def snapping(self) -> dict[str, Snapping]:
+        """How each microscale spring snapped, where that is known; see `snapping_of`."""
+        stress = self.curves.measured_stress if self.drive == "stress" else self.curves.stress
+        return snapping_of(self.chain, self.strain, None if self.drive == "impact" else stress)
+
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of ``fit.json``: SI, plain types, null for what is not there."""
         content: dict[str, Any] = plain(
@@ -252,6 +331,15 @@ class Fit:
                 "derived": {
                     name: {point: getattr(spring, point) for point in DERIVED_POINTS}
                     for name, spring in self.bistable_springs.items()
+                }
+                | {
+                    name: {
+                        "p_max": snapped.most,
+                        "p_max_stress": float(snapped.stress[snapped.turn]),
+                        "p_max_strain": None if self.strain is None else self.strain[snapped.turn],
+                        "snap_strain": self.microscale_springs[name].snap_strain,
+                    }
+                    for name, snapped in self.snapping.items()
                 },
                 "visited": self.visited,
                 "misfit": self.misfit,

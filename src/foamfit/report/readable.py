@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 
 from foamfit import text
@@ -12,6 +13,8 @@ SYMBOLS = {
     "k0": ("k", "0"), "kc": ("k", "c"), "dsigma": ("Δσ", ""), "eps_a": ("ε", "a"),
     "eps_c": ("ε", "c"), "kh_plus": ("k", "h+"), "kh_minus": ("k", "h−"), "eta": ("η", ""),
     "height": ("h", ""), "site_eta": ("η", "site"), "time_shift": ("Δt", ""),
+    "eps_star": ("ε", "*"), "sigma_plus": ("σ", "+"), "spread_plus": ("s", "+"),
+    "sigma_minus": ("σ", "−"), "spread_minus": ("s", "−"),
 }  # fmt: skip
 
 UNITS = {
@@ -87,9 +90,11 @@ def number(value: float | None) -> str:
 def _symbol(name: str) -> tuple[str, str]:
     """Return the symbol of a parameter and its index: k and "c,2" of s2_kc."""
     spring, _, base = name.partition("_")
-    if name in SYMBOLS or base not in SYMBOLS:
-        return SYMBOLS.get(name, (name, ""))
-    stem, index = SYMBOLS[base]
+    term = re.fullmatch(r"(g|tau)(\d+)", base)
+    known = SYMBOLS | ({base: ("τ" if term[1] == "tau" else "g", term[2])} if term else {})
+    if name in known or base not in known:
+        return known.get(name, (name, ""))
+    stem, index = known[base]
     return stem, ",".join(part for part in (index, spring.removeprefix("s")) if part)
 
 

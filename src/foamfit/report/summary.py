@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from foamfit.data.measurement import interior_channel
 from foamfit.report.readable import Readable, readable
 from foamfit.results import Fit, Ladder, ParameterEstimate, Rung
-from foamfit.text import aligned, counted, listed, percent, wrapped
+from foamfit.text import aligned, counted, engineering, listed, number, percent, wrapped
 
 CURVES = {
     "stress_time": "stress-time",
@@ -31,7 +31,7 @@ def summary_text(result: Fit, *, verbose: bool = False) -> str:
     checklist, the notes and all warnings.
     """
     m = result.measurement
-    head = f"{m.name}: {result.model}, {result.drive} drive, seed {result.seed}: {result.status}"
+    head = f"{m.name}: {result.law}, {result.drive} drive, seed {result.seed}: {result.status}"
     head += f" (stopped by {result.stopped}, not finished)" if result.stopped else ""
     shown = [f"{name} {percent(off)}" for name, off in misfits(result).items() if off is not None]
     rows = [readable(name, p) for name, p in result.parameters.items()]
@@ -54,9 +54,13 @@ def summary_text(result: Fit, *, verbose: bool = False) -> str:
     return "\n".join(lines).rstrip()
 
 
-def conclusions(result: Fit) -> tuple[str, str, str]:
-    """Say in three sentences how well the model fits, what is known, and what is not."""
-    return _how_well(result), _known(result), _unknown(result)
+def conclusions(result: Fit) -> tuple[str, ...]:
+    """Say in three sentences how well the model fits, what is known, and what is not.
+
+    Of microscale springs and of relaxation, also what the identified law does.
+    """
+    law = (*_snapping(result), *_relaxation(result)) if result.status != "failed" else ()
+    return (_how_well(result), _known(result), _unknown(result), *law)
 
 
 def misfits(result: Fit) -> dict[str, float | None]:
@@ -118,6 +122,54 @@ def _unknown(result: Fit) -> str:
     if result.insight is None or len(names := list(result.insight.weakest()[1])) < 2:
         return "No varied parameter is weak or not determined."
     return f"No varied parameter is weak; least determined is the combination of {listed(names)}."
+
+
+def _of_spring(result: Fit, name: str) -> str:
+    """Return " of spring 2" of s2, nothing where there is one spring only."""
+    return f" of spring {name[1:]}" if len(result.chain.springs) > 1 else ""
+
+
+def _snapping(result: Fit) -> Iterator[str]:
+    """Say how many micro-springs the test snapped: it tells nothing of the others."""
+    for name, snapped in result.snapping.items():
+        at = f"{engineering(float(snapped.stress[snapped.turn]), 'Pa')}"
+        if result.strain is not None:
+            at += f" and a strain of {number(float(result.strain[snapped.turn]))}"
+        sentence = (
+            f"{percent(snapped.most)} of the micro-springs{_of_spring(result, name)} snap in this "
+            f"test, at {at}"
+        )
+        if 1.0 - snapped.most > 0.005:
+            sentence += "; what the others would do is extrapolated"
+        yield f"{sentence}."
+
+
+def _relaxation(result: Fit) -> Iterator[str]:
+    """Say what the relaxation of each spring that has any amounts to."""
+    for i, spring in enumerate(result.chain.springs, start=1):
+        terms = [
+            (f"s{i}_g{k}", g, f"s{i}_tau{k}", tau)
+            for k, (g, tau) in enumerate(spring.relaxation, start=1)
+        ]
+        if not terms:
+            continue
+        lost = [
+            name
+            for g, _, tau, _ in terms
+            for name in (g, tau)
+            if name in result.parameters and result.parameters[name].state == "not determined"
+        ]
+        whose = _of_spring(result, f"s{i}")
+        if lost:
+            yield f"The relaxation{whose} is not determined ({', '.join(lost)})."
+            continue
+        total = 1.0 + sum(g for _, g, _, _ in terms)
+        parts = (f"{percent(g / total)} of it with a time constant of {engineering(tau, 's')}"
+                 for _, g, _, tau in terms)  # fmt: skip
+        yield (
+            f"On a sudden change of strain the stress{whose} changes {number(total)} times as much "
+            f"as in equilibrium, and relaxes: {listed(parts)}."
+        )
 
 
 def _rows(result: Fit) -> list[str]:

@@ -6,20 +6,20 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import chain, groupby
 
 import numpy as np
 
 from foamfit.data.energy import EnergyAudit
 from foamfit.data.measurement import INTEGRATED
 from foamfit.errors import InputError
-from foamfit.fitting.branches import visited
+from foamfit.fitting.branches import covered, visited
 from foamfit.fitting.curves import check_time_shift
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.search import SearchRecord
 from foamfit.results import Check, ParameterEstimate
-from foamfit.springs.parameters import split_name
-from foamfit.text import engineering, percent
+from foamfit.springs.parameters import BRANCHES, split_name
+from foamfit.text import engineering, listed, percent
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import AT_LIMIT, WEAK
 from foamfit.trust.intervals import Intervals
@@ -36,7 +36,6 @@ STATED, ESTIMATED = 1.1, 1.5
 STRUCTURED = 5.0
 # Reasons that one warning gives at most; more of them are read better in the table of parameters.
 REASONS = 3
-BRANCHES = ("a", "d", "c", "e")
 # Parameters that may be zero: their interval tells whether there is anything at all.
 MAY_VANISH = ("dsigma", "kh_plus", "kh_minus", "eta")
 
@@ -248,16 +247,20 @@ def _by_reason(of: list[tuple[str, str]]) -> str:
 
 
 def _visited(e: Findings) -> _Answer:
+    kinds = e.best.problem.model.kinds
+    wanted = [tuple(dict.fromkeys(BRANCHES.get(kind, {}).values())) for kind in kinds]
     absent = {
-        spring: [branch for branch in BRANCHES if branch not in seen]
-        for spring, seen in visited(e.best.problem, e.best.simulated).items()
-        if "a" in seen
+        spring: [branch for branch in branches if branch not in covered(seen)]
+        for branches, (spring, seen) in zip(
+            wanted, visited(e.best.problem, e.best.simulated).items(), strict=True
+        )
+        if branches
     }
     lost = [f"{branch} of {spring}" for spring, gone in absent.items() for branch in gone]
     if not absent:
         return True, "Linear springs have one branch."
     if not lost:
-        return True, "a, d, c and e were."
+        return True, f"{listed(dict.fromkeys(chain.from_iterable(wanted)))} were."
     # It matters if some parameter that varies depends on it; its own warning says so.
     depend = any(
         item.state == "not determined" and absent.get(f"s{split_name(name)[0] + 1}")

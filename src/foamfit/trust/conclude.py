@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from foamfit.arrays import Array
+from foamfit.data.cycles import inner_loops
 from foamfit.data.describe import noise_sentences
 from foamfit.data.energy import audit
 from foamfit.data.measurement import INTEGRATED, interior_channel
@@ -24,7 +25,7 @@ from foamfit.fitting.search import SearchRecord
 from foamfit.results import Correlation, Curves, Fit, ParameterEstimate, Switch
 from foamfit.springs import kernels
 from foamfit.springs.parameters import split_name, unit_of
-from foamfit.text import engineering, percent
+from foamfit.text import engineering, listed, percent
 from foamfit.trust import covariance
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.checklist import MAY_VANISH, Findings, make_checklist, status_of, warnings_of
@@ -138,7 +139,7 @@ def _notes(best: BestPoint) -> list[str]:
     problem, simulated = best.problem, best.simulated
     objective, specimen = problem.objective, problem.measurement.specimen
     single = len(problem.model.kinds) == 1
-    told = [*problem.notes]
+    told = [*problem.notes, *_inner_loops(best)]
     unseen = [name for name in MOTION_CURVES if name not in objective.counted]
     off = [(name.replace("_", "-"), objective.off(simulated, name)) for name in unseen]
     there = [f"the {name} curve is {share:.1%} of its range off" for name, share in off if share]
@@ -175,6 +176,34 @@ def _notes(best: BestPoint) -> list[str]:
         *told,
         f"{left_out}; the specimen's {specimen.mass * 1e6:.3g} mg between the springs would change "
         f"{' and '.join(changes)} (RMS over range).",
+    ]
+
+
+def _inner_loops(best: BestPoint) -> list[str]:
+    """Say what a partial unloading leaves in the residuals of a law that has no inner loops."""
+    test, kinds = best.problem.measurement, best.problem.model.kinds
+    curve = best.simulated.curves.get("stress_strain")
+    if "bistable" not in kinds or "microscale" in kinds or curve is None:
+        return []
+    assert test.displacement is not None  # there is a curve along it
+    assert test.stress is not None
+    loops = inner_loops(test.displacement)
+    squares = (curve - test.stress) ** 2
+    inside = np.zeros(squares.size, dtype=bool)
+    for first, stop in loops:
+        inside[first:stop] = True
+    total = float(squares.sum())
+    if not loops or total == 0.0:
+        return []
+    ends = [(first, min(stop, squares.size - 1)) for first, stop in loops]
+    spans = [f"from sample {first} to {stop}" for first, stop in ends]
+    if test.time is not None:
+        spans = [f"from {engineering(test.time[a], 's')} to {engineering(test.time[b], 's')}"
+                 for a, b in ends]  # fmt: skip
+    return [
+        f"The motion turns back below its peak ({listed(spans)}): these {percent(inside.mean())} "
+        f"of the samples hold {percent(float(squares[inside].sum()) / total)} of the squared "
+        "residuals of stress-strain. Bistable springs have no inner loops; microscale springs do."
     ]
 
 
