@@ -52,7 +52,7 @@ from independent import (
     H,
     Integers,
     Truth,
-    _bistable,
+    bistable_row,
     _bounds,
     _linear,
     _sigma,
@@ -658,7 +658,7 @@ def follow(chain: Any, drive: Any, time: Array, tol: float = TIGHT, most: int = 
             rows.append(_microscale(spring, h))
             kinds.append(HELD)
         elif hasattr(spring, "kc"):
-            rows.append(_bistable(spring, h))
+            rows.append(bistable_row(spring, h))
             kinds.append(A)
         else:
             rows.append(_linear(spring, h))
