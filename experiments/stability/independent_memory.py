@@ -52,12 +52,12 @@ from independent import (
     H,
     Integers,
     Truth,
-    bistable_row,
     _bounds,
     _linear,
     _sigma,
     _slope,
     _turn,
+    bistable_row,
 )  # fmt: skip
 from numba import njit
 
