@@ -224,9 +224,14 @@ class Plan(NamedTuple):
             if ending[0] not in _STIFF:
                 break
             rate, culprit = self._fastest(given)
-            too_fast = _TOO_FAST.format(culprit=culprit, rate=rate, steps=self.max_steps)
-            if most == self.max_steps or rate > RADIANS * self.max_steps:
-                raise SimulationError(too_fast)
+            too_fast = rate > RADIANS * self.max_steps
+            if most == self.max_steps and ending[0] == scenes.TOO_MANY_STEPS:
+                too_fast = RADIANS * rate > self.max_steps
+            if too_fast:
+                message = _TOO_FAST.format(culprit=culprit, rate=rate, steps=self.max_steps)
+                raise SimulationError(message)
+            if ending[0] == scenes.STEP_UNDERFLOW:  # more steps would end there too
+                break
         return _motion(TAYLOR, ending, curves, slopes, log)
 
     def _fastest(self, given: scenes.SceneTuple) -> tuple[float, str]:

@@ -325,7 +325,7 @@ def longest(memory: Memory, i: int, order: int, span: float) -> float:
     """
     s, u, scale = memory.series[EQ, i], abs(memory.series[SCORE, i, 0]), memory.now[i, SCALE]
     within = min(MOST_SCORE, SHARE_OF_ORDER * order / u) if u > 0.0 else MOST_SCORE
-    most = s[0] * min(0.8, scale * max(within, u - FAR))
+    most = s[0] * min(0.8, 1.0 - math.exp(-scale * max(within, u - FAR)))  # also where it falls
     for _ in range(400):
         moved = 0.0
         for n in range(order, 0, -1):

@@ -167,13 +167,20 @@ def step_length(
 
 @piece
 def tangent_length(
-    heights: Array, d: SeriesTangents, order: int, tol: float, span: float, sizes: Array
+    heights: Array,
+    d: SeriesTangents,
+    order: int,
+    tol: float,
+    span: float,
+    sizes: Array,
+    memory: Memory | None,
 ) -> float:
     """Longest step within `span` whose last two terms fall below `tol` of the derivatives so far.
 
     A vibration or relaxation that the motion itself does not show may be in its derivatives: steps
     that are too long for it let these grow without bound. `sizes` (p, 2) holds the largest
-    elongation and base stress of each direction.
+    elongation and base stress of each direction. With memory, those that begin at a high order,
+    behind masses and relaxation, have no size yet that could bound a step.
     """
     for p in range(d.drag.size):
         if d.live[p] == 0.0:
@@ -190,6 +197,8 @@ def tangent_length(
                     before = max(before, weight * abs(c[order - 1]))
                     tail = max(tail, weight * abs(c[order]))
                 size, longest = max(sizes[p, part], bar), span
+                if memory is not None and size == 0.0:
+                    break
                 bar = tol * size
                 if before * span ** (order - 1) > bar:
                     span = (bar / before) ** (1.0 / (order - 1))
@@ -606,7 +615,7 @@ def _integrated(
         more = min(least + 2, order)  # for what is, in time, a derivative of these
         if tangent:
             expand_tangents(links, s, d, more, memory)
-            shorter = tangent_length(heights, d, more, OF_TANGENTS * tol, span, sizes)
+            shorter = tangent_length(heights, d, more, OF_TANGENTS * tol, span, sizes, memory)
             if shorter < span:
                 span, spring, leaves = shorter, -1, False
         end = now + span
