@@ -17,14 +17,14 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from foamfit.study.cycles import CycleFits
+    from foamfit.study.cycle_fits import FittedCycles
 
 COLUMNS, PANEL = 4, (1.85, 1.5)  # of the picture; inches
 MOST_LOOPS = 12
 FAR = 20  # a last cycle that is so many times the first is drawn on a logarithmic axis
 
 
-def save_cycles(found: CycleFits, folder: str | Path) -> Path:
+def save_cycles(found: FittedCycles, folder: str | Path) -> Path:
     """Write the folder whole, replacing an older result at the end; returns it."""
 
     def write(fresh: Path) -> None:
@@ -42,7 +42,7 @@ def save_cycles(found: CycleFits, folder: str | Path) -> Path:
 # ------------------------------------------------------------------------------- in words
 
 
-def cycles_text(found: CycleFits) -> str:
+def cycles_text(found: FittedCycles) -> str:
     """Return what the command prints of the cycles of a record."""
     n = len(found.recorded)
     fitted = f"{len(found.results)} of {n} {'cycle' if n == 1 else 'cycles'} fitted"
@@ -58,7 +58,7 @@ def cycles_text(found: CycleFits) -> str:
     return "\n".join(lines)
 
 
-def _table(found: CycleFits) -> list[str]:
+def _table(found: FittedCycles) -> list[str]:
     names = [n for n in found.names if any(r.parameters[n].vary for r in found.results.values())]
     rows = [["cycle", "start strain", "misfit", *(name.removeprefix("s1_") for name in names)]]
     for number, one in sorted(found.results.items()):
@@ -71,7 +71,7 @@ def _table(found: CycleFits) -> list[str]:
     return aligned(rows)
 
 
-def _steps(found: CycleFits) -> list[str]:
+def _steps(found: FittedCycles) -> list[str]:
     assert found.selection is not None
     content = found.to_json_dict()["together"]
     rows = [["", "of each cycle", "parameters", "BIC", *(f"misfit {n}" for n in found.together)]]
@@ -87,7 +87,7 @@ def _steps(found: CycleFits) -> list[str]:
 # ------------------------------------------------------------------------------- the picture
 
 
-def plot_cycles(found: CycleFits) -> Figure:
+def plot_cycles(found: FittedCycles) -> Figure:
     """Draw the loops laid over each other, and start strain, energy, misfit, parameters by cycle.
 
     Bars are 95 % intervals; a hollow mark is a parameter that its cycle does not determine well.
@@ -122,7 +122,7 @@ def plot_cycles(found: CycleFits) -> Figure:
     return figure
 
 
-def _loops(ax: Axes, found: CycleFits) -> None:
+def _loops(ax: Axes, found: FittedCycles) -> None:
     """Measured loops over each other, from light to dark; the first and the last one fitted."""
     import matplotlib
 
@@ -154,7 +154,7 @@ def _by_cycle(ax: Axes, values: dict[int, float]) -> None:
     ax.plot(list(values), list(values.values()), "o-", color=BLUE, markersize=3, linewidth=0.8)
 
 
-def _short(name: str, found: CycleFits) -> str:
+def _short(name: str, found: FittedCycles) -> str:
     """Name of a parameter, without the spring where there is one alone."""
     return name if "+" in found.model else name.removeprefix("s1_")
 
@@ -167,7 +167,7 @@ def _scale(values: Sequence[float], unit: str) -> tuple[float, str]:
     return 1.0, unit
 
 
-def _parameter(ax: Axes, found: CycleFits, name: str) -> None:
+def _parameter(ax: Axes, found: FittedCycles, name: str) -> None:
     """One parameter with its 95 % intervals against the cycle."""
     points = [
         (n, r.parameters[name]) for n, r in sorted(found.results.items()) if name in r.parameters
@@ -189,7 +189,7 @@ def _parameter(ax: Axes, found: CycleFits, name: str) -> None:
     _limit(ax, factor, [p for _, p in points], found, name)
 
 
-def _limit(ax: Axes, factor: float, points: Sequence[Any], found: CycleFits, name: str) -> None:
+def _limit(ax: Axes, factor: float, points: Sequence[Any], found: FittedCycles, name: str) -> None:
     """Let wide intervals run out of the panel rather than flatten the values."""
     values = [factor * p.value for p in points]
     if found.selection is not None and name in found.selection.best.fits[0].shared:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from importlib.metadata import version
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import Any, Unpack
 
 import lmfit
 import numpy as np
@@ -16,156 +15,28 @@ from foamfit.data.csv_file import read_test
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError
 from foamfit.one_model import Keywords, Options, Progress
-from foamfit.results import plain
+from foamfit.report.cycles import save_cycles
+from foamfit.study.cycle_fits import FittedCycles, loop_misfits
 from foamfit.study.shared import Group, Selection, select_own
 from foamfit.text import counted, listed, percent
 from foamfit.trust.intervals import Announce
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-SCHEMA = 1
 # Cycles that are fitted together at most; of more the first and others at equal ratios are taken.
 MOST_TOGETHER = 6
 CTRL_C = "not fitted, because Ctrl-C ended the command before"
-CURVES = ("stress_time", "displacement_time", "stress_strain")
-ENERGY = "dissipated_energy"
 
 Params = Callable[[Measurement], lmfit.Parameters | None]
 
 
-@dataclass(frozen=True, eq=False)
-class CycleFits:
-    """Fits of the cycles of one record.
-
-    Attributes
-    ----------
-    test, model
-        Names of the test and of the model.
-    recorded : tuple of int
-        Numbers of all cycles in the record.
-    results : dict of int to FitResult
-        The fit of each cycle that could be read and fitted.
-    refused : dict of int to str
-        Why the others could not, one sentence each.
-    selection : Selection or None
-        Which parameters change from cycle to cycle; `together` holds the numbers of its cycles.
-    sentences : tuple of str
-        What the fit of several cycles says, or why there is none.
-    """
-
-    test: str
-    model: str
-    recorded: tuple[int, ...]
-    results: dict[int, FitResult]
-    refused: dict[int, str]
-    selection: Selection | None = None
-    together: tuple[int, ...] = ()
-    sentences: tuple[str, ...] = ()
-
-    @property
-    def names(self) -> list[str]:
-        """Names of the parameters of any fit, in their order."""
-        return list(dict.fromkeys(name for one in self.results.values() for name in one.parameters))
-
-    def rows(self) -> Iterator[list[object]]:
-        """Rows of cycles.csv, the header first: SI, one row for each cycle, empty = not there."""
-        head = [
-            "cycle", "start_strain", "peak_strain", "peak_stress", ENERGY,
-            *(f"misfit_{name}" for name in CURVES), "status", "error",
-        ]  # fmt: skip
-        parts = "", "_stderr", "_lo", "_hi", "_state"
-        yield [*head, *(f"{name}{part}" for name in self.names for part in parts)]
-        for number in sorted({*self.results, *self.refused}):
-            one = self.results.get(number)
-            if one is None:
-                blank = [None] * (5 * len(self.names))
-                yield [number, *[None] * 7, "refused", self.refused[number], *blank]
-                continue
-            m = one.measurement
-            strain = None if m.displacement is None else float(m.displacement.max())
-            cells: list[object] = [
-                number,
-                m.start_strain,
-                None if strain is None else strain / m.specimen.height,
-                None if m.stress is None else float(m.stress.max()),
-                one.energy.get(ENERGY),
-                *(one.misfit.get(name) for name in CURVES),
-                one.status,
-                None,
-            ]
-            for name in self.names:
-                p = one.parameters.get(name)
-                if p is None:
-                    cells += [None] * 5
-                else:
-                    cells += [p.value, p.stderr, *(p.ci95 or (None, None)), p.state]
-            yield [plain(cell) for cell in cells]
-
-    @property
-    def table(self) -> pd.DataFrame:
-        """The rows of cycles.csv, indexed by the cycle."""
-        import pandas as pd
-
-        head, *rows = self.rows()
-        return pd.DataFrame(rows, columns=[str(name) for name in head]).set_index("cycle")
-
-    def to_json_dict(self) -> dict[str, Any]:
-        """Return the content of cycles.json: what was fitted together, in plain types and SI."""
-        content: dict[str, Any] = {
-            "schema": SCHEMA,
-            "foamfit": version("foamfit"),
-            "test": self.test,
-            "model": self.model,
-            "recorded": self.recorded,
-            "fitted": sorted(self.results),
-            "refused": self.refused,
-            "sentences": self.sentences,
-            "together": None if self.selection is None else self._together(self.selection),
-        }
-        return dict(plain(content))
-
-    def _together(self, selection: Selection) -> dict[str, Any]:
-        best = selection.best.fits[0]
-        return {
-            "cycles": self.together,
-            "effective_samples": selection.n_eff,
-            "own": best.own,
-            "shared": best.shared,
-            "parameters": {name: best.value(name) for name in best.own}
-            | {name: best.value(name)[0] for name in best.shared},
-            "steps": [
-                {
-                    "own": step.own,
-                    "n_vary": step.n_vary,
-                    "bic": step.bic,
-                    "misfit": dict(zip(self.together, _misfits(step.fits[0].misfits), strict=True)),
-                    "explained": selection.explained(step),
-                    "chosen": step is selection.best,
-                }
-                for step in selection.steps
-            ],
-            "alone": {
-                "n_vary": selection.n_alone,
-                "bic": selection.bic_alone,
-                "misfit": {n: _misfits([self.results[n].misfit])[0] for n in self.together},
-            },
-        }
+class CycleFits(FittedCycles):
+    """Fits of the cycles of one record, and how they are written; see `FittedCycles`."""
 
     def save(self, folder: str | Path) -> Path:
         """Write ``cycle-<n>/``, cycles.csv, cycles.png and cycles.json whole; returns the folder.
 
         An older result there is replaced as a whole, at the end.
         """
-        from foamfit.report.cycles import save_cycles
-
         return save_cycles(self, folder)
-
-
-def _misfits(found: Sequence[dict[str, float | None]]) -> list[float | None]:
-    """The one misfit that tells most of each fit: of the loop, else of the stress."""
-    names = ("stress_strain", "stress_time", "displacement_time")
-    return [next((one[n] for n in names if one.get(n) is not None), None) for one in found]
 
 
 def fit_cycles(
@@ -294,10 +165,10 @@ def _sentences(found: CycleFits, selection: Selection) -> Iterator[str]:
     cycles = listed(str(n) for n in found.together)
 
     def shown(step: Any) -> str:
-        off = [m for m in _misfits(step.fits[0].misfits) if m is not None]
+        off = [m for m in loop_misfits(step.fits[0].misfits) if m is not None]
         return f"{percent(min(off))} to {percent(max(off))}"
 
-    alone = [m for m in _misfits([found.results[n].misfit for n in found.together]) if m]
+    alone = [m for m in loop_misfits([found.results[n].misfit for n in found.together]) if m]
     each = f"{percent(min(alone))} to {percent(max(alone))}" if alone else "nothing"
     if not best.own:
         yield (
