@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import lmfit
@@ -11,13 +12,29 @@ from foamfit.api import FitResult
 from foamfit.data.measurement import Measurement, Specimen, Striker
 from foamfit.results import Curves, ParameterEstimate, Switch
 from foamfit.springs.chain import Chain
-from foamfit.springs.spring import BistableSpring, LinearSpring
+from foamfit.springs.parameters import MICROSCALE_NAMES
+from foamfit.springs.spring import BistableSpring, LinearSpring, MicroscaleSpring
 
 HEIGHT, AREA = 1.19e-3, 1.9635e-5
 SPRING = BistableSpring(
     k0=5.5e6, kc=82.5e6, dsigma=-0.17907e6, eps_a=0.14, eps_c=0.31, kh_plus=14.3e6, kh_minus=2.3e6
 )
-UNITS = {"eps_a": "", "eps_c": "", "height": "m", "eta": "Pa·s", "site_eta": "Pa·s"}
+MICRO = MicroscaleSpring(
+    k0=4.4e5, kc=4.9e5, eps_star=0.29, sigma_plus=1.06e5, spread_plus=0.44, sigma_minus=7.9e4,
+    spread_minus=0.7, relaxation=[(0.5, 0.25)],
+)  # fmt: skip
+UNITS = {
+    "eps_a": "",
+    "eps_c": "",
+    "eps_star": "",
+    "spread_plus": "",
+    "spread_minus": "",
+    "g1": "",
+    "tau1": "s",
+    "height": "m",
+    "eta": "Pa·s",
+    "site_eta": "Pa·s",
+}
 
 
 def half_sine(
@@ -156,3 +173,43 @@ def chain_result() -> FitResult:
         visited={"s1": (), "s2": ("a", "d", "c", "e")},
         switches=switches,
     )
+
+
+def microscale_result(**changed: Any) -> FitResult:
+    """Return a result of a microscale spring that relaxes, along a slow triangle to 60 %."""
+    time = np.linspace(0.0, 5.0, 401)
+    strain = 0.6 * (1.0 - np.abs(time / 2.5 - 1.0))
+    stress = np.asarray(MICRO.stress(strain))
+    measured = stress + 1e3 * np.random.default_rng(0).standard_normal(time.size)
+
+    def at(place: int, source: str, target: str) -> Switch:
+        return Switch(1, source, target, time[place], strain[place] * HEIGHT, stress[place])
+
+    back = 214  # where the largest held stress has come down to the first snap-back
+    switches = (
+        at(3, "a", "snap-through"), at(50, "snap-through", "held"), at(51, "held", "snap-through"),
+        at(200, "snap-through", "held"), at(back, "held", "snap-back"),
+    )  # fmt: skip
+    values = {name: getattr(MICRO, name) for name in MICROSCALE_NAMES}
+    values |= {"g1": 0.5, "tau1": 0.25}
+    made = {f"s1_{name}": estimate(f"s1_{name}", value) for name, value in values.items()}
+    made["s1_eta"] = result().parameters["s1_eta"]
+    base = result()
+    given: dict[str, Any] = {
+        "measurement": replace(
+            base.measurement, name="shoe foam", time=time, stress=measured,
+            displacement=strain * HEIGHT, striker=None,
+        ),
+        "model": "microscale",
+        "relaxation": 1,
+        "drive": "displacement",
+        "status": "ok",
+        "warnings": (),
+        "chain": Chain(springs=[MICRO], heights=[HEIGHT], area=AREA),
+        "parameters": made,
+        "visited": {"s1": ("a", "snap-through", "held", "snap-back")},
+        "misfit": {"stress_time": 0.006, "displacement_time": None, "stress_strain": 0.006},
+        "curves": Curves(time, measured, strain * HEIGHT, stress, None, stress),
+        "switches": switches,
+    }  # fmt: skip
+    return result(**(given | changed))

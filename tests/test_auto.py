@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from scipy.signal import lfilter
 
 import foamfit as ff
-from conftest import synthetic_impact, synthetic_loop
+from conftest import DATA, needs_data, synthetic_impact, synthetic_loop
 from foamfit import auto, one_model
 from foamfit.cli import main
 from foamfit.data.measurement import Measurement, Outliers, Specimen, Striker
@@ -22,11 +22,17 @@ from foamfit.fitting.branches import branch_of_samples
 from foamfit.fitting.problem import make_problem
 from foamfit.report.page import render_report
 from foamfit.report.summary import summary_text
-from foamfit.trust import evidence
+from foamfit.springs.model import Model
+from foamfit.trust import evidence, prediction
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.residual_tests import find_structure, neighbours_test, runs_test
 
 HEIGHT, AREA = 1.2e-3, 1.9635e-5
+
+
+def groups(*names, relaxation=0):
+    """Models to compare, each a group of its own."""
+    return tuple((Model.parse(name, relaxation),) for name in names)
 
 
 # ---------------------------------------------------------------- runs test
@@ -208,7 +214,7 @@ def test_a_clear_structure_is_found(name):
 
 def test_two_bistable_springs_are_told_from_fewer(monkeypatch):
     """With all starts, which two springs need; for time, without the model of a linear spring."""
-    monkeypatch.setattr(auto, "LADDER", ("bistable", *auto.LADDER[2:]))
+    monkeypatch.setattr(auto, "LADDER", groups("bistable", "bistable+bistable"))
     test = impact([SOFT, STIFF], HALVES, velocity=4.5)
     result = ff.fit(test, model="auto")
     assert result.ladder.chosen.name == "bistable+bistable without damping"
@@ -226,12 +232,176 @@ def test_a_linear_spring_in_series_adds_combinations_and_no_evidence():
     for result in (one, chain):
         problem = make_problem(loop, result.model, result.drive, result.params, None, False)
         both.append(evidence.Tried(result, "none", BestPoint(problem, problem.vector()), 0.0))
-    best, found = evidence.choose(both)
-    assert best == 0
+    decision = evidence.choose(both)
+    found = decision.criteria
+    assert decision.best == 0
+    assert not decision.by_prediction
     varied = [sum(item.vary for item in result.parameters.values()) for result in (one, chain)]
     assert varied == [7, 9]
     assert found[0].rank == 7
     assert found[1].rank < 9
+
+
+# ---------------------------------------------------------------- prediction
+
+
+def choose_of(table, by_prediction, criteria=None):
+    """Decision on a table of (parameters, fitted misfit, predicted misfit)."""
+    scores = [evidence.Score(*row) for row in table]
+    criteria = criteria or [evidence.Criteria(n, 0.0, 0.0) for n, *_ in table]
+    return evidence.decide(scores, criteria, by_prediction)
+
+
+def test_the_model_that_predicts_best_for_its_parameters_is_chosen():
+    """A shoe foam: misfits in percent of the range."""
+    foam = [
+        (7, 2.35, 3.07),  # bistable
+        (7, 1.20, 1.39),  # microscale
+        (9, 2.36, 3.00),  # linear+bistable
+        (9, 1.42, 2.06),  # bistable with relaxation
+        (9, 0.63, 0.88),  # microscale with relaxation
+        (15, 1.05, 1.08),  # bistable+bistable
+        (17, 0.61, 0.80),  # richer: 9 % for eight parameters
+    ]
+    decision = choose_of(foam, by_prediction=True)
+    assert decision.best == 4
+    assert decision.before == (None, 0, 1, 1, 1, 4, 4)
+    assert decision.ruled_out_by == (None, None, 0, 1, None, 4, None)
+    assert choose_of([*foam, (11, 0.5, 0.82)], by_prediction=True).best == 7  # 6.8 % for two
+    assert choose_of([*foam, (11, 0.5, 0.84)], by_prediction=True).best == 4  # 4.5 %
+    assert choose_of([*foam, (9, 0.9, 0.87)], by_prediction=True).best == 7  # as many: the lowest
+
+
+def test_no_model_twice_as_bad_with_no_fewer_parameters_is_chosen():
+    """Whatever the criteria and predictions say, on random tables of numbers."""
+    rng = np.random.default_rng(5)
+    for _ in range(500):
+        table = [
+            (int(rng.integers(7, 20)), *np.exp(rng.normal(0.0, 1.0, 2)))
+            for _ in range(rng.integers(1, 9))
+        ]
+        criteria = [evidence.Criteria(7, *(100.0 * rng.standard_normal(2))) for _ in table]
+        for by_prediction in (True, False):
+            best = choose_of(table, by_prediction, criteria).best
+            varied, misfit, _ = table[best]
+            assert not any(n <= varied and 2.0 * off < misfit for n, off, _ in table)
+
+
+def slow_loop(*, noise=0.003, wave=0.0, seed=0):
+    """A loop in 2 s on a microscale spring that relaxes, known in time; a wave that none follows.
+
+    Noise and wave are shares of the range of stress.
+    """
+    spring = ff.MicroscaleSpring(
+        k0=5.5e5, kc=2.5e5, eps_star=0.08, sigma_plus=1.3e5, spread_plus=0.4, sigma_minus=5.5e4,
+        spread_minus=0.77, relaxation=[(0.5, 0.2)],
+    )  # fmt: skip
+    time = np.linspace(0.0, 2.0, 300)
+    strain = 0.5 * np.interp(time, [0.0, 1.0, 2.0], [0.0, 1.0, 0.02])
+    drive = ff.DisplacementDrive(strain * HEIGHT)
+    stress = ff.simulate(ff.Chain([spring], [HEIGHT], AREA), drive, time).base_stress
+    rng = np.random.default_rng(seed)
+    off = noise * rng.standard_normal(time.size) + wave * np.sin(20.0 * time)
+    return Measurement(
+        name="slow loop",
+        path=None,
+        data_sha256="",
+        time=time,
+        stress=stress + np.ptp(stress) * off,
+        displacement=strain * HEIGHT,
+        specimen=Specimen(HEIGHT, AREA),
+        motion="measured",
+    )
+
+
+def test_held_back_samples_are_predicted_by_a_fit_to_the_others():
+    """From a point beside the best one: the true model predicts curves without noise exactly."""
+    test = slow_loop(noise=0.0)
+    found = one_model.identify(
+        test, "microscale", None, one_model.Options(starts=4, relaxation=1), lambda *_: None
+    )
+    beside = BestPoint(found.problem, found.best().values * 1.02)
+    assert prediction.misfit_of(beside, beside.residual) > 3e-3
+    assert prediction.predicted_misfit(beside) < 3e-4
+
+
+def test_a_microscale_spring_that_relaxes_is_found():
+    result = ff.fit(slow_loop(), model="auto", starts=4)
+    chosen = result.ladder.chosen
+    assert chosen.name == "microscale with relaxation"
+    assert (chosen.relaxation, result.relaxation) == (1, 1)
+    assert not result.ladder.by_prediction
+    assert chosen.why.startswith("its residuals are structureless")
+    assert result.params["s1_g1"].value == pytest.approx(0.5, rel=0.1)
+    assert result.params["s1_tau1"].value == pytest.approx(0.2, rel=0.15)
+    assert chosen.predicted_misfit == pytest.approx(0.003, rel=0.3)
+    assert chosen.gain > 0.5
+
+
+def test_where_no_model_reaches_the_noise_prediction_decides(monkeypatch):
+    monkeypatch.setattr(
+        auto,
+        "LADDER",
+        (*groups("bistable", "microscale"), *groups("microscale", relaxation=1)),
+    )
+    result = ff.fit(slow_loop(wave=0.005), model="auto", starts=4)
+    ladder = result.ladder
+    assert ladder.by_prediction
+    assert ladder.chosen.name == "microscale with relaxation"
+    assert len(ladder.rungs) == 3
+    for rung in ladder.rungs:
+        assert rung.predicted_misfit >= 0.98 * rung.misfit["stress_strain"]
+    content = result.to_json_dict()["ladder"]
+    row = content["rungs"][2]
+    assert (row["model"], row["relaxation"], row["gain_over"]) == ("microscale", 1, "microscale")
+    assert row["gain"] == pytest.approx(
+        1.0 - row["predicted_misfit"] / content["rungs"][1]["predicted_misfit"]
+    )
+    assert f"{100 * row['gain']:.0f} % less than microscale;" in ladder.chosen.why
+    assert any("AICc and BIC do not hold" in sentence for sentence in ladder.sentences)
+    assert any(text.startswith("No model reaches the noise: the res") for text in result.warnings)
+
+
+@pytest.mark.parametrize("given", [None, 0.004])
+def test_without_the_time_for_a_prediction_the_fitted_misfit_stands_in(given):
+    """Of all models, if it is missing of one."""
+    models = [
+        SimpleNamespace(varied=7, misfit=0.02, predicted=0.05),
+        SimpleNamespace(varied=9, misfit=0.003, predicted=given),
+    ]
+    scores = evidence.scores_of(models)
+    assert [one.predicted for one in scores] == ([0.02, 0.003] if given is None else [0.05, 0.004])
+
+
+@needs_data
+def test_a_running_shoe_foam_ends_below_one_percent(tmp_path, monkeypatch):
+    toml = tmp_path / "specimen.toml"
+    toml.write_text('[specimen]\nheight = "10.53 mm"\ndiameter = "7.63 mm"\n')
+    test = ff.read_test(DATA / "shoe-foam" / "turbo-comp-1_cycle1.csv", toml)
+    few = (*groups("bistable", "microscale"), *groups("microscale", relaxation=1))
+    monkeypatch.setattr(auto, "LADDER", few)  # for time
+    result = ff.fit(test, model="auto", starts=4, intervals="local")
+    assert result.misfit["stress_strain"] <= 0.009
+    assert result.ladder.chosen.name == "microscale with relaxation"
+
+
+def test_a_simpler_model_is_carried_into_its_relaxation():
+    """With a share of zero the curves are those of the simpler one."""
+    test = slow_loop()
+    simple = ff.fit(test, model="microscale", starts=2)
+    problem = make_problem(test, "microscale", None, None, None, False, relaxation=1)
+    auto._carry(problem.params, problem.model, simple)
+    assert problem.params["s1_g1"].value == 0.0
+    there = problem.objective.simulate(problem.vector()).curves["stress_strain"]
+    assert there == pytest.approx(simple.curves.stress_along, rel=1e-9)
+
+
+def test_relaxation_belongs_to_one_model(loop_file):
+    with pytest.raises(ff.InputError, match="relaxation = 1 belongs to one model"):
+        ff.fit(synthetic_loop()[1], model="auto", relaxation=1)
+    done = run("fit", loop_file, "--model", "auto", "--relaxation", 2)
+    assert (done.exit_code, done.stdout) == (1, "")
+    assert "relaxation = 2 belongs to one model" in done.stderr
 
 
 # --------------------------------------------------------------- which models
@@ -240,8 +410,8 @@ def test_a_linear_spring_in_series_adds_combinations_and_no_evidence():
 def test_only_models_that_the_test_allows_are_tried(monkeypatch):
     tried = []
 
-    def identify(_, model, *__):
-        tried.append(model)
+    def identify(_, model, __, options, *___):
+        tried.append((model, options.relaxation))
         raise ff.SimulationError("not now")
 
     def models(test):
@@ -249,21 +419,25 @@ def test_only_models_that_the_test_allows_are_tried(monkeypatch):
         tried.clear()
         with pytest.raises(ff.SimulationError) as caught:
             ff.fit(test, model="auto")
-        told = str(caught.value).split("no rung could be tried: ")[1].split("; ")
+        told = str(caught.value).split("no model could be tried: ")[1].split("; ")
         return list(dict.fromkeys(tried)), [why for why in told if not why.endswith("not now")]
 
     monkeypatch.setattr(one_model, "identify", identify)
-    monkeypatch.setattr(auto, "WITHOUT_EVIDENCE", len(auto.LADDER) + 1)
+    all_of_them = [(model.name, model.relaxation) for group in auto.LADDER for model in group]
     _, test = synthetic_impact()
-    assert models(test) == (list(auto.LADDER), [])
+    assert models(test) == (all_of_them, [])
     given = replace(test, specimen=replace(test.specimen, heights=(0.6e-3, 0.59e-3)))
     allowed, skipped = models(given)
-    assert allowed == ["bistable", "linear+bistable", "bistable+bistable"]
+    assert allowed == [one for one in all_of_them if one[0].count("+") < 2]
     assert skipped == ["linear+bistable+bistable: [specimen] heights are those of 2 springs"]
     allowed, skipped = models(replace(test, interior={1: test.displacement * 0.4}))
-    assert allowed == list(auto.LADDER[1:])
-    assert len(skipped) == 1
-    assert "motion was measured" in skipped[0]
+    assert allowed == [one for one in all_of_them if "+" in one[0]]
+    assert len(skipped) == 4
+    assert all("motion was measured" in why for why in skipped)
+    _, loop = synthetic_loop()
+    allowed, skipped = models(replace(loop, time=None))
+    assert allowed == [one for one in all_of_them if one[1] == 0]
+    assert skipped[0] == "bistable with relaxation: relaxation needs a time column"
     with pytest.raises(ff.InputError, match="no model of the ladder"):
         ff.fit(replace(test, interior={5: test.displacement}), model="auto")
 
@@ -305,7 +479,7 @@ def test_outliers_leave_the_ladder_standing():
     at = test.time[left_out]
     spikes = {"stress": Outliers(left_out, at, stress[left_out])}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(auto, "LADDER", auto.LADDER[:1])
+        patch.setattr(auto, "LADDER", groups("bistable"))
         result = ff.fit(replace(test, stress=stress, outliers=spikes), model="auto", starts=4)
     assert any("have a structure" in text for text in result.warnings)
 
@@ -334,7 +508,7 @@ def test_an_interrupted_ladder_keeps_what_is_done(wavy, monkeypatch):
 
     monkeypatch.setattr(auto.one_model, "identify", interrupted)
     result = ff.fit(wavy, model="auto", starts=2)
-    assert [rung.model for rung in result.ladder.rungs] == ["bistable"]
+    assert [rung.name for rung in result.ladder.rungs] == ["bistable"]
     assert (result.stopped, result.ladder.stopped) == ("Ctrl-C", "Ctrl-C")
     assert result.status == "warnings"
     assert "stopped by Ctrl-C" in result.warnings[0]
@@ -355,6 +529,7 @@ def test_the_time_limit_is_shared_over_the_rungs(wavy, monkeypatch):
         return original(measurement, model, params, replace(options, max_time=None), progress)
 
     monkeypatch.setattr(auto.one_model, "identify", watched)
+    monkeypatch.setattr(auto, "predicted_misfit", lambda *_: 0.1)  # it looks at the timer too
     result = ff.fit(wavy, model="auto", starts=2, max_time=2.5)
     assert given == [1.5, 0.5]
     assert len(result.ladder.rungs) == 2
@@ -378,11 +553,11 @@ def test_a_rung_that_cannot_be_simulated_is_left_out(wavy, monkeypatch):
         return original(measurement, model, *rest)
 
     monkeypatch.setattr(auto.one_model, "identify", failing)
-    monkeypatch.setattr(auto, "LADDER", auto.LADDER[:2])
+    monkeypatch.setattr(auto, "LADDER", groups("bistable", "linear+bistable"))
     result = ff.fit(wavy, model="auto", starts=2)
     assert result.ladder.skipped == ("linear+bistable: none could be simulated",)
-    monkeypatch.setattr(auto, "LADDER", auto.LADDER[1:2])
-    with pytest.raises(ff.SimulationError, match="no rung could be tried"):
+    monkeypatch.setattr(auto, "LADDER", groups("linear+bistable"))
+    with pytest.raises(ff.SimulationError, match="no model could be tried"):
         ff.fit(wavy, model="auto", starts=2)
 
 
@@ -393,7 +568,7 @@ def test_a_rung_that_cannot_be_simulated_is_left_out(wavy, monkeypatch):
 def climbed(wavy):
     """Two models, neither of which reaches the noise."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(auto, "LADDER", auto.LADDER[:2])
+        patch.setattr(auto, "LADDER", groups("bistable", "linear+bistable"))
         return ff.fit(wavy, model="auto", starts=4)
 
 
@@ -402,14 +577,14 @@ def test_what_remains_is_said(climbed):
     assert "residuals of stress_strain have a structure of" in warning
     size = float(warning.split("structure of ")[1].split(" %")[0])
     assert size == pytest.approx(5 / np.sqrt(2), rel=0.25)  # what the springs follow of it is less
-    assert climbed.ladder.ended == "the top of the ladder was reached"
+    assert climbed.ladder.ended == "there are no richer ones that this test allows"
 
 
 def test_undetermined_parameters_of_the_chosen_model_are_named(climbed):
     """A loop that never closes leaves branches c and e out of every model."""
     _, test = synthetic_impact(velocity=1.75)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(auto, "LADDER", auto.LADDER[:1])
+        patch.setattr(auto, "LADDER", groups("bistable"))
         result = ff.fit(test, model="auto", starts=4)
     (sentence,) = [text for text in result.ladder.cautions if "does not determine" in text]
     assert "s1_kc" in sentence

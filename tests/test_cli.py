@@ -15,6 +15,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 import fabricated
+import foamfit as ff
 from conftest import EXPERIMENTS
 from foamfit.cli import main
 from foamfit.report.page import STATISTICS
@@ -271,6 +272,60 @@ def test_simulate_own_springs(here: Path) -> None:
     accepted("simulate", scene(here, PUBLISHED + IMPACT))
     accepted("simulate", scene(here, OWN + IMPACT + "samples = 501\n"), "--out", "own.csv")
     assert table(here / "own.csv") == pytest.approx(table(here / "scene.csv"), rel=1e-3, abs=50)
+
+
+MICROSCALE = """\
+[chain]
+diameter = "5 mm"
+[[chain.springs]]
+kind = "microscale"
+height = "1 cm"
+k0 = "550 kPa"
+kc = "250 kPa"
+eps_star = 0.08
+sigma_plus = "130 kPa"
+spread_plus = 0.4
+sigma_minus = "55 kPa"
+spread_minus = 0.77
+relaxation = [{ g = 0.5, tau = "200 ms" }, { g = 0.1, tau = "2 s" }]
+[drive]
+kind = "displacement"
+file = "drive.csv"
+"""
+
+
+def test_simulate_a_microscale_spring_that_relaxes(here: Path) -> None:
+    time, strain = np.linspace(0.0, 1.0, 9), np.array([0, 2, 4, 3, 2, 3, 5, 2, 0]) / 10
+    rows = [f"{t},{1e-2 * eps}" for t, eps in zip(time, strain, strict=True)]
+    (here / "drive.csv").write_text("\n".join(["t,displacement", *rows]) + "\n")
+    accepted("simulate", scene(here, MICROSCALE))
+    spring = ff.MicroscaleSpring(
+        5.5e5, 2.5e5, 0.08, 1.3e5, 0.4, 5.5e4, 0.77, relaxation=[(0.5, 0.2), (0.1, 2.0)]
+    )
+    chain = ff.Chain([spring], [1e-2], np.pi / 4 * 5e-3**2)
+    want = ff.simulate(chain, ff.DisplacementDrive(1e-2 * strain), time).base_stress
+    np.testing.assert_allclose(table(here / "scene.csv")[:, 1], want, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("was", "now", "says"),
+    [
+        ("eps_star = 0.08\n", "", "spring 1: eps_star is missing; give it like eps_star = 0.08"),
+        ("g = 0.1", "g = -0.1", "spring 1: g2 = -0.1 is not admissible"),
+        ('tau = "2 s"', 'tau = "2 m"', "spring 1: relaxation term 2: tau"),
+        ("g = 0.1, ", "", "spring 1: relaxation term 2: g is missing; give it like g = 0.5"),
+        ("{ g = 0.1,", "{ h = 0.1,", "relaxation term 2:"),
+        ("= [{ g = 0.5", "= [1, { g = 0.5", "must be a list of terms like"),
+        ("eps_star = 0.08", "dsigma = 0.08", "dsigma"),
+        ('"microscale"', '"linear"', "kc"),
+    ],
+)
+def test_a_microscale_spring_that_is_wrong_is_refused(
+    here: Path, was: str, now: str, says: str
+) -> None:
+    assert was in MICROSCALE
+    path = scene(here, MICROSCALE.replace(was, now))
+    refused(here, "simulate", path, words=(str(path), says))
 
 
 def test_what_is_simulated_can_be_read(here: Path) -> None:

@@ -21,6 +21,7 @@ SOLVERS: dict[str, dict[str, Any]] = {
     "SciPy Radau": {"color": "#6b6b6b", "marker": "v"},
     "velocity Verlet": {"color": "#E69F00", "marker": "x", "linestyle": "--"},
     "Heun": {"color": "#E69F00", "marker": "x", "linestyle": "--"},
+    "exponential recursion": {"color": "#E69F00", "marker": "x", "linestyle": "--"},
     "Runge-Kutta 4": {"color": "#009E73", "marker": "+", "linestyle": "--"},
     "implicit midpoint": {"color": "#CC79A7", "marker": "1", "linestyle": "--"},
 }

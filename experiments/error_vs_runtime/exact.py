@@ -7,7 +7,8 @@ which v is smooth, by Chebyshev polynomials between all stresses at which a spri
 differential equation is solved. One or two springs with dashpots or a mass between them are left
 to `tests/reference.py`: DOP853 at rtol = 1e-13, stopped at every switch. Both have a law of their
 own, whose points are found by bracketing. Longer chains with masses would take that plain Python
-hours; there it is SciPy's DOP853 of `restarted.py` at rtol = 1e-13.
+hours; there it is SciPy's DOP853 of `restarted.py` at rtol = 1e-13. Springs with memory are left to
+the judge of the stability study.
 """
 
 from __future__ import annotations
@@ -28,6 +29,9 @@ from foamfit.solve.plan import plan
 from foamfit.springs.chain import Drive
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
+sys.path.append(str(Path(__file__).parents[1] / "stability"))
+import independent_memory
+
 import reference
 
 Array = np.ndarray
@@ -198,8 +202,14 @@ def _x_at(piece: Piece, apart: float) -> float:
 def _restarted(chain: ff.Chain, drive: ff.Impact, t: Array) -> tuple[Array, Array]:
     scene = plan(chain, drive, t)
     rows, heights = np.array([s.row for s in chain.springs]), np.array(chain.heights)
-    given = rows, heights, scene.mass, scene.drag, scene.speed, t
-    return restarted.impact(*given, "DOP853", 1e-13, looks=15)
+    system = restarted.System(rows, heights, scene.mass, scene.drag, scene.speed)
+    return restarted.impact(system, t, "DOP853", 1e-13, looks=15)
+
+
+def _by_brute_force(chain: ff.Chain, drive: Drive, t: Array) -> tuple[Array, Array]:
+    truth = independent_memory.follow(chain, drive, t)
+    assert not truth.why
+    return truth.displacement[-1], truth.base_stress
 
 
 def _by_reference(chain: ff.Chain, drive: Drive, t: Array) -> tuple[Array, Array]:
@@ -219,6 +229,8 @@ def reference_of(
 
     The function gives the displacement of the top (m) and the base stress (Pa), (n,) each.
     """
+    if independent_memory.has_memory(chain):
+        return "brute force at 1e-13 (experiments/stability/independent_memory.py)", _by_brute_force
     if not isinstance(drive, ff.Impact):
         return "root finding on the law (tests/reference.py)", _by_reference
     damped = chain.site_damping > 0.0 or any(spring.eta > 0.0 for spring in chain.springs)

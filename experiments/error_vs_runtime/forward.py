@@ -130,6 +130,9 @@ def compile_all() -> None:
         "one_spring_impact",
         "two_springs_impact",
         "10_springs_mass_impact",
+        "microscale_impact",
+        "microscale_relaxation_displacement",
+        "linear_microscale_relaxation_impact",
     )
     for scene in kinds.scenes():
         if scene.name in wanted:

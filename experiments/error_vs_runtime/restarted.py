@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numba import njit
@@ -256,6 +256,7 @@ class System:
         assert self.series or self.mass.size == self.heights.size
         self.branches = np.array([at_rest(row) for row in self.rows])
         self.pressed = False
+        self.unit = self.rows[0, K0]
         n = self.mass.size
         if self.series:
             assert not self.rows[:, ETA].any()
@@ -273,6 +274,10 @@ class System:
         """What the compiled functions want to know besides the state."""
         return self.rows, self.branches, self.heights, self.mass, self.drag
 
+    def enter(self, who: int, side: int) -> None:
+        """Change the branch of a spring that has come to an end of it."""
+        self.branches[who] = entered(self.branches[who], side > 0)
+
     def room(self) -> Callable[[np.ndarray], tuple[int, float, int, int]]:
         """Return the function that looks for the first of some states (size, n) past a switch.
 
@@ -289,26 +294,33 @@ class System:
         self.output(states, self.rows, self.branches, self.heights, out_w, out_s)
 
 
+class Impact(Protocol):
+    """What `impact` wants of a system: `System`, or that of springs with memory."""
+
+    y: np.ndarray
+    scale: np.ndarray
+    unit: float
+    pressed: bool
+    rate: Callable[..., np.ndarray]
+    slope: Callable[..., np.ndarray]
+
+    still: Callable[[], tuple[Any, ...]]
+    enter: Callable[[int, int], None]
+    room: Callable[[], Callable[[np.ndarray], tuple[int, float, int, int]]]
+    write: Callable[[np.ndarray, np.ndarray, np.ndarray], None]
+
+
 def impact(
-    rows: np.ndarray,
-    heights: np.ndarray,
-    mass: np.ndarray,
-    drag: float,
-    speed: float,
-    t: np.ndarray,
-    method: str,
-    rtol: float,
-    looks: int = 0,
+    system: Impact, t: np.ndarray, method: str, rtol: float, looks: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Displacement of the striker and base stress, (n,) each, of an impact at the samples t.
 
     A switch is looked for at the samples, at the ends of steps, and at `looks` points inside them:
     where masses ring, a spring may leave its branch and come back within a step.
     """
-    system = System(rows, heights, mass, drag, speed)
     out_w, out_s = np.zeros(t.size), np.zeros(t.size)
     now, done = float(t[0]), 0
-    for _ in range(1000 + 20 * heights.size):
+    for _ in range(1000 + 20 * system.y.size):
         with np.errstate(all="ignore"):  # a stage past a pole: the step is rejected
             now, done, who, side = _phase(system, now, t, done, method, rtol, looks, out_w, out_s)
         if who is None:
@@ -318,13 +330,12 @@ def impact(
             system.write(system.y[:, None], last_w, last_s)
             out_w[done:] = last_w[0] + system.y[-1] * (t[done:] - now)
             return out_w, out_s
-        branch = system.branches[who]
-        system.branches[who] = entered(branch, side > 0)
+        system.enter(who, side)
     raise RuntimeError(f"{method}: too many switches at rtol = {rtol:g}")
 
 
 def _phase(
-    system: System,
+    system: Impact,
     now: float,
     t: np.ndarray,
     done: int,
@@ -378,7 +389,7 @@ def _phase(
         if last > done:
             system.write(states[:, :-1], out_w[done:last], out_s[done:last])
             done = last
-            system.pressed = system.pressed or out_s[last - 1] > 10.0 * rtol * system.rows[0, K0]
+            system.pressed = system.pressed or out_s[last - 1] > 10.0 * rtol * system.unit
             room = system.room()
     return now, done, None, 0
 

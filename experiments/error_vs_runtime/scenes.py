@@ -9,6 +9,7 @@ import exact
 import fixed_step
 import numpy as np
 import restarted
+import restarted_memory
 
 import foamfit as ff
 from foamfit.solve.plan import Plan, plan
@@ -132,6 +133,37 @@ def scenes() -> list[Scene]:
             substeps=(1, 4, 16), longest=4.0,
             looks=4,
         ),
+        *_with_memory(),
+    ]  # fmt: skip
+
+
+def _with_memory() -> list[Scene]:
+    """A microscale spring like shoe foam; two of three scenes have a relaxation term."""
+    law = (5.5e5, 2.5e5, 0.08, 1.3e5, 0.4, 5.5e4, 0.77)
+    height, area = 25e-3, 1.6e-3
+    plain = ff.MicroscaleSpring(*law)
+    slow = ff.MicroscaleSpring(*law, relaxation=[(0.5, 0.2)])
+    quick = ff.MicroscaleSpring(*law, relaxation=[(0.5, 0.01)])
+    struck = np.linspace(0.0, 0.08, SAMPLES)
+    pressed = np.linspace(0.0, 2.0, 1280)
+    motion = 0.6 * height * np.sin(np.pi * pressed) ** 2 * np.where(pressed < 1.0, 1.0, 0.8)
+    base = ff.LinearSpring(5e6)
+    return [
+        Scene(
+            "microscale_impact", "one microscale spring, impact at 1.5 m/s",
+            ff.Chain([plain], [height], area), ff.Impact(2.0, 1.5), struck,
+        ),
+        Scene(
+            "microscale_relaxation_displacement",
+            "one microscale spring with a relaxation term, displacement drive of two cycles",
+            ff.Chain([slow], [height], area), ff.DisplacementDrive(motion), pressed,
+        ),
+        Scene(
+            "linear_microscale_relaxation_impact",
+            "a microscale spring with a relaxation term on a linear one, impact at 1.5 m/s",
+            ff.Chain([base, quick], [0.2 * height, 0.8 * height], area), ff.Impact(2.0, 1.5),
+            struck,
+        ),
     ]  # fmt: skip
 
 
@@ -147,8 +179,7 @@ class Competitor:
 def own(scene: Scene) -> dict[str, list[Competitor]]:
     """The project's solver: `simulate`, and the bare `Plan.run` that the fit calls."""
     made = plan(scene.chain, scene.drive, scene.time)
-    rows = np.array([spring.row for spring in scene.chain.springs])
-    heights = np.array(scene.chain.heights)
+    rows, heights = scene.chain.arrays.rows, scene.chain.arrays.heights
 
     def public(rtol: float) -> Answer:
         response = ff.simulate(scene.chain, scene.drive, scene.time, rtol)
@@ -173,6 +204,8 @@ def own(scene: Scene) -> dict[str, list[Competitor]]:
 
 def others(scene: Scene) -> dict[str, list[Competitor]]:
     """The fixed-step schemes and SciPy's integrators."""
+    if isinstance(scene.chain.springs[-1], ff.MicroscaleSpring):
+        return _memory(scene)
     rows = np.array([spring.row for spring in scene.chain.springs])
     heights = np.array(scene.chain.heights)
     made = plan(scene.chain, scene.drive, scene.time)
@@ -191,11 +224,11 @@ def _impact(scene: Scene, made: Plan, rows: Array, heights: Array) -> dict[str, 
         return out
 
     def outside(method: str, rtol: float) -> Answer:
-        given = rows, heights, made.mass, made.drag, made.speed, t
-        return restarted.impact(*given, method, rtol, scene.looks)
+        system = restarted.System(rows, heights, made.mass, made.drag, made.speed)
+        return restarted.impact(system, t, method, rtol, scene.looks)
 
     schemes = (fixed_step.VERLET, fixed_step.RK4, fixed_step.MIDPOINT)
-    return _ladders(scene, schemes, fixed, outside)
+    return _ladders(scene, [(fixed_step.NAMES[s], s) for s in schemes], fixed, outside)
 
 
 def _quasi_static(scene: Scene, row: Array, height: float) -> dict[str, list[Competitor]]:
@@ -216,19 +249,49 @@ def _quasi_static(scene: Scene, row: Array, height: float) -> dict[str, list[Com
         return answer(restarted.quasi_static(row, driven, by_stress, method, rtol))
 
     schemes = (fixed_step.HEUN, fixed_step.RK4, fixed_step.MIDPOINT)
-    return _ladders(scene, schemes, fixed, outside)
+    return _ladders(scene, [(fixed_step.NAMES[s], s) for s in schemes], fixed, outside)
+
+
+def _memory(scene: Scene) -> dict[str, list[Competitor]]:
+    """One microscale spring, alone or on a linear one: impact, or along a displacement."""
+    t, drive = scene.time, scene.drive
+    if isinstance(drive, ff.Impact):
+        row = restarted_memory.row_of(scene.chain, drive.mass)
+
+        def fixed(scheme: int, substeps: int) -> Answer:
+            out = np.zeros(t.size), np.zeros(t.size)
+            restarted_memory.runge_kutta(row, drive.velocity, t, substeps, *out)
+            return out
+
+        def outside(method: str, rtol: float) -> Answer:
+            system = restarted_memory.MemorySystem(row, drive.velocity)
+            return restarted.impact(system, t, method, rtol, scene.looks)
+
+        return _ladders(scene, [("Runge-Kutta 4", 0)], fixed, outside)
+    assert isinstance(drive, ff.DisplacementDrive)
+    row, motion = restarted_memory.row_of(scene.chain), np.array(drive.displacement)
+    eps = motion / scene.chain.height
+
+    def by_hand(scheme: int, substeps: int) -> Answer:
+        out = np.zeros(t.size)
+        restarted_memory.recursion(row, t, eps, substeps, out)
+        return motion, out
+
+    def integrated(method: str, rtol: float) -> Answer:
+        return motion, restarted_memory.along_displacement(row, t, eps, method, rtol)
+
+    return _ladders(scene, [("exponential recursion", 0)], by_hand, integrated)
 
 
 def _ladders(
     scene: Scene,
-    schemes: tuple[int, ...],
+    schemes: Sequence[tuple[str, int]],
     fixed: Callable[[int, int], Answer],
     outside: Callable[[str, float], Answer],
 ) -> dict[str, list[Competitor]]:
     intervals = scene.time.size - 1
     out = {}
-    for scheme in schemes:
-        family = fixed_step.NAMES[scheme]
+    for family, scheme in schemes:
         out[family] = [
             Competitor(family, f"{n * intervals} steps", lambda s=scheme, n=n: fixed(s, n))
             for n in scene.substeps

@@ -1,13 +1,19 @@
 """Fresh scenes, each answered by the solver and by a judge that shares nothing with it.
 
-Five families, drawn at random from a seed (every scene is synthetic):
+Nine families, drawn at random from a seed (every scene is synthetic):
 
 - study: the ranges of scenes.py, another seed;
 - base: impacts on a chain whose base spring has a dashpot, with a mass above it; windows from 1e-7
   s on, shorter than the contact or longer;
 - gap: unilateral springs that open, with derivatives by parameters;
 - turns: displacement and stress histories that turn round at random places;
-- long: chains of 3 to 10 springs with masses inside and few or no dashpots.
+- long: chains of 3 to 10 springs with masses inside and few or no dashpots;
+- microscale: one to three microscale springs, in all three drives, with spreads from 1e-3 to 2;
+- relaxation: one to three bistable springs with one to three relaxation terms each;
+- microscale+relaxation: both;
+- mixed: two to five springs of all kinds, with and without relaxation, dashpots and masses.
+
+A tenth of the last four ask for derivatives.
 
 One command runs them and writes a line per scene and rtol; another shows one scene:
 
@@ -22,6 +28,7 @@ PYTHONPATH=that/checkout/src.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import math
 import sys
@@ -42,6 +49,8 @@ from numpy.typing import NDArray
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
 
+import independent_memory  # noqa: E402
+from energy import rebound_of  # noqa: E402
 from independent import LOOSE, Truth, follow, judge, over_range  # noqa: E402
 from scenes import Point, designed, scene_of  # noqa: E402
 
@@ -54,7 +63,8 @@ Spec = dict[str, Any]
 SEED = 2027
 RTOLS = (1e-4, 1e-6, 1e-8)
 MOST = {"study": 4_000_000, "base": 10_000_000, "gap": 4_000_000, "turns": 4_000_000,
-        "long": 20_000_000}  # fmt: skip
+        "long": 20_000_000, "microscale": 4_000_000, "relaxation": 4_000_000,
+        "microscale+relaxation": 4_000_000, "mixed": 4_000_000}  # fmt: skip
 BAD, POOR = 3.0, 1.0  # error over rtol
 SLOPE_BAR = 1e-3  # error of a derivative over its range, at an rtol of up to 1e-5
 
@@ -89,6 +99,7 @@ def foam(rng: Generator, k0: float, eta: float = 0.0) -> Spec:
     near = {
         key: value * rng.uniform(0.93, 1.07) * (1.0 if key.startswith("eps") else k0 / item.k0)
         for key, value in asdict(item).items()
+        if key != "relaxation"
     }
     sigma_a = near["k0"] * near["eps_a"] / (1.0 - near["eps_a"])
     near["dsigma"] = item.dsigma / item.sigma_a * sigma_a * rng.uniform(0.93, 1.07)
@@ -286,10 +297,143 @@ def long(rng: Generator, number: int) -> Spec:
     return spec | {"samples": 151}
 
 
+# ------------------------------------------------------------------------- springs with memory
+
+MICROSCALE = ("k0", "kc", "eps_star", "sigma_plus", "spread_plus", "sigma_minus", "spread_minus")
+
+
+def microscale(rng: Generator, k0: float) -> Spec:
+    """Draw a microscale spring of a first slope: narrow and wide spreads, loops and none."""
+    kc = k0 * log(rng, 0.05, 100.0)
+    least = max(0.0, (math.sqrt(kc) - math.sqrt(k0)) / (math.sqrt(kc) + math.sqrt(k0)))
+    wide = [log(rng, 1e-3, 2.0) if rng.random() < 0.3 else log(rng, 0.05, 1.0) for _ in range(2)]
+    if rng.random() < 0.15:
+        wide[1] = wide[0]
+    sigma_plus = k0 * log(rng, 0.02, 2.0)
+    return {
+        "k0": k0,
+        "kc": kc,
+        "eps_star": least * (1.0 + 1e-12) + (0.0 if rng.random() < 0.1 else rng.uniform(0.0, 0.6)),
+        "sigma_plus": sigma_plus,
+        "spread_plus": wide[0],
+        "sigma_minus": sigma_plus * log(rng, 0.02, 1.5),
+        "spread_minus": wide[1],
+    }
+
+
+def terms(rng: Generator, stop: float) -> list[list[float]]:
+    """Draw one to three relaxation terms; one in ten has no strength."""
+    return [
+        [0.0 if rng.random() < 0.1 else log(rng, 1e-3, 5.0), stop * log(rng, 1e-4, 1e3)]
+        for _ in range(int(rng.integers(1, 4)))
+    ]
+
+
+def room(spring: Spec) -> float:
+    """Strain up to which a spring can be compressed at all, or 1."""
+    return 1.0 + spring.get("eps_star", 0.0)
+
+
+def remembering(rng: Generator, number: int, springs: list[Spec], relaxing: list[bool]) -> Spec:
+    """Put springs with memory into a chain, and load it by impact, stress or displacement."""
+    k0, count = min(s["k0"] for s in springs), len(springs)
+    inertia = count > 1 and rng.random() < 0.3
+    masses = [log(rng, 1e-6, 5e-3) if inertia else 0.0 for _ in range(count - 1)] + [0.0]
+    spec = chain_of(rng, springs, log(rng, 3e-4, 2e-2), masses)
+    drive = ("impact", "stress", "displacement")[number % 3]
+    stop = log(rng, 1e-4, 10.0)
+    if drive == "stress" and rng.random() < 0.3:
+        masses[-1] = log(rng, 1e-6, 5e-2)
+    if drive == "impact":
+        struck(rng, spec, 0.02, 10.0)
+        stop = bounce(spec, spec["impact"][0]) * log(rng, 0.3, 4.0)
+    elif max(masses) > 0.0:
+        stop = bounce(spec, max(masses)) * log(rng, 1.0, 100.0)
+    if drive != "impact":
+        kind = rng.random()
+        most = sum(h * room(s) for s, h in zip(springs, spec["heights"], strict=True))
+        if kind < 0.15:
+            top = log(rng, 1e-3, 0.1)  # hardly anything snaps
+        elif kind < 0.25 and drive == "displacement":
+            top = 1.0 - log(rng, 1e-3, 0.1)  # near the pole
+        else:
+            top = rng.uniform(0.2, 0.75)
+        at, levels = path(rng, top, int(rng.integers(1, 10)))
+        scale = most if drive == "displacement" else k0 * log(rng, 0.3, 10.0)
+        floor = -math.inf if drive == "displacement" and rng.random() < 0.5 else 0.0
+        spec[drive] = [at, [scale * max(level, floor) for level in levels]]
+    if rng.random() < 0.4:
+        for spring in springs:
+            if rng.random() < 0.7:
+                spring["eta"] = spring["k0"] * stop * log(rng, 1e-5, 10.0)
+    if rng.random() < 0.2:
+        spec["site"] = k0 * stop * log(rng, 1e-4, 1.0)
+    for spring, relaxes in zip(springs, relaxing, strict=True):
+        if relaxes:
+            spring["relaxation"] = terms(rng, stop)
+    if number % 10 < 3 and number // 10 % 3 == number % 10:  # a tenth, of every drive
+        names = []
+        for i, spring in enumerate(springs, start=1):
+            own = ["k0", "height"]
+            if "sigma_plus" in spring:
+                own += MICROSCALE
+            elif "kc" in spring:
+                own += ["kc", "eps_a", "eps_c", "kh_plus", "kh_minus"]
+            names.append(f"s{i}_{rng.choice(own)}")
+            for k, (g, _) in enumerate(spring.get("relaxation", []), start=1):
+                if g > 0.0:
+                    names += [f"s{i}_g{k}", f"s{i}_tau{k}"]
+        spec["sensitivities"] = list(dict.fromkeys(names))
+    return spec | {"stop": stop, "samples": int(rng.choice([21, 101, 501]))}
+
+
+def only_microscale(rng: Generator, number: int) -> Spec:
+    k0 = log(rng, 1e5, 3e7)
+    count = int(rng.choice([1, 1, 2, 3]))
+    springs = [microscale(rng, k0 * log(rng, 0.5, 2.0)) for _ in range(count)]
+    return remembering(rng, number, springs, [False] * count)
+
+
+def only_relaxation(rng: Generator, number: int) -> Spec:
+    k0 = log(rng, 1e5, 3e7)
+    count = int(rng.choice([1, 1, 2, 3]))
+    draw = foam if rng.random() < 0.5 else bistable
+    springs = [draw(rng, k0 * log(rng, 0.5, 2.0)) for _ in range(count)]
+    return remembering(rng, number, springs, [True] * count)
+
+
+def relaxing_microscale(rng: Generator, number: int) -> Spec:
+    k0 = log(rng, 1e5, 3e7)
+    count = int(rng.choice([1, 1, 2, 3]))
+    springs = [microscale(rng, k0 * log(rng, 0.5, 2.0)) for _ in range(count)]
+    return remembering(rng, number, springs, [True] * count)
+
+
+def mixed(rng: Generator, number: int) -> Spec:
+    """Springs of all kinds; at least one has memory."""
+    k0 = log(rng, 1e5, 3e7)
+    count = int(rng.integers(2, 6))
+    at = int(rng.integers(count))
+    springs, relaxing = [], []
+    for i in range(count):
+        kind, relaxes = rng.random(), bool(rng.random() < 0.5)
+        if i == at or kind < 0.4:
+            springs.append(microscale(rng, k0 * log(rng, 0.5, 2.0)))
+        elif kind < 0.7:
+            springs.append(bistable(rng, k0 * log(rng, 0.5, 2.0)))
+        else:
+            springs.append(linear(rng, k0, unilateral=bool(rng.random() < 0.2)))
+            relaxes = False
+        relaxing.append(relaxes)
+    return remembering(rng, number, springs, relaxing)
+
+
 DRAWN: dict[str, Callable[[Generator, int], Spec]] = {
-    "base": base, "gap": gap, "turns": turns, "long": long,
+    "base": base, "gap": gap, "turns": turns, "long": long, "microscale": only_microscale,
+    "relaxation": only_relaxation, "microscale+relaxation": relaxing_microscale, "mixed": mixed,
 }  # fmt: skip
 FAMILIES = ("study", *DRAWN)
+MEMORY = FAMILIES[5:]
 
 
 def spec_of(family: str, number: int) -> Spec:
@@ -305,8 +449,10 @@ def scene_from(spec: Spec) -> Scene:
     if "point" in spec:
         return scene_of(Point(**spec["point"]))
     springs = [
-        ff.BistableSpring(**s) if "kc" in s else ff.LinearSpring(**s) for s in spec["springs"]
-    ]
+        (ff.MicroscaleSpring if "sigma_plus" in s else
+         ff.BistableSpring if "kc" in s else ff.LinearSpring)(**s)
+        for s in spec["springs"]
+    ]  # fmt: skip
     chain = ff.Chain(springs, spec["heights"], spec["area"], spec["masses"], spec["site"])
     grid = np.linspace(0.0, spec["stop"], spec["samples"])
     if "impact" in spec:
@@ -315,6 +461,11 @@ def scene_from(spec: Spec) -> Scene:
     at, levels = np.array(spec[drive][0]), np.array(spec[drive][1])
     values = np.interp(grid, spec["stop"] * (at - at[0]) / (at[-1] - at[0]), levels)
     return chain, (ff.StressDrive if drive == "stress" else ff.DisplacementDrive)(values), grid
+
+
+def follower(scene: Scene) -> Callable[[Any, Any, Array, float, int], Truth]:
+    """Choose the program that judges a scene."""
+    return independent_memory.follow if independent_memory.has_memory(scene[0]) else follow
 
 
 # ------------------------------------------------------------------------------- the derivatives
@@ -327,6 +478,8 @@ def moved(spec: Spec, name: str, factor: float) -> tuple[Spec, float]:
     i = int(prefix[1:]) - 1
     place = other["heights"] if short == "height" else other["springs"][i]
     key: Any = i if short == "height" else short
+    if short[:-1] in ("g", "tau"):
+        place, key = place["relaxation"][int(short[-1]) - 1], int(short.startswith("tau"))
     value = float(place[key])
     place[key] = value * factor
     return other, value
@@ -349,7 +502,11 @@ def slopes_of(spec: Spec, name: str, most: int) -> tuple[Array, Array, NDArray[n
         sides = []
         for sign in (1.0, -1.0):
             other, value = moved(spec, name, 1.0 + sign * step)
-            truth = follow(*scene_from(other), LOOSE, most)
+            try:
+                scene = scene_from(other)
+            except ValueError:  # the scene is at the end of what is admissible
+                return None
+            truth = follower(scene)(*scene, LOOSE, most)
             if truth.why:
                 return None
             sides.append(np.vstack((truth.base_stress, truth.displacement)))
@@ -403,6 +560,7 @@ REASONS = {
     "not finite": "no longer finite",
     "flat branch under stress": "flat branch",
     "bound on steps": "the bound of",
+    "too fast for explicit steps": "are followed by explicit steps",
 }
 
 
@@ -414,7 +572,7 @@ def lines_of(
     spec, most = spec_of(family, number), most or MOST[family]
     scene = scene_from(spec)
     began = time.perf_counter()
-    truth = judge(*scene, most)
+    truth = judge(*scene, most, follower(scene))
     took = time.perf_counter() - began
     known: dict[str, Any] = {}
     lines = [
@@ -440,7 +598,7 @@ def judged(
         "dip": truth.dip, "judge_steps": truth.steps, "switches": truth.switches,
         "true_end": truth.contact_end, "outcome": "answer", "reason": "", "method": "",
         "displacement": math.nan, "base_stress": math.nan, "error": math.nan, "end": math.nan,
-        "slope": math.nan, "seconds": math.nan, "steps": 0,
+        "slope": math.nan, "energy": math.nan, "seconds": math.nan, "steps": 0,
     }  # fmt: skip
     began = time.perf_counter()
     try:
@@ -450,8 +608,13 @@ def judged(
         found["reason"] = next((k for k, part in REASONS.items() if part in str(refusal)), "other")
         found["outcome"] = "refused"
         return found
+    except Exception as wrong:  # a run of hundreds of scenes tells of it and goes on
+        return found | {"outcome": "failure", "reason": f"{type(wrong).__name__}: {wrong}"[:200]}
     found["seconds"] = time.perf_counter() - began
     found |= {"method": answer.method, "steps": answer.steps}
+    bounced = rebound_of(*scene[:2])
+    if bounced is not None and answer.contact_end is not None:
+        found["energy"] = energy_error(scene, answer, bounced) / rtol
     if not sure:
         return found
     found["displacement"] = over_range(answer.displacement, truth.displacement) / rtol
@@ -465,12 +628,25 @@ def judged(
     try:
         found["slope"] = slope_error(spec, scene, rtol, most, known)
     except ff.SimulationError:
-        found["slope"] = math.nan
-    if found["error"] > BAD or not math.isfinite(found["error"]):
+        found["reason"] = "derivatives refused"
+    if max(found["error"], np.nan_to_num(found["energy"])) > BAD or not math.isfinite(
+        found["error"]
+    ):
         found["outcome"] = "failure"
     elif found["slope"] > slope_bar(rtol):
         found["outcome"] = "wrong derivative"
     return found
+
+
+def energy_error(scene: Scene, answer: ff.Response, bounced: tuple[float, float, float]) -> float:
+    """Hold the end of contact, and the speed of the flight after it, against those by energy."""
+    end, speed, _ = bounced
+    worst = abs(answer.contact_end / end - 1.0)  # type: ignore[operator]
+    after = np.flatnonzero(scene[2] > answer.contact_end)
+    if after.size > 1:
+        flown = np.diff(answer.displacement[-1, after[[0, -1]]]) / np.diff(scene[2][after[[0, -1]]])
+        worst = max(worst, abs(-float(flown[0]) - speed) / scene[1].velocity)  # type: ignore[union-attr]
+    return float(worst)
 
 
 def summary(lines: pd.DataFrame) -> pd.DataFrame:
@@ -490,7 +666,9 @@ def summary(lines: pd.DataFrame) -> pd.DataFrame:
                 "over 1 rtol": int((known.error > POOR).sum()),
                 "over 3 rtol": int((known.error > BAD).sum()),
                 "largest": known.error.max(),
+                "largest energy": known.energy.max(),
                 "derivatives": int(known.slope.notna().sum()),
+                "refused derivatives": int((known.reason == "derivatives refused").sum()),
                 "wrong derivatives": int((known.slope > slope_bar(rtol)).sum()),
                 "longest s": group.seconds.max(),
             }
@@ -514,13 +692,22 @@ def run(
         yield from pool.map(lines_of, tasks, chunksize=4)
 
 
+def compile_all(families: tuple[str, ...]) -> None:
+    """Take a few scenes of each family, so that none of those that are timed compiles."""
+    for family in families:
+        for number in range(6):
+            scene = scene_from(spec_of(family, number))
+            with contextlib.suppress(ff.SimulationError):
+                ff.simulate(*scene)
+
+
 def show(name: str, rtol: float) -> None:
     """Print solver and judge side by side for one scene."""
     family, _, number = name.partition(":")
     spec = spec_of(family, int(number))
     scene = scene_from(spec)
     print(json.dumps(spec, indent=1))
-    truth = judge(*scene, MOST[family])
+    truth = judge(*scene, MOST[family], follower(scene))
     found = judged(spec, scene, truth, rtol, MOST[family], {})
     for key, value in found.items():
         print(f"{key:>14}  {value}")
@@ -563,6 +750,7 @@ def main() -> None:
     else:
         numbers = range(given.first, given.first + given.scenes)
         tasks = [(f, n, rtols) for f in given.family or FAMILIES for n in numbers]
+    compile_all(tuple(dict.fromkeys(family for family, *_ in tasks)))
     lines: list[dict[str, Any]] = []
     for found in run(tasks, given.processes):
         lines += found

@@ -20,6 +20,7 @@ Stiff scenes take many steps: past a bound there is no judgement.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -789,12 +790,18 @@ def follow(chain: Any, drive: Any, time: Array, tol: float = TIGHT, most: int = 
     )
 
 
-def judge(chain: Any, drive: Any, time: Array, most: int = MOST_WORK) -> Truth:
+def judge(
+    chain: Any,
+    drive: Any,
+    time: Array,
+    most: int = MOST_WORK,
+    by: Callable[[Any, Any, Array, float, int], Truth] = follow,
+) -> Truth:
     """Follow a scene at two tolerances; their difference is the uncertainty of the judgement."""
-    tight = follow(chain, drive, time, TIGHT, most)
+    tight = by(chain, drive, time, TIGHT, most)
     if tight.why:
         return tight
-    loose = follow(chain, drive, time, LOOSE, most)
+    loose = by(chain, drive, time, LOOSE, most)
     if loose.why:
         return loose
     unsure = max(

@@ -292,6 +292,47 @@ def fresh_table(lines: pd.DataFrame) -> str:
     return "\n".join([head, *body])
 
 
+def memory_table(lines: pd.DataFrame) -> str:
+    """Count the fresh scenes of springs with memory per family and rtol."""
+    head = "| family | rtol | scenes | judged | answers | refused | refused, beyond the judge | "
+    head += "over 1 rtol | over 3 rtol | largest error / rtol | by energy: impacts, largest / rtol "
+    head += "| derivatives judged | refused | wrong, largest | longest s |\n" + "| --- " * 15 + "|"
+    body, last = [], ""
+    lines = lines[lines.family.isin(fresh.MEMORY)]
+    for _, row in fresh.summary(lines).iterrows():
+        own = lines[(lines.family == row.family) & (lines.rtol == row.rtol)]
+        beyond = int(((own.outcome == "refused") & (own.judge != "judged")).sum())
+        family = row.family if row.family != last else ""
+        last = row.family
+        refused = f"{row.refused} ({row.reasons})" if row.refused else "0"
+        body.append(
+            f"| {family} | {row.rtol:g} | {row.scenes} | {row.judged} | {row.answers} | {refused} "
+            f"| {beyond} | {row['over 1 rtol']} | {row['over 3 rtol']} | "
+            f"{_number(row.largest, '.2g')} | {own.energy.notna().sum()}, "
+            f"{_number(row['largest energy'], '.1g')} | {row.derivatives} | "
+            f"{row['refused derivatives']} | {row['wrong derivatives']}, "
+            f"{_number(own.slope.max())} | {row['longest s']:.2g} |"
+        )
+    return "\n".join([head, *body])
+
+
+def memory_wrong(lines: pd.DataFrame) -> str:
+    """Name the fresh scenes of springs with memory that are wrong, or refused though judged."""
+    known = lines[lines.family.isin(fresh.MEMORY) & (lines.judge == "judged")]
+    groups = {
+        f"over {fresh.BAD:g} rtol at one rtol at least": known[known.outcome == "failure"],
+        "with a wrong derivative": known[known.outcome == "wrong derivative"],
+        "refused at one rtol at least": known[known.outcome == "refused"],
+        "derivatives refused at one rtol at least": known[known.reason == "derivatives refused"],
+    }
+    named = [
+        f"- {what} ({group.scene.nunique()}): {', '.join(group.scene.unique())}"
+        for what, group in groups.items()
+        if len(group)
+    ]
+    return "\n".join(named) or "None is wrong, and none that is judged is refused."
+
+
 def page(lines: pd.DataFrame, rows: pd.DataFrame, drawn: pd.DataFrame) -> str:
     """Write the README of the study."""
     answers = lines[lines.outcome == "answer"]
@@ -324,7 +365,9 @@ def page(lines: pd.DataFrame, rows: pd.DataFrame, drawn: pd.DataFrame) -> str:
         other=int(answers["other method"].notna().sum()),
         independent=int(answers.independent.notna().sum()),
         largest_independent=_number(answers.independent.max()),
-        fresh=fresh_table(drawn),
+        fresh=fresh_table(drawn[~drawn.family.isin(fresh.MEMORY)]),
+        memory=memory_table(drawn),
+        memory_wrong=memory_wrong(drawn),
         fresh_scenes=f"{drawn.scene.nunique():,}",
         fresh_judged=f"{drawn[drawn.judge == 'judged'].scene.nunique():,}",
         fresh_seed=fresh.SEED,

@@ -39,8 +39,8 @@ def fit(
     measurement : Measurement
         The test; see `foamfit.read_test`.
     model : str
-        Springs from the base up, joined by "+"; "auto" takes the simplest that holds, see
-        `foamfit.auto.compare_models`.
+        Springs from the base up, joined by "+"; "auto" compares models and takes the simplest
+        that holds, see `foamfit.auto.compare_models`.
     params : lmfit.Parameters, optional
         Values, bounds, fixed values and expressions; see `make_params`.
     progress : callable, optional
@@ -65,7 +65,8 @@ def fit(
         Whether the time by which the motion channel is late against the force is fitted too, as
         the parameter time_shift (s).
     relaxation : int
-        Relaxation terms of every bistable and microscale spring: s1_g1, s1_tau1, …
+        Relaxation terms of every bistable and microscale spring: s1_g1, s1_tau1, …; model="auto"
+        tries one term by itself and refuses this.
     loss : str
         "linear" (least squares), or one that gives way to large residuals: "soft_l1", "huber",
         "cauchy"; see `fitting.objective.soften`.
@@ -100,6 +101,11 @@ def fit(
     if model == "auto":
         if params is not None:
             raise InputError("params belong to one model; name it instead of 'auto'")
+        if chosen.relaxation:
+            raise InputError(
+                f"relaxation = {chosen.relaxation} belongs to one model; name it instead of "
+                "'auto', which tries relaxation by itself"
+            )
         from foamfit.auto import compare_models
 
         found = compare_models(measurement, chosen, progress, tell)

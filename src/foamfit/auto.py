@@ -1,14 +1,16 @@
 """The simplest model that follows the curves, and the evidence for each that was tried.
 
-A ladder of models is fitted from the simplest up, each without damping and then with it, and
-compared by AICc and BIC with the effective numbers of samples and of parameters. It ends where the
-residuals are structureless, or where two models in a row bring no evidence.
+Models are fitted from the simplest up, each without damping and then with it. They are compared by
+AICc and BIC with the effective numbers of samples and of parameters where one of them comes to the
+noise, else by how well they predict what they were not fitted to (`trust.evidence`). The comparison
+ends where the residuals are structureless, or where two groups of models in a row bring no gain.
 """
 
 from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -18,22 +20,49 @@ import numpy as np
 from foamfit import one_model
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError
+from foamfit.fitting.box import is_share
 from foamfit.fitting.curves import choose_drive
 from foamfit.fitting.problem import make_params
+from foamfit.fitting.search import SearchStoppedError
 from foamfit.one_model import Found, Options, Progress
 from foamfit.results import Fit, Ladder, Rung, rung_name
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import split_name
 from foamfit.text import counted, percent
-from foamfit.trust.evidence import MARGIN, Criteria, Tried, choose, effective_samples, reference_of
+from foamfit.trust.best_point import BestPoint
+from foamfit.trust.evidence import (
+    MARGIN,
+    SHARE,
+    WORSE,
+    Decision,
+    Tried,
+    choose,
+    effective_samples,
+    reference_of,
+)
 from foamfit.trust.intervals import Announce, Choice
+from foamfit.trust.prediction import BLOCKS, predicted_misfit
 from foamfit.trust.residual_tests import BENT, find_structure, neighbours_test, runs_test
 
-# From the simplest up. More springs have more parameters (23 and more) than a loop has features,
-# and take minutes.
-LADDER = ("bistable", "linear+bistable", "bistable+bistable", "linear+bistable+bistable")
-# So many models in a row without evidence end the comparison.
-WITHOUT_EVIDENCE = 2
+# From the simplest up, in groups: one spring; a linear spring below it or its relaxation; two
+# springs; three. More springs have more parameters (23 and more) than a loop has features.
+LADDER = (
+    (Model.parse("bistable"), Model.parse("microscale")),
+    (
+        Model.parse("linear+bistable"),
+        Model.parse("linear+microscale"),
+        Model.parse("bistable", 1),
+        Model.parse("microscale", 1),
+    ),
+    (
+        Model.parse("bistable+bistable"),
+        Model.parse("microscale+microscale"),
+        Model.parse("microscale+microscale", 1),
+    ),
+    (Model.parse("linear+bistable+bistable"),),
+)
+# So many groups in a row without a gain end the comparison.
+WITHOUT_GAIN = 2
 
 
 def _dampers(params: lmfit.Parameters) -> list[str]:
@@ -41,10 +70,23 @@ def _dampers(params: lmfit.Parameters) -> list[str]:
     return [name for name in params if split_name(name)[1] == "eta" and params[name].vary]
 
 
-def _carry(params: lmfit.Parameters, model: Model, below: Fit | None) -> None:
-    """Start from the springs of the rung below, the top one first; in place.
+def _nested(tried: Sequence[Tried], model: Model) -> Tried | None:
+    """Of the models whose springs and relaxation a model has too, the one that fits best."""
+    kinds = Counter(model.kinds)
+    inside = [
+        one
+        for one in tried
+        if Counter(Model.parse(one.result.model).kinds) <= kinds
+        and one.result.relaxation <= model.relaxation
+    ]
+    return min(inside, key=lambda one: one.chisqr, default=None)
 
-    A new linear spring starts short and stiff, so that the chain does what it did below.
+
+def _carry(params: lmfit.Parameters, model: Model, below: Fit | None) -> None:
+    """Start from the springs of a simpler model, the top one first; in place.
+
+    A new linear spring starts short and stiff and new relaxation with a share of zero, so that the
+    chain does what the simpler one did.
     """
     if below is None:
         return
@@ -63,6 +105,8 @@ def _carry(params: lmfit.Parameters, model: Model, below: Fit | None) -> None:
             continue
         if source in values:
             params[name].value = values[source]
+        elif spring in sources and is_share(short):
+            params[name].value = 0.0
         elif spring not in sources and model.kinds[spring] == "linear":
             params[name].value = params[name].min if short == "height" else 0.1 * params[name].max
 
@@ -75,25 +119,30 @@ def compare_models(
 ) -> Fit:
     """Fit ever richer models until one holds; this is `foamfit.fit` with model="auto".
 
-    The time limit is that of all rungs together; it and Ctrl-C keep what is done. Rungs have local
-    intervals; those that were asked for are made of the chosen one.
+    The time limit is that of all models together; it and Ctrl-C keep what is done. Models have
+    local intervals; those that were asked for are made of the chosen one.
     """
     state = _Comparison(measurement, options, progress)
-    models, skipped = _models(measurement)
+    groups, skipped = _models(measurement)
     tried: list[Tried] = []
-    ended, stopped, idle = "the top of the ladder was reached", None, 0
+    ended, stopped, idle = "there are no richer ones that this test allows", None, 0
     try:
-        for model in models:
+        for i, group in enumerate(groups):
             below = len(tried)
-            family = state.family(model, models, tried, skipped)
+            for k, model in enumerate(group):
+                done = (i + k / len(group)) / len(groups)
+                family = state.family(model, done, tried, skipped)
+                if state.stopped or any(one.structureless for one in family):
+                    break
             if state.stopped:
                 break
-            if any(one.structureless for one in family):
+            if any(one.structureless for one in tried[below:]):
                 ended = "the residuals are structureless"
                 break
-            idle = 0 if _has_evidence(tried, below) else idle + 1
-            if idle == WITHOUT_EVIDENCE:
-                ended = f"{WITHOUT_EVIDENCE} models in a row brought no evidence"
+            if len(tried) > below:
+                idle = 0 if _has_gained(tried, below) else idle + 1
+            if idle == WITHOUT_GAIN:
+                ended = f"{WITHOUT_GAIN} groups of richer models in a row brought no gain"
                 break
         stopped = state.stopped
     except KeyboardInterrupt:
@@ -101,9 +150,9 @@ def compare_models(
             raise
         stopped = "Ctrl-C"
     if not tried:
-        raise SimulationError(f"{measurement.name}: no rung could be tried: {'; '.join(skipped)}")
+        raise SimulationError(f"{measurement.name}: no model could be tried: {'; '.join(skipped)}")
     if stopped is None and options.choice.method != "local":
-        best = choose(tried)[0]
+        best = choose(tried).best
         result, point = one_model.judge(state.fits[best], options.choice, announce)
         tried[best] = replace(tried[best], result=result, best=point)  # it may be a better point
     progress(1.0, "done")
@@ -111,20 +160,25 @@ def compare_models(
     return _conclude(tried, ended, stopped, tuple(skipped), time.perf_counter() - state.began)
 
 
-def _has_evidence(tried: Sequence[Tried], below: int) -> bool:
-    """Whether AICc or BIC strongly prefers one of the last rungs to all below them."""
-    if not 0 < below < len(tried):
-        return len(tried) > below
-    found = choose(tried)[1]
+def _has_gained(tried: Sequence[Tried], below: int) -> bool:
+    """Whether one of the last models is chosen, or AICc or BIC strongly prefers it to all below."""
+    if below == 0:
+        return True
+    decision = choose(tried)
+    if decision.best >= below or decision.by_prediction:
+        return decision.best >= below
     return any(
         min(values[below:]) < min(values[:below]) - MARGIN
-        for values in ([one.aicc for one in found], [one.bic for one in found])
+        for values in (
+            [one.aicc for one in decision.criteria],
+            [one.bic for one in decision.criteria],
+        )
     )
 
 
 @dataclass(eq=False)
 class _Comparison:
-    """What every rung is fitted with, and what stopped the comparison."""
+    """What every model is fitted with, and what stopped the comparison."""
 
     measurement: Measurement
     options: Options
@@ -140,27 +194,25 @@ class _Comparison:
             self.options = replace(self.options, drive=choose_drive(self.measurement))
 
     def family(
-        self, model: str, models: Sequence[str], tried: list[Tried], skipped: list[str]
+        self, model: Model, done: float, tried: list[Tried], skipped: list[str]
     ) -> list[Tried]:
         """Fit one model without damping and, unless that is enough, with it.
 
-        What is fitted is added to `tried` at once.
+        What is fitted is added to `tried` at once. `done` is the share of the comparison before it.
         """
-        params = self.params(model)
-        dampings = ("without", "with") if _dampers(params) else ("none",)
+        dampings = ("without", "with") if _dampers(self.params(model)) else ("none",)
         family: list[Tried] = []
-        for i, damping in enumerate(dampings):
+        for damping in dampings:
             left = None if self.deadline is None else max(self.deadline - time.monotonic(), 1e-6)
             if left == 1e-6 and tried:
                 self.stopped = "the time limit"
                 break
-            below = family[-1] if family else tried[choose(tried)[0]] if tried else None
-            share = (models.index(model) + i / len(dampings)) / len(models)
             try:
-                found, one = self.rung(model, damping, below, left, share)
+                found, one = self.rung(model, damping, _nested(tried, model), left, done)
             except SimulationError as error:
-                skipped.append(f"{rung_name(model, damping)}: {error}")
-                continue
+                told = str(error).removeprefix(f"{self.measurement.name}: ")
+                skipped.append(f"{rung_name(model.name, 'none', model.relaxation)}: {told}")
+                break  # a dashpot makes nothing easier to simulate
             family.append(one)
             tried.append(one)
             self.fits.append(found)
@@ -169,53 +221,68 @@ class _Comparison:
                 break
         return family
 
-    def params(self, model: str) -> lmfit.Parameters:
+    def params(self, model: Model) -> lmfit.Parameters:
         """Parameters of a model, as they are by default."""
         options = self.options
         return make_params(self.measurement, model, options.drive, time_shift=options.time_shift)
 
     def rung(
-        self, model: str, damping: str, below: Tried | None, left: float | None, share: float
+        self, model: Model, damping: str, below: Tried | None, left: float | None, done: float
     ) -> tuple[Found, Tried]:
-        """Fit one rung."""
+        """Fit one model with or without damping."""
         began = time.perf_counter()
         params = self.params(model)
-        _carry(params, Model.parse(model), None if below is None else below.result)
+        _carry(params, model, None if below is None else below.result)
         if damping == "without":
             for name in _dampers(params):
                 params[name].set(value=0.0, vary=False)
-        label = rung_name(model, damping)
+        label = rung_name(model.name, damping, model.relaxation)
         found = one_model.identify(
             self.measurement,
-            model,
+            model.name,
             params,
-            replace(self.options, max_time=left),
-            lambda done, what: self.progress(share + 0.1 * done, f"{label}: {what}"),
+            replace(self.options, max_time=left, relaxation=model.relaxation),
+            lambda share, what: self.progress(done + 0.1 * share, f"{label}: {what}"),
         )
         result, best = one_model.judge(found, Choice("local"), lambda _: None)
-        return found, Tried(result, damping, best, time.perf_counter() - began)
+        predicted = None if result.stopped else self.predicted(best)
+        return found, Tried(result, damping, best, time.perf_counter() - began, predicted)
+
+    def predicted(self, best: BestPoint) -> float | None:
+        """Misfit of samples that are held back; None if the time is up."""
+        try:
+            return predicted_misfit(best, self.deadline)
+        except SearchStoppedError:
+            return None
 
 
-def _models(measurement: Measurement) -> tuple[list[str], list[str]]:
-    """Models that a test allows, and which are left out and why.
+def _models(measurement: Measurement) -> tuple[list[list[Model]], list[str]]:
+    """Models that a test allows, in their groups, and which are left out and why.
 
-    They have as many springs as heights were given, or one, and every mass that was followed.
+    They have as many springs as heights were given, or one, and every mass that was followed; those
+    with relaxation need the time.
     """
     heights, inside = measurement.specimen.heights, max(measurement.interior, default=0)
-    models, skipped = [], []
-    for model in LADDER:
-        count = len(Model.parse(model).kinds)
-        if inside >= count:
-            skipped.append(f"{model}: it has no mass {inside} inside, whose motion was measured")
-        elif heights is not None and count not in (1, len(heights)):
-            skipped.append(f"{model}: [specimen] heights are those of {len(heights)} springs")
-        else:
-            models.append(model)
-    if not models:
+    groups, skipped = list[list[Model]](), []
+    for group in LADDER:
+        allowed = []
+        for model in group:
+            count, name = len(model.kinds), rung_name(model.name, "none", model.relaxation)
+            if inside >= count:
+                skipped.append(f"{name}: it has no mass {inside} inside, whose motion was measured")
+            elif heights is not None and count not in (1, len(heights)):
+                skipped.append(f"{name}: [specimen] heights are those of {len(heights)} springs")
+            elif model.relaxation and measurement.time is None:
+                skipped.append(f"{name}: relaxation needs a time column")
+            else:
+                allowed.append(model)
+        if allowed:
+            groups.append(allowed)
+    if not groups:
         raise InputError(
             f"{measurement.name}: no model of the ladder fits this test: {'; '.join(skipped)}"
         )
-    return models, skipped
+    return groups, skipped
 
 
 # ---------------------------------------------------------------- what it says
@@ -224,21 +291,22 @@ def _models(measurement: Measurement) -> tuple[list[str], list[str]]:
 def _conclude(
     tried: Sequence[Tried], ended: str, stopped: str | None, skipped: tuple[str, ...], took: float
 ) -> Fit:
-    """Result of the chosen rung with the whole ladder."""
-    best, found = choose(tried)
+    """Result of the chosen model with the whole comparison."""
+    decision = choose(tried)
+    best = decision.best
     reference, result = reference_of(tried), tried[best].result
-    said, warned = _choice_sentences(tried, found, best, ended), []
+    said, warned = _choice_sentences(tried, decision, ended), []
     if stopped is not None:
         warned.append(
             f"The comparison was stopped by {stopped} on {tried[-1].name}; richer models were not "
             "tried."
         )
     if tried[best].states("not determined"):
-        warned.append(_undetermined(tried, found, best))
+        warned.append(_undetermined(tried, decision))
     if not any(rung.structureless for rung in tried):
         warned.append(_structure_left(tried, best))
     ladder = Ladder(
-        rungs=tuple(_rung(i, best, tried, found) for i in range(len(tried))),
+        rungs=tuple(_rung(i, tried, decision) for i in range(len(tried))),
         n_eff=effective_samples(reference),
         noise_from=reference.name,
         ended=ended,
@@ -246,6 +314,7 @@ def _conclude(
         skipped=skipped,
         sentences=(*said, *warned),
         cautions=tuple(warned),
+        by_prediction=decision.by_prediction,
     )
     return replace(
         result,
@@ -257,38 +326,79 @@ def _conclude(
     )
 
 
-def _rung(i: int, best: int, tried: Sequence[Tried], found: Sequence[Criteria]) -> Rung:
-    one = tried[i]
+def _rung(i: int, tried: Sequence[Tried], decision: Decision) -> Rung:
+    one, found, before = tried[i], decision.criteria[i], decision.before[i]
     return Rung(
         model=one.result.model,
         damping=one.damping,
         misfit=dict(one.result.misfit),
         chisqr=one.chisqr,
         n_vary=one.varied,
-        rank=found[i].rank,
+        rank=found.rank,
         n_eff=effective_samples(one),
-        aicc=found[i].aicc,
-        bic=found[i].bic,
+        aicc=found.aicc,
+        bic=found.bic,
         runs_p=one.runs_p,
         neighbours_p=one.neighbours_p,
         not_determined=one.states("not determined"),
         weak=one.states("weak"),
         seconds=one.seconds,
         stopped=one.result.stopped,
-        chosen=i == best,
-        why=_why(i, best, tried, found),
+        chosen=i == decision.best,
+        why=_why(i, tried, decision),
+        relaxation=one.result.relaxation,
+        predicted_misfit=one.predicted,
+        gain=_gain(tried, i, before),
+        gain_over=None if before is None else tried[before].name,
     )
 
 
-def _why(i: int, best: int, tried: Sequence[Tried], found: Sequence[Criteria]) -> str:
-    """Why a rung was chosen or not."""
+def _gain(tried: Sequence[Tried], i: int, before: int | None) -> float | None:
+    """Share by which the predicted misfit of a model is below that of another."""
+    if before is None:
+        return None
+    own, other = tried[i].predicted, tried[before].predicted
+    return None if own is None or other is None else 1.0 - own / other
+
+
+def _why(i: int, tried: Sequence[Tried], decision: Decision) -> str:
+    """Why a model was chosen or not."""
+    best, one = decision.best, tried[i]
+    if (ruler := decision.ruled_out_by[i]) is not None:
+        fewer = tried[ruler].varied < one.varied
+        told = "more closely with fewer" if fewer else f"over {WORSE:g} times better with as many"
+        return f"not considered: {tried[ruler].name} follows the curves {told} parameters"
+    if decision.by_prediction:
+        return _why_by_prediction(i, tried, decision)
     if i == best:
-        reason = "its residuals are structureless" if tried[i].structureless else "best supported"
-        richer = f"lowers AICc and BIC by {MARGIN:g}" if i < len(tried) - 1 else "was tried"
+        reason = "its residuals are structureless" if one.structureless else "best supported"
+        richer = f"lowers AICc and BIC by {MARGIN:g}" if len(tried) > 1 else "was tried"
+        richer = "was tried" if one.varied >= max(each.varied for each in tried) else richer
         return f"{reason}, and no richer model {richer}"
+    found = decision.criteria
     bic, aicc = found[i].bic - found[best].bic, found[i].aicc - found[best].aicc
     told = f"BIC {signed(bic)}, AICc {signed(aicc)}"
-    return told if i < best else f"richer without evidence: {told}"
+    return told if one.varied <= tried[best].varied else f"richer without evidence: {told}"
+
+
+def _why_by_prediction(i: int, tried: Sequence[Tried], decision: Decision) -> str:
+    """Why a model was chosen or not, where what it predicts decides."""
+    one, before = tried[i], decision.before[i]
+    if one.predicted is None:
+        said = f"{percent(one.misfit)} of the range is left (no prediction: the time was up)"
+    else:
+        said = f"predicts held-back samples to {percent(one.predicted)} of the range"
+    gain = _gain(tried, i, before)
+    if before is not None and gain is not None:
+        more = one.varied - tried[before].varied
+        side = "less" if gain >= 0.0 else "more"
+        said += f", {percent(abs(gain))} {side} than {tried[before].name}"
+        if more and i != decision.best:
+            needed = 1.0 - (1.0 - SHARE) ** more
+            said += f" ({counted(more, 'more parameter')} must gain {percent(needed)})"
+    if i == decision.best:
+        said += "; none that was tried gains enough over it"
+    return said
 
 
 def signed(value: float) -> str:
@@ -298,17 +408,29 @@ def signed(value: float) -> str:
     return f"{value:+.1f}".replace("-", "−")
 
 
-def _choice_sentences(
-    tried: Sequence[Tried], found: Sequence[Criteria], best: int, ended: str
-) -> list[str]:
+def _choice_sentences(tried: Sequence[Tried], decision: Decision, ended: str) -> list[str]:
     """What was chosen, and what each criterion alone would choose."""
+    best, found = decision.best, decision.criteria
     one = tried[best]
-    simplest = "it is the simplest whose residuals are structureless"
-    reason = simplest if one.structureless else "the evidence supports it best"
+    if one.structureless:
+        reason = "it is the simplest whose residuals are structureless"
+    elif not decision.by_prediction:
+        reason = "the evidence supports it best"
+    elif any(each.predicted is None for each in tried):
+        reason = "for its number of parameters it follows the curves best"
+    else:
+        reason = "for its number of parameters it predicts best what was held back"
     said = [
         f"{one.name} was chosen of {counted(len(tried), 'model')}: {reason}. No more models were "
         f"tried because {ended}."
     ]
+    if decision.by_prediction:
+        said.append(
+            "What is left is more than noise, so AICc and BIC do not hold. Each model was fitted to "
+            f"the test without one of {BLOCKS} blocks in time, in turn, and predicted that block; "
+            f"each further parameter must lower this predicted misfit by {percent(SHARE)}."
+        )
+        return said
     if found[best].rank < one.varied:
         said.append(
             f"The curves fix {found[best].rank} combinations of its {one.varied} parameters; AICc "
@@ -322,20 +444,25 @@ def _choice_sentences(
     return said
 
 
-def _undetermined(tried: Sequence[Tried], found: Sequence[Criteria], best: int) -> str:
-    """Sentence on the parameters of the chosen rung that the test does not determine."""
+def _undetermined(tried: Sequence[Tried], decision: Decision) -> str:
+    """Sentence on the parameters of the chosen model that the test does not determine."""
+    best, found = decision.best, decision.criteria
     lost = ", ".join(tried[best].states("not determined"))
     told = f"The test does not determine {lost} of the chosen model {tried[best].name}"
     sound = [i for i, one in enumerate(tried) if not one.states("not determined")]
     if not sound:
         return f"{told}; no model of the ladder has all parameters determined."
+    if decision.by_prediction:
+        nearest = min(sound, key=lambda i: tried[i].misfit)
+        off = f"misfit of {percent(tried[nearest].misfit)} of the range"
+        return f"{told}; all of {tried[nearest].name} are determined, at a {off}."
     nearest = min(sound, key=lambda i: found[i].bic)
-    off = found[nearest].bic - found[best].bic
-    return f"{told}; all of {tried[nearest].name} are determined, at a BIC higher by {off:.1f}."
+    higher = found[nearest].bic - found[best].bic
+    return f"{told}; all of {tried[nearest].name} are determined, at a BIC higher by {higher:.1f}."
 
 
 def _structure_left(tried: Sequence[Tried], best: int) -> str:
-    """Sentence on the structure in the residuals of the chosen rung."""
+    """Sentence on the structure in the residuals of the chosen model."""
     one = tried[best]
     worst = int(np.argmin([min(runs_test(part), neighbours_test(part)) for part in one.curves]))
     found = find_structure(one.curves[worst], one.places[worst])

@@ -133,6 +133,10 @@ _DRIVE = click.option(
     type=click.Choice(["impact", "stress", "displacement"]),
     help="Default: impact if striker and time are known, else displacement.",
 )  # fmt: skip
+_RELAXATION = click.option(
+    "--relaxation", type=click.IntRange(min=0), default=0, show_default=True, metavar="N",
+    help="Relaxation terms of every bistable and microscale spring; auto tries one by itself.",
+)  # fmt: skip
 
 
 @main.command()
@@ -140,6 +144,7 @@ _DRIVE = click.option(
 @_SPECIMEN
 @click.option("--model", help="Also estimate what the test determines of this model.")
 @_DRIVE
+@_RELAXATION
 @click.option("--published", "published_set", metavar="NAME", help="Start from a published set.")
 @click.option(
     "--params", metavar="RESULT", type=_FILE,
@@ -148,7 +153,7 @@ _DRIVE = click.option(
 @_PLOT
 def check(
     test: Path, specimen: Path | None, model: str | None, drive: str | None,
-    published_set: str | None, params: Path | None, plot: Path | None,
+    published_set: str | None, params: Path | None, plot: Path | None, relaxation: int,
 ) -> None:  # fmt: skip
     """Say what the loader understood of TEST.csv: columns, contact, specimen, energy.
 
@@ -167,7 +172,10 @@ def check(
     from foamfit.data.energy import audit
 
     if model is None:
-        given = {"drive": drive, "published": published_set, "params": params, "plot": plot}
+        given: dict[str, object] = {
+            "drive": drive, "published": published_set, "params": params, "plot": plot,
+            "relaxation": relaxation or None,
+        }  # fmt: skip
         for option, value in given.items():
             if value is not None:
                 raise InputError(f"--{option} needs --model; give one, as --model bistable")
@@ -186,7 +194,10 @@ def check(
 
     with _compiling(quiet=False) as compile_rest:
         compile_rest()
-    outlook = outlook_of(test, specimen, model, drive, published_set=published_set, result=params)
+    outlook = outlook_of(
+        test, specimen, model, drive, published_set=published_set, result=params,
+        relaxation=relaxation,
+    )  # fmt: skip
     if description:
         say(description)
     say(outlook_text(outlook))
@@ -275,7 +286,7 @@ def _interval_method(profile: bool, bootstrap: int | None, mcmc: int | None) -> 
 @_CYCLE
 @click.option(
     "--model", default="bistable", show_default=True,
-    help="Springs from the base up; auto takes the simplest that holds.",
+    help="Springs from the base up; auto compares models, takes the simplest that holds.",
 )  # fmt: skip
 @_DRIVE
 @click.option("--out", type=_FILE, help="Result folder. Default: fits/<test>/<model>.")
@@ -291,10 +302,7 @@ def _interval_method(profile: bool, bootstrap: int | None, mcmc: int | None) -> 
 @click.option("--vary", multiple=True, metavar="NAME", help="Vary one that is held by default.")
 @click.option("--interior-mass", is_flag=True, help="Put the specimen's mass between the springs.")
 @click.option("--time-shift", is_flag=True, help="Fit how late the motion is against the force.")
-@click.option(
-    "--relaxation", type=click.IntRange(min=0), default=0, show_default=True, metavar="N",
-    help="Relaxation terms of every bistable and microscale spring.",
-)  # fmt: skip
+@_RELAXATION
 @click.option(
     "--loss", type=click.Choice(["linear", "soft_l1", "huber", "cauchy"]), default="linear",
     show_default=True, help="All but linear weigh large residuals less.",
@@ -487,7 +495,7 @@ def simulate(scene: Path, out: Path | None, plot: Path | None, rtol: float) -> N
         [chain]
         diameter = "5 mm"
         [[chain.springs]]               # from the base up
-        kind = "bistable"               # or "linear", "unilateral"
+        kind = "bistable"               # or "microscale", "linear", "unilateral"
         height = "1.19 mm"
         k0 = "5.5 MPa"
         kc = "82.5 MPa"
@@ -503,7 +511,9 @@ def simulate(scene: Path, out: Path | None, plot: Path | None, rtol: float) -> N
         [time]
         end = "1 ms"
         samples = 501
-    Instead of the springs, published = "foam-1/model-3" under [chain] takes a published set.
+    Instead of the springs, published = "foam-1/model-3" under [chain] takes a published set. A
+    microscale spring has k0, kc, eps_star, sigma_plus, spread_plus, sigma_minus and spread_minus;
+    it and the bistable one may relax: relaxation = [{ g = 0.5, tau = "0.2 s" }].
     """
     from foamfit.scene_file import files_of_scene, read_scene, write_response
     from foamfit.solve.simulation import simulate as run

@@ -32,6 +32,7 @@ from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
 from foamfit.trust.covariance import AT_LIMIT
 from foamfit.trust.intervals import Announce, Choice, Intervals, assess
+from foamfit.trust.ranges import Open, left_open
 
 Progress = Callable[[float, str], None]
 
@@ -39,9 +40,13 @@ Progress = Callable[[float, str], None]
 STARTS = 16
 # Refits of the bootstrap and steps of the Markov chain.
 DRAWS = {"bootstrap": 500, "mcmc": 2000}
-# Evaluations that the default spends on profiles, over those of the search; and how often it goes
-# on from a better point that a profile has met.
+# Evaluations that the default spends on profiles, and on ranges, over those of the search; and how
+# often it goes on from a better point that these have met.
 PROFILE_SHARE, IMPROVEMENTS = 0.5, 3
+# Evaluations over those of the search past which no better point is gone on from.
+TOGETHER = 0.8
+# Cost over the one before below which the ranges are made anew from a better point.
+MOVED = 0.999
 
 
 class Keywords(TypedDict, total=False):
@@ -144,9 +149,18 @@ def identify(
     if tracker.best_values is None:
         raise SimulationError(
             f"{measurement.name}: none of the {problem.objective.evaluations} sets of parameters "
-            "that were tried could be simulated; check the drive, the heights and the bounds"
+            f"that were tried could be simulated; {_why_not(problem)}"
         )
     return Found(problem, tracker, record)
+
+
+def _why_not(problem: Problem) -> str:
+    """Why the values that a search begins with cannot be simulated."""
+    try:
+        problem.objective.simulate(problem.vector())
+    except SimulationError as error:
+        return str(error)
+    return "check the drive, the heights and the bounds"
 
 
 def judge(found: Found, choice: Choice, announce: Announce) -> tuple[Fit, BestPoint]:
@@ -175,25 +189,33 @@ def _assess(
     """Make the intervals; where these meet a better point, go on from there."""
     problem, tracker, record = found.problem, found.tracker, found.record
     budget = PROFILE_SHARE * problem.objective.evaluations
+    enough = (1.0 + TOGETHER) * problem.objective.evaluations
+    left, there = Open(), math.inf
     for _ in range(IMPROVEMENTS + 1):
-        if choice.method == "local" or not best.names:
+        if not best.names or problem.objective.evaluations > enough:
             break
-        made = assess(
-            best, choice, minima=tracker.ends, deadline=tracker.deadline, budget=budget,
-            announce=announce,
-        )  # fmt: skip
-        if made.better is None:
-            return best, record, made
         before = tracker.best_cost
-        tracker.consider(made.better)
         try:
+            better = None
+            if best.cost < MOVED * there:  # what is left open is not that of the point before
+                left, there = left_open(best, tracker.ends, tracker, budget), best.cost
+                better = None if choice.method == "local" else left.better
+            made = Intervals(better=better)
+            if better is None:
+                made = assess(
+                    best, choice, minima=[*tracker.ends, *left.minima],
+                    deadline=tracker.deadline, budget=budget, announce=announce,
+                )  # fmt: skip
+            if made.better is None:
+                return best, record, replace(made, ranges=left.ranges)
+            tracker.consider(made.better)
             _refine(problem, tracker)
         except SearchStoppedError:
             return found.best(), record, Intervals()
         best = found.best()
         if tracker.best_cost < before / 1.02:  # a minimum that no descent of the search has found
             record = replace(record, costs=((tracker.best_cost, 1), *record.costs))
-    return best, record, Intervals()
+    return best, record, Intervals(ranges=left.ranges)
 
 
 def _search(

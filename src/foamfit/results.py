@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from importlib.metadata import version
 from typing import Any
 
@@ -14,7 +15,9 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.springs.chain import Chain
-from foamfit.springs.spring import BistableSpring
+from foamfit.springs.microscale import follow_fractions
+from foamfit.springs.spring import BistableSpring, MicroscaleSpring
+from foamfit.text import counted
 from foamfit.trust.identifiability import Insight
 from foamfit.trust.intervals import Intervals
 
@@ -29,7 +32,10 @@ class ParameterEstimate:
     `stderr` and `ci95` are None where the test does not determine it; `state` is "determined",
     "weak", "not determined" or "fixed" (fixed by the user or the model), and `why` says so in a
     sentence. `ci95_method` names what made the interval: "local covariance", "profile likelihood",
-    "block bootstrap" or "MCMC".
+    "block bootstrap", "MCMC" or "other minima" (ends of
+    the search's descents that noise could have made the best). `range` is the hull of its values
+    over descriptions that follow the curves about as well, which the error of the law leaves open;
+    None where only noise is left of the curves.
     """
 
     value: float
@@ -40,6 +46,7 @@ class ParameterEstimate:
     state: str
     why: str
     ci95_method: str | None = None
+    range: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +76,33 @@ class Correlation:
     matrix: Array
 
 
+@dataclass(frozen=True, eq=False)
+class Snapping:
+    """How many of its micro-springs a microscale spring snapped along the fitted curves."""
+
+    fraction: Array  # that has snapped, one per sample
+    stress: Array  # of the spring in equilibrium, Pa
+
+    @property
+    def turn(self) -> int:
+        """Sample at which most have snapped."""
+        return int(np.argmax(self.fraction))
+
+    @property
+    def most(self) -> float:
+        """Largest fraction that has snapped; the test tells nothing of the ranks above."""
+        return float(self.fraction[self.turn])
+
+    @property
+    def halves(self) -> tuple[int | None, int | None]:
+        """Samples from which on half have snapped, and half have snapped back; None if never."""
+        turn, snapped = self.turn, self.fraction >= 0.5
+        if not snapped[turn]:
+            return None, None
+        back = np.flatnonzero(~snapped[turn:])
+        return int(np.argmax(snapped)), turn + int(back[0]) if back.size else None
+
+
 @dataclass(frozen=True)
 class Switch:
     """A change of branch in the fitted response: which spring, when, and where on the curves."""
@@ -94,14 +128,17 @@ class Check:
     fatal: bool = False  # Whether a "no" means that no acceptable fit was found
 
 
-def rung_name(model: str, damping: str) -> str:
-    """Model and damping in words."""
-    return model if damping == "none" else f"{model} {damping} damping"
+def rung_name(model: str, damping: str, relaxation: int = 0) -> str:
+    """Model, relaxation and damping in words."""
+    if not relaxation:
+        return model if damping == "none" else f"{model} {damping} damping"
+    rest = {"with": " and damping", "without": ", without damping"}.get(damping, "")
+    return f"{model} with relaxation{rest}"
 
 
 @dataclass(frozen=True)
 class Rung:
-    """One model of the ladder and the evidence for it."""
+    """One model that was tried and the evidence for it."""
 
     model: str  # Springs from the base up
     # "with", "without" (every dashpot held at zero) or "none" where the drive has none to vary.
@@ -124,31 +161,42 @@ class Rung:
     weak: tuple[str, ...]
     seconds: float  # Run time
     stopped: str | None  # What ended the search before its time
-    chosen: bool  # Whether the result is that of this rung
+    chosen: bool  # Whether the result is that of this model
     why: str  # Why it was chosen or not
+    relaxation: int = 0  # Terms of each hysteretic spring
+    # RMS over the range, all counted curves together, of samples that were held back in blocks;
+    # None where the time did not allow it.
+    predicted_misfit: float | None = None
+    # By what share that is below the one of `gain_over`; None where that is none.
+    gain: float | None = None
+    # The model that was the best of those with no more parameters; None of the first.
+    gain_over: str | None = None
 
     @property
     def name(self) -> str:
-        """Model and damping in words."""
-        return rung_name(self.model, self.damping)
+        """Model, relaxation and damping in words."""
+        return rung_name(self.model, self.damping, self.relaxation)
 
 
 @dataclass(frozen=True)
 class Ladder:
-    """The rungs that were tried, and what the comparison says."""
+    """The models that were tried, and what the comparison says."""
 
-    rungs: tuple[Rung, ...]  # From the simplest up
+    rungs: tuple[Rung, ...]  # In the order in which they were tried, from the simplest up
     n_eff: float  # Effective samples that AICc and BIC use
-    noise_from: str  # The rung of the least chi-square: its residuals are taken for the noise
+    noise_from: str  # The model of the least chi-square: its residuals are taken for the noise
     ended: str  # Why the comparison ended
     stopped: str | None  # "the time limit" or "Ctrl-C" if that ended it
-    skipped: tuple[str, ...]  # Rungs that could not be tried, and why
+    skipped: tuple[str, ...]  # Models that could not be tried, and why
     sentences: tuple[str, ...]  # What the comparison says
     cautions: tuple[str, ...]  # Those of them that are warnings
+    # Whether models were compared by what they predict, because none reaches the noise; else by
+    # AICc and BIC.
+    by_prediction: bool = False
 
     @property
     def chosen(self) -> Rung:
-        """The rung whose result was taken."""
+        """The model whose result was taken."""
         return next(rung for rung in self.rungs if rung.chosen)
 
     def rows(self) -> Iterator[list[object]]:
@@ -161,6 +209,31 @@ class Ladder:
             cells = (plain(getattr(rung, name)) for name in rest)
             told = (" ".join(cell) if isinstance(cell, list) else cell for cell in cells)
             yield [rung.model, rung.damping, *(rung.misfit.get(name) for name in curves), *told]
+
+
+def snapping_of(chain: Chain, strain: Array | None, stress: Array | None) -> dict[str, Snapping]:
+    """How each microscale spring snaps along an overall strain and a base stress (Pa).
+
+    A single spring's snapping follows from its strain. In a chain it follows from the stress, if
+    all springs are in equilibrium under it, else there is none.
+    """
+    out, springs = {}, chain.springs
+    plain = not any(spring.eta or spring.relaxation for spring in springs)
+    for i, spring in enumerate(springs, start=1):
+        if not isinstance(spring, MicroscaleSpring):
+            continue
+        own = stress if plain else None
+        if len(springs) == 1:
+            own = None if strain is None else np.asarray(spring.stress(strain))
+        if own is not None and np.all(np.isfinite(own)):
+            fraction = follow_fractions(own, spring.snapped_below, spring.left_below)
+            out[f"s{i}"] = Snapping(fraction, own)
+    return out
+
+
+def law_in_words(model: str, relaxation: int) -> str:
+    """Model and relaxation in words."""
+    return f"{model} with {counted(relaxation, 'relaxation term')}" if relaxation else model
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,6 +274,30 @@ class Fit:
         springs = enumerate(self.chain.springs, start=1)
         return {f"s{i}": one for i, one in springs if isinstance(one, BistableSpring)}
 
+    @property
+    def microscale_springs(self) -> dict[str, MicroscaleSpring]:
+        """The microscale springs of the chain by their prefix, "s1" at the base."""
+        springs = enumerate(self.chain.springs, start=1)
+        return {f"s{i}": one for i, one in springs if isinstance(one, MicroscaleSpring)}
+
+    @property
+    def law(self) -> str:
+        """The model and its relaxation in words."""
+        return law_in_words(self.model, self.relaxation)
+
+    @cached_property
+    def strain(self) -> Array | None:
+        """Overall strain along the fitted curves; None if neither simulated nor measured."""
+        c = self.curves
+        moved = c.displacement if c.displacement is not None else c.measured_displacement
+        return None if moved is None else moved / self.measurement.specimen.height
+
+    @cached_property
+    def snapping(self) -> dict[str, Snapping]:
+        """How each microscale spring snapped, where that is known; see `snapping_of`."""
+        stress = self.curves.measured_stress if self.drive == "stress" else self.curves.stress
+        return snapping_of(self.chain, self.strain, None if self.drive == "impact" else stress)
+
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of ``fit.json``: SI, plain types, null for what is not there."""
         content: dict[str, Any] = plain(
@@ -234,6 +331,15 @@ class Fit:
                 "derived": {
                     name: {point: getattr(spring, point) for point in DERIVED_POINTS}
                     for name, spring in self.bistable_springs.items()
+                }
+                | {
+                    name: {
+                        "p_max": snapped.most,
+                        "p_max_stress": float(snapped.stress[snapped.turn]),
+                        "p_max_strain": None if self.strain is None else self.strain[snapped.turn],
+                        "snap_strain": self.microscale_springs[name].snap_strain,
+                    }
+                    for name, snapped in self.snapping.items()
                 },
                 "visited": self.visited,
                 "misfit": self.misfit,

@@ -18,6 +18,7 @@ import foamfit as ff
 from conftest import synthetic_impact
 from foamfit.api import FitResult
 from foamfit.cli import main
+from foamfit.errors import InputError
 from foamfit.report.comparison import (
     Comparison,
     Pair,
@@ -388,3 +389,49 @@ def test_the_command_refuses_in_one_line(
     assert message in done.stderr
     assert done.stderr.count("\n") == 1
     assert done.stdout == ""
+
+
+def test_microscale_fits_stand_beside_each_other() -> None:
+    one = fabricated.microscale_result()
+    stiffer = {
+        name: replace(p, value=1.1 * p.value) if p.vary else p for name, p in one.parameters.items()
+    }
+    pair = compare([one, replace(one, parameters=stiffer)]).pairs[0]
+    labels = ["k0", "k_c", "ε_*", "σ₊", "s₊", "σ₋", "s₋", "g_1", "τ_1"]
+    assert [row.label for row in pair.rows] == labels
+    assert [row.percent for row in pair.rows] == [pytest.approx(10.0)] * 9
+    assert pair.model == "microscale with 1 relaxation term"
+    rows = {row.label: row for row in pair.rows}
+    assert (rows["σ₊"].reference, rows["σ₊"].unit) == (pytest.approx(0.106), "MPa")
+    assert (rows["τ_1"].reference, rows["τ_1"].unit) == (0.25, "s")
+    ticks = [
+        tick.get_text() for tick in plot_comparison(compare([one, one])).axes[0].get_yticklabels()
+    ]
+    assert ticks[-2:] == ["$g_1$", r"$\tau_1$"]
+    assert r"$\sigma_+$" in ticks
+
+
+def test_a_law_that_relaxes_beside_one_that_does_not() -> None:
+    one = fabricated.microscale_result()
+    still = {n: p for n, p in one.parameters.items() if not n.startswith(("s1_g", "s1_tau"))}
+    pair = compare([one, replace(one, parameters=still, relaxation=0)]).pairs[0]
+    assert any("Only one of the two laws relaxes" in remark for remark in pair.remarks)
+    pair = compare([replace(one, parameters=still, relaxation=0), one]).pairs[0]
+    assert {row.label: row.reference for row in pair.rows}["g_1"] is None
+
+
+def test_no_published_set_has_microscale_springs() -> None:
+    one = fabricated.microscale_result()
+    named = replace(one.measurement, name="VACNT foam-1/model-1")
+    one = replace(one, measurement=named)
+    assert not compare([one, one]).with_published  # though the name is that of a set
+    told = comparison_text(compare([one], "foam-1/model-1"))
+    assert "The published sets have no microscale springs, so there is nothing" in told
+    with pytest.raises(InputError, match="no published set has microscale springs; give a second"):
+        compare([one])
+
+
+def test_a_result_with_an_odd_number_of_relaxation_terms_is_refused() -> None:
+    content = fabricated.microscale_result().to_json_dict() | {"relaxation": "one"}
+    with pytest.raises(InputError, match="'relaxation' cannot be 'one'; fit again"):
+        compare([content, content])

@@ -5,11 +5,13 @@ import json
 import os
 from dataclasses import replace
 from pathlib import Path
+from statistics import NormalDist
 
 import numpy as np
 import pytest
 
 import fabricated
+import foamfit as ff
 import foamfit.report.figures
 import foamfit.report.folder
 import foamfit.report.page
@@ -20,8 +22,8 @@ FILES = {"fit.json", "parameters.csv", "curves.csv", "report.html", "fit.png", "
 KEYS = {
     "schema", "foamfit", "test", "data_sha256", "model", "drive", "seed", "status", "warnings",
     "notes", "checklist", "data",
-    "parameters", "derived", "visited", "misfit", "weights", "statistics", "energy", "runtime_s",
-    "stopped", "loss", "noise", "outliers",
+    "parameters", "relaxation", "derived", "visited", "misfit", "weights", "statistics", "energy",
+    "runtime_s", "stopped", "loss", "noise", "outliers",
 }  # fmt: skip
 
 
@@ -69,7 +71,7 @@ def test_json_keeps_the_contract(saved: Path) -> None:
     assert content["parameters"]["s1_k0"] == {
         "value": 5.5e6, "stderr": 66000.0, "ci95": [5370640.0, 5629360.0], "unit": "Pa",
         "vary": True, "state": "determined", "why": "the test reaches its branch",
-        "ci95_method": None,
+        "ci95_method": None, "range": None,
     }  # fmt: skip
     assert content["visited"] == {"s1": ["a", "d", "c", "e"]}
     assert content["misfit"]["stress_strain"] is None
@@ -245,3 +247,29 @@ def test_loading_what_is_no_result(tmp_path: Path, text: str | None, complaint: 
 def test_the_same_result_gives_the_same_files(saved: Path, tmp_path: Path) -> None:
     again = fabricated.result().save(tmp_path / "again")
     assert all((again / name).read_bytes() == (saved / name).read_bytes() for name in FILES)
+
+
+def test_derived_numbers_of_a_microscale_spring() -> None:
+    result = fabricated.microscale_result()
+    derived = result.to_json_dict()["derived"]["s1"]
+    peak = float(fabricated.MICRO.stress([0.0, 0.6])[-1])
+    most = NormalDist(np.log(1.06e5), 0.44).cdf(np.log(peak))
+    assert derived["p_max"] == pytest.approx(most, rel=1e-9)
+    assert derived["p_max_stress"] == pytest.approx(peak, rel=1e-9)
+    assert derived["p_max_strain"] == pytest.approx(0.6)
+    on_a, on_c = 1.06e5 / (4.4e5 + 1.06e5), 0.29 + 1.06e5 / (4.9e5 + 1.06e5)
+    assert derived["snap_strain"] == pytest.approx(on_c - on_a)
+
+
+def test_snapping_in_a_chain_is_told_where_the_stress_tells_it() -> None:
+    one = fabricated.microscale_result()
+    still = replace(fabricated.MICRO, relaxation=())
+    linear = ff.LinearSpring(k0=6e6)
+    heights = [0.5 * fabricated.HEIGHT] * 2
+    for top, known in ((still, True), (fabricated.MICRO, False), (replace(still, eta=9.0), False)):
+        chain = ff.Chain([linear, top], heights, fabricated.AREA)
+        result = fabricated.microscale_result(model="linear+microscale", chain=chain)
+        assert set(result.snapping) == ({"s2"} if known else set())
+        assert set(replace(result, drive="impact").snapping) == set()
+        if known:
+            assert result.snapping["s2"].most == pytest.approx(one.snapping["s1"].most)

@@ -106,10 +106,14 @@ CASES: dict[str, Callable[[], str]] = {
     "fit_one_spring": lambda: summary_text(one_spring()),
     "fit_one_spring_verbose": lambda: summary_text(one_spring(), verbose=True),
     "fit_two_springs": lambda: summary_text(with_rows(fabricated.chain_result())),
+    "fit_microscale": lambda: summary_text(with_rows(fabricated.microscale_result())),
     "fit_failed": lambda: summary_text(failed()),
     "fit_auto": lambda: summary_text(auto()),
     "fit_auto_verbose": lambda: summary_text(auto(), verbose=True),
     "compare_published": lambda: comparison_text(compare([one_spring()], "foam-1/model-1")),
+    "compare_microscale": lambda: comparison_text(
+        compare([fabricated.microscale_result(), fabricated.microscale_result(relaxation=0)])
+    ),
     "compare_fits": lambda: comparison_text(compare([one_spring(), failed()])),
 }
 

@@ -12,7 +12,7 @@ import fabricated
 from foamfit.data.energy import audit
 from foamfit.report.page import render_report
 from foamfit.report.readable import number, readable
-from foamfit.report.summary import summary_text
+from foamfit.report.summary import conclusions, summary_text
 
 
 class Page(HTMLParser):
@@ -228,3 +228,35 @@ def test_the_terminal_says_why_a_parameter_is_not_determined() -> None:
     assert f"\nweak: {first}, its interval is wide\n" in text
     assert f"\ndetermined: {second}, ±5%; its profile stalled\n" in text
     assert "±5% of its size" not in text
+
+
+def test_what_a_microscale_spring_snapped_and_relaxes_is_told() -> None:
+    words = Page(render_report(fabricated.microscale_result())).words
+    assert "microscale model with 1 relaxation term, displacement drive" in words
+    snapped = "96 % of the micro-springs snap in this test, at 230.8 kPa and a strain of 0.6000"
+    assert snapped in words
+    assert "what the others would do is extrapolated" in words
+    assert "changes 1.500 times as much as in equilibrium, and relaxes: 33 % of it" in words
+    assert "time constant of 250 ms" in words
+    assert "68 % snap through between 68.27 and 164.6 kPa 106.0 kPa" in words
+    assert "relaxes, with τ = 250.0 ms 0.3333" in words
+    assert "snap-back · micro-springs snap back" in words
+    assert "not reached" not in words
+    assert "A1 and C1" not in words
+    assert "s1_sigma_plus σ +" in words
+    assert "s1_tau1 τ 1,1 250.0 ± 3.0 ms" in words
+
+
+def test_all_that_snaps_leaves_nothing_to_extrapolate() -> None:
+    narrow = replace(fabricated.MICRO, spread_plus=0.1)
+    chain = fabricated.Chain(springs=[narrow], heights=[fabricated.HEIGHT], area=fabricated.AREA)
+    told = " ".join(conclusions(fabricated.microscale_result(chain=chain)))
+    assert "100 % of the micro-springs snap" in told
+    assert "extrapolated" not in told
+
+
+def test_a_relaxation_that_is_not_determined_is_not_described() -> None:
+    result = fabricated.microscale_result()
+    lost = replace(result.parameters["s1_g1"], state="not determined", stderr=None, ci95=None)
+    told = conclusions(replace(result, parameters=result.parameters | {"s1_g1": lost}))
+    assert told[-1] == "The relaxation is not determined (s1_g1)."

@@ -14,7 +14,9 @@ import fabricated
 import foamfit as ff
 from foamfit.api import FitResult
 from foamfit.errors import InputError
+from foamfit.fitting.branches import Section
 from foamfit.report.figures import STYLE, image, laid_out
+from foamfit.report.identifiability_plots import _without_shakes
 from foamfit.report.plots import origin_word, plot_fit, plot_residuals, plot_response
 from foamfit.report.readable import readable_unit
 from foamfit.results import Switch
@@ -278,3 +280,45 @@ def test_a_response_of_a_drive_has_no_end_of_contact() -> None:
 )
 def test_readable_unit(size: float, unit: str, expected: tuple[float, str]) -> None:
     assert readable_unit(size, unit) == expected
+
+
+def test_a_microscale_loop_has_its_branches_and_medians() -> None:
+    result = fabricated.microscale_result()
+    stress_time, displacement_time, loop = plot_fit(result).axes
+    assert texts(stress_time) == ["σ₊", "σ₋"]
+    assert texts(displacement_time) == []  # nothing is simulated there
+    assert texts(loop) == ["a", "c", "σ₊", "σ₋", "snap-through", "held", "snap-back"]
+    marks = [line.get_xydata() for line in loop.lines if line.get_color() == "black"]
+    for (strain, stress), median, up in zip(
+        np.concatenate(marks), (106.0, 79.0), (True, False), strict=True
+    ):
+        assert stress == pytest.approx(median, rel=0.02)
+        way = [0.0, strain] if up else [0.0, 0.6, strain]
+        assert float(fabricated.MICRO.stress(way)[-1]) / 1e3 == pytest.approx(stress)
+    limits = loop.get_ylim()
+    assert limits[1] < 1.2 * np.max(result.curves.stress) / 1e3  # branch a goes far beyond
+    equilibrium = line(loop, "equilibrium")
+    np.testing.assert_allclose(equilibrium.get_ydata(), result.curves.stress / 1e3)
+
+
+def test_a_microscale_loop_that_does_not_reach_branch_c_is_drawn() -> None:
+    far = replace(fabricated.MICRO, eps_star=0.9, relaxation=())
+    chain = fabricated.Chain(springs=[far], heights=[fabricated.HEIGHT], area=fabricated.AREA)
+    result = fabricated.microscale_result(chain=chain, relaxation=0)
+    loop = plot_fit(result).axes[-1]
+    assert "a" in texts(loop)
+    assert "c" not in texts(loop)
+
+
+def test_shakes_of_a_measured_motion_are_no_branch_of_their_own() -> None:
+    cuts = tuple(
+        Section(name, start, stop)
+        for name, start, stop in (
+            ("snap-through", 0, 400), ("held", 400, 402), ("snap-through", 402, 600),
+            ("held", 600, 640), ("snap-back", 640, 1000),
+        )
+    )  # fmt: skip
+    kept = _without_shakes(cuts, 1000)
+    assert [(cut.branches, cut.start, cut.stop) for cut in kept] == [
+        ("snap-through", 0, 600), ("held", 600, 640), ("snap-back", 640, 1000)
+    ]  # fmt: skip

@@ -302,7 +302,7 @@ def test_nothing_presses_behind_an_open_gap() -> None:
         assert answer.sensitivities[name].base_stress[-1] == 0.0
 
 
-@pytest.mark.parametrize("family", fresh.FAMILIES)
+@pytest.mark.parametrize("family", FRESH)
 def test_fresh_scenes(family: str) -> None:
     judged = 0
     for number in FRESH[family]:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from foamfit.trust.covariance import autocorrelation_time, covariance, half_width, state
+from foamfit.trust.covariance import covariance, half_width, state
+from foamfit.trust.noise_process import autocorrelation_time
 
 
 def ar1(n: int, rho: float, seed: int) -> np.ndarray:

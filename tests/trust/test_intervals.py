@@ -32,9 +32,10 @@ from foamfit.report.identifiability_plots import plot_profiles
 from foamfit.trust import intervals, resample
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
-from foamfit.trust.covariance import NoiseProcess, noise_process
 from foamfit.trust.intervals import Choice, assess
+from foamfit.trust.noise_process import NoiseProcess, noise_process
 from foamfit.trust.profile import departures, profile
+from foamfit.trust.ranges import Open
 from foamfit.trust.refit import Refit
 from foamfit.trust.resample import block_length, bootstrap, mcmc
 
@@ -645,6 +646,8 @@ def test_intervals_are_made_with_the_parameters_on_their_limits(impact, monkeypa
     monkeypatch.setattr(
         one_model, "assess", lambda best, *_, **__: seen.append(best) or intervals.Intervals()
     )
+    # The point is no minimum; what would go on from there is left out.
+    monkeypatch.setattr(one_model, "left_open", lambda *_: Open())
     found = Found(problem, Tracker(problem.objective, best_values=values), AGREED)
     _, best = judge(found, Choice("profile"), lambda _: None)
     assert [one.values[at] for one in seen] == [0.0]

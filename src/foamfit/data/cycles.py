@@ -263,6 +263,23 @@ def _cycles(displacement: Array, stress: Array) -> tuple[list[int], list[int]]:
     return peaks, rests
 
 
+def inner_loops(displacement: Array) -> list[tuple[int, int]]:
+    """Samples (first, past the last) in which one loading and unloading is partly reversed.
+
+    A reversal lasts until the motion is past the place again where it turned.
+    """
+    turns = find_turns(displacement)
+    peak, out = int(np.argmax(displacement[turns])), list[tuple[int, int]]()
+    for i in (*range(0, peak, 2), *range(peak + 1, len(turns) - 1, 2)):
+        start = int(turns[i])
+        ahead = displacement[int(turns[i + 1]) :]
+        past = ahead >= displacement[start] if i < peak else ahead <= displacement[start]
+        stop = int(turns[i + 1]) + int(np.argmax(past)) if past.any() else len(displacement)
+        if not out or start >= out[-1][1]:  # a loop in a loop is a part of it
+            out.append((start, stop))
+    return out
+
+
 def inner_reversals(displacement: Array) -> list[str]:
     """Say where the motion of one loading and unloading turns round below its peak."""
     turns = find_turns(displacement)
@@ -277,7 +294,7 @@ def inner_reversals(displacement: Array) -> list[str]:
         return []
     times, share = "once" if len(backs) == 1 else f"{len(backs)} times", max(backs) / size
     return [
-        f"Check: the record reverses {times} below its peak, by up to {percent(share)} of it; the "
-        "law has no inner loops: partial unloading runs back along the branch it came along, so a "
-        "loop there stays in the residuals."
+        f"Check: the record reverses {times} below its peak, by up to {percent(share)} of it; "
+        "bistable springs have no inner loops: their partial unloading runs back along the branch "
+        "it came along, so a loop there stays in the residuals; microscale springs follow it."
     ]

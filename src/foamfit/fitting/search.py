@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 from scipy.stats import qmc
@@ -127,12 +128,13 @@ class Loop:
         return float(np.interp(strain, np.maximum.accumulate(self.strain[way]), self.stress[way]))
 
 
-def read_spring(loop: Loop, marks: Array, scales: Scales) -> Array:
+def read_spring(loop: Loop, marks: Array, scales: Scales, *, soft: bool = False) -> Array:
     """Read a bistable spring off a loop, given where on it A1, C1 and C2 are taken to lie.
 
     `marks` (5,) in [0, 1] are the places of A1, C1 and C2 between their neighbours, and shares of
     the stress at C2 and of the damping. Returned are k0 … kh_minus, eta (SI): initial slope from
-    A1, k_h+ from A1 to C1, k_c through C1 and C2, k_h- from C2 towards rest.
+    A1, k_h+ from A1 to C1, k_c through C1 and C2 (of two such branches the `soft` one, close to its
+    pole, or the stiff one), k_h- from C2 towards rest.
     """
     last = float(np.max(loop.strain))
     eps_a = min((0.02 + 0.85 * marks[0]) * last, 0.9)
@@ -144,10 +146,11 @@ def read_spring(loop: Loop, marks: Array, scales: Scales) -> Array:
     eps_c = eps_a + (0.2 + 0.8 * marks[2]) * (hat_c - eps_a)
     sigma_c = loop.at(eps_c, loading=False) * (0.5 + marks[3])
     sigma_c = min(max(sigma_c, 0.02 * sigma_a), 0.98 * sigma_a)
+    kc = _stiffness_between(hat_c - eps_c, sigma_c, sigma_hat_c)
     return np.array(
         [
             sigma_a * (1.0 - eps_a) / eps_a,
-            _stiffness_between(hat_c - eps_c, sigma_c, sigma_hat_c),
+            sigma_c * sigma_hat_c / kc if soft else kc,  # the product of the two
             sigma_c - sigma_a,
             eps_a,
             eps_c,
@@ -211,7 +214,7 @@ def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> l
     relaxing = 2 * terms * sum(kind in HYSTERETIC for kind in kinds)
     marks = qmc.LatinHypercube(7 * count + 2 * micro + relaxing, rng=rng).random(CURVE_STARTS)
     starts = []
-    for mark in marks:
+    for mark, near_pole in product(marks, (False, True) if "bistable" in kinds else (False,)):
         values = space.values.copy()
         heights = np.full(count, space.scales.height / count)
         if count > 1:
@@ -238,7 +241,8 @@ def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> l
                 places = np.append(places, [next(rest), next(rest)])
                 values[first : first + 8] = read_microscale(own, places, space.scales)
             else:
-                values[first : first + 8] = read_spring(own, places, space.scales)
+                read = read_spring(own, places, space.scales, soft=near_pole)
+                values[first : first + 8] = read
             for at in range(first + 8, first + 8 + 2 * terms, 2):
                 values[at] = 10.0 ** (1.5 * next(rest) - 1.5)
                 values[at + 1] = space.scales.duration * 10.0 ** (2.0 * next(rest) - 2.5)

@@ -14,6 +14,8 @@ from typing import Any
 
 from foamfit.errors import InputError
 from foamfit.report.sides import Result, Side, published_side, side_of
+from foamfit.results import law_in_words
+from foamfit.springs.parameters import HYSTERETIC
 from foamfit.springs.published import MM, MPA
 from foamfit.springs.published import published as published_sets
 
@@ -119,17 +121,24 @@ def compare(results: Sequence[Result], published: str | None = None) -> Comparis
     sides = [side_of(result) for result in results]
     if not sides:
         raise InputError("nothing to compare; give at least one result folder")
-    belongs = [published or recognised(side.test) for side in sides]
+    belongs = [published or _published_of(side) for side in sides]
     found = [name for name in belongs if name is not None]
     if len(found) == len(sides):
         pairs = zip(sides, [published_side(name) for name in found], strict=True)
         return Comparison(tuple(_pair(one, other) for one, other in pairs), with_published=True)
     if len(sides) == 1:
         raise InputError(
-            f"the test '{sides[0].test}' names no published set; choose one by --published "
+            "no published set has microscale springs; give a second result to compare with"
+            if "microscale" in sides[0].kinds
+            else f"the test '{sides[0].test}' names no published set; choose one by --published "
             f"({names}), or give a second result"
         )
     return Comparison(tuple(_pair(side, sides[0]) for side in sides[1:]), with_published=False)
+
+
+def _published_of(side: Side) -> str | None:
+    """Return the published set that a result goes beside: none if it has microscale springs."""
+    return None if "microscale" in side.kinds else recognised(side.test)
 
 
 def recognised(test: str) -> str | None:
@@ -171,17 +180,43 @@ def _total(*parts: Any) -> Any:
 
 
 _ETA = _Quantity("η", "Pa·s", ("eta",), _total)
+_K0 = _Quantity("k0", "MPa", ("k0",), lambda k0: k0 / MPA)
+_HEIGHT = _Quantity("h", "mm", ("height",), lambda h: h / MM)
 TABLE = (  # of a linear spring, those whose parameters it has
-    _Quantity("k0", "MPa", ("k0",), lambda k0: k0 / MPA),
+    _K0,
     _Quantity("Δσ/σ_a", "", ("dsigma", "k0", "eps_a"), _drop),
     _ETA,
     _Quantity("ε_a", "", ("eps_a",), _total),
     _Quantity("ε_c", "", ("eps_c",), _total),
-    _Quantity("h", "mm", ("height",), lambda h: h / MM),
+    _HEIGHT,
     _Quantity("k_h+/k0", "", ("kh_plus", "k0"), _ratio),
     _Quantity("k_h−/k0", "", ("kh_minus", "k0"), _ratio),
     _Quantity("k_c/k0", "", ("kc", "k0"), _ratio),
 )
+OF_MICROSCALE = (  # which the paper's tables do not have
+    _K0,
+    _Quantity("k_c", "MPa", ("kc",), lambda kc: kc / MPA),
+    _ETA,
+    _Quantity("ε_*", "", ("eps_star",), _total),
+    _Quantity("σ₊", "MPa", ("sigma_plus",), lambda sigma: sigma / MPA),
+    _Quantity("s₊", "", ("spread_plus",), _total),
+    _Quantity("σ₋", "MPa", ("sigma_minus",), lambda sigma: sigma / MPA),
+    _Quantity("s₋", "", ("spread_minus",), _total),
+    _HEIGHT,
+)
+
+
+def _quantities(kind: str, relaxation: int) -> tuple[_Quantity, ...]:
+    """Return the rows of a kind of spring; a linear spring leaves out what it does not have."""
+    table = OF_MICROSCALE if kind == "microscale" else TABLE
+    if kind not in HYSTERETIC:
+        return table
+    terms = [
+        _Quantity(f"{symbol}_{k}", unit, (f"{short}{k}",), _total)
+        for k in range(1, relaxation + 1)
+        for symbol, unit, short in (("g", "", "g"), ("τ", "s", "tau"))
+    ]
+    return (*table, *terms)
 
 
 def _evaluate(side: Side, names: Sequence[str], formula: Callable[..., Any]) -> _Value | None:
@@ -231,7 +266,7 @@ def _pair(side: Side, other: Side) -> Pair:
     if not nothing:
         remarks += _remarks(side, other, any("/" in row.name for row in rows))
     status = f"{side.status}, stopped by {side.stopped}" if side.stopped else side.status
-    kinds = "+".join(side.kinds)
+    kinds = law_in_words("+".join(side.kinds), side.relaxation)
     return Pair(side.test, kinds, side.drive, status, other.label, rows, tuple(remarks))
 
 
@@ -246,6 +281,11 @@ def _remarks(side: Side, other: Side, ratios: bool) -> Iterator[str]:
         yield (
             f"The measured {side.drive} is the input of this fit: its noise can bias the "
             "parameters, which the standard errors do not count."
+        )
+    if (side.relaxation > 0) != (other.relaxation > 0):
+        yield (
+            "Only one of the two laws relaxes: in the other one the springs' parameters take up "
+            "what relaxes."
         )
     if side.kinds != other.kinds:
         yield (
@@ -266,6 +306,11 @@ def _remarks(side: Side, other: Side, ratios: bool) -> Iterator[str]:
 
 def _incomparable(side: Side, other: Side) -> str:
     """Return why no parameter can be compared, "" if some can."""
+    if other.source is not None and "microscale" in side.kinds:
+        return (
+            "the published sets have no microscale springs, so there is nothing to compare these "
+            "parameters with"
+        )
     if [*map(_family, side.kinds)] != [*map(_family, other.kinds)]:
         return (
             f"the springs differ ({'+'.join(side.kinds)} and {'+'.join(other.kinds)}), so their "
@@ -276,16 +321,16 @@ def _incomparable(side: Side, other: Side) -> str:
 
 
 def _family(kind: str) -> str:
-    return "bistable" if kind == "bistable" else "linear"
+    return kind if kind in HYSTERETIC else "linear"
 
 
 def _spring_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
-    chain = len(side.kinds) > 1
+    several = len(side.kinds) > 1
     for i, kind in enumerate(side.kinds, start=1):
         alike = i <= len(other.kinds) and _family(other.kinds[i - 1]) == _family(kind)
-        for quantity in TABLE:
+        for quantity in _quantities(kind, side.relaxation):
             eta = quantity is _ETA
-            if eta and not chain:
+            if eta and not several:
                 continue  # of one spring, it stands with the onsite damper
             names = [f"s{i}_{part}" for part in quantity.parts]
             value = _evaluate(side, names, quantity.formula)
@@ -295,7 +340,7 @@ def _spring_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
             ):
                 continue
             remark = nothing or _remark(value, reference, eta, side, other)
-            yield _row(i if chain else 0, quantity.name, quantity.unit, value, reference, remark)
+            yield _row(i if several else 0, quantity.name, quantity.unit, value, reference, remark)
 
 
 def _damping_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:

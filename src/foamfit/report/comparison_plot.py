@@ -20,8 +20,11 @@ MARKS = ((BLUE, "o"), (VERMILION, "s"), ("black", "^"), (GREY, "D"))  # of the r
 MATH = {
     "k0": "$k_0$", "σ_a": r"$\sigma_a$", "ε_a": r"$\varepsilon_a$", "ε_c": r"$\varepsilon_c$",
     "k_h+": "$k_{h+}$", "k_h−": "$k_{h-}$", "k_c": "$k_c$", "Δσ": r"$\Delta\sigma$",
-    "η": r"$\eta$",
+    "η": r"$\eta$", "ε_*": r"$\varepsilon_*$", "σ₊": r"$\sigma_+$", "σ₋": r"$\sigma_-$",
+    "s₊": "$s_+$", "s₋": "$s_-$",
 }  # fmt: skip
+MATH |= {f"g_{k}": f"$g_{k}$" for k in range(1, 10)}
+MATH |= {f"τ_{k}": rf"$\tau_{k}$" for k in range(1, 10)}
 IN_MATH = re.compile("|".join(map(re.escape, MATH)))
 
 

@@ -171,11 +171,12 @@ def write_table(path: Path, rows: Iterable[Iterable[object]]) -> None:
 
 def _parameter_rows(parameters: Mapping[str, ParameterEstimate]) -> Iterator[list[object]]:
     yield [
-        "name", "value", "stderr", "ci95_low", "ci95_high", "unit", "state", "why", "ci95_method"
+        "name", "value", "stderr", "ci95_low", "ci95_high", "range_low", "range_high", "unit",
+        "state", "why", "ci95_method",
     ]  # fmt: skip
     for name, p in parameters.items():
-        low, high = p.ci95 or (None, None)
-        numbers = (plain(number) for number in (p.value, p.stderr, low, high))
+        ends = (*(p.ci95 or (None, None)), *(p.range or (None, None)))
+        numbers = (plain(number) for number in (p.value, p.stderr, *ends))
         yield [name, *numbers, p.unit, p.state, p.why, p.ci95_method]
 
 

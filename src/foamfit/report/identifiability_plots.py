@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,7 +22,10 @@ if TYPE_CHECKING:
     from foamfit.trust.profile import Profile
 
 # Of one spring's branches.
-SHADES = {"a": "#eef3f7", "d": "#fbeedd", "c": "#e6ddd5", "e": "#e3f1ea"}
+SHADES = {
+    "a": "#eef3f7", "d": "#fbeedd", "c": "#e6ddd5", "e": "#e3f1ea",
+    "snap-through": "#fbeedd", "held": "#e6ddd5", "snap-back": "#e3f1ea",
+}  # fmt: skip
 OTHERS = ("#f3f3f3", "#e4e4e4")  # of several springs' branches, in turn
 STRIP = 0.4  # height of a strip, in
 CELL = 0.24  # height of a cell, in
@@ -126,7 +130,7 @@ def _draw_sensitivities(figure: FigureBase, insight: Insight) -> None:
 
 
 def _shade(ax: Axes, x: Array, cuts: tuple[Section, ...]) -> None:
-    for turn, cut in enumerate(cuts):
+    for turn, cut in enumerate(_without_shakes(cuts, x.size)):
         left, right = x[cut.start], x[min(cut.stop, x.size - 1)]
         flies = " " in cut.branches
         shade = SHADES.get(cut.branches, "white" if flies else OTHERS[turn % 2])
@@ -137,6 +141,23 @@ def _shade(ax: Axes, x: Array, cuts: tuple[Section, ...]) -> None:
                 xycoords=("data", "axes fraction"), textcoords="offset points",
                 ha="center", va="bottom", fontsize=6.5, color=GREY,
             )  # fmt: skip
+
+
+def _without_shakes(cuts: tuple[Section, ...], samples: int) -> list[Section]:
+    """Leave out what lasts for less than a hundredth of the test between two of one name.
+
+    Micro-springs are held wherever a measured motion shakes.
+    """
+    out: list[Section] = []
+    for i, cut in enumerate(cuts):
+        around = {one.branches for one in (*out[-1:], *cuts[i + 1 : i + 2])}
+        if out and len(around) == 1 and cut.stop - cut.start < 0.01 * samples:
+            cut = replace(cut, branches=out[-1].branches)
+        if out and cut.branches == out[-1].branches:
+            out[-1] = replace(out[-1], stop=cut.stop)
+        else:
+            out.append(cut)
+    return out
 
 
 def _color(curve: str) -> str:
@@ -153,7 +174,7 @@ def _draw_information(figure: FigureBase, insight: Insight, correlation: Array |
     told = [c for c in range(len(parts)) if np.nanmax(shares[:, c], initial=0.0) > 0.005]
     parts, shares = tuple(parts[c] for c in told), shares[:, told]
     k = len(insight.names)
-    left, right = figure.subplots(1, 2, width_ratios=[len(parts) + 1.0, k])
+    left, right = figure.subplots(1, 2, width_ratios=[max(len(parts) + 1.0, 0.6 * k), k])
     _cells(left, 100.0 * shares, "Blues", (0.0, 130.0), "{:.0f}")
     left.set_title("where the information comes from (%)", loc="left", fontsize=7.5, pad=4)
     left.set_yticks(range(k), insight.names)

@@ -22,7 +22,7 @@ from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.search import Tracker, search
 from foamfit.report.folder import load_result
 from foamfit.report.sides import published_side
-from foamfit.results import ParameterEstimate
+from foamfit.results import ParameterEstimate, snapping_of
 from foamfit.solve.simulation import Response, simulate
 from foamfit.springs import kernels
 from foamfit.springs.chain import Chain, Impact
@@ -53,6 +53,7 @@ class Expected:
     estimates: dict[str, ParameterEstimate]  # What varies, with expected standard errors
     visited: dict[str, tuple[str, ...]]  # Branches of each spring
     insight: Insight | None  # None if no parameter changes the curves
+    snapped: dict[str, float]  # Largest fraction of micro-springs that snaps, of each spring
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +104,7 @@ def start_values(problem: Problem, seed: int = 0) -> tuple[Array, str]:
     rng = np.random.default_rng(seed)
     search(tracker, problem.space(), starts=starts, rng=rng, progress=lambda *_: None)
     if tracker.best_values is None:
+        problem.objective.simulate(problem.vector())  # says why, if it cannot be simulated at all
         raise SimulationError(
             f"{problem.measurement.name}: no start value could be simulated; give some by "
             "--published or --params"
@@ -259,7 +261,7 @@ def _faster(
     test = simulated_test(test, chain_of(problem, values), impact)
     return make_problem(
         test, problem.model.name, "impact", problem.params, problem.objective.weights,
-        problem.objective.interior_mass,
+        problem.objective.interior_mass, relaxation=problem.model.relaxation,
     )  # fmt: skip
 
 
@@ -286,7 +288,20 @@ def expect(problem: Problem, values: Array, noise: Mapping[str, float]) -> Expec
         expected[name] = ParameterEstimate(value, known, None, unit, True, state, why)
     impact = problem.objective.drive == "impact"
     velocity = _impact(problem.measurement).velocity if impact else None
-    return Expected(velocity, expected, visited(problem, best.simulated), insight)
+    there = _snapped(best)
+    return Expected(velocity, expected, visited(problem, best.simulated), insight, there)
+
+
+def _snapped(best: BestPoint) -> dict[str, float]:
+    """Largest fraction of micro-springs that snaps, of each microscale spring where it is known."""
+    problem, curves = best.problem, best.simulated.curves
+    test, drive = problem.measurement, problem.objective.drive
+    moved = curves.get("displacement_time", test.displacement)
+    stress = test.stress if drive == "stress" else curves.get("stress_strain")
+    strain = None if moved is None else moved / test.specimen.height
+    chain = chain_of(problem, best.values[: len(problem.model.names)])
+    found = snapping_of(chain, strain, None if drive == "impact" else stress)
+    return {name: snapped.most for name, snapped in found.items()}
 
 
 def worth(insight: Insight) -> dict[str, dict[str, float]]:
@@ -313,6 +328,7 @@ def outlook_of(
     *,
     published_set: str | None = None,
     result: Path | None = None,
+    relaxation: int = 0,
 ) -> Outlook:
     """Read a test, or a TOML that plans one, and look ahead.
 
@@ -328,7 +344,9 @@ def outlook_of(
             f"{test} plans a test without data; say by --published or --params what foam it is"
         )
     measurement = read_test(test, specimen) if made else planned_test(test)
-    problem = make_problem(measurement, model, drive, None, None, interior_mass=False)
+    problem = make_problem(
+        measurement, model, drive, None, None, interior_mass=False, relaxation=relaxation
+    )
     if published_set is not None:
         values, source = published_values(problem, published_set)
     elif result is not None:
@@ -338,5 +356,7 @@ def outlook_of(
     if not made:
         chain = chain_of(problem, values)
         measurement = simulated_test(measurement, chain, _impact(measurement))
-        problem = make_problem(measurement, model, drive, None, None, interior_mass=False)
+        problem = make_problem(
+            measurement, model, drive, None, None, interior_mass=False, relaxation=relaxation
+        )
     return make_outlook(problem, values, source)

@@ -8,6 +8,9 @@ import numpy as np
 
 from foamfit.report.outlook import GUESSED, Outlook, chain_of, worth
 from foamfit.report.readable import readable
+from foamfit.results import law_in_words
+from foamfit.springs.law import MICROSCALE
+from foamfit.springs.parameters import KINDS
 from foamfit.springs.spring import BistableSpring
 from foamfit.text import aligned, engineering, labelled, percent, significant, wrapped
 from foamfit.trust.checklist import ESTIMATED
@@ -23,8 +26,9 @@ def outlook_text(outlook: Outlook) -> str:
         f"({'stated' if level.given else 'estimated'})"
         for name, level in outlook.noise.items()
     )
+    law = law_in_words(problem.model.name, problem.model.relaxation)
     told = [
-        ("model", [f"{problem.model.name}, {problem.objective.drive} drive"]),
+        ("model", [f"{law}, {problem.objective.drive} drive"]),
         ("start", [f"{outlook.source}; all that follows holds there"]),
         ("noise", [noise, *_larger_residuals(outlook)]),
         ("loop", list(_closing_sentences(outlook))),
@@ -59,6 +63,9 @@ def _closing_sentences(outlook: Outlook) -> Iterator[str]:
     for name, seen in planned.visited.items():
         if "a" not in seen:
             continue
+        if KINDS.index(outlook.problem.model.kinds[int(name[1:]) - 1]) == MICROSCALE:
+            yield _snapping_sentence(at, name, seen, planned.snapped.get(name))
+            continue
         if planned.velocity is None:
             strain, stress = _needed(outlook, int(name[1:]))
             closing = f"from an overall strain of {strain:.3g} ({engineering(stress, 'Pa')}) on"
@@ -77,6 +84,17 @@ def _closing_sentences(outlook: Outlook) -> Iterator[str]:
         if lost and outlook.source.startswith(GUESSED) and "e" not in seen:
             sentence += f", which is a guess: this test does not determine {lost}"
         yield f"{sentence}."
+
+
+def _snapping_sentence(at: str, name: str, seen: tuple[str, ...], most: float | None) -> str:
+    """Say how far a microscale spring goes; it has no one point that closes its loop."""
+    does = "snaps back" if "snap-back" in seen else "does not snap back"
+    if "snap-through" not in seen:
+        return f"{at} spring {name[1:]} stays elastic."
+    if most is None:
+        return f"{at} spring {name[1:]} snaps through and {does}."
+    sentence = f"{at} {percent(most)} of the micro-springs of spring {name[1:]} snap, and it {does}"
+    return f"{sentence}{'; of the others the test tells nothing' if most < 0.995 else ''}."
 
 
 def _needed(outlook: Outlook, spring: int) -> tuple[float, float]:

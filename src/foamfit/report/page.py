@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import base64
+import math
 from collections.abc import Iterator
 from importlib.metadata import version
 from typing import Any
 
+from foamfit.fitting.branches import covered
 from foamfit.report.figures import DPI, image
 from foamfit.report.identifiability_plots import plot_insight, plot_profiles
 from foamfit.report.plots import origin_word, plot_fit, plot_residuals
 from foamfit.report.readable import number, readable, readable_unit
 from foamfit.report.summary import ANSWERS, LADDER, conclusions, ladder_cells, misfits
 from foamfit.results import Fit
+from foamfit.springs.parameters import KINDS
+from foamfit.springs.spring import BistableSpring, MicroscaleSpring
 from foamfit.text import engineering, percent
+from foamfit.trust.covariance import RULE
 
 DRIVES = {
     "impact": "The motion follows from the mass and the velocity of the striker; nothing measured "
@@ -21,7 +26,24 @@ DRIVES = {
     "stress": "The measured stress acts on the chain, which is in equilibrium at every sample.",
     "displacement": "The measured displacement of the top is prescribed.",
 }
-BRANCHES = {"a": "elastic", "d": "snap-buckling", "c": "densified", "e": "snap-back"}
+# By kind of spring: its branches, and the points or marks that the figure has of it.
+BRANCHES = {
+    "bistable": {"a": "elastic", "d": "snap-buckling", "c": "densified", "e": "snap-back"},
+    "microscale": {
+        "a": "elastic, none has snapped",
+        "snap-through": "micro-springs snap",
+        "held": "as many stay snapped",
+        "snap-back": "micro-springs snap back",
+    },
+}
+MARKS = {
+    "bistable": "A1 and C1 are where the spring starts to snap and has snapped on loading; C2 and "
+    "A2 where it starts to snap back and has recovered on unloading.",
+    "microscale": "σ₊ and σ₋ are where half of the micro-springs have snapped on loading, and "
+    "where half have snapped back on unloading. Of a single spring also its branches are drawn, "
+    "thin and grey: the elastic branch a, on which none has snapped, and the densified branch c, "
+    "on which all have.",
+}
 POINTS = (  # attribute of the spring, symbol and its index, meaning, unit
     ("sigma_a", ("σ", "a"), "stress at A1, where snapping starts", "Pa"),
     ("sigma_c", ("σ̄", "c"), "stress at C2, where snap-back starts", "Pa"),
@@ -47,6 +69,7 @@ ENERGY = {  # of the audit: label and unit
     "momentum_change": ("change of momentum", "N·s"),
     "impulse_ratio": ("impulse over change of momentum", ""),
 }
+Point = tuple[tuple[str, str], str, str, str]  # symbol and its index, meaning, value, unit
 COARSE = 160  # dots per inch of what is only on the page, and should not take long
 BADGES = {True: "ok", False: "weak", None: "fixed"}  # of the answers to the checklist
 CITATION = (
@@ -88,12 +111,21 @@ def render_report(result: Fit, *, fit_png: bytes | None = None) -> str:
             if name not in ("nfev", "n_starts")  # the page says these where it says how
         },
         visited=_visited(result),
+        marks=[MARKS[kind] for kind in MARKS if kind in result.model.split("+")],
         parameters=[readable(name, p) for name, p in result.parameters.items()],
-        points={name: _points(spring) for name, spring in result.bistable_springs.items()},
+        ranged=any(p.range for p in result.parameters.values()),
+        rule=RULE,
+        points={
+            f"Points of the law, spring {name}": _points(spring)
+            for name, spring in result.bistable_springs.items()
+        }
+        | {
+            f"Snapping of spring {name}": list(_snapping(result, name, spring))
+            for name, spring in result.microscale_springs.items()
+        },
         energy_sentences=energy.pop("sentences", None) or [],
         energy=dict(_energies(energy)),
         drive_meaning=DRIVES.get(result.drive, ""),
-        branches=BRANCHES,
         ladder=result.ladder,
         ladder_header=LADDER,
         ladder_rows=[] if result.ladder is None else ladder_cells(result.ladder),
@@ -107,7 +139,7 @@ def render_report(result: Fit, *, fit_png: bytes | None = None) -> str:
     )
 
 
-def _points(spring: Any) -> list[tuple[tuple[str, str], str, str, str]]:
+def _points(spring: BistableSpring) -> list[Point]:
     rows = []
     for attribute, symbol, meaning, si in POINTS:
         value = getattr(spring, attribute)
@@ -115,6 +147,33 @@ def _points(spring: Any) -> list[tuple[tuple[str, str], str, str, str]]:
         shown = "does not exist" if value is None else number(value / factor)
         rows.append((symbol, meaning, shown, unit or "–"))
     return rows
+
+
+def _snapping(result: Fit, name: str, spring: MicroscaleSpring) -> Iterator[Point]:
+    """Give what stands for the points of a bistable spring: symbol, meaning, value and unit."""
+    for sign, sigma, spread, word in (
+        ("+", spring.sigma_plus, spring.spread_plus, "through"),
+        ("−", spring.sigma_minus, spring.spread_minus, "back"),
+    ):
+        factor, unit = readable_unit(sigma, "Pa")
+        low, high = (number(sigma * math.exp(s * spread) / factor) for s in (-1.0, 1.0))
+        median = f"median snap-{word} stress; 68 % snap {word} between {low} and {high} {unit}"
+        yield ("σ", sign), median, number(sigma / factor), unit
+    jump = "strain by which a micro-spring of median snap-through stress jumps"
+    yield ("Δε", "+"), jump, number(spring.snap_strain), "–"
+    if (snapped := result.snapping.get(name)) is not None:
+        factor, unit = readable_unit(stress := float(snapped.stress[snapped.turn]), "Pa")
+        yield ("p", "max"), "largest fraction snapped in the test", number(snapped.most), "–"
+        yield ("σ", "max"), "equilibrium stress there", number(stress / factor), unit
+        if result.strain is not None:
+            strain = float(result.strain[snapped.turn])
+            yield ("ε", "max"), "overall strain there", number(strain), "–"
+    total = sum(g for g, _ in spring.relaxation)
+    for k, (g, tau) in enumerate(spring.relaxation, start=1):
+        factor, unit = readable_unit(tau, "s")
+        time = f"{number(tau / factor)} {unit}"
+        share = f"g/(1+Σg), share of a sudden change of stress that relaxes, with τ = {time}"
+        yield ("g", str(k)), share, number(g / (1.0 + total)), "–"
 
 
 def _energies(energy: dict[str, Any]) -> Iterator[tuple[str, str]]:
@@ -125,11 +184,15 @@ def _energies(energy: dict[str, Any]) -> Iterator[tuple[str, str]]:
             yield label, engineering(value, unit) if unit else number(value)
 
 
-def _visited(result: Fit) -> dict[str, tuple[str, ...] | None]:
-    """Return the branches that each spring went through, None for a spring that has none."""
-    bistable = result.bistable_springs
-    names = [f"s{i}" for i in range(1, len(result.chain.springs) + 1)]
-    return {name: result.visited.get(name, ()) if name in bistable else None for name in names}
+def _visited(result: Fit) -> dict[str, list[tuple[str, str, bool]]]:
+    """Return the branches of each spring, what they are, and whether it went through them."""
+    return {
+        f"s{i}": [
+            (branch, meaning, branch in covered(result.visited.get(f"s{i}", ())))
+            for branch, meaning in BRANCHES.get(KINDS[spring.kind], {}).items()
+        ]
+        for i, spring in enumerate(result.chain.springs, start=1)
+    }
 
 
 def _figure(png: bytes, dpi: int = DPI) -> tuple[str, float]:

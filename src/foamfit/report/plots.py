@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from foamfit.arrays import Array
 from foamfit.report.figures import BLUE, GREY, INSIDE, VERMILION, drawing, save, say_nothing_there
 from foamfit.report.readable import readable_unit
+from foamfit.springs.spring import LinearSpring
 from foamfit.terminal import printable
 
 if TYPE_CHECKING:
@@ -32,8 +33,10 @@ POINTS = {
     ("e", "a"): "A2",
 }  # fmt: skip
 # Where the name of a point stands, in points from it: beside its curve, off the others.
-IN_LOOP = {"A1": (-4, 5), "C1": (-5, 3), "C2": (5, -3), "A2": (4, -7)}
-IN_TIME = {"A1": (5, -4), "C1": (-5, 3), "C2": (5, 3), "A2": (5, 4)}
+IN_LOOP = {"A1": (-4, 5), "C1": (-5, 3), "C2": (5, -3), "A2": (4, -7), "σ₊": (-4, 5), "σ₋": (5, -5)}
+IN_TIME = {"A1": (5, -4), "C1": (-5, 3), "C2": (5, 3), "A2": (5, 4), "σ₊": (5, -4), "σ₋": (5, 4)}
+LIGHT = {"a": (-4.0, 3.0), "c": (5.0, -4.0)}  # of branches that are drawn lightly
+IN_WORDS = {"snap-through": (-6.0, 6.0), "held": (-6.0, 4.0), "snap-back": (7.0, -6.0)}
 BESIDE = {"a": (-6, 4), "d": (-6, 4), "c": (7, -3), "e": (4, -7)}  # points from the branch
 MARKERS = 60  # of a measured curve: more of them blot
 PALE = "#A6CEE3"
@@ -54,9 +57,12 @@ def plot_fit(result: Fit, path: str | Path | None = None) -> Figure:
         for ax, panel in zip(axes, panels, strict=False):
             _draw(ax, panel)
             _mark_outliers(ax, panel, result)
-            _mark_switches(ax, panel, result)
+            labels = _Labels(ax, panel)
             if panel.key == "stress_strain":
-                _name_branches(ax, panel, result)
+                _draw_law(labels, result)
+            _mark_switches(labels, panel, result)
+            if panel.key == "stress_strain":
+                _name_branches(labels, panel, result)
         _head(figure, result)
     return save(figure, path)
 
@@ -249,13 +255,61 @@ def _mark_outliers(ax: Axes, panel: _Panel, result: Fit) -> None:
         ax.set_ylim(low, high)
 
 
-def _mark_switches(ax: Axes, panel: _Panel, result: Fit) -> None:
-    """Mark the points where a spring changes its branch, and name each where it first does."""
-    from matplotlib.patheffects import withStroke
+class _Labels:
+    """Places names in a panel: on no other name, and on little of the fitted curves and marks."""
 
-    fx, _, fy, _ = panel.scale()
+    def __init__(self, ax: Axes, panel: _Panel) -> None:
+        self.ax, (self.fx, _, self.fy, _) = ax, panel.scale()
+        low = np.array([ax.get_xlim()[0], ax.get_ylim()[0]])
+        self.corner, span = low, np.array(PANEL)
+        self.span = span / [np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim())]  # points per unit
+        self.curves = [
+            np.column_stack((s.x / self.fx, s.y / self.fy))[_evenly(s.x, s.y, 4 * MARKERS)]
+            for s in panel.lines
+            if s.kind == "fitted"
+        ]
+        self.marks: list[Array] = []
+        self.taken: list[Array] = []
+
+    def mark(self, places: Array) -> None:
+        """Draw dots at places (n, 2), in the units of the axes, that names are to leave free."""
+        self.ax.plot(*places.T, "o", ms=3.2, color="black", zorder=5)
+        self.marks += [places, places]
+
+    def write(
+        self, name: str, at: Array, wanted: tuple[float, float], *, stay: bool = False, **style: Any
+    ) -> None:
+        """Write a name beside a place; `stay`: on no other side of it than is wanted."""
+        from matplotlib.patheffects import withStroke
+
+        avoid = np.concatenate([np.empty((0, 2)), *self.curves, *self.marks])
+        anchor, avoid = (at - self.corner) * self.span, (avoid - self.corner) * self.span
+        offset = _free_offset(anchor, name, wanted, avoid, self.taken, stay=stay)
+        self.ax.annotate(
+            name, tuple(at), offset, textcoords="offset points", zorder=6,
+            ha="left" if offset[0] > 0 else "right", va="center",
+            path_effects=[withStroke(linewidth=1.5, foreground="white")], **style,
+        )  # fmt: skip
+
+
+def _mark_switches(labels: _Labels, panel: _Panel, result: Fit) -> None:
+    """Mark what happens to the springs, and name each mark where it first stands."""
     at: dict[str, list[tuple[float, float]]] = {}
+    for name, x, y in (*_switches(panel, result), *_halves(panel, result)):
+        at.setdefault(name, []).append((x / labels.fx, y / labels.fy))
+    wanted = IN_LOOP if panel.key == "stress_strain" else IN_TIME
+    for places in at.values():
+        labels.mark(np.array(places))
+    for name, places in at.items():
+        labels.write(name, np.array(places[0]), wanted.get(name[-2:], (5, 5)), fontsize=7)
+
+
+def _switches(panel: _Panel, result: Fit) -> Iterator[tuple[str, float, float]]:
+    """Give the points where a bistable spring changes its branch: name and place, SI."""
+    micro = result.microscale_springs
     for switch in result.switches:
+        if f"s{switch.spring}" in micro:
+            continue
         point = POINTS.get((switch.source, switch.target), f"{switch.source}→{switch.target}")
         name = f"s{switch.spring} {point}" if len(result.chain.springs) > 1 else point
         x = switch.time
@@ -263,28 +317,51 @@ def _mark_switches(ax: Axes, panel: _Panel, result: Fit) -> None:
             x = switch.displacement / result.measurement.specimen.height
         y = switch.displacement if panel.key == "displacement_time" else switch.stress
         if x is not None:
-            at.setdefault(name, []).append((x / fx, y / fy))
-    corner, span = np.array([ax.get_xlim()[0], ax.get_ylim()[0]]), np.array(PANEL)
-    span = span / [np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim())]  # typographic points per unit
-    lines = [np.column_stack((s.x / fx, s.y / fy)) for s in panel.lines if s.kind == "fitted"]
-    curves = [line[_evenly(line[:, 0], line[:, 1], 4 * MARKERS)] for line in lines]
-    points = [np.array(places) for places in at.values()]
-    avoid = (np.concatenate([np.empty((0, 2)), *curves, *points, *points]) - corner) * span
-    wanted = IN_LOOP if panel.key == "stress_strain" else IN_TIME
-    taken: list[Array] = []
-    for name, places in at.items():
-        ax.plot(*zip(*places, strict=True), "o", ms=3.2, color="black", zorder=5)
-        anchor = (np.array(places[0]) - corner) * span
-        offset = _free_offset(anchor, name, wanted.get(name[-2:], (5, 5)), avoid, taken)
-        ax.annotate(
-            name, places[0], offset, textcoords="offset points", zorder=6,
-            ha="left" if offset[0] > 0 else "right", va="center", fontsize=7,
-            path_effects=[withStroke(linewidth=1.5, foreground="white")],
+            yield name, x, y
+
+
+def _halves(panel: _Panel, result: Fit) -> Iterator[tuple[str, float, float]]:
+    """Give where half of the micro-springs have snapped, and snapped back: name and place, SI."""
+    fitted = next((line for line in panel.lines if line.kind == "fitted" and not line.node), None)
+    for spring, snapped in result.snapping.items():
+        for symbol, sample in zip(("σ₊", "σ₋"), snapped.halves, strict=True):
+            if sample is not None and fitted is not None and sample < fitted.x.size:
+                name = f"{spring} {symbol}" if len(result.chain.springs) > 1 else symbol
+                yield name, float(fitted.x[sample]), float(fitted.y[sample])
+
+
+def _draw_law(labels: _Labels, result: Fit) -> None:
+    """Draw branches a and c of the only spring, if it is microscale, and its equilibrium."""
+    if len(result.chain.springs) > 1 or not result.microscale_springs:
+        return
+    spring, ax = result.microscale_springs["s1"], labels.ax
+    (left, right), (low, top) = ax.get_xlim(), ax.get_ylim()
+    ax.set(xlim=(left, right), ylim=(low, top))  # the branches go on beyond
+    stress = np.linspace(0.0, top * labels.fy, 200)
+    on_a = stress / (spring.k0 + stress)
+    on_c = spring.eps_star + stress / (spring.kc + stress)
+    for name, strain, along in (("a", on_a, 0.9), ("c", on_c, 0.5)):
+        line = np.column_stack((strain, stress / labels.fy))[strain < right]
+        if len(line):  # branch c may lie beyond all that the test reached
+            ax.plot(*line.T, color="0.72", lw=0.7, zorder=1.5)
+            at = line[int(along * (len(line) - 1))]
+            labels.write(name, at, LIGHT[name], color=GREY, style="italic", fontsize=7)
+    if spring.relaxation and "s1" in result.snapping and result.strain is not None:
+        equilibrium = result.snapping["s1"].stress
+        ax.plot(
+            result.strain, equilibrium / labels.fy, color="0.35", lw=0.7, ls=(0, (4, 2)),
+            zorder=3.5, label="equilibrium",
         )  # fmt: skip
 
 
 def _free_offset(
-    anchor: Array, name: str, wanted: tuple[float, float], avoid: Array, taken: list[Array]
+    anchor: Array,
+    name: str,
+    wanted: tuple[float, float],
+    avoid: Array,
+    taken: list[Array],
+    *,
+    stay: bool = False,
 ) -> tuple[float, float]:
     """Return where a name stands beside its anchor: on no other name, on little of the curves.
 
@@ -293,7 +370,8 @@ def _free_offset(
     x, y = wanted
     size, best, found = np.array([4.2 * len(name), 9.0]), math.inf, (wanted, np.zeros(4))
     for factor in (1.0, 2.5, 4.0):
-        for dx, dy in ((x, factor * y), (-x, -factor * y), (x, -factor * y), (-x, factor * y)):
+        sides = ((x, factor * y), (-x, -factor * y), (x, -factor * y), (-x, factor * y))
+        for dx, dy in sides[:1] if stay else sides:
             low = np.add(anchor, (dx - (size[0] if dx < 0 else 0.0), dy - 0.5 * size[1]))
             high = low + size
             names = sum(bool(np.all((low < b[2:]) & (b[:2] < high))) for b in taken)
@@ -306,24 +384,45 @@ def _free_offset(
     return found[0]
 
 
-def _name_branches(ax: Axes, panel: _Panel, result: Fit) -> None:
-    """Write a, d, c, e beside the branches of the only spring."""
+def _name_branches(labels: _Labels, panel: _Panel, result: Fit) -> None:
+    """Write beside the curve of the only spring on which branch it is."""
     fitted = next((line for line in panel.lines if line.kind == "fitted"), None)
-    if len(result.chain.springs) > 1 or not result.bistable_springs or fitted is None:
+    springs = result.chain.springs
+    if len(springs) > 1 or isinstance(springs[0], LinearSpring) or fitted is None:
         return
-    fx, _, fy, _ = panel.scale()
+    style: Any = {"color": BLUE, "style": "italic", "weight": "bold"}
+    for branch, start, end in _first_visits(result, fitted):
+        x, y = fitted.x[start : end + 1] / labels.fx, fitted.y[start : end + 1] / labels.fy
+        middle = _evenly(x, y, 3)[1]
+        if branch in BESIDE and result.bistable_springs:
+            labels.ax.annotate(
+                branch, (x[middle], y[middle]), BESIDE[branch], textcoords="offset points",
+                ha="center", va="center", zorder=6, **style,
+            )  # fmt: skip
+        elif branch in IN_WORDS:
+            at = np.array([x[middle], y[middle]])
+            labels.write(branch, at, IN_WORDS[branch], stay=True, fontsize=7, **style)
+
+
+def _first_visits(result: Fit, fitted: _Line) -> Iterator[tuple[str, int, int]]:
+    """Give each branch of the only spring, and the samples of its first stretch on it.
+
+    Micro-springs are held wherever a measured motion shakes: a stretch that goes back by less than
+    a fiftieth of the largest strain is part of the one before it.
+    """
     starts = [0, *_switch_samples(result, fitted), fitted.x.size - 1]
     branches = [switch.source for switch in result.switches[:1]] or ["a"]
     branches += [switch.target for switch in result.switches]
-    for i, (branch, start, end) in enumerate(zip(branches, starts, starts[1:], strict=False)):
-        if branch not in branches[:i] and end > start:
-            x, y = fitted.x[start : end + 1] / fx, fitted.y[start : end + 1] / fy
-            middle = _evenly(x, y, 3)[1]
-            ax.annotate(
-                branch, (x[middle], y[middle]), BESIDE.get(branch, (6, 6)),
-                textcoords="offset points", ha="center", va="center", color=BLUE,
-                style="italic", weight="bold", zorder=6,
-            )  # fmt: skip
+    stretches: list[tuple[str, int, int]] = []
+    for branch, start, end in zip(branches, starts, starts[1:], strict=False):
+        shakes = branch == "held" and np.ptp(fitted.x[start : end + 1]) < 0.02 * np.ptp(fitted.x)
+        if stretches and (shakes or branch == stretches[-1][0]):
+            stretches[-1] = (stretches[-1][0], stretches[-1][1], end)
+        elif not shakes:
+            stretches.append((branch, start, end))
+    for i, (branch, start, end) in enumerate(stretches):
+        if end > start and branch not in [one for one, *_ in stretches[:i]]:
+            yield branch, start, end
 
 
 def _switch_samples(result: Fit, loop: _Line) -> list[int]:
@@ -343,7 +442,7 @@ def _switch_samples(result: Fit, loop: _Line) -> list[int]:
 def _head(figure: Figure, result: Fit) -> None:
     name = printable(" ".join(result.measurement.name.split()))
     name = name if len(name) <= 60 else name[:59] + "…"
-    title = f"{name} · {result.model} · {result.drive} drive"
+    title = f"{name} · {result.law} · {result.drive} drive"
     word = origin_word(result)
     if word and word not in name.lower():
         title += f" · {word}"

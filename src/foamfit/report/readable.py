@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 
 from foamfit import text
@@ -12,6 +13,8 @@ SYMBOLS = {
     "k0": ("k", "0"), "kc": ("k", "c"), "dsigma": ("Δσ", ""), "eps_a": ("ε", "a"),
     "eps_c": ("ε", "c"), "kh_plus": ("k", "h+"), "kh_minus": ("k", "h−"), "eta": ("η", ""),
     "height": ("h", ""), "site_eta": ("η", "site"), "time_shift": ("Δt", ""),
+    "eps_star": ("ε", "*"), "sigma_plus": ("σ", "+"), "spread_plus": ("s", "+"),
+    "sigma_minus": ("σ", "−"), "spread_minus": ("s", "−"),
 }  # fmt: skip
 
 UNITS = {
@@ -43,6 +46,7 @@ class Readable:
     state: str
     why: str
     method: str = ""
+    range: str = ""
 
     @property
     def with_error(self) -> str:
@@ -62,14 +66,18 @@ def readable(name: str, p: ParameterEstimate) -> Readable:
     """
     factor, unit = readable_unit(p.value or p.stderr or 0.0, p.unit)
     value = p.value / factor
-    shown, stderr, interval = number(value), "", ""
+    shown, stderr, interval, span = number(value), "", "", ""
     if math.isfinite(value) and p.stderr is not None and 0 < p.stderr < math.inf:
         shown, stderr, places = _rounded(value, p.stderr / factor)
         if p.ci95 is not None:
             interval = " to ".join(_fixed(bound / factor, places) for bound in p.ci95)
+    if p.range is not None:  # an error of the law leaves two digits
+        span = " to ".join(f"{bound / factor + 0.0:.2g}".replace("-", "−") for bound in p.range)
     unit = {"": "–", "1": "–", "-": "–", "Pa s": "Pa·s", "Pa*s": "Pa·s"}.get(unit, unit)
     method = p.ci95_method or ""
-    return Readable(name, _symbol(name), shown, stderr, interval, unit, p.state, p.why, method)
+    return Readable(
+        name, _symbol(name), shown, stderr, interval, unit, p.state, p.why, method, span
+    )
 
 
 def number(value: float | None) -> str:
@@ -82,9 +90,11 @@ def number(value: float | None) -> str:
 def _symbol(name: str) -> tuple[str, str]:
     """Return the symbol of a parameter and its index: k and "c,2" of s2_kc."""
     spring, _, base = name.partition("_")
-    if name in SYMBOLS or base not in SYMBOLS:
-        return SYMBOLS.get(name, (name, ""))
-    stem, index = SYMBOLS[base]
+    term = re.fullmatch(r"(g|tau)(\d+)", base)
+    known = SYMBOLS | ({base: ("τ" if term[1] == "tau" else "g", term[2])} if term else {})
+    if name in known or base not in known:
+        return known.get(name, (name, ""))
+    stem, index = known[base]
     return stem, ",".join(part for part in (index, spring.removeprefix("s")) if part)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from foamfit.errors import InputError
 from foamfit.report.folder import load_result
-from foamfit.results import Fit, ParameterEstimate
+from foamfit.results import Fit, ParameterEstimate, law_in_words
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import BISTABLE_NAMES, LINEAR_NAMES
 from foamfit.springs.published import PublishedSet
@@ -41,6 +41,7 @@ class Side:
     test: str = ""
     sha: str = ""
     source: PublishedSet | None = None
+    relaxation: int = 0  # terms of each hysteretic spring
 
 
 def side_of(result: Result) -> Side:
@@ -52,9 +53,16 @@ def side_of(result: Result) -> Side:
     where = str(result) if isinstance(result, str | Path) else "the result"
     given = _whole(content, CONTENT, where)
     test, model, drive = given["test"], given["model"], given["drive"]
+    terms = given.get("relaxation", 0)
+    if type(terms) is not int or terms < 0:
+        raise InputError(
+            f"{where} is no whole result of a fit: 'relaxation' cannot be {str(terms)[:40]!r}; "
+            "fit again"
+        )
     return Side(
-        label=f"{test}: {model}, {drive} drive",
+        label=f"{test}: {law_in_words(model, terms)}, {drive} drive",
         kinds=Model.parse(model).kinds,
+        relaxation=terms,
         estimates={name: _read_estimate(p, where, name) for name, p in given["parameters"].items()},
         correlation=_correlation(given.get("correlation"), where),
         drive=drive,

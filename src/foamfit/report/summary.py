@@ -7,8 +7,8 @@ from collections.abc import Iterable, Iterator
 
 from foamfit.data.measurement import interior_channel
 from foamfit.report.readable import Readable, readable
-from foamfit.results import Fit, Ladder, ParameterEstimate
-from foamfit.text import aligned, counted, listed, percent, wrapped
+from foamfit.results import Fit, Ladder, ParameterEstimate, Rung
+from foamfit.text import aligned, counted, engineering, listed, number, percent, wrapped
 
 CURVES = {
     "stress_time": "stress-time",
@@ -17,8 +17,7 @@ CURVES = {
 }
 ANSWERS = {True: "yes", False: "no", None: "–"}
 LADDER = (
-    "", "model", "damping", "misfit %", "χ²", "rank", "n_eff", "AICc", "BIC", "runs p", "lag p",
-    "n.d.", "s",
+    "", "model", "with", "misfit %", "pred. %", "gain %", "rank", "AICc", "BIC", "p", "n.d.", "s",
 )  # fmt: skip
 # Lines that the terminal has for the warnings and for the rows that are not used.
 WARNING_LINES, ROW_LINES = 4, 2
@@ -32,7 +31,7 @@ def summary_text(result: Fit, *, verbose: bool = False) -> str:
     checklist, the notes and all warnings.
     """
     m = result.measurement
-    head = f"{m.name}: {result.model}, {result.drive} drive, seed {result.seed}: {result.status}"
+    head = f"{m.name}: {result.law}, {result.drive} drive, seed {result.seed}: {result.status}"
     head += f" (stopped by {result.stopped}, not finished)" if result.stopped else ""
     shown = [f"{name} {percent(off)}" for name, off in misfits(result).items() if off is not None]
     rows = [readable(name, p) for name, p in result.parameters.items()]
@@ -55,9 +54,13 @@ def summary_text(result: Fit, *, verbose: bool = False) -> str:
     return "\n".join(lines).rstrip()
 
 
-def conclusions(result: Fit) -> tuple[str, str, str]:
-    """Say in three sentences how well the model fits, what is known, and what is not."""
-    return _how_well(result), _known(result), _unknown(result)
+def conclusions(result: Fit) -> tuple[str, ...]:
+    """Say in three sentences how well the model fits, what is known, and what is not.
+
+    Of microscale springs and of relaxation, also what the identified law does.
+    """
+    law = (*_snapping(result), *_relaxation(result)) if result.status != "failed" else ()
+    return (_how_well(result), _known(result), _unknown(result), *law)
 
 
 def misfits(result: Fit) -> dict[str, float | None]:
@@ -121,6 +124,54 @@ def _unknown(result: Fit) -> str:
     return f"No varied parameter is weak; least determined is the combination of {listed(names)}."
 
 
+def _of_spring(result: Fit, name: str) -> str:
+    """Return " of spring 2" of s2, nothing where there is one spring only."""
+    return f" of spring {name[1:]}" if len(result.chain.springs) > 1 else ""
+
+
+def _snapping(result: Fit) -> Iterator[str]:
+    """Say how many micro-springs the test snapped: it tells nothing of the others."""
+    for name, snapped in result.snapping.items():
+        at = f"{engineering(float(snapped.stress[snapped.turn]), 'Pa')}"
+        if result.strain is not None:
+            at += f" and a strain of {number(float(result.strain[snapped.turn]))}"
+        sentence = (
+            f"{percent(snapped.most)} of the micro-springs{_of_spring(result, name)} snap in this "
+            f"test, at {at}"
+        )
+        if 1.0 - snapped.most > 0.005:
+            sentence += "; what the others would do is extrapolated"
+        yield f"{sentence}."
+
+
+def _relaxation(result: Fit) -> Iterator[str]:
+    """Say what the relaxation of each spring that has any amounts to."""
+    for i, spring in enumerate(result.chain.springs, start=1):
+        terms = [
+            (f"s{i}_g{k}", g, f"s{i}_tau{k}", tau)
+            for k, (g, tau) in enumerate(spring.relaxation, start=1)
+        ]
+        if not terms:
+            continue
+        lost = [
+            name
+            for g, _, tau, _ in terms
+            for name in (g, tau)
+            if name in result.parameters and result.parameters[name].state == "not determined"
+        ]
+        whose = _of_spring(result, f"s{i}")
+        if lost:
+            yield f"The relaxation{whose} is not determined ({', '.join(lost)})."
+            continue
+        total = 1.0 + sum(g for _, g, _, _ in terms)
+        parts = (f"{percent(g / total)} of it with a time constant of {engineering(tau, 's')}"
+                 for _, g, _, tau in terms)  # fmt: skip
+        yield (
+            f"On a sudden change of strain the stress{whose} changes {number(total)} times as much "
+            f"as in equilibrium, and relaxes: {listed(parts)}."
+        )
+
+
 def _rows(result: Fit) -> list[str]:
     """Say how many rows are used and, where it is short, why not the others."""
     rows = result.measurement.rows
@@ -158,9 +209,13 @@ def _paragraphs(texts: Iterable[str]) -> list[str]:
 
 
 def _table(rows: list[Readable]) -> list[str]:
-    header = ("parameter", "value ± stderr", "unit", "95 % interval", "state")
+    ranged = any(row.range for row in rows)  # where an error of the law leaves something open
+    span = (lambda text: (text,)) if ranged else (lambda _: ())
+    header = ("parameter", "value ± stderr", "unit", "95 % interval", *span("range"), "state")
     cells = [
-        (r.name, r.with_error, r.unit, r.interval, r.state) for r in rows if r.state != "fixed"
+        (r.name, r.with_error, r.unit, r.interval, *span(r.range), r.state)
+        for r in rows
+        if r.state != "fixed"
     ]
     fixed = ", ".join(f"{row.name} {row.value} {row.unit}" for row in rows if row.state == "fixed")
     return [*aligned([header, *cells]), *(wrapped(f"fixed: {fixed}") if fixed else [])]
@@ -187,7 +242,9 @@ def ladder_cells(ladder: Ladder) -> list[tuple[str, ...]]:
     """Return the models of a ladder as text, in the columns of `LADDER`.
 
     The misfits are those of the curves in time where there are any, else that of stress-strain;
-    "rank" is rank over parameters varied, "n.d." parameters not determined over weak ones.
+    "pred." is the predicted misfit, "gain" by how much it is below that of the best model with no
+    more parameters; "rank" is rank over parameters varied, "p" the smaller p-value of the two tests
+    of the residuals, "n.d." parameters not determined over weak ones.
     """
     cells = list[tuple[str, ...]]()
     for one in ladder.rungs:
@@ -196,14 +253,26 @@ def ladder_cells(ladder: Ladder) -> list[tuple[str, ...]]:
         shown = shown or [off for off in one.misfit.values() if off is not None]
         cells.append(
             (
-                "→" if one.chosen else "", one.model, one.damping,
-                " ".join(percent(off).removesuffix(" %") for off in shown), f"{one.chisqr:.4g}",
-                f"{one.rank}/{one.n_vary}", _whole(one.n_eff), _whole(one.aicc),
-                _whole(one.bic), _p(one.runs_p), _p(one.neighbours_p),
+                "→" if one.chosen else "", one.model, _with(one),
+                " ".join(percent(off).removesuffix(" %") for off in shown),
+                _percents(one.predicted_misfit),
+                "–" if one.gain is None else _whole(100.0 * one.gain),
+                f"{one.rank}/{one.n_vary}", _whole(one.aicc), _whole(one.bic),
+                _p(min(one.runs_p, one.neighbours_p)),
                 f"{len(one.not_determined)}/{len(one.weak)}", f"{one.seconds:.1f}",
             )
         )  # fmt: skip
     return cells
+
+
+def _with(one: Rung) -> str:
+    """Return what a model has besides its springs."""
+    has = (["relaxation"] if one.relaxation else []) + ["damping"] * (one.damping == "with")
+    return "both" if len(has) == 2 else has[0] if has else "–"
+
+
+def _percents(value: float | None) -> str:
+    return "–" if value is None else percent(value).removesuffix(" %")
 
 
 def _whole(value: float) -> str:

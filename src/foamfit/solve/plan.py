@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import optimize
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
@@ -15,9 +16,9 @@ from foamfit.solve import cache, many, relaxation
 from foamfit.solve import scene as scenes
 from foamfit.solve.explicit import taylor
 from foamfit.solve.implicit import steps, vibration
-from foamfit.springs import kernels
+from foamfit.springs import kernels, microscale_kernels
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
-from foamfit.springs.law import BISTABLE, MICROSCALE
+from foamfit.springs.law import BISTABLE, LINEAR, MICROSCALE
 from foamfit.springs.parameters import OWN_ETA, OWN_HEIGHT
 from foamfit.springs.sensitivities import equilibrium_tangents
 from foamfit.springs.spring import as_samples
@@ -59,10 +60,13 @@ _OUTCOMES = {
 }
 
 
-_WITH_MEMORY = (
-    "a microscale spring, or one that relaxes, is only simulated alone under a prescribed "
-    "displacement, or under a prescribed stress without relaxation, dashpots and masses"
+_TOO_FAST = (
+    "springs with memory are followed by explicit steps, for which {culprit} is too fast: the "
+    "scene lasts {rate:.2g} of its radians or relaxation times, and has at most {steps} steps"
 )
+# Radians, or relaxation times, that one explicit step goes through at most; steps after which it
+# is asked how many it takes.
+RADIANS, FEW_EXPLICIT = 3.0, 20_000
 
 NO_DIRECTIONS: Directions = np.empty((0, 2), np.int64)
 NO_SWITCHES = np.empty((0, 5))
@@ -162,13 +166,15 @@ class Plan(NamedTuple):
         SimulationError
             If the scene has no finite answer; the message says why.
         """
-        if self.memory and self.solver != CLOSED_FORM:
-            raise SimulationError(_WITH_MEMORY)
         if self.solver == CLOSED_FORM:
             return self._closed_form(rows, heights, rtol, everything, directions)
         p, time = len(directions), self.time
         curves = np.empty((1 + len(heights) if everything else 2, time.size))
         slopes = np.empty((p, *curves.shape)) if p else NO_SLOPES
+        if self.memory:
+            log = np.empty((LOGGED, 5)) if everything else NO_SWITCHES
+            scene = self.given(rows, heights, drag)
+            return self._remembered(scene, rtol, directions, curves, slopes, log)
         bounces = self.plain and not drag and self.implicit is None
         stiff = not bounces and self._is_stiff(self.given(rows, heights, drag))
         one = self.speed > 0.0 and self.top == scenes.FREE and len(self.ends) == 1
@@ -194,6 +200,94 @@ class Plan(NamedTuple):
             self.max_steps, directions, start, curves, slopes, log, np.zeros(2, np.int64),
         )  # fmt: skip
         return _motion(RADAU, ending, curves, slopes, log, lost)
+
+    def _remembered(
+        self,
+        given: scenes.SceneTuple,
+        rtol: float,
+        directions: Directions,
+        curves: Array,
+        slopes: Array,
+        log: Array,
+    ) -> Motion:
+        """Springs with memory: by explicit steps, which must follow all that is fast."""
+        start = _AT_REST
+        if self.top not in _RESTING:
+            start = np.zeros((1 + len(directions), len(given[1])))
+            if self.values[0] != 0.0:
+                start = self._loaded(given[0], given[1], directions)
+        cache.announce(taylor.integrate_with_memory, "the solver of springs with memory")
+        for most in (min(FEW_EXPLICIT, self.max_steps), self.max_steps):
+            ending = taylor.integrate_with_memory(
+                *given, self.margin * rtol, most, directions, start, curves, slopes, log
+            )
+            if ending[0] not in _STIFF:
+                break
+            rate, culprit = self._fastest(given)
+            too_fast = rate > RADIANS * self.max_steps
+            if most == self.max_steps and ending[0] == scenes.TOO_MANY_STEPS:
+                too_fast = RADIANS * rate > self.max_steps
+            if too_fast:
+                message = _TOO_FAST.format(culprit=culprit, rate=rate, steps=self.max_steps)
+                raise SimulationError(message)
+            if ending[0] == scenes.STEP_UNDERFLOW:  # more steps would end there too
+                break
+        return _motion(TAYLOR, ending, curves, slopes, log)
+
+    def _fastest(self, given: scenes.SceneTuple) -> tuple[float, str]:
+        """What of springs with memory is fastest, in radians while the scene lasts; its name."""
+        rows, heights, k = given[0], given[1], kernels
+        elastic, terms = np.zeros((len(rows), k.N_COLUMNS)), rows[:, k.N_COLUMNS :]
+        bistable = rows[:, k.KIND] == BISTABLE
+        steep = np.where(bistable, np.maximum(rows[:, k.KH_PLUS], rows[:, k.KC]), rows[:, k.KC])
+        elastic[:, k.KIND], elastic[:, k.ETA] = LINEAR, rows[:, k.ETA]
+        elastic[:, k.K0] = np.maximum(rows[:, k.K0], steep) * (1.0 + terms[:, ::2].sum(axis=1))
+        swings, decays = vibration.fastest_rates((elastic, heights, *given[2:]))
+        found = [(swings, "a light mass"), (decays, "a light mass or a dashpot")]
+        lasts = float(given[8][-1] - (0.0 if self.speed > 0.0 else given[8][0]))
+        for i, term in zip(*np.nonzero(terms[:, ::2]), strict=True):
+            tau = terms[i, 2 * term + 1]
+            name = f"the relaxation of spring {i + 1} (s{i + 1}_tau{term + 1} = {tau:g} s)"
+            found.append((lasts / tau, name))
+        return max(found)
+
+    def _loaded(self, rows: Array, heights: Array, directions: Directions) -> Array:
+        """Strains of springs with memory, loaded in one go, and derivatives; see `_start`."""
+        start = np.zeros((1 + len(directions), len(heights)))
+        first = self.ends[-2] if len(self.ends) > 1 else 0
+        rows, heights = rows[first:], heights[first:]
+        moved = self.top == scenes.MOTION
+
+        def strains(stress: float) -> Array:
+            at = np.array([stress])
+            strain: Array = relaxation.strains_along(rows, heights, at, NO_DIRECTIONS)[0][:, 0]
+            return strain
+
+        def missing(stress: float) -> float:
+            return max(float(heights @ strains(stress)), -1e300) - float(self.values[0])
+
+        stress = float(self.values[0])
+        if moved:
+            stress = 1e-6 * rows[0, kernels.K0] * math.copysign(1.0, stress)
+            while missing(stress) * stress < 0.0 and abs(stress) < 1e290:
+                stress *= 2.0
+            stress = optimize.brentq(missing, 0.0, stress, xtol=1e-300, rtol=1e-15)
+        strain = strains(stress)
+        rigid = np.full(len(rows), True) if moved else rows[:, kernels.ETA] == 0.0
+        if not np.isfinite(strain[rigid]).all():
+            raise SimulationError(_OUTCOMES[scenes.NOT_FINITE])
+        own = np.flatnonzero(directions[:, 0] >= first)
+        local = directions[own] - np.array([first, 0])
+        above = relaxation.strains_along(rows, heights, np.array([stress]), local)[2]
+        longer = np.diff(above[:, :, 0], axis=1, prepend=0.0)
+        if moved:
+            soft = heights / [_slope(row, eps) for row, eps in zip(rows, strain, strict=True)]
+            longer -= longer.sum(axis=1, keepdims=True) * soft / soft.sum()
+        for p, (spring, what) in enumerate(local):
+            longer[p, spring] -= strain[spring] if what == OWN_HEIGHT else 0.0
+        start[0, first:] = np.where(rigid, strain, 0.0)  # a dashpot holds its spring where it is
+        start[1 + own, first:] = np.where(rigid, longer / heights, 0.0)
+        return start
 
     def given(self, rows: Array, heights: Array, drag: float | None = None) -> scenes.SceneTuple:
         """The scene with these springs (and onsite damping) as the compiled integrators take it."""
@@ -328,6 +422,15 @@ class Plan(NamedTuple):
             return self.implicit
         vibrates, relaxes = vibration.fastest_rates(given)
         return bool(vibrates > MOST_VIBRATION or relaxes > MOST_RELAXATION)
+
+
+def _slope(row: Array, eps: float) -> float:
+    """Slope dσ/dε of a spring that was loaded from rest to a strain in one go."""
+    strain = np.array([eps])
+    if row[kernels.KIND] == MICROSCALE:
+        at = microscale_kernels.stress_along(row, strain)
+        return float(microscale_kernels.stress_tangents_along(row, strain, *at)[1][0])
+    return float(kernels.tangent_along(row, strain, kernels.stress_along(row, strain)[1])[0])
 
 
 def _motion(

@@ -62,7 +62,10 @@ def _calls() -> dict[Any, tuple[Any, ...]]:
     with ExitStack() as uncompiled, np.errstate(all="ignore"):
         for module in (kernels, sensitivities, polynomial, scene, series, taylor, plan):
             names = {name: loop for name, loop in vars(module).items() if hasattr(loop, "py_func")}
-            called = {name: plain(loop, module is taylor) for name, loop in names.items()}
+            called = {}
+            for name, loop in names.items():
+                own = loop.targetoptions.get("inline") != "always"  # else a part of another
+                called[name] = plain(loop, own and module is taylor)
             uncompiled.enter_context(patch.dict(vars(module), called))
         _run("impact")
         _run("impact", eta=50.0)

@@ -22,9 +22,7 @@ from foamfit.springs.law import (
     MICROSCALE,
     UNILATERAL,
     admissible,
-    crossing,
     derived_points,
-    least_eps_star,
 )
 
 Row = Array
@@ -71,8 +69,6 @@ BRANCH_NAMES = (
 
 _derived_points = inner(derived_points)
 _admissible = inner(admissible)
-_least_eps_star = inner(least_eps_star)
-_crossing = inner(crossing)
 
 
 @compiled
@@ -114,64 +110,19 @@ def fill_linear(row: Row, k0: float, eta: float, unilateral: bool) -> bool:
 
 
 @compiled
-def fill_microscale(
-    row: Row,
-    k0: float,
-    kc: float,
-    eps_star: float,
-    sigma_plus: float,
-    spread_plus: float,
-    sigma_minus: float,
-    spread_minus: float,
-    eta: float,
-) -> bool:
-    """Write a microscale spring into `row`; false, and nothing written, if not admissible."""
-    stiff = 0.0 < k0 < math.inf and 0.0 < kc < math.inf
-    plus = 0.0 < sigma_plus < math.inf and 0.0 < spread_plus < math.inf
-    minus = 0.0 < sigma_minus < math.inf and 0.0 < spread_minus < math.inf
-    if not (stiff and plus and minus and eta >= 0.0):
-        return False
-    if not _least_eps_star(k0, kc) <= eps_star < math.inf:
-        return False
-    row[KIND] = MICROSCALE
-    row[K0], row[KC], row[EPS_STAR], row[ETA] = k0, kc, eps_star, eta
-    row[LOG_PLUS], row[SPREAD_PLUS] = math.log(sigma_plus), spread_plus
-    row[LOG_MINUS], row[SPREAD_MINUS] = math.log(sigma_minus), spread_minus
-    row[LOG_CROSS] = _crossing(row[LOG_PLUS], spread_plus, row[LOG_MINUS], spread_minus)
-    return True
-
-
-@inner
-def _fill_relaxation(row: Row, terms: Array) -> bool:
-    """Write g and τ of relaxation terms, and none after them; false if one is not admissible."""
-    for k in range(N_COLUMNS, row.size, 2):
-        row[k], row[k + 1] = 0.0, math.inf
-    for k in range(0, terms.size, 2):
-        if not (0.0 <= terms[k] < math.inf and 0.0 < terms[k + 1] < math.inf):
-            return False
-        row[N_COLUMNS + k], row[N_COLUMNS + k + 1] = terms[k], terms[k + 1]
-    return True
-
-
-@compiled
 def fill_rows(kinds: Branches, values: Array, rows: Array) -> bool:
     """Write the springs of a flat vector of parameters into `rows`; false if one is not admissible.
 
-    A bistable or microscale spring takes its own eight values, then g and τ of every relaxation
-    term that rows have room for; a linear one takes two (k0, eta).
+    A bistable spring takes eight values (k0 … kh_minus, eta), a linear one two (k0, eta). Where
+    there are microscale springs or relaxation, see `microscale_kernels`.
     """
-    at, more = 0, rows.shape[1] - N_COLUMNS
+    at = 0
     for i in range(kinds.size):
-        if kinds[i] == BISTABLE or kinds[i] == MICROSCALE:
+        if kinds[i] == BISTABLE:
             p = values[at : at + 8]
-            if kinds[i] == BISTABLE:
-                fine = fill_bistable(rows[i], p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7])
-            else:
-                fine = fill_microscale(rows[i], p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7])
-            fine = _fill_relaxation(rows[i], values[at + 8 : at + 8 + more]) and fine
-            at += 8 + more
+            fine = fill_bistable(rows[i], p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7])
+            at += 8
         else:
-            _fill_relaxation(rows[i], values[:0])
             fine = fill_linear(rows[i], values[at], values[at + 1], kinds[i] == UNILATERAL)
             at += 2
         if not fine:
@@ -183,13 +134,6 @@ def bistable_row(*parameters: float) -> Row:
     """Make the row of an admissible bistable spring from k0 … kh_minus, eta (SI)."""
     row = np.zeros(N_COLUMNS)
     fill_bistable(row, *parameters)
-    return row
-
-
-def microscale_row(*parameters: float) -> Row:
-    """Make the row of an admissible microscale spring from k0 … spread_minus, eta (SI)."""
-    row = np.zeros(N_COLUMNS)
-    fill_microscale(row, *parameters)
     return row
 
 

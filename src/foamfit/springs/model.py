@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError
-from foamfit.springs import kernels
+from foamfit.springs import kernels, microscale_kernels
 from foamfit.springs.chain import Chain
 from foamfit.springs.parameters import HYSTERETIC, KINDS, direction, names_of
 from foamfit.springs.spring import BistableSpring, LinearSpring, MicroscaleSpring, Spring
@@ -93,7 +93,9 @@ class Model:
     def rows(self, values: Array) -> Array | None:
         """Springs as the kernels know them, (n_springs, columns); None if one is not admissible."""
         rows = np.zeros((len(self.kinds), kernels.N_COLUMNS + 2 * self.relaxation))
-        return rows if kernels.fill_rows(self._codes, values, rows) else None
+        plain = self.relaxation == 0 and "microscale" not in self.kinds
+        fill = kernels.fill_rows if plain else microscale_kernels.fill_rows
+        return rows if fill(self._codes, values, rows) else None
 
     def heights(self, values: Array, total: float) -> Array:
         """Heights of the springs (m) in a specimen of height `total`."""

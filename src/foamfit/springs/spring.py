@@ -112,6 +112,15 @@ def _as_history(values: ArrayLike, name: str) -> Array:
     return np.atleast_1d(history)
 
 
+def _ranks_below(stress: ArrayLike, middle: float, spread: float) -> Array:
+    """Fraction of ranks whose snap stress lies below these stresses; none in tension."""
+    from scipy.special import ndtr
+
+    with np.errstate(divide="ignore"):
+        scores = (np.log(np.maximum(stress, 0.0)) - math.log(middle)) / spread
+    return np.asarray(ndtr(scores), dtype=float)
+
+
 def _first(mask: NDArray[np.bool_]) -> int:
     return int(np.argmax(np.atleast_1d(mask)))
 
@@ -380,12 +389,29 @@ class MicroscaleSpring(_Law):
         """The kind of spring that the kernels know."""
         return MICROSCALE
 
+    @property
+    def snap_strain(self) -> float:
+        """Strain by which a micro-spring of the middle rank jumps where it snaps through."""
+        sigma = self.sigma_plus
+        return self.eps_star + sigma / (self.kc + sigma) - sigma / (self.k0 + sigma)
+
+    def snapped_below(self, stress: ArrayLike) -> Array:
+        """P₊: the fraction that has snapped on first loading to these stresses."""
+        return _ranks_below(stress, self.sigma_plus, self.spread_plus)
+
+    def left_below(self, stress: ArrayLike) -> Array:
+        """P₋: the fraction that is left on unloading to these stresses, P₊ at least."""
+        left = _ranks_below(stress, self.sigma_minus, self.spread_minus)
+        return np.maximum(left, self.snapped_below(stress))
+
     @cached_property
     def row(self) -> Row:
         """The spring as the kernels know it."""
-        from foamfit.springs import kernels
+        from foamfit.springs import microscale_kernels
 
-        return kernels.microscale_row(*(getattr(self, name) for name in _numbers_of(self)))
+        return microscale_kernels.microscale_row(
+            *(getattr(self, name) for name in _numbers_of(self))
+        )
 
     def _stress_along(self, strain: Array) -> tuple[Array, NDArray[np.int64]]:
         from foamfit.springs import microscale_kernels

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.fitting.branches import unreached
@@ -17,6 +18,8 @@ from foamfit.fitting.objective import Simulated
 from foamfit.fitting.problem import Problem
 from foamfit.trust import covariance
 from foamfit.trust.covariance import Covariance
+from foamfit.trust.law_error import CurveError, curve_errors
+from foamfit.trust.noise_process import parts
 
 
 def m_estimate(residual: Array, sizes: tuple[int, ...], loss: str) -> tuple[Array, Array]:
@@ -29,7 +32,7 @@ def m_estimate(residual: Array, sizes: tuple[int, ...], loss: str) -> tuple[Arra
     """
     psi, slope = influence(residual, loss)
     weights = np.empty(residual.size)
-    for part in covariance.parts(sizes):
+    for part in parts(sizes):
         weights[part] = max(float(slope[part].mean()), 0.05) ** 0.5
     return weights, psi / weights
 
@@ -79,18 +82,70 @@ class BestPoint:
         return self.problem.linear.slopes(self.values, self.names)
 
     @cached_property
-    def spread(self) -> Covariance:
-        """Their local covariance, as estimated with the loss."""
+    def _weighted(self) -> tuple[Array, Array]:
+        """Jacobian and residual whose least squares have the covariance of the loss."""
         objective = self.problem.objective
         weights, pseudo = m_estimate(self.residual, objective.sizes, objective.loss)
-        jacobian = self.jacobian * weights[:, None]
-        return covariance.covariance(jacobian, pseudo, objective.sizes, self.sizes)
+        return self.jacobian * weights[:, None], pseudo
+
+    @cached_property
+    def errors(self) -> tuple[CurveError, ...]:
+        """What the residual of each counted curve is made of: noise, or an error of the law too."""
+        jacobian, pseudo = self._weighted
+        return tuple(curve_errors(pseudo, jacobian * self.sizes, self.problem.objective.sizes))
+
+    @property
+    def misfits(self) -> bool:
+        """Whether the law misses more of some curve than its noise."""
+        return any(error.found for error in self.errors)
+
+    @cached_property
+    def spread(self) -> Covariance:
+        """Their local covariance, as estimated with the loss."""
+        jacobian, pseudo = self._weighted
+        noise, curves = [error.noise for error in self.errors], self.problem.objective.sizes
+        plain = covariance.covariance(jacobian, pseudo, curves, self.sizes, noise)
+        if not self.misfits:
+            return plain
+        held = self._held(jacobian, pseudo, plain)
+        if held.all():
+            return plain
+        free = np.flatnonzero(~held)
+
+        def gradient(step: Array) -> Array:
+            values = self.values.copy()
+            places = [self.index[self.names[i]] for i in free]
+            low, high = np.array([self.limits(self.names[i]) for i in free]).T
+            values[places] = np.clip(values[places] + step * self.sizes[free], low, high)
+            names = tuple(self.names[i] for i in free)
+            slopes = self.problem.slopes(values, names) * self.sizes[free]
+            return np.asarray(slopes.T @ self.problem.objective.residual(values))
+
+        bent = covariance.covariance(
+            jacobian[:, free], pseudo, curves, self.sizes[free], noise, gradient
+        )
+        return plain.with_some(free, bent)
+
+    def _held(self, jacobian: Array, residual: Array, spread: Covariance) -> NDArray[np.bool_]:
+        """Parameters that the residual presses to a limit by more than its noise could, (k,)."""
+        pull = jacobian.T @ residual
+        noise = zip(spread.noise, parts(self.problem.objective.sizes), strict=True)
+        sure = np.sum([process.forms(jacobian[part]) for process, part in noise], axis=0)
+        limits = np.array([self.limits(name) for name in self.names])
+        there = self.values[[self.index[name] for name in self.names]]
+        near = np.abs(limits.T - there) <= covariance.AT_LIMIT * self.sizes
+        outward = np.where(near[0], pull, np.where(near[1], -pull, 0.0))
+        return np.asarray(outward > 1.96 * np.sqrt(sure))
+
+    @cached_property
+    def soft(self) -> Array:
+        """Residual, softened by the loss, (n_data,)."""
+        return soften(self.residual, self.problem.objective.loss)
 
     @cached_property
     def cost(self) -> float:
         """Sum of squares of the residual, softened by the loss."""
-        soft = soften(self.residual, self.problem.objective.loss)
-        return float(soft @ soft)
+        return float(self.soft @ self.soft)
 
     @property
     def index(self) -> dict[str, int]:

@@ -6,20 +6,20 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import chain, groupby
 
 import numpy as np
 
 from foamfit.data.energy import EnergyAudit
 from foamfit.data.measurement import INTEGRATED
 from foamfit.errors import InputError
-from foamfit.fitting.branches import visited
+from foamfit.fitting.branches import covered, visited
 from foamfit.fitting.curves import check_time_shift
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.search import SearchRecord
 from foamfit.results import Check, ParameterEstimate
-from foamfit.springs.parameters import split_name
-from foamfit.text import engineering
+from foamfit.springs.parameters import BRANCHES, split_name
+from foamfit.text import engineering, listed, percent
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import AT_LIMIT, WEAK
 from foamfit.trust.intervals import Intervals
@@ -36,7 +36,6 @@ STATED, ESTIMATED = 1.1, 1.5
 STRUCTURED = 5.0
 # Reasons that one warning gives at most; more of them are read better in the table of parameters.
 REASONS = 3
-BRANCHES = ("a", "d", "c", "e")
 # Parameters that may be zero: their interval tells whether there is anything at all.
 MAY_VANISH = ("dsigma", "kh_plus", "kh_minus", "eta")
 
@@ -170,7 +169,21 @@ def _floor(e: Findings) -> _Answer:
 def _structure(e: Findings) -> _Answer:
     if not e.tau:
         return None, "No parameter varies whose branch was reached."
+    objective = e.objective
+    missed = [
+        f"{_spoken(name)} {percent(error.law / objective.factor(name) / spread)}"
+        for name, error in zip(objective.counted, e.best.errors, strict=True)
+        if error.found and (spread := float(np.ptp(objective.measured[name])))
+    ]
     longest = max(e.tau)
+    if missed:
+        found = f"Error of the law, RMS over range: {', '.join(missed)}."
+        warning = (
+            f"The residuals have structure that is no noise: the law misses {' and '.join(missed)} "
+            "of the range. The 95 % intervals hold the noise alone; the range tells what this "
+            "error leaves open."
+        )
+        return False, found, (warning,)
     if longest < 1.05:
         return True, "Their autocorrelation is that of white noise."
     found = f"Noise correlated over {longest:.2g} samples."
@@ -218,7 +231,8 @@ def _vanishes(e: Findings, name: str) -> bool:
     if item.state != "weak" or item.ci95 is None or split_name(name)[1] not in MAY_VANISH:
         return False
     size = float(e.best.problem.sizes((name,), e.best.values)[0])
-    return item.ci95[0] <= 0.0 <= item.ci95[1] and max(np.abs(item.ci95)) <= WEAK * size
+    ends = (*item.ci95, *(item.range or ()))
+    return min(ends) <= 0.0 <= max(ends) and float(np.max(np.abs(ends))) <= WEAK * size
 
 
 def _by_reason(of: list[tuple[str, str]]) -> str:
@@ -233,16 +247,20 @@ def _by_reason(of: list[tuple[str, str]]) -> str:
 
 
 def _visited(e: Findings) -> _Answer:
+    kinds = e.best.problem.model.kinds
+    wanted = [tuple(dict.fromkeys(BRANCHES.get(kind, {}).values())) for kind in kinds]
     absent = {
-        spring: [branch for branch in BRANCHES if branch not in seen]
-        for spring, seen in visited(e.best.problem, e.best.simulated).items()
-        if "a" in seen
+        spring: [branch for branch in branches if branch not in covered(seen)]
+        for branches, (spring, seen) in zip(
+            wanted, visited(e.best.problem, e.best.simulated).items(), strict=True
+        )
+        if branches
     }
     lost = [f"{branch} of {spring}" for spring, gone in absent.items() for branch in gone]
     if not absent:
         return True, "Linear springs have one branch."
     if not lost:
-        return True, "a, d, c and e were."
+        return True, f"{listed(dict.fromkeys(chain.from_iterable(wanted)))} were."
     # It matters if some parameter that varies depends on it; its own warning says so.
     depend = any(
         item.state == "not determined" and absent.get(f"s{split_name(name)[0] + 1}")

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from foamfit.arrays import Array
+from foamfit.data.cycles import inner_loops
 from foamfit.data.describe import noise_sentences
 from foamfit.data.energy import audit
 from foamfit.data.measurement import INTEGRATED, interior_channel
@@ -24,7 +25,7 @@ from foamfit.fitting.search import SearchRecord
 from foamfit.results import Correlation, Curves, Fit, ParameterEstimate, Switch
 from foamfit.springs import kernels
 from foamfit.springs.parameters import split_name, unit_of
-from foamfit.text import engineering, percent
+from foamfit.text import engineering, listed, percent
 from foamfit.trust import covariance
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.checklist import MAY_VANISH, Findings, make_checklist, status_of, warnings_of
@@ -87,12 +88,20 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
 
 
 def _noise(best: BestPoint) -> dict[str, dict[str, Any]]:
-    """Noise of each counted curve, how it is known, its scale, and the residuals over it."""
+    """Noise of each counted curve, how it is known, its scale, and the residuals over it.
+
+    `law_error` is the RMS of what the law misses beyond the noise, SI, None where it misses nothing
+    else; `law_error_evidence` by how much the Bayesian information criterion is for it.
+    """
     objective, found = best.problem.objective, {}
+    errors = dict(zip(objective.counted, best.errors, strict=True)) if best.names else {}
     for name, rms in objective.rms(best.residual).items():
-        level = objective.noise(name)
+        level, error = objective.noise(name), errors.get(name)
+        law = error is not None and error.found
         found[name] = asdict(level) | {
             "scale": objective.scale[name],
+            "law_error": error.law / objective.factor(name) if error and law else None,
+            "law_error_evidence": error.evidence if error else None,
             "residual_over_noise": rms / level.sigma if level.sigma > 0.0 else None,
         }
     return found
@@ -130,7 +139,7 @@ def _notes(best: BestPoint) -> list[str]:
     problem, simulated = best.problem, best.simulated
     objective, specimen = problem.objective, problem.measurement.specimen
     single = len(problem.model.kinds) == 1
-    told = [*problem.notes]
+    told = [*problem.notes, *_inner_loops(best)]
     unseen = [name for name in MOTION_CURVES if name not in objective.counted]
     off = [(name.replace("_", "-"), objective.off(simulated, name)) for name in unseen]
     there = [f"the {name} curve is {share:.1%} of its range off" for name, share in off if share]
@@ -167,6 +176,34 @@ def _notes(best: BestPoint) -> list[str]:
         *told,
         f"{left_out}; the specimen's {specimen.mass * 1e6:.3g} mg between the springs would change "
         f"{' and '.join(changes)} (RMS over range).",
+    ]
+
+
+def _inner_loops(best: BestPoint) -> list[str]:
+    """Say what a partial unloading leaves in the residuals of a law that has no inner loops."""
+    test, kinds = best.problem.measurement, best.problem.model.kinds
+    curve = best.simulated.curves.get("stress_strain")
+    if "bistable" not in kinds or "microscale" in kinds or curve is None:
+        return []
+    assert test.displacement is not None  # there is a curve along it
+    assert test.stress is not None
+    loops = inner_loops(test.displacement)
+    squares = (curve - test.stress) ** 2
+    inside = np.zeros(squares.size, dtype=bool)
+    for first, stop in loops:
+        inside[first:stop] = True
+    total = float(squares.sum())
+    if not loops or total == 0.0:
+        return []
+    ends = [(first, min(stop, squares.size - 1)) for first, stop in loops]
+    spans = [f"from sample {first} to {stop}" for first, stop in ends]
+    if test.time is not None:
+        spans = [f"from {engineering(test.time[a], 's')} to {engineering(test.time[b], 's')}"
+                 for a, b in ends]  # fmt: skip
+    return [
+        f"The motion turns back below its peak ({listed(spans)}): these {percent(inside.mean())} "
+        f"of the samples hold {percent(float(squares[inside].sum()) / total)} of the squared "
+        "residuals of stress-strain. Bistable springs have no inner loops; microscale springs do."
     ]
 
 
@@ -223,11 +260,14 @@ def _varied(
     # refits that stall in a long minimum make a profile narrow: the wider interval is taken
     stalled = ratio < 1.0 / ASTRAY and method == "profile likelihood"
     ends = local if stalled else ends
-    state, why = state_of(name, value, ends, insight, (low, high))
+    span = intervals.ranges.get(name)
+    if span is not None:  # of a point a little off, if that was improved last
+        span = min(span[0], value), max(span[1], value)
+    state, why = state_of(name, value, ends, insight, (low, high), span)
     if state == "determined" and best.problem.objective.interior_mass:
         state, why = "weak", "the vibration of the interior mass leaves other minima; " + why
-    if state == "not determined":
-        return ParameterEstimate(value, None, None, unit, True, state, why)
+    if not 0.5 * (ends[1] - ends[0]) <= covariance.NOTHING * best.sizes[column]:
+        return ParameterEstimate(value, None, None, unit, True, state, why, range=span)
     if name in intervals.doubtful:
         why += "; its interval is local, though the cost is no parabola there"
     if stalled:
@@ -237,23 +277,28 @@ def _varied(
         stderr *= ratio
         why += "; its standard error is that of the interval, as the local one does not hold"
     ci95 = (max(ends[0], low), min(ends[1], high))
-    return ParameterEstimate(value, stderr, ci95, unit, True, state, why, method)
+    return ParameterEstimate(value, stderr, ci95, unit, True, state, why, method, span)
 
 
 def state_of(
     name: str, value: float, ends: tuple[float, float], insight: Insight,
-    limits: tuple[float, float],
+    limits: tuple[float, float], span: tuple[float, float] | None = None,
 ) -> tuple[str, str]:  # fmt: skip
     """State of a parameter that varies and whose branch is reached, and the reason in one sentence.
 
     `ends` are those of its 95 % interval, not cut at its `limits`; NaN or infinite where the data
-    fix only a combination.
+    fix only a combination. `span` is its range, if there is one; the wider of the two counts.
     """
+    what = "95 % interval"
+    if span is not None and span[1] - span[0] > ends[1] - ends[0]:
+        ends, what = span, "range"
     size, short = float(insight.sizes[insight.names.index(name)]), split_name(name)[1]
     unit = unit_of(name)
     half = 0.5 * (ends[1] - ends[0])
     half = half if math.isfinite(half) else math.nan
-    state, why = covariance.state(value, half, size, *limits, scale_in_words(name, value, size))
+    state, why = covariance.state(
+        value, half, size, *limits, scale_in_words(name, value, size), what
+    )
     if state == "not determined":
         reason = why if math.isfinite(half) else "the curves do not depend on it"
         return state, insight.combination(name, covariance.NOTHING / 1.96) or reason
@@ -262,7 +307,7 @@ def state_of(
         side, end = ("lower", ends[0]) if short == "dsigma" else ("upper", ends[1])
         bound = engineering(end, unit).replace("Pa s", "Pa·s").replace("-", "−")
         where = "lies at its limit 0" if value == 0.0 else "is consistent with zero"
-        return "weak", f"it {where}; {side} bound {bound} (95 %)"
+        return "weak", f"it {where}; {side} bound {bound} ({what.removesuffix(' interval')})"
     if state == "determined":
         return state, why
     past = [ends[0] <= limits[0], ends[1] >= limits[1]]

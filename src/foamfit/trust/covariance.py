@@ -1,212 +1,39 @@
 """How sure the identified parameters are: covariance, intervals, and which are determined at all.
 
-Measured noise is seldom white: oversampled curves repeat themselves, and what the model cannot
-follow shows as slow waves in the residuals. The covariance therefore takes the noise of each curve
-as an autoregressive process that is read off its residuals, corrected for what the fit took out of
-them; n/τ is the effective number of samples, τ the autocorrelation time.
+An interval tells where the best that the law can do would lie if the test were measured again. So
+the covariance has the noise alone in it, correlated as it is (`noise_process`); an error of the law
+(`law_error`) only changes how the best point follows the noise.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import stats
-from scipy.linalg import toeplitz
 
 from foamfit.arrays import Array
 from foamfit.text import percent
+from foamfit.trust.noise_process import NoiseProcess, noise_processes, parts
 
 # Half widths of the 95 % interval, over the scale of a parameter (`fitting.box.Scales`), past which
 # it is weak, and past which the test does not determine it.
 WEAK, NOTHING = 0.5, 3.0
+RULE = (
+    f"Determined: 95 % interval and range are both within ±{WEAK:.0%} of the parameter's scale "
+    "(its value, or what its sentence names).",
+    f"Not determined: one of them is wider than ±{NOTHING:.0%}, or its branch was never reached; "
+    "weak: all between.",
+)
 # A parameter this close to a limit, over its scale, lies at it.
 AT_LIMIT = 1e-6
 # Two directions closer than this count as one.
 SINGULAR = 1e-12
-# Of the autoregressive noise: most orders, largest reflection coefficient, rounds of correction.
-MOST_ORDERS, LARGEST, CORRECTIONS = 10, 0.995, 4
-
-
-@dataclass(frozen=True, eq=False)
-class NoiseProcess:
-    """Autoregressive noise of one curve: x_t = Σ φ_j x_(t-j) + white."""
-
-    coefficients: Array  # (p,): φ_1 … φ_p; none for white noise
-    variance: float  # Of the process itself, not of the white noise that drives it
-    # How many it was read off, less those that the parameters of the fit took; infinite if it is
-    # known.
-    samples: float = math.inf
-
-    def autocovariance(self, n: int) -> Array:
-        """Autocovariance at the lags 0 … n-1."""
-        size = 4 * max(n, 256)
-        transfer = np.abs(np.fft.rfft(np.append(1.0, -self.coefficients), size)) ** -2
-        lags = np.fft.irfft(transfer)[:n]
-        return np.asarray(lags * (self.variance / lags[0]))
-
-    @cached_property
-    def tau(self) -> float:
-        """Autocorrelation time 1 + 2 Σ ρ_k, at least one, in samples."""
-        if not self.coefficients.size:
-            return 1.0
-        white = self._white_share()
-        return max(white / (1.0 - float(self.coefficients.sum())) ** 2, 1.0)
-
-    def _white_share(self) -> float:
-        """Variance of the driving white noise over that of the process."""
-        size = 1 << 14
-        transfer = np.abs(np.fft.rfft(np.append(1.0, -self.coefficients), size)) ** -2
-        return float(1.0 / np.fft.irfft(transfer)[0])
-
-    def times(self, columns: Array) -> Array:
-        """Covariance matrix of n samples times the columns of an (n, k) array."""
-        if not self.coefficients.size:
-            return self.variance * columns
-        n = len(columns)
-        lags = self.autocovariance(n)
-        around = np.fft.rfft(np.concatenate([lags, [0.0], lags[:0:-1]]))
-        spectrum = np.fft.rfft(columns, 2 * n, axis=0) * around[:, None]
-        product: Array = np.fft.irfft(spectrum, axis=0)[:n]
-        return product
-
-    def forms(self, columns: Array) -> Array:
-        """Variance lᵀΣl of the noise times each column l of an (n, k) array, (k,)."""
-        return np.asarray(np.einsum("ij,ij->j", columns, self.times(columns)))
-
-    def doubt(self, columns: Array) -> Array:
-        """Variance of `forms`, as estimated from `samples`, (k,): the delta method.
-
-        Estimates of the white variance w and of φ are independent for large n. That of w has the
-        variance 2w²/n of normal noise; those of φ have the covariance w Γ⁻¹/n with Γ that of p
-        successive samples (Brockwell & Davis 1991, Time Series: Theory and Methods, theorem 8.1.1).
-        """
-        if math.isinf(self.samples):
-            return np.zeros(columns.shape[1])
-        here = self.forms(columns)
-        out = 2.0 * here**2
-        order = self.coefficients.size
-        if order:
-            white = self.variance * self._white_share()
-            step = 1e-4 * (1.0 - np.max(np.abs(np.roots(np.append(1.0, -self.coefficients)))))
-            moved = [
-                NoiseProcess(phi, white / NoiseProcess(phi, 1.0)._white_share())
-                for phi in self.coefficients + step * np.eye(order)
-            ]
-            slopes = np.array([(other.forms(columns) - here) / step for other in moved])
-            gamma = toeplitz(self.autocovariance(order))
-            out += white * np.einsum("ik,ik->k", slopes, np.linalg.solve(gamma, slopes))
-        return np.asarray(out / self.samples)
-
-
-def _levinson(lags: Array) -> list[tuple[Array, float]]:
-    """Autoregressions of order 0, 1, … from autocovariances, with their white variance."""
-    fits = [(np.empty(0), float(lags[0]))]
-    for order in range(1, lags.size):
-        phi, white = fits[-1]
-        if white <= 0.0:
-            break
-        reflection = (lags[order] - phi @ lags[order - 1 : 0 : -1]) / white
-        reflection = float(np.clip(reflection, -LARGEST, LARGEST))
-        phi = np.append(phi - reflection * phi[::-1], reflection)
-        fits.append((phi, white * (1.0 - reflection**2)))
-    return fits
-
-
-def _lag_sums(one: Array, other: Array, order: int) -> Array:
-    """Σ_t (one_t ⊗ other_(t+k), symmetric in k) for k = 0 … order, (order+1, columns, columns)."""
-    n = len(one)
-    sums = [one[: n - k].T @ other[k:] + one[k:].T @ other[: n - k] for k in range(order + 1)]
-    return 0.5 * np.array(sums)
-
-
-def noise_process(residual: Array, jacobian: Array | None = None) -> NoiseProcess:
-    """Noise of one curve alone; see `noise_processes`."""
-    none = np.empty((residual.size, 0))
-    return noise_processes(residual, none if jacobian is None else jacobian, (residual.size,))[0]
-
-
-def noise_processes(residual: Array, jacobian: Array, sizes: tuple[int, ...]) -> list[NoiseProcess]:
-    """Noise of each curve as an autoregressive process, from the residuals of a fit.
-
-    The order is that of the least Bayesian information criterion. A fit takes what its parameters
-    can follow out of the noise, mostly at low frequencies: residuals look less correlated and
-    smaller than the noise was. With the hat matrix H = QQᵀ of the fit, residuals (I-H)e have the
-    expected lag sums tr S_k (I-H)Σ(I-H); the autocovariances are corrected by what Σ itself loses.
-
-    `residual` (n,) holds all curves after each other, each in the order of time, so many samples of
-    each as in `sizes`; `jacobian` (n, k) may have any scaling of its columns.
-    """
-    basis = _basis(jacobian)
-    curves = parts(sizes)
-    sums, processes = [], []
-    for part in curves:
-        own = residual[part][:, None]
-        n = len(own)
-        highest = min(MOST_ORDERS, n // 10)
-        sums.append(_lag_sums(own, own, highest)[:, 0, 0])
-        fits = _levinson(sums[-1] / n)
-        scores = [n * math.log(max(white, 1e-300)) + len(f) * math.log(n) for f, white in fits]
-        order = int(np.argmin(scores))
-        sums[-1] = sums[-1][: order + 1]
-        left = max(n - float(np.sum(basis[part] ** 2)), 1.0)
-        processes.append(NoiseProcess(_damped(fits[order][0], n), float(sums[-1][0] / n), left))
-    if not basis.shape[1]:
-        return processes
-    for _ in range(CORRECTIONS):
-        pairs = list(zip(processes, curves, strict=True))
-        images = [process.times(basis[part]) for process, part in pairs]
-        squares = [basis[part].T @ image for image, part in zip(images, curves, strict=True)]
-        middle = np.sum(squares, axis=0)
-        processes = [
-            _corrected(process, seen, basis[part], image, middle)
-            for process, seen, part, image in zip(processes, sums, curves, images, strict=True)
-        ]
-    return processes
-
-
-def _corrected(
-    process: NoiseProcess, seen: Array, basis: Array, image: Array, middle: Array
-) -> NoiseProcess:
-    """Process whose lag sums, less what the fit took of them, are those seen in the residual."""
-    n, order = len(basis), seen.size - 1
-    once = np.trace(_lag_sums(basis, image, order), axis1=1, axis2=2)
-    twice = np.einsum("kij,ji->k", _lag_sums(basis, basis, order), middle)
-    taken = 2.0 * once - twice
-    lags = (seen + taken) / (n - np.arange(order + 1))
-    # A fit that took most of a curve's noise leaves nothing to correct it by.
-    lags *= min(1.0, 4.0 * seen[0] / n / lags[0]) if lags[0] > 0.0 else 1.0
-    if lags[0] <= 0.0:
-        return process
-    coefficients = _damped(_levinson(lags)[-1][0], n)
-    return replace(process, coefficients=coefficients, variance=float(lags[0]))
-
-
-def _damped(coefficients: Array, n: int) -> Array:
-    """Coefficients of an autoregression none of whose waves lives longer than a quarter of n."""
-    if not coefficients.size:
-        return coefficients
-    radius = float(np.max(np.abs(np.roots(np.append(1.0, -coefficients)))))
-    share = min(1.0, (1.0 - 4.0 / n) / max(radius, 1e-300))
-    return np.asarray(coefficients * share ** np.arange(1, coefficients.size + 1))
-
-
-def _basis(jacobian: Array) -> Array:
-    """Orthonormal basis of the columns of a Jacobian."""
-    if not jacobian.shape[1]:
-        return jacobian
-    scale = np.linalg.norm(jacobian, axis=0)
-    left, singular, _ = np.linalg.svd(jacobian / np.where(scale > 0, scale, 1), full_matrices=False)
-    return left[:, singular > 1e-10 * max(float(singular[0]), 1e-300)]
-
-
-def autocorrelation_time(residual: Array) -> float:
-    """Autocorrelation time τ = 1 + 2 Σ ρ_k >= 1 of a residual, in samples; 1 of white noise."""
-    if residual.size < 8 or not residual.any():
-        return 1.0
-    return noise_process(residual).tau
+# Curvature of the cost over that of JᵀJ below which it is not believed.
+FLATTEST = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,30 +68,53 @@ class Covariance:
         scale = self.stderr
         return self.matrix / np.outer(scale, scale)
 
+    def with_some(self, chosen: NDArray[np.intp], other: Covariance) -> Covariance:
+        """Take these parameters from another covariance; the rest is correlated with nothing.
+
+        No variance becomes smaller: the curvature of a cost with kinks is known to some tenths.
+        """
+        variance = np.diag(self.matrix)
+        more = np.sqrt(np.fmax(variance[chosen] / np.diag(other.matrix), 1.0))
+        matrix = np.diag(variance)
+        matrix[np.ix_(chosen, chosen)] = other.matrix * np.outer(more, more)
+        inflation, freedom = self.inflation.copy(), self.freedom.copy()
+        inflation[chosen], freedom[chosen] = other.inflation * more**2, other.freedom
+        return replace(self, matrix=matrix, inflation=inflation, freedom=freedom)
+
 
 def covariance(
-    jacobian: Array, residual: Array, sizes: tuple[int, ...], sizes_of: Array
+    jacobian: Array,
+    residual: Array,
+    sizes: tuple[int, ...],
+    sizes_of: Array,
+    noise: Sequence[NoiseProcess] | None = None,
+    gradient: Callable[[Array], Array] | None = None,
 ) -> Covariance:
-    """Covariance (JᵀJ)⁻¹ JᵀΣJ (JᵀJ)⁻¹ with Σ the noise of each curve (`noise_processes`).
+    """Covariance H⁻¹ JᵀΣJ H⁻¹ with Σ the noise of each curve (by default `noise_processes`).
 
     `residual` (n,) and `jacobian` (n, k) are those of the best point, so many samples of each curve
-    as in `sizes`; `sizes_of` (k,) are the scales of the parameters, so that directions compare.
+    as in `sizes`; `sizes_of` (k,) are the scales of the parameters, so that directions compare. H
+    is JᵀJ, or with `gradient` the derivative of Jᵀr, which a residual that is no noise changes
+    (White 1982, Econometrica 50, 1): `gradient` gives Jᵀr (k,) at a step (k,), both scaled, off the
+    best point; it is asked one standard error to either side along the principal axes.
     """
     scaled = jacobian * sizes_of
-    noise = noise_processes(residual, scaled, sizes)
+    noise = noise_processes(residual, scaled, sizes) if noise is None else noise
     left, singular, vt = np.linalg.svd(scaled, full_matrices=False)
     seen = singular > SINGULAR * max(float(singular[0]), 1e-300)
     left, root = left[:, seen], vt[seen].T / singular[seen]
     curves = list(zip(noise, parts(sizes), strict=True))
     inner = np.sum([left[part].T @ process.times(left[part]) for process, part in curves], axis=0)
     power, axes = np.linalg.eigh(0.5 * (inner + inner.T))
-    spread = root @ axes * np.sqrt(np.maximum(power, 1e-12 * power[-1]))  # no variance is negative
-    matrix, inverse = spread @ spread.T, root @ root.T
+    axes = axes * np.sqrt(np.maximum(power, 1e-12 * power[-1]))  # no variance is negative
+    bread = np.eye(len(axes)) if gradient is None else _bread(gradient, root, axes)
+    spread = root @ bread @ axes
+    matrix, inverse = spread @ spread.T, root @ bread @ root.T
     lost = np.any(np.abs(vt[~seen]) > 1e-3, axis=0)
     matrix[lost, :] = np.nan
     matrix[:, lost] = np.nan
     effective = sum(n / process.tau for n, process in zip(sizes, noise, strict=True))
-    errors = left @ root.T  # of the estimates, by the noise of each sample
+    errors = left @ bread @ root.T  # of the estimates, by the noise of each sample
     variance = np.sum([process.forms(errors[part]) for process, part in curves], axis=0)
     doubt = np.sum([process.doubt(errors[part]) for process, part in curves], axis=0)
     known = 2.0 * variance**2 / np.maximum(doubt, 1e-300)
@@ -277,10 +127,20 @@ def covariance(
     )
 
 
-def parts(sizes: tuple[int, ...]) -> list[slice]:
-    """Slices of the curves in a residual, of which they have so many samples each."""
-    ends = np.cumsum(sizes)
-    return [slice(int(end - size), int(end)) for size, end in zip(sizes, ends, strict=True)]
+def _bread(gradient: Callable[[Array], Array], root: Array, axes: Array) -> Array:
+    """H⁻¹ in coordinates in which JᵀJ is one; along what has no curvature, that of JᵀJ.
+
+    `root` (k, m) leads from these coordinates to scaled steps, `axes` (m, m) are the steps.
+    """
+    steps = (root @ axes).T
+    change = np.array([0.5 * (gradient(step) - gradient(-step)) for step in steps]).T
+    try:
+        curvature = np.linalg.solve(axes.T, (root.T @ change).T)
+    except np.linalg.LinAlgError:
+        return np.eye(len(axes))
+    values, vectors = np.linalg.eigh(0.5 * (curvature + curvature.T))
+    values = np.where(values > FLATTEST, values, 1.0)
+    return np.asarray((vectors / values) @ vectors.T)
 
 
 def half_width(stderr: float, freedom: float) -> float:
@@ -289,20 +149,28 @@ def half_width(stderr: float, freedom: float) -> float:
 
 
 def state(
-    value: float, half: float, size: float, low: float, high: float, of: str = "its value"
+    value: float,
+    half: float,
+    size: float,
+    low: float,
+    high: float,
+    of: str = "its value",
+    what: str = "95 % interval",
 ) -> tuple[str, str]:
     """State of a parameter that was varied and whose branch was reached, and why.
 
-    `half` is half of its 95 % interval, not cut at the limits, NaN where the data fix only a
+    The rule (`RULE`): determined if its 95 % interval and its range are within ±`WEAK` of its
+    scale, not determined if one of them is wider than ±`NOTHING`, weak between. `half` is half of
+    the wider of the two, in words `what`, not cut at the limits, NaN where the data fix only a
     combination; `size` is its scale, in words `of`; `low` and `high` are its limits.
     """
     if not math.isfinite(half):
         return "not determined", "the data fix only a combination of it with other parameters"
     ratio, edge = half / size, AT_LIMIT * size
-    width = f"its 95 % interval is ±{percent(ratio)} of {of}"
+    width = f"its {what} is ±{percent(ratio)} of {of}"
     if half > NOTHING * size:
         wide = "more than 100 times" if ratio > 100.0 else f"±{ratio:.2g} times"
-        return "not determined", f"its 95 % interval is {wide} {of}"
+        return "not determined", f"its {what} is {wide} {of}"
     if value - low <= edge or high - value <= edge:
         limit = low if value - low <= edge else high
         return "weak", f"it lies at its limit {limit:g}; its interval is open on that side"

@@ -1,6 +1,9 @@
-"""What speaks for a model: AICc and BIC by the samples and the parameters that count.
+"""What speaks for a model: AICc and BIC where the noise is reached, else what it predicts.
 
-Neither correlated residuals nor combinations of parameters that the curves do not fix are evidence.
+AICc and BIC go by the samples and the parameters that count: neither correlated residuals nor
+combinations of parameters that the curves do not fix are evidence. They take the residuals for
+noise. Where every model leaves an error of its own, they do not hold; then models are compared by
+how well they predict blocks of the test that are held back.
 """
 
 from __future__ import annotations
@@ -18,26 +21,39 @@ from foamfit.fitting.branches import branch_of_samples
 from foamfit.fitting.losses import soften, softness
 from foamfit.results import Fit, rung_name
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.covariance import NOTHING, autocorrelation_time
+from foamfit.trust.covariance import NOTHING
+from foamfit.trust.noise_process import autocorrelation_time
+from foamfit.trust.prediction import misfit_of
 from foamfit.trust.residual_tests import neighbours_test, runs_test
 
 # Residuals are structureless where neither test of their order rejects it at this level.
 LEVEL = 0.05
+# Below this level the order of the residuals is an error of the model for sure: one true model in
+# twenty or ten fails `LEVEL` by chance, hardly one this.
+SURE = 1e-4
 # By how much AICc and BIC must both fall for a richer model to be preferred: "strong" evidence of
 # Kass & Raftery (1995), J. Am. Stat. Assoc. 90, 773.
 MARGIN = 6.0
+# Where no model reaches the noise: by what share each further parameter of a richer model must
+# lower the predicted misfit for it to be preferred.
+SHARE = 0.03
+# A model that follows the curves so many times worse than another of as many parameters is not
+# chosen, whatever it predicts.
+WORSE = 2.0
 # Below this misfit (over the range) residuals are the simulation's own error.
 EXACT = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
 class Tried:
-    """A fitted rung: its result, "with" or "without" damping, its best point, and its run time."""
+    """A fitted model: its result, "with" or "without" damping, its best point, and its run time."""
 
     result: Fit
     damping: str
     best: BestPoint
     seconds: float
+    # RMS over the range of samples that were held back; None where the time did not allow it.
+    predicted: float | None = None
 
     @property
     def counted(self) -> tuple[str, ...]:
@@ -77,8 +93,8 @@ class Tried:
 
     @property
     def name(self) -> str:
-        """Model and damping in words."""
-        return rung_name(self.result.model, self.damping)
+        """Model, relaxation and damping in words."""
+        return rung_name(self.result.model, self.damping, self.result.relaxation)
 
     @property
     def curves(self) -> list[Array]:
@@ -116,6 +132,16 @@ class Tried:
         return self.chisqr <= self.floor or min(self.runs_p, self.neighbours_p) >= LEVEL
 
     @property
+    def errs(self) -> bool:
+        """Whether an error of the model is left for sure."""
+        return self.chisqr > self.floor and min(self.runs_p, self.neighbours_p) < SURE
+
+    @cached_property
+    def misfit(self) -> float:
+        """RMS over the range, all curves together, not less than the simulation's own error."""
+        return max(misfit_of(self.best, self.residual), EXACT)
+
+    @property
     def varied(self) -> int:
         """How many parameters vary."""
         return sum(item.vary for item in self.result.parameters.values())
@@ -127,7 +153,7 @@ class Tried:
 
 @dataclass(frozen=True)
 class Criteria:
-    """Information criteria of a rung, all rungs by one measure of the noise."""
+    """Information criteria of a model, all models by one measure of the noise."""
 
     rank: int
     aicc: float
@@ -139,10 +165,10 @@ class Criteria:
 
 
 def reference_of(tried: Sequence[Tried]) -> Tried:
-    """The rung of the least chi-square: its residuals are taken for the noise of all.
+    """The model of the least chi-square: its residuals are taken for the noise of all.
 
     As the variance inflation of the global model in QAICc (Burnham & Anderson 2002, Model Selection
-    and Multimodel Inference, section 2.5): what a simpler rung leaves over is not noise.
+    and Multimodel Inference, section 2.5): what a simpler model leaves over is not noise.
     """
     return min(tried, key=lambda one: one.chisqr)
 
@@ -169,7 +195,7 @@ def effective_parameters(grams: Array, reference: Tried) -> int:
 
 
 def criteria(one: Tried, reference: Tried) -> Criteria:
-    """AICc and BIC of a rung: n_eff ln(χ²/n) and the penalty for its effective parameters."""
+    """AICc and BIC of a model: n_eff ln(χ²/n) and the penalty for its effective parameters."""
     n_eff = effective_samples(reference)
     rank = effective_parameters(one.grams, reference)
     fit = n_eff * math.log(max(one.chisqr, 1e-300) / one.residual.size)
@@ -178,11 +204,78 @@ def criteria(one: Tried, reference: Tried) -> Criteria:
     return Criteria(rank, aicc, fit + rank * math.log(max(n_eff, 1.0)))
 
 
-def choose(tried: Sequence[Tried]) -> tuple[int, list[Criteria]]:
-    """Index of the simplest rung that no richer one beats, and the criteria of each."""
+@dataclass(frozen=True)
+class Score:
+    """What the comparison by prediction goes by: parameters, fitted and predicted misfit."""
+
+    varied: int
+    misfit: float
+    predicted: float
+
+    def beats(self, other: Score) -> bool:
+        """Whether it predicts better, by `SHARE` for each parameter that it has more."""
+        return self.predicted < other.predicted * (1.0 - SHARE) ** (self.varied - other.varied)
+
+    def rules_out(self, other: Score) -> bool:
+        """Whether it has no more parameters and follows the curves better, or much better.
+
+        Better is enough for fewer parameters; as many need `WORSE` times better.
+        """
+        factor = 1.0 if self.varied < other.varied else WORSE
+        return self.varied <= other.varied and factor * self.misfit < other.misfit
+
+
+@dataclass(frozen=True)
+class Decision:
+    """Which model is chosen, and what it and the others were compared with."""
+
+    best: int
+    criteria: tuple[Criteria, ...]
+    by_prediction: bool  # Else by AICc and BIC
+    # Of each model: the chosen one of those before it, from the fewest parameters up; None of the
+    # first.
+    before: tuple[int | None, ...]
+    # Of each model: another that follows the curves better with no more parameters, if any.
+    ruled_out_by: tuple[int | None, ...]
+
+
+def scores_of(tried: Sequence[Tried]) -> list[Score]:
+    """Scores of all models; the fitted misfit is that predicted if one has no prediction."""
+    known = all(one.predicted is not None for one in tried)
+    return [
+        Score(one.varied, one.misfit, one.predicted if known and one.predicted else one.misfit)
+        for one in tried
+    ]
+
+
+def decide(scores: Sequence[Score], criteria: Sequence[Criteria], by_prediction: bool) -> Decision:
+    """Go through the models from the fewest parameters up; see `choose`."""
+    before: list[int | None] = [None] * len(scores)
+    rulers = [
+        next((j for j, other in enumerate(scores) if j != i and other.rules_out(one)), None)
+        for i, one in enumerate(scores)
+    ]
+    best: int | None = None
+    for i in sorted(range(len(scores)), key=lambda i: scores[i].varied):
+        before[i] = best
+        if rulers[i] is not None:
+            continue
+        if best is None:
+            best = i
+        elif by_prediction:
+            best = i if scores[i].beats(scores[best]) else best
+        else:
+            best = i if criteria[i].beats(criteria[best]) else best
+    assert best is not None  # the model of the least misfit and fewest parameters is not ruled out
+    return Decision(best, tuple(criteria), by_prediction, tuple(before), tuple(rulers))
+
+
+def choose(tried: Sequence[Tried]) -> Decision:
+    """Choose the simplest model that no richer one beats.
+
+    AICc and BIC decide where at least one model comes to the noise; else the misfit of samples that
+    were held back decides.
+    """
     reference = reference_of(tried)
     found = [criteria(one, reference) for one in tried]
-    best = 0
-    for i, one in enumerate(found):
-        best = i if one.beats(found[best]) else best
-    return best, found
+    return decide(scores_of(tried), found, all(one.errs for one in tried))

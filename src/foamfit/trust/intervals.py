@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from foamfit.arrays import Array
 from foamfit.errors import InputError
 from foamfit.fitting.search import Tracker
 from foamfit.trust.best_point import BestPoint
+from foamfit.trust.noise_process import parts
 from foamfit.trust.profile import PLACED, Profile, Tracing, departures
 from foamfit.trust.resample import bootstrap, check_emcee, mcmc, walkers
 
@@ -67,6 +68,8 @@ class Intervals:
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()  # Why they are not, or hardly, what was asked for
     better: Array | None = None  # A point of lower cost: the fit should go on from there
+    # Ends of the ranges that the error of the law leaves open; none where there is no such error.
+    ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
 def assess(
@@ -101,7 +104,37 @@ def assess(
     far[_elsewhere(best, minima, tracker)] = np.inf
     order = sorted(known, key=lambda name: -far[best.names.index(name)])
     bent = [name for name in order if far[best.names.index(name)] > BENT]
-    return _by_profiles(best, bent, minima, tracker, budget)
+    return _with_minima(best, _by_profiles(best, bent, minima, tracker, budget), minima, tracker)
+
+
+def _with_minima(
+    best: BestPoint, made: Intervals, minima: Sequence[Array], tracker: Tracker
+) -> Intervals:
+    """Intervals that hold the other minima which other noise could have made the best.
+
+    Beside an error of the law two minima differ by more than noise. Of the difference of their
+    costs the noise e makes 2 eᵀd, with d the difference of their residuals.
+    """
+    if not best.misfits or made.better is not None:
+        return made
+    ends, methods = dict(made.ends), dict(made.methods)
+    here = best.soft
+    for point in minima:
+        residual = tracker.consider(point)
+        apart = (residual - here)[:, None]
+        noise = zip(best.spread.noise, parts(best.problem.objective.sizes), strict=True)
+        chance = 2.0 * math.sqrt(sum(float(process.forms(apart[p])[0]) for process, p in noise))
+        if float(residual @ residual) - best.cost > 1.96 * chance:
+            continue
+        for name in best.known:
+            half = best.halves[best.names.index(name)]
+            value, there = best.values[best.index[name]], point[best.index[name]]
+            low, high = ends.get(name, (value - half, value + half))
+            wider = min(low, there - half), max(high, there + half)
+            if wider[1] - wider[0] > (1.0 + PLACED) * (high - low):
+                ends[name] = wider
+                methods[name] = "other minima"
+    return replace(made, ends=ends, methods=methods)
 
 
 def _elsewhere(best: BestPoint, minima: Sequence[Array], tracker: Tracker) -> NDArray[np.bool_]:

@@ -10,6 +10,7 @@ from foamfit.arrays import Array
 from foamfit.fitting.levenberg import Iterate, descend
 from foamfit.fitting.losses import soften, softness
 from foamfit.fitting.search import Tracker
+from foamfit.springs.law import least_eps_star
 from foamfit.trust.best_point import BestPoint
 
 # Largest drop of the stress from A1 to C2 over the stress at A1.
@@ -39,6 +40,10 @@ class Refit:
             ([index[own + "k0"], index[own + "eps_a"]], index[own + "dsigma"])
             for own in (name.removesuffix("dsigma") for name in best.names if "_dsigma" in name)
         ]
+        self.stars = [
+            ([index[own + "k0"], index[own + "kc"]], index[own + "eps_star"])
+            for own in (name.removesuffix("eps_star") for name in best.names if "_eps_star" in name)
+        ]
         cuts = best.quantiles**2 * best.spread.inflation  # NaN where the test says nothing
         self.enough = ENOUGH * float(min(cuts[np.isfinite(cuts)], default=1.0))
 
@@ -66,17 +71,32 @@ class Refit:
         for sigma_a, drop in self.drops:  # no spring's stress at C2 falls below zero
             k0, eps_a = point[sigma_a]
             point[drop] = max(point[drop], -LAST_DROP * k0 * eps_a / (1.0 - eps_a))
+        for stiffnesses, star in self.stars:  # branch c never lies before branch a
+            point[star] = max(point[star], least_eps_star(*point[stiffnesses]))
         return self.complete(point)
 
     def moved(self, at: Iterate, step: Array) -> Array:
         """Point that is off an iterate by a scaled step, within the limits."""
         return self.point(at.point[self.places] / self.best.sizes + step, self.low, self.high)
 
-    def run(self, start: Array, hold: tuple[int, float] | None = None) -> Iterate | None:
+    def taken(self, point: Array) -> Array:
+        """Scaled step from the best point to another one."""
+        return np.asarray((point - self.best.values)[self.places] / self.best.sizes)
+
+    def run(
+        self,
+        start: Array,
+        hold: tuple[int, float] | None = None,
+        *,
+        weights: Array | float = 1.0,
+        iterations: int = STEPS,
+    ) -> Iterate | None:
         """Descend from a point, one parameter (its column) held at a value or none.
 
-        Returns None if the start cannot be simulated.
+        `weights` (n_data,) multiply the squares. Returns None if the start cannot be simulated.
         """
+        root = np.sqrt(weights)
+        rows = np.reshape(root, (-1, 1))
         problem, names, sizes = self.best.problem, self.best.names, self.best.sizes
         low, high = self.low.copy(), self.high.copy()
         if hold is not None:
@@ -86,7 +106,7 @@ class Refit:
             return self.point(scaled, low, high)
 
         def jacobian(scaled: Array) -> Array:
-            slopes = problem.linear.slopes(point(scaled), names)
+            slopes: Array = problem.linear.slopes(point(scaled), names) * rows
             if problem.objective.loss == "linear":
                 return slopes * sizes
             differences = problem.objective.differences(point(scaled)) - self.shift
@@ -96,7 +116,7 @@ class Refit:
         if self.residual(point(scaled)) is None:
             return None
         end = descend(
-            lambda scaled: self.tracker.residual(point(scaled), self.shift), jacobian,
-            scaled, (low / sizes, high / sizes), STEPS, least=self.enough, damping=1e-6,
+            lambda scaled: root * self.tracker.residual(point(scaled), self.shift), jacobian,
+            scaled, (low / sizes, high / sizes), iterations, least=self.enough, damping=1e-6,
         )  # fmt: skip
         return replace(end, point=point(end.point))

@@ -13,7 +13,7 @@ from foamfit.arrays import Array
 from foamfit.errors import InputError
 from foamfit.fitting.search import STOPPING, Tracker, what_stopped
 from foamfit.trust.best_point import BestPoint, m_estimate
-from foamfit.trust.covariance import NoiseProcess
+from foamfit.trust.noise_process import NoiseProcess
 from foamfit.trust.refit import Refit
 
 # Farthest that a walker of a Markov chain begins from the best point along a direction that the
@@ -63,8 +63,18 @@ class Refits:
     stopped: str | None = None
 
 
+def _misfits(best: BestPoint) -> Array:
+    """Residuals of the curves that hold an error of the law, zero for the others, (n_data,)."""
+    pairs = zip(best.problem.objective.sizes, best.errors, strict=True)
+    found = np.concatenate([np.full(size, error.found) for size, error in pairs])
+    return np.where(found, best.residual, 0.0)
+
+
 def bootstrap(best: BestPoint, draws: int, seed: int, tracker: Tracker | None = None) -> Refits:
     """Refits to data remade from the fitted curves and blocks of the residuals.
+
+    Where a residual holds an error of the law, that stays, and noise of the kind that is in it is
+    added to the measured curve.
 
     Each refit descends from the best point; other minima of the cost are not searched. They are
     fewer than asked for if the deadline or Ctrl-C ended them.
@@ -81,12 +91,18 @@ def bootstrap(best: BestPoint, draws: int, seed: int, tracker: Tracker | None = 
     ):  # fmt: skip
         length = block_length(process, n)
         sources.append((_scaled_residual(part, process, like, length), length))
+    kept = _misfits(best)
     out: list[Array] = []
     stopped = None
     try:
         for _ in range(draws):
-            noise = np.concatenate([_draw(part, length, rng) for part, length in sources])
-            refit = Refit(best, tracker, best.residual - noise)
+            drawn = [
+                process.draw(part.size, rng) if error.found else _draw(part, length, rng)
+                for (part, length), error, process in zip(
+                    sources, best.errors, best.spread.noise, strict=True
+                )
+            ]
+            refit = Refit(best, tracker, best.residual - kept - np.concatenate(drawn))
             end = refit.run(best.values)
             assert end is not None  # the best point can be simulated
             out.append(end.point[refit.places])

@@ -21,9 +21,35 @@ from typing import NamedTuple
 
 import numpy as np
 
+from foamfit.solve.explicit.memory import (
+    BASE,
+    EQ,
+    GAIN,
+    GIVE,
+    SOFT,
+    Memory,
+    advance_memory,
+    advance_memory_tangents,
+    enter_mixture,
+    fill_partials,
+    finish_mixture,
+    keep,
+    keep_tangent,
+    relaxed,
+    relaxed_tangent,
+    start_mixture,
+    start_relaxed,
+    start_relaxed_tangent,
+    strain_at,
+    strain_of_mixture,
+    tangent_of_mixture,
+)
 from foamfit.solve.polynomial import value_at
 from foamfit.solve.scene import FREE, MOTION, STRESS, VISCOUS
 from foamfit.springs.kernels import (
+    BACK,
+    HELD,
+    KIND,
     Array,
     Branches,
     branch_shape,
@@ -34,6 +60,8 @@ from foamfit.springs.kernels import (
     once,
     piece,
 )
+from foamfit.springs.law import MICROSCALE
+from foamfit.springs.microscale_kernels import FIRST
 from foamfit.springs.parameters import DRAG, OWN_ETA, OWN_HEIGHT
 from foamfit.springs.sensitivities import branch_derivative
 
@@ -41,9 +69,9 @@ from foamfit.springs.sensitivities import branch_derivative
 # stress of the springs, common stress of the groups, slope T = dσ/dε of the springs.
 W, V, EPS, SIG, GROUP, TILT, N_SERIES = range(7)
 # Columns of `Links.law`: slope k of the branch that a spring is on, its origins x0 and s0, the
-# spring's dashpot and height: what parameters move; then whether the branch is curved, the strains
-# between which the spring stays on it, and what a step keeps of a curved one: 1/(1 - x) at its
-# start.
+# spring's dashpot and height: what parameters move; then whether the branch is curved (0 or 1; or
+# which one it is of those on which a microscale spring is a mixture of both), the strains between
+# which the spring stays on it, and what a step keeps of a curved one: 1/(1 - x) at its start.
 SLOPE, ORIGIN, OFFSET, DASHPOT, HEIGHT, N_MOVES = range(6)
 CURVED, LOW, HIGH, INVERSE, N_LAW = range(N_MOVES, 10)
 
@@ -83,18 +111,28 @@ class SeriesTangents(NamedTuple):
 
 
 @inner
-def enter(rows: Array, i: int, branch: int, law: Array) -> None:
+def enter(rows: Array, i: int, branch: int, law: Array, memory: Memory | None) -> None:
     """Write the branch that spring i enters."""
+    if memory is not None and branch >= HELD:
+        law[i, CURVED] = float(branch)
+        law[i, LOW], law[i, HIGH] = enter_mixture(memory, i)
+        return
     curved, law[i, SLOPE], law[i, ORIGIN], law[i, OFFSET] = branch_shape(rows[i], branch)
     law[i, CURVED] = 1.0 if curved else 0.0
     law[i, LOW], law[i, HIGH] = interval(rows[i], branch)
+    if memory is not None and rows[i, KIND] == MICROSCALE:
+        law[i, LOW], law[i, HIGH] = -math.inf, memory.state[i, FIRST]
 
 
 @inner
-def slope_now(law: Array, i: int, eps: float) -> float:
-    """Slope dσ/dε on the branch that spring i is on."""
+def slope_now(law: Array, i: int, eps: float, memory: Memory | None) -> float:
+    """Slope dΣ/dε on the branch that spring i is on; of a mixture, where the step started."""
     k, y = law[i, SLOPE], 1.0 - (eps - law[i, ORIGIN])
-    return k / (y * y) if law[i, CURVED] != 0.0 else k
+    slope = k / (y * y) if law[i, CURVED] != 0.0 else k
+    if memory is not None:
+        gain = memory.now[i, GAIN]
+        return gain / memory.now[i, GIVE] if law[i, CURVED] >= HELD else gain * slope
+    return slope
 
 
 @inner
@@ -107,6 +145,8 @@ def enter_tangents(
             dk, dx0, ds0 = branch_derivative(rows[i], branch, directions[p, 1])
             d.law[p, i, SLOPE], d.law[p, i, ORIGIN], d.law[p, i, OFFSET] = dk, dx0, ds0
             if dk != 0.0 or dx0 != 0.0 or ds0 != 0.0:
+                d.live[p] = 1.0
+            if branch >= HELD:  # of a mixture, `Memory` has them
                 d.live[p] = 1.0
 
 
@@ -155,8 +195,8 @@ def _product(x: Array, y: Array, i: int, n: int) -> float:
 
 
 @inlined
-def _stress_term(law: Array, i: int, eps: Array, sig: Array, n: int) -> float:
-    """Order n of a spring's stress from its strain up to order n."""
+def _law_stress(law: Array, i: int, eps: Array, sig: Array, n: int) -> float:
+    """Order n of the stress of a spring's law from its strain up to order n."""
     k = law[i, SLOPE]
     if n > 0:
         if law[i, CURVED] == 0.0:
@@ -170,18 +210,78 @@ def _stress_term(law: Array, i: int, eps: Array, sig: Array, n: int) -> float:
     return k * x * law[i, INVERSE]
 
 
-@inlined
-def _strain_term(law: Array, i: int, eps: Array, sig: Array, n: int) -> tuple[float, float]:
-    """Order n >= 1 of a spring's strain as (known part, compliance): ε_n = known + compliance σ_n.
+@inner
+def _remembered_stress(law: Array, i: int, eps: Array, n: int, memory: Memory) -> float:
+    """Order n of the stress of a spring in a chain with memory; see `_stress_term`."""
+    moving = law[i, CURVED] > HELD
+    if law[i, CURVED] < HELD:
+        s_n = _law_stress(law, i, eps, memory.series[EQ], n)
+    elif n == 0:
+        s_n = start_mixture(memory, i, moving, eps[i, 0])
+    else:
+        s_n = eps[i, n] - strain_of_mixture(memory, i, moving, n)
+        s_n *= 1.0 / memory.now[i, GIVE]
+        finish_mixture(memory, i, moving, n, s_n)
+    keep(memory, i, n, s_n)
+    return memory.now[i, GAIN] * s_n + relaxed(memory, i, n)
 
-    The compliance of a flat branch is infinite.
-    """
+
+@inlined
+def _stress_term(
+    law: Array, i: int, eps: Array, sig: Array, n: int, memory: Memory | None
+) -> float:
+    """Order n of a spring's stress from its strain up to order n."""
+    if memory is None:
+        return _law_stress(law, i, eps, sig, n)
+    return _remembered_stress(law, i, eps, n, memory)
+
+
+@inlined
+def _law_strain(law: Array, i: int, eps: Array, sig: Array, n: int) -> tuple[float, float]:
+    """Order n >= 1 of a strain on a branch as (known part, compliance), as `_strain_term` does."""
     k = law[i, SLOPE]
     if law[i, CURVED] == 0.0:
         return 0.0, (1.0 / k if k > 0.0 else math.inf)
     stiff = k + sig[i, 0]
     known = _product(eps, sig, i, n)
     return -known / stiff, (1.0 - (eps[i, 0] - law[i, ORIGIN])) / stiff
+
+
+@inner
+def _remembered_strain(
+    law: Array, i: int, eps: Array, n: int, memory: Memory
+) -> tuple[float, float]:
+    """Order n >= 1 of the strain of a spring in a chain with memory; see `_strain_term`."""
+    if law[i, CURVED] < HELD:
+        known, soft = _law_strain(law, i, eps, memory.series[EQ], n)
+    else:
+        known = strain_of_mixture(memory, i, law[i, CURVED] > HELD, n)
+        soft = memory.now[i, GIVE]
+    soft /= memory.now[i, GAIN]
+    memory.now[i, SOFT] = soft
+    return (known - soft * relaxed(memory, i, n) if soft < math.inf else known), soft
+
+
+@inlined
+def _strain_term(
+    law: Array, i: int, eps: Array, sig: Array, n: int, memory: Memory | None
+) -> tuple[float, float]:
+    """Order n >= 1 of a spring's strain as (known part, compliance): ε_n = known + compliance σ_n.
+
+    The compliance of a flat branch is infinite.
+    """
+    if memory is None:
+        return _law_strain(law, i, eps, sig, n)
+    return _remembered_strain(law, i, eps, n, memory)
+
+
+@inner
+def _settle_stress(law: Array, i: int, n: int, s_n: float, memory: Memory) -> None:
+    """Take down order n >= 1 of the stress of a spring whose strain came from `_strain_term`."""
+    own = (s_n - relaxed(memory, i, n)) / memory.now[i, GAIN]
+    if law[i, CURVED] >= HELD:
+        finish_mixture(memory, i, law[i, CURVED] > HELD, n, own)
+    keep(memory, i, n, own)
 
 
 @once
@@ -193,6 +293,7 @@ def _share_elongation(
     sig: Array,
     u_n: float,
     n: int,
+    memory: Memory | None,
 ) -> float:
     """Order n >= 1 of the common stress of a group that has springs without dashpot.
 
@@ -203,7 +304,7 @@ def _share_elongation(
         if law[i, DASHPOT] > 0.0:
             rest -= law[i, HEIGHT] * eps[i, n]
             continue
-        known, soft = _strain_term(law, i, eps, sig, n)
+        known, soft = _strain_term(law, i, eps, sig, n, memory)
         eps[i, n] = known  # so far
         rest -= law[i, HEIGHT] * known
         if soft < math.inf:
@@ -211,10 +312,17 @@ def _share_elongation(
         elif flat < 0:
             flat = i
     s_n = 0.0 if flat >= 0 else rest / compliance
+    if memory is not None and flat >= 0:
+        s_n = relaxed(memory, flat, n)
+        rest -= s_n * compliance
     for i in range(i0, i1):
         if law[i, DASHPOT] == 0.0:
             sig[i, n] = s_n
-            if law[i, CURVED] != 0.0:
+            if memory is not None:
+                if memory.now[i, SOFT] < math.inf:
+                    eps[i, n] += memory.now[i, SOFT] * s_n
+                _settle_stress(law, i, n, s_n, memory)
+            elif law[i, CURVED] != 0.0:
                 x = eps[i, 0] - law[i, ORIGIN]
                 eps[i, n] += (1.0 - x) / (law[i, SLOPE] + sig[i, 0]) * s_n
             elif law[i, SLOPE] > 0.0:
@@ -262,12 +370,13 @@ def _group_term(
     push_n: float,
     drag: float,
     n: int,
+    memory: Memory | None,
 ) -> float:
     """Order n of the common stress of a group whose elongation u and its rate are known."""
     if i1 - i0 == 1:
         if n > 0:
             eps[i0, n] = u_n * (1.0 / law[i0, HEIGHT])  # the quotient waits for nothing
-        sig[i0, n] = _stress_term(law, i0, eps, sig, n)
+        sig[i0, n] = _stress_term(law, i0, eps, sig, n, memory)
         if law[i0, DASHPOT] == 0.0:
             return sig[i0, n]
         return _damped_term(law, i0, i1, sig, rate_n, push_n, drag, n)
@@ -278,28 +387,37 @@ def _group_term(
         elif first < 0 or (law[i, CURVED] == 0.0 and law[i, SLOPE] == 0.0):
             first = i  # a flat branch knows the common stress without rounding (0 in an open gap)
         if n == 0 or law[i, DASHPOT] > 0.0:
-            sig[i, n] = _stress_term(law, i, eps, sig, n)
+            sig[i, n] = _stress_term(law, i, eps, sig, n, memory)
     if damped == i1 - i0:
         return _damped_term(law, i0, i1, sig, rate_n, push_n, drag, n)
     if n == 0:
         return sig[first, 0]
-    return _share_elongation(law, i0, i1, eps, sig, u_n, n)
+    return _share_elongation(law, i0, i1, eps, sig, u_n, n, memory)
 
 
 @once
 def _stressed_term(
-    law: Array, i0: int, i1: int, eps: Array, sig: Array, s_n: float, n: int
+    law: Array,
+    i0: int,
+    i1: int,
+    eps: Array,
+    sig: Array,
+    s_n: float,
+    n: int,
+    memory: Memory | None,
 ) -> bool:
     """Order n of the strains of a group whose stress is prescribed; false if it cannot be."""
     for i in range(i0, i1):
         if law[i, DASHPOT] > 0.0 or n == 0:
-            sig[i, n] = _stress_term(law, i, eps, sig, n)
+            sig[i, n] = _stress_term(law, i, eps, sig, n, memory)
             continue
-        known, soft = _strain_term(law, i, eps, sig, n)
+        known, soft = _strain_term(law, i, eps, sig, n, memory)
         if soft == math.inf:
             return False
         eps[i, n] = known + soft * s_n
         sig[i, n] = s_n
+        if memory is not None:
+            _settle_stress(law, i, n, s_n, memory)
     return True
 
 
@@ -315,7 +433,7 @@ def is_bare(links: Links) -> bool:
 
 
 @inlined
-def expand_bare(links: Links, s: Array, push: Array, order: int) -> None:
+def expand_bare(links: Links, s: Array, push: Array, order: int, memory: Memory | None) -> None:
     """Fill the series of a chain that `is_bare`, as `expand` does, asking less at each order."""
     law, _, mass, drag, _ = links
     w, v, eps, sig, group = s[W], s[V], s[EPS], s[SIG], s[GROUP]
@@ -324,7 +442,7 @@ def expand_bare(links: Links, s: Array, push: Array, order: int) -> None:
         share = 1.0 / (n + 1)
         for i in range(last + 1):
             eps[i, n] = (w[i, n] - (w[i - 1, n] if i > 0 else 0.0)) * (1.0 / law[i, HEIGHT])
-            sig[i, n] = group[i, n] = _stress_term(law, i, eps, sig, n)
+            sig[i, n] = group[i, n] = _stress_term(law, i, eps, sig, n, memory)
         for i in range(last + 1):
             net = -sig[i, n]
             if i < last:
@@ -338,7 +456,9 @@ def expand_bare(links: Links, s: Array, push: Array, order: int) -> None:
 
 
 @inner
-def expand(links: Links, s: Array, push: Array, motion: Array, order: int) -> bool:
+def expand(
+    links: Links, s: Array, push: Array, motion: Array, order: int, memory: Memory | None
+) -> bool:
     """Fill the series up to `order`; false if a prescribed stress meets a flat branch.
 
     `push` (2,) is the stress on the top and its rate, `motion` (2,) its displacement and rate.
@@ -357,7 +477,7 @@ def expand(links: Links, s: Array, push: Array, motion: Array, order: int) -> bo
             stressed = g == last and top == STRESS
             if stressed:
                 group[g, n] = push_n
-                if not _stressed_term(law, i0, i1, eps, sig, push_n, n):
+                if not _stressed_term(law, i0, i1, eps, sig, push_n, n, memory):
                     return False
             else:
                 viscous = g == last and top == VISCOUS
@@ -365,8 +485,9 @@ def expand(links: Links, s: Array, push: Array, motion: Array, order: int) -> bo
                 if g > 0:
                     u_n -= w[g - 1, n]
                     rate_n -= v[g - 1, n]
+                weight = drag if viscous else 0.0
                 group[g, n] = _group_term(
-                    law, i0, i1, eps, sig, u_n, rate_n, push_n, drag if viscous else 0.0, n
+                    law, i0, i1, eps, sig, u_n, rate_n, push_n, weight, n, memory
                 )
             if i1 - i0 > 1 or stressed:
                 for i in range(i0, i1):
@@ -390,7 +511,7 @@ def expand(links: Links, s: Array, push: Array, motion: Array, order: int) -> bo
 
 @inner
 def _fill_tilt(law: Array, i: int, sig: Array, tilt: Array, order: int) -> None:
-    """Series T of dσ/dε of a spring: k on a straight branch, (k + σ)²/k on a curved one."""
+    """Series T of dσ/dε on a branch: k on a straight one, (k + σ)²/k on a curved one."""
     k = law[i, SLOPE]
     tilt[i, 0] = k
     if law[i, CURVED] == 0.0:
@@ -404,19 +525,30 @@ def _fill_tilt(law: Array, i: int, sig: Array, tilt: Array, order: int) -> None:
 
 
 @inlined
-def _known_tangent(law: Array, s: Array, m: Array, d: Array, i: int, n: int) -> float:
-    """Order n of δσ of a spring, but for the term T_0 δε_n."""
-    eps, sig, tilt = s[EPS], s[SIG], s[TILT]
+def _known_tangent(
+    law: Array, s: Array, m: Array, d: Array, i: int, n: int, memory: Memory | None, p: int
+) -> float:
+    """Order n of δσ of a spring in direction p, but for the term T_0 δε_n."""
+    eps, sig, tilt, gain = s[EPS], s[SIG], s[TILT], 1.0
+    if memory is not None:
+        sig, gain = memory.series[EQ], memory.now[i, GAIN]
     known = -tilt[i, n] * m[i, ORIGIN]
     if law[i, CURVED] == 0.0:
-        known += (eps[i, n] - (law[i, ORIGIN] if n == 0 else 0.0)) * m[i, SLOPE]
-        known += m[i, OFFSET] if n == 0 else 0.0
-    else:
-        known += sig[i, n] / law[i, SLOPE] * m[i, SLOPE]
+        known += gain * (eps[i, n] - (law[i, ORIGIN] if n == 0 else 0.0)) * m[i, SLOPE]
+        known += gain * m[i, OFFSET] if n == 0 else 0.0
+    elif law[i, CURVED] < HELD:
+        known += gain * sig[i, n] / law[i, SLOPE] * m[i, SLOPE]
         if n > 0:
             known += d[EPS, i, 0] * tilt[i, n] + _product(d[EPS], tilt, i, n)
+    if memory is not None:
+        if law[i, CURVED] >= HELD:
+            known = tangent_of_mixture(memory, p, i, law[i, CURVED] > HELD, tilt[i, 0], n)
+        memory.now[i, BASE] = relaxed_tangent(memory, p, i, n)
+        known += memory.now[i, BASE]
     if law[i, DASHPOT] == 0.0 and n + 2 < tilt.shape[1]:  # a dashpot of zero: what it would take
         known += (n + 1) * eps[i, n + 1] * m[i, DASHPOT]
+        if memory is not None:
+            memory.now[i, BASE] += (n + 1) * eps[i, n + 1] * m[i, DASHPOT]
     return known
 
 
@@ -471,7 +603,17 @@ def _damped_tangent(
 
 
 @inlined
-def _group_tangent(links: Links, s: Array, m: Array, drag: float, d: Array, g: int, n: int) -> None:
+def _group_tangent(
+    links: Links,
+    s: Array,
+    m: Array,
+    drag: float,
+    d: Array,
+    g: int,
+    n: int,
+    memory: Memory | None,
+    p: int,
+) -> None:
     """Order n of the derivative of a group's stress and of its strains that are no state."""
     law, tilt = links.law, s[TILT]
     i0, i1 = springs_of(links.ends, g)
@@ -482,7 +624,7 @@ def _group_tangent(links: Links, s: Array, m: Array, drag: float, d: Array, g: i
     for i in range(i0, i1):
         damped += law[i, DASHPOT] > 0.0
         rest -= s[EPS, i, n] * m[i, HEIGHT]
-        known = _known_tangent(law, s, m, d, i, n)
+        known = _known_tangent(law, s, m, d, i, n, memory, p)
         if single:
             d[EPS, i, n] = rest * (1.0 / law[i, HEIGHT])
         elif stressed and law[i, DASHPOT] == 0.0:
@@ -501,15 +643,27 @@ def _group_tangent(links: Links, s: Array, m: Array, drag: float, d: Array, g: i
 
 
 @once
-def _expand_tangent(links: Links, s: Array, m: Array, drag: float, d: Array, order: int) -> None:
-    """Fill the derivatives in one direction, that moves `m` and `drag`, up to `order`."""
+def _expand_tangent(
+    links: Links,
+    s: Array,
+    m: Array,
+    drag: float,
+    d: Array,
+    order: int,
+    memory: Memory | None,
+    p: int,
+) -> None:
+    """Fill the derivatives in direction p, that moves `m` and `drag`, up to `order`."""
     law, last = links.law, links.ends.size - 1
     w, v = d[W], d[V]
     for n in range(order + 1):
         share = 1.0 / (n + 1)
         for g in range(last + 1):
-            _group_tangent(links, s, m, drag, d, g, n)
+            _group_tangent(links, s, m, drag, d, g, n, memory, p)
             i0, i1 = springs_of(links.ends, g)
+            if memory is not None:
+                for i in range(i0, i1):
+                    keep_tangent(memory, p, i, n, d[SIG, i, n])
             if i1 - i0 > 1 or (g == last and links.top == STRESS):
                 for i in range(i0, i1):
                     if law[i, DASHPOT] > 0.0:
@@ -531,29 +685,152 @@ def _expand_tangent(links: Links, s: Array, m: Array, drag: float, d: Array, ord
 
 
 @piece
-def expand_tangents(links: Links, s: Array, d: SeriesTangents, order: int) -> None:
+def expand_tangents(
+    links: Links, s: Array, d: SeriesTangents, order: int, memory: Memory | None
+) -> None:
     """Fill the derivatives up to `order`, after `expand`; those that are still zero stay so."""
     for i in range(links.law.shape[0]):
-        _fill_tilt(links.law, i, s[SIG], s[TILT], order)
+        if memory is None:
+            _fill_tilt(links.law, i, s[SIG], s[TILT], order)
+        else:
+            kind = links.law[i, CURVED]
+            if kind >= HELD:
+                s[TILT, i, 0] = fill_partials(
+                    memory, i, kind > HELD, kind == BACK, s[EPS, i], order
+                )
+            else:
+                _fill_tilt(links.law, i, memory.series[EQ], s[TILT], order)
+                for n in range(order + 1):
+                    s[TILT, i, n] *= memory.now[i, GAIN]
     for p in range(d.drag.size):
         if d.live[p] > 0.0:
-            _expand_tangent(links, s, d.law[p], d.drag[p], d.series[p], order)
+            _expand_tangent(links, s, d.law[p], d.drag[p], d.series[p], order, memory, p)
+
+
+@inner
+def start_relaxing(law: Array, i: int, s: Array, d: SeriesTangents, memory: Memory) -> None:
+    """Let nothing have relaxed yet of the stress at which a spring starts: q_k = 0."""
+    sig, tilt = s[SIG], s[TILT]
+    _stress_term(law, i, s[EPS], sig, 0, memory)
+    kind, stress = law[i, CURVED], memory.series[EQ, i, 0]
+    if kind >= HELD:
+        tilt[i, 0] = fill_partials(memory, i, kind > HELD, kind == BACK, s[EPS, i], 0)
+    else:
+        _fill_tilt(law, i, memory.series[EQ], tilt, 0)
+        tilt[i, 0] *= memory.now[i, GAIN]
+    for p in range(d.drag.size):
+        change = _known_tangent(law, s, d.law[p], d.series[p], i, 0, memory, p)
+        change += tilt[i, 0] * d.series[p, EPS, i, 0] - memory.now[i, BASE]
+        start_relaxed_tangent(memory, p, i, change / memory.now[i, GAIN])
+    start_relaxed(memory, i, stress)
 
 
 # ---------------------------------------------------------------- the end of a step
 
 
 @inner
-def advance(s: Array, groups: int, order: int, span: float) -> None:
+def share_a_stress(law: Array, ends: Branches, i: int, j: int, memory: Memory) -> bool:
+    """Whether two springs bear one stress, without dashpot or relaxation."""
+    plain = law[i, DASHPOT] == 0.0 and law[j, DASHPOT] == 0.0
+    plain = plain and memory.now[i, GAIN] == 1.0 and memory.now[j, GAIN] == 1.0
+    for g in range(ends.size if plain else 0):
+        first, last = springs_of(ends, g)
+        if first <= i < last:
+            return bool(first <= j < last)
+    return False
+
+
+@inner
+def _own_strain(law: Array, i: int, stress: float, memory: Memory) -> tuple[float, float]:
+    """Strain of a spring under a stress on the branch that it is on, and its slope dε/dΣ."""
+    gain, k = memory.now[i, GAIN], law[i, SLOPE]
+    s = (stress - relaxed(memory, i, 0)) / gain
+    if law[i, CURVED] >= HELD:
+        eps, soft = strain_at(memory, i, law[i, CURVED] > HELD, s)
+        return eps, soft / gain
+    if law[i, CURVED] == 0.0:
+        return law[i, ORIGIN] + (s - law[i, OFFSET]) / k, 1.0 / (k * gain)
+    stiff = k + s
+    return law[i, ORIGIN] + s / stiff, k / (stiff * stiff * gain)
+
+
+@inner
+def _share_under(
+    law: Array, i0: int, i1: int, eps: Array, stress: float, memory: Memory
+) -> tuple[float, float, float]:
+    """Give the undamped springs of a group a stress; elongation, its size, and compliance."""
+    total = size = compliance = 0.0
+    for i in range(i0, i1):
+        if law[i, DASHPOT] == 0.0:
+            own, soft = _own_strain(law, i, stress, memory)
+            eps[i, 0] = own
+            total += law[i, HEIGHT] * own
+            size += law[i, HEIGHT] * abs(own)
+            compliance += law[i, HEIGHT] * soft
+    return total, size, compliance
+
+
+@piece
+def settle_together(
+    links: Links, s: Array, order: int, span: float, push: Array, memory: Memory
+) -> None:
+    """Bring the undamped springs of each group to one stress, at the elongation that they share.
+
+    A spring that is nearly rigid, or about to snap all at once, feels the least difference of
+    stress; without this, truncation of the strains lets their stresses part.
+    """
+    law, eps = links.law, s[EPS]
+    for g in range(links.ends.size):
+        i0, i1 = springs_of(links.ends, g)
+        stressed = g == links.ends.size - 1 and links.top == STRESS
+        if i1 - i0 == 1 and not stressed:
+            continue
+        rest, free = s[W, g, 0] - (s[W, g - 1, 0] if g > 0 else 0.0), 0
+        for i in range(i0, i1):
+            if law[i, DASHPOT] > 0.0:
+                rest -= law[i, HEIGHT] * eps[i, 0]
+            elif law[i, CURVED] == 0.0 and not law[i, SLOPE] > 0.0:
+                free = -links.law.shape[0]  # a flat branch has no strain of its own
+            else:
+                free += 1
+        if free <= 0:
+            continue
+        stress = push[0] + push[1] * span if stressed else value_at(s[GROUP, g], order, span)
+        for i in range(i0, i1):
+            s[TILT, i, 0] = eps[i, 0]
+        found = False
+        for _ in range(20):
+            total, size, compliance = _share_under(law, i0, i1, eps, stress, memory)
+            found = stressed or abs(total - rest) <= 4e-16 * (size + abs(rest))
+            if found or not math.isfinite(total):
+                break
+            step = (total - rest) / compliance
+            found = abs(total - rest) <= 1e-14 * size and abs(step) <= 1e-15 * abs(stress)
+            if found:
+                break
+            stress -= step
+        if not (found and math.isfinite(total)):
+            for i in range(i0, i1):
+                eps[i, 0] = s[TILT, i, 0]
+
+
+@inner
+def advance(s: Array, groups: int, order: int, span: float, memory: Memory | None) -> None:
     """Carry the state, order 0 of W, V and EPS, over a step of length `span`."""
     for row in range(W, EPS + 1):
         for i in range(s.shape[1] if row == EPS else groups):
             s[row, i, 0] = value_at(s[row, i], order, span)
+    if memory is not None:
+        advance_memory(memory, order, span)
 
 
 @piece
-def advance_tangents(d: SeriesTangents, groups: int, order: int, span: float) -> None:
+def advance_tangents(
+    d: SeriesTangents, groups: int, order: int, span: float, memory: Memory | None
+) -> None:
     """Carry the derivatives of the state over a step of length `span`."""
     for p in range(d.drag.size):
         if d.live[p] > 0.0:
-            advance(d.series[p], groups, order, span)
+            advance(d.series[p], groups, order, span, None)
+            if memory is not None:
+                advance_memory_tangents(memory, p, order, span)

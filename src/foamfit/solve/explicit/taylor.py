@@ -12,6 +12,14 @@ import math
 
 import numpy as np
 
+from foamfit.solve.explicit.memory import (
+    Memory,
+    first_turn,
+    leave,
+    load,
+    longest,
+    make_memory,
+)
 from foamfit.solve.explicit.series import (
     DASHPOT,
     EPS,
@@ -34,8 +42,11 @@ from foamfit.solve.explicit.series import (
     expand_tangents,
     is_bare,
     make_series,
+    settle_together,
+    share_a_stress,
     slope_now,
     springs_of,
+    start_relaxing,
 )
 from foamfit.solve.polynomial import (
     LEAST_TRUNCATION,
@@ -62,7 +73,11 @@ from foamfit.solve.scene import (
     log_switch,
 )
 from foamfit.springs.kernels import (
+    BACK,
     ETA,
+    HELD,
+    KIND,
+    A,
     Array,
     Branches,
     above,
@@ -72,11 +87,15 @@ from foamfit.springs.kernels import (
     first_branch,
     inlined,
     inner,
+    once,
     piece,
 )
+from foamfit.springs.law import MICROSCALE
 
 # Strains closer than this to the end of a branch are at it.
 CLOSE = 1e-13
+# Side on which a spring leaves its branch where its strain turns.
+TURN = 2
 MOST_ORDERS = 24
 # Truncation of derivatives, relative to what they were so far, over that of the motion.
 OF_TANGENTS = 1e3
@@ -148,13 +167,20 @@ def step_length(
 
 @piece
 def tangent_length(
-    heights: Array, d: SeriesTangents, order: int, tol: float, span: float, sizes: Array
+    heights: Array,
+    d: SeriesTangents,
+    order: int,
+    tol: float,
+    span: float,
+    sizes: Array,
+    memory: Memory | None,
 ) -> float:
     """Longest step within `span` whose last two terms fall below `tol` of the derivatives so far.
 
     A vibration or relaxation that the motion itself does not show may be in its derivatives: steps
     that are too long for it let these grow without bound. `sizes` (p, 2) holds the largest
-    elongation and base stress of each direction.
+    elongation and base stress of each direction. With memory, those that begin at a high order,
+    behind masses and relaxation, have no size yet that could bound a step.
     """
     for p in range(d.drag.size):
         if d.live[p] == 0.0:
@@ -171,6 +197,8 @@ def tangent_length(
                     before = max(before, weight * abs(c[order - 1]))
                     tail = max(tail, weight * abs(c[order]))
                 size, longest = max(sizes[p, part], bar), span
+                if memory is not None and size == 0.0:
+                    break
                 bar = tol * size
                 if before * span ** (order - 1) > bar:
                     span = (bar / before) ** (1.0 / (order - 1))
@@ -184,7 +212,7 @@ def tangent_length(
 
 @piece
 def first_switch(law: Array, s: Array, order: int, span: float) -> tuple[float, int, int]:
-    """First switch of branch within `span`: when, which spring (-1: none), on which side."""
+    """First end of a branch within `span`: when, which spring (-1: none), on which side."""
     spring, side = -1, 0
     for i in range(law.shape[0]):
         when, where = first_crossing(s[EPS, i], order, law[i, LOW], law[i, HIGH], span)
@@ -325,8 +353,8 @@ def depart(
     for i in range(count):
         speed += law[i, HEIGHT] * slope_at(s[EPS, i], order, span)
         rate[min(i, nodes - 1)] = speed
-    advance(s, groups, order, span)
-    advance_tangents(d, groups, more, span)
+    advance(s, groups, order, span, None)
+    advance_tangents(d, groups, more, span, None)
     for i in range(count):
         moved += law[i, HEIGHT] * s[EPS, i, 0]
         place[min(i, nodes - 1)] = moved
@@ -347,7 +375,7 @@ def depart(
 
 
 @inner
-def settle(links: Links, s: Array) -> None:
+def settle(links: Links, s: Array, memory: Memory | None) -> None:
     """Share the elongation of undamped groups anew, so that rounding does not pile up."""
     law = links.law
     for g in range(links.ends.size):
@@ -358,13 +386,13 @@ def settle(links: Links, s: Array) -> None:
         compliance = 0.0
         miss = s[W, g, 0] - (s[W, g - 1, 0] if g > 0 else 0.0)
         for i in range(i0, i1):
-            slope = slope_now(law, i, s[EPS, i, 0])
+            slope = slope_now(law, i, s[EPS, i, 0], memory)
             plain = plain and law[i, DASHPOT] == 0.0 and slope > 0.0
             compliance += law[i, HEIGHT] / slope
             miss -= law[i, HEIGHT] * s[EPS, i, 0]
         if plain:
             for i in range(i0, i1):
-                s[EPS, i, 0] += miss / compliance / slope_now(law, i, s[EPS, i, 0])
+                s[EPS, i, 0] += miss / compliance / slope_now(law, i, s[EPS, i, 0], memory)
 
 
 @inner
@@ -382,13 +410,23 @@ def switch(
     side: int,
     log: Array,
     switches: int,
+    ends: Branches,
+    memory: Memory | None,
 ) -> int:
     """Change the branch of a spring, and of all that end theirs at the same time; counts them."""
+    turned = branches[spring]
     for i in range(branches.size):
         low, high, eps = law[i, LOW], law[i, HIGH], s[EPS, i, 0]
         out = 0
         if i == spring:
             out = side
+        elif (
+            memory is not None
+            and side == TURN
+            and branches[i] == turned
+            and share_a_stress(law, ends, i, spring, memory)
+        ):
+            out = TURN  # the stress turns for both
         elif eps >= high - CLOSE and slope_at(s[EPS, i], order, span) > 0.0:
             out = 1
         elif eps <= low + CLOSE and slope_at(s[EPS, i], order, span) < 0.0:
@@ -396,10 +434,15 @@ def switch(
         if out == 0:
             continue
         left = branches[i]
+        if out != TURN:
+            s[EPS, i, 0] = high if out > 0 else low
         branches[i] = above(left) if out > 0 else below(left)
-        s[EPS, i, 0] = high if out > 0 else low
+        if memory is not None and rows[i, KIND] == MICROSCALE:
+            up = left == BACK if out == TURN else out > 0
+            moved = d.series[:, EPS, :, 0]
+            branches[i] = leave(memory, i, s[EPS, i, 0], up, out == TURN, moved)
         switches = log_switch(log, switches, now, i, left, branches[i], s[EPS, i, 0])
-        enter(rows, i, branches[i], law)
+        enter(rows, i, branches[i], law, memory)
         enter_tangents(rows, i, branches[i], directions, d)
     return switches
 
@@ -447,6 +490,7 @@ def begin(
     law: Array,
     s: Array,
     d: SeriesTangents,
+    memory: Memory | None,
 ) -> None:
     """Write the state at the first sample: branches, strains and their derivatives."""
     for i in range(branches.size):
@@ -459,8 +503,12 @@ def begin(
                 if start[1 + p, i] != 0.0:
                     d.live[p] = 1.0
         law[i, DASHPOT], law[i, HEIGHT] = rows[i, ETA], heights[i]
-        enter(rows, i, branches[i], law)
+        if memory is not None and rows[i, KIND] == MICROSCALE:
+            branches[i] = A if start.shape[1] == 0 else load(memory, i, start[0, i])
+        enter(rows, i, branches[i], law, memory)
         enter_tangents(rows, i, branches[i], directions, d)
+        if memory is not None and start.shape[1] > 0:
+            start_relaxing(law, i, s, d, memory)
 
 
 @inner
@@ -482,6 +530,130 @@ def _reached(links: Links, s: Array, w_scale: float) -> tuple[float, float]:
         w_scale = max(w_scale, links.law[i, HEIGHT] * abs(s[EPS, i, 0]))
         total += s[EPS, i, 0]
     return w_scale, total
+
+
+@once
+def _integrated(
+    rows: Array,
+    heights: Array,
+    ends: Branches,
+    mass: Array,
+    drag: float,
+    top: int,
+    values: Array,
+    speed: float,
+    t: Array,
+    tol: float,
+    max_steps: int,
+    directions: Branches,
+    start: Array,
+    curves: Array,
+    slopes: Array,
+    log: Array,
+    memory: Memory | None,
+) -> tuple[int, float, int, int]:
+    """Integrate a chain of springs with or without memory; see `integrate`."""
+    tol = max(tol, LEAST_TRUNCATION)
+    count, groups, size = heights.size, ends.size, directions.shape[0]
+    struck, tangent, order = speed > 0.0, size > 0, order_for(tol, MOST_ORDERS)
+    links = Links(np.empty((count, N_LAW)), ends, mass, drag, top)
+    law, out = links.law, Samples(t, curves, slopes)
+    s, d = make_series(count, order, directions)
+    branches = np.empty(count, np.int64)
+    scratch = np.empty((6, max(order + 1, max(size, curves.shape[0]))))
+    late, c, push, motion = scratch[0], scratch[3], scratch[4], scratch[5]
+    sizes = np.zeros((size, 2))
+    push[0] = push[1] = 0.0
+    for p in range(size):
+        late[p] = 0.0
+    begin(rows, heights, start, directions, branches, law, s, d, memory)
+    bare, apart = is_bare(links), is_apart(links)
+    w_scale, s_scale, b_scale, pressed, knot, stalled, done = 0.0, 0.0, math.inf, False, 0, 0, 0
+    switches = count - count  # a whole number, and no constant: one type to compile for
+    now = 0.0 if struck else t[0]
+    if struck:
+        s[V, groups - 1, 0] = speed
+        done = before_contact(curves, t, speed)
+        for p in range(size):
+            before_contact(slopes[p], t, 0.0)
+    for step in range(max_steps):
+        if done == t.size:
+            return DONE, math.nan, step, switches
+        fresh, horizon = False, t[t.size - 1]
+        if not struck:
+            while knot < t.size - 2 and now >= t[knot + 1]:
+                knot += 1
+                fresh = True
+            horizon = _prescribe(top, values, t, knot, now, push, motion)
+        if bare:
+            expand_bare(links, s, push, order, memory)
+        elif not expand(links, s, push, motion, order, memory):
+            return FLAT_UNDER_STRESS, now, step, switches
+        if step > 0:
+            s_scale = _loaded(s, s_scale)
+        if apart:
+            b_scale = max(b_scale if step > 0 else 0.0, abs(s[GROUP, 0, 0]))
+        span = step_length(links, s, push, order, tol, horizon - now, w_scale, s_scale, b_scale)
+        if not math.isfinite(span) or not math.isfinite(s[GROUP, 0, order]):
+            return NOT_FINITE, now, step, switches
+        if memory is not None:
+            for i in range(count):
+                span = longest(memory, i, order, span) if branches[i] > HELD else span
+        span, spring, side = first_switch(law, s, order, span)
+        if memory is not None:
+            span, turning = first_turn(branches, s[EPS], order, span, c)
+            if turning >= 0:
+                spring, side = turning, TURN
+        leaves = False
+        if struck:
+            pressed = pressed or s[GROUP, 0, 0] > tol * s_scale
+            span, leaves = first_lift(s, order, step == 0, pressed, span)
+            spring = -1 if leaves else spring
+        least = order
+        if spring >= 0 or leaves or now + span >= horizon:  # not its own error ended the step
+            least = _enough(law, s, order, span, 1e-3 * tol, w_scale, s_scale, b_scale)
+        more = min(least + 2, order)  # for what is, in time, a derivative of these
+        if tangent:
+            expand_tangents(links, s, d, more, memory)
+            shorter = tangent_length(heights, d, more, OF_TANGENTS * tol, span, sizes, memory)
+            if shorter < span:
+                span, spring, leaves = shorter, -1, False
+        end = now + span
+        stalled = stalled + 1 if span == 0.0 else 0
+        if (end <= now and span > 0.0) or stalled > 4 * count + 8:
+            return STEP_UNDERFLOW, now, step, switches
+        last = end >= horizon and not leaves and spring < 0
+        end = horizon if last else end
+        if top == MOTION and knot > 0 and fresh:
+            _mend_kink(out, s, d, knot)
+        first, done = done, first_past(t, done, end, last)
+        if first < done:
+            sample(links, s, least, out, first, done, now, c)
+        if tangent:
+            sample_tangents(links, s, d, more, out, first, done, now, c)
+            if leaves or spring >= 0:  # the base stress may end with this step
+                _delay(s, d, more, span, late)
+        if leaves:
+            depart(links, s, d, order, more, span, end, out, done, scratch)
+            return DONE, end, step + 1, switches
+        now = end
+        advance(s, groups, order, span, memory)
+        if tangent:
+            advance_tangents(d, groups, more, span, memory)
+        w_scale, total = _reached(links, s, w_scale)
+        if not math.isfinite(total):
+            return NOT_FINITE, now, step, switches
+        settle(links, s, memory)
+        if memory is not None:
+            settle_together(links, s, order, span, push, memory)
+        if spring >= 0:
+            switches = switch(
+                rows, branches, law, s, d, directions, order, span, now, spring, side, log,
+                switches, ends, memory,
+            )  # fmt: skip
+            if memory is not None:
+                settle_together(links, s, order, span, push, memory)
+    return TOO_MANY_STEPS, now, max_steps, switches
 
 
 @compiled
@@ -525,92 +697,35 @@ def integrate(
         Outcome, end of contact (NaN if none; where there is no answer, how far it came), steps
         taken, switches (also those past the log).
     """
-    tol = max(tol, LEAST_TRUNCATION)
-    count, groups, size = heights.size, ends.size, directions.shape[0]
-    struck, tangent, order = speed > 0.0, size > 0, order_for(tol, MOST_ORDERS)
-    links = Links(np.empty((count, N_LAW)), ends, mass, drag, top)
-    law, out = links.law, Samples(t, curves, slopes)
-    s, d = make_series(count, order, directions)
-    branches = np.empty(count, np.int64)
-    scratch = np.empty((6, max(order + 1, max(size, curves.shape[0]))))
-    late, c, push, motion = scratch[0], scratch[3], scratch[4], scratch[5]
-    sizes = np.zeros((size, 2))
-    push[0] = push[1] = 0.0
-    for p in range(size):
-        late[p] = 0.0
-    begin(rows, heights, start, directions, branches, law, s, d)
-    bare, apart = is_bare(links), is_apart(links)
-    w_scale, s_scale, b_scale, pressed, knot, stalled, done = 0.0, 0.0, math.inf, False, 0, 0, 0
-    switches = count - count  # a whole number, and no constant: one type to compile for
-    now = 0.0 if struck else t[0]
-    if struck:
-        s[V, groups - 1, 0] = speed
-        done = before_contact(curves, t, speed)
-        for p in range(size):
-            before_contact(slopes[p], t, 0.0)
-    for step in range(max_steps):
-        if done == t.size:
-            return DONE, math.nan, step, switches
-        fresh, horizon = False, t[t.size - 1]
-        if not struck:
-            while knot < t.size - 2 and now >= t[knot + 1]:
-                knot += 1
-                fresh = True
-            horizon = _prescribe(top, values, t, knot, now, push, motion)
-        if bare:
-            expand_bare(links, s, push, order)
-        elif not expand(links, s, push, motion, order):
-            return FLAT_UNDER_STRESS, now, step, switches
-        if step > 0:
-            s_scale = _loaded(s, s_scale)
-        if apart:
-            b_scale = max(b_scale if step > 0 else 0.0, abs(s[GROUP, 0, 0]))
-        span = step_length(links, s, push, order, tol, horizon - now, w_scale, s_scale, b_scale)
-        if not math.isfinite(span) or not math.isfinite(s[GROUP, 0, order]):
-            return NOT_FINITE, now, step, switches
-        span, spring, side = first_switch(law, s, order, span)
-        leaves = False
-        if struck:
-            pressed = pressed or s[GROUP, 0, 0] > tol * s_scale
-            span, leaves = first_lift(s, order, step == 0, pressed, span)
-            spring = -1 if leaves else spring
-        least = order
-        if spring >= 0 or leaves or now + span >= horizon:  # not its own error ended the step
-            least = _enough(law, s, order, span, 1e-3 * tol, w_scale, s_scale, b_scale)
-        more = min(least + 2, order)  # for what is, in time, a derivative of these
-        if tangent:
-            expand_tangents(links, s, d, more)
-            shorter = tangent_length(heights, d, more, OF_TANGENTS * tol, span, sizes)
-            if shorter < span:
-                span, spring, leaves = shorter, -1, False
-        end = now + span
-        stalled = stalled + 1 if span == 0.0 else 0
-        if (end <= now and span > 0.0) or stalled > 4 * count + 8:
-            return STEP_UNDERFLOW, now, step, switches
-        last = end >= horizon and not leaves and spring < 0
-        end = horizon if last else end
-        if top == MOTION and knot > 0 and fresh:
-            _mend_kink(out, s, d, knot)
-        first, done = done, first_past(t, done, end, last)
-        if first < done:
-            sample(links, s, least, out, first, done, now, c)
-        if tangent:
-            sample_tangents(links, s, d, more, out, first, done, now, c)
-            if leaves or spring >= 0:  # the base stress may end with this step
-                _delay(s, d, more, span, late)
-        if leaves:
-            depart(links, s, d, order, more, span, end, out, done, scratch)
-            return DONE, end, step + 1, switches
-        now = end
-        advance(s, groups, order, span)
-        if tangent:
-            advance_tangents(d, groups, more, span)
-        w_scale, total = _reached(links, s, w_scale)
-        if not math.isfinite(total):
-            return NOT_FINITE, now, step, switches
-        settle(links, s)
-        if spring >= 0:
-            switches = switch(
-                rows, branches, law, s, d, directions, order, span, now, spring, side, log, switches
-            )
-    return TOO_MANY_STEPS, now, max_steps, switches
+    return _integrated(
+        rows, heights, ends, mass, drag, top, values, speed, t, tol, max_steps, directions, start,
+        curves, slopes, log, None,
+    )  # fmt: skip
+
+
+@compiled
+def integrate_with_memory(
+    rows: Array,
+    heights: Array,
+    ends: Branches,
+    mass: Array,
+    drag: float,
+    top: int,
+    values: Array,
+    speed: float,
+    t: Array,
+    tol: float,
+    max_steps: int,
+    directions: Branches,
+    start: Array,
+    curves: Array,
+    slopes: Array,
+    log: Array,
+) -> tuple[int, float, int, int]:
+    """Integrate a chain in which springs relax or are microscale, as `integrate` does others."""
+    order = order_for(max(tol, LEAST_TRUNCATION), MOST_ORDERS)
+    memory = make_memory(rows, order, directions)
+    return _integrated(
+        rows, heights, ends, mass, drag, top, values, speed, t, tol, max_steps, directions, start,
+        curves, slopes, log, memory,
+    )  # fmt: skip

@@ -1,0 +1,391 @@
+"""What intervals, ranges and states say where the law is not that of the foam.
+
+Synthetic tests of one law are fitted by another, a bistable spring: a microscale spring with
+relaxation, a bistable spring whose kinks are rounded, and one whose stress depends on the rate.
+Each is measured again and again with fresh noise, written to CSV and TOML, read and fitted with the
+defaults. `ci95` is to hold the best fit of the curves without noise; tests of the own law show what
+is the same without an error of the law. Twins, specimens of one foam, show whether states repeat.
+
+    python experiments/law_error/law_error.py                # 200 draws each, 50 of the own law
+    FOAMFIT_DATA=path/to/data python experiments/law_error/law_error.py --draws 20
+
+The twins are running-shoe foam (arXiv:2602.12694, LivingMatterLab/CANN), in shoe-foam/ and
+shoe-foam-twins/ of FOAMFIT_DATA; without them their table stays as it is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from scipy.integrate import solve_ivp
+from scipy.signal import lfilter
+from scipy.special import ndtr
+
+import foamfit as ff
+
+HERE = Path(__file__).parent
+NOISE = 0.005  # of the range
+BISECTIONS = 60
+
+
+@dataclass(frozen=True)
+class Curves:
+    """A test without noise: SI."""
+
+    time: np.ndarray
+    stress: np.ndarray
+    displacement: np.ndarray
+    height: float
+    area: float
+    striker: tuple[float, float] | None = None  # mass and velocity
+
+
+# ---------------------------------------------------------------- laws that are not the fitted one
+
+
+def microscale(time_: np.ndarray, strain: np.ndarray) -> np.ndarray:
+    """Stress of a spring of log-normal snap stresses with one relaxation, sample by sample."""
+    k0, kc, eps_star = 5.5e5, 2.5e5, 0.08
+    plus, spread_plus, minus, spread_minus = 1.3e5, 0.4, 5.5e4, 0.77
+    g, tau = 0.5, 0.2
+    p, q, before, out = 0.0, 0.0, 0.0, []
+
+    def state(stress: float, p: float) -> tuple[float, float]:
+        """Strain, and the fraction that is snapped."""
+        up = down = 0.0
+        if stress > 0.0:
+            up = ndtr(np.log(stress / plus) / spread_plus)
+            down = max(up, ndtr(np.log(stress / minus) / spread_minus))
+        p = min(max(p, up), down)
+        return (1 - p) * stress / (k0 + stress) + p * (eps_star + stress / (kc + stress)), p
+
+    for i, eps in enumerate(strain):
+        low, high = -0.5 * k0, 1e8
+        for _ in range(BISECTIONS):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if state(middle, p)[0] < eps else (low, middle)
+        p = state(middle, p)[1]
+        if i:
+            step = time_[i] - time_[i - 1]
+            left = np.exp(-step / tau)
+            q = q * left + g * tau * (1.0 - left) / step * (middle - before)
+        before = middle
+        out.append(middle + q)
+    return np.array(out)
+
+
+SPRING = ff.BistableSpring(
+    k0=5.5e6, kc=82.5e6, dsigma=-0.179e6, eps_a=0.14, eps_c=0.31, kh_plus=4e6, kh_minus=2.1e6
+)
+
+
+def branches(width: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Strain, and the loading and unloading stress there with kinks rounded over a width."""
+    top = 1.12 * SPRING.eps_hat_c
+    strain = np.linspace(0.0, top + 0.08, 6001)
+    up = SPRING.stress(strain)
+    down = SPRING.stress(np.concatenate([strain, strain[::-1]]))[strain.size :][::-1]
+    half = max(int(0.5 * width / strain[1]), 1)
+    window = np.hanning(2 * half + 3)[1:-1]
+
+    def rounded(stress: np.ndarray) -> np.ndarray:
+        longer = np.pad(stress, half, mode="reflect", reflect_type="odd")
+        return np.convolve(longer, window / window.sum(), "valid")
+
+    return strain, rounded(up), rounded(down)
+
+
+def impact(width: float, rate: float, samples: int = 501) -> Curves:
+    """A striker on a foam with rounded kinks, or whose stress rises by `rate` per e-fold."""
+    height, area, mass = 1.2e-3, 1.9635e-5, 7e-3
+    strain, up, down = branches(width)
+    last = 1.12 * SPRING.eps_hat_c
+    inside = strain <= last
+    velocity = np.sqrt(2.0 * np.trapezoid(up[inside], strain[inside]) * area * height / mass)
+
+    def stress(x: float, v: float, path: np.ndarray) -> float:
+        speed = np.maximum(np.abs(v), 0.01 * velocity) / velocity
+        return np.interp(x / height, strain, path) * (1.0 + rate * np.log(speed))
+
+    def run(start: float, state: list[float], path: np.ndarray, end) -> object:
+        end.terminal, end.direction = True, -1
+        return solve_ivp(
+            lambda _, y: [y[1], -area * stress(y[0], y[1], path) / mass],
+            (start, start + 20.0 * height / velocity), state, events=end, dense_output=True,
+            rtol=1e-9, atol=1e-12, max_step=height / velocity / 500.0,
+        )  # fmt: skip
+
+    there = run(0.0, [0.0, velocity], up, lambda t, y: y[1])
+    back = run(there.t[-1], there.y[:, -1], down, lambda t, y: stress(y[0], y[1], down))
+    clock = np.linspace(0.0, back.t[-1], samples)
+    loading = clock <= there.t[-1]
+    turn = there.t[-1]
+    y = np.where(loading, there.sol(np.minimum(clock, turn)), back.sol(np.maximum(clock, turn)))
+    force = np.where(loading, stress(y[0], y[1], up), stress(y[0], y[1], down))
+    return Curves(clock, force, y[0], height, area, (mass, float(velocity)))
+
+
+@cache
+def curves(kind: str) -> Curves:
+    """The test of one kind, without noise."""
+    if kind == "microscale and relaxation":
+        height, area = 10e-3, 4.6e-5
+        time_ = np.linspace(0.0, 5.0, 1000)[:930]
+        strain = 0.5 * (1.0 - np.abs(2.0 * time_ / 5.0 - 1.0))
+        return Curves(time_, microscale(time_, strain), strain * height, height, area)
+    if kind == "rounded kinks":
+        return impact(width=0.03, rate=0.0)
+    if kind == "rate effect":
+        return impact(width=1e-4, rate=0.02)
+    return impact(width=1e-4, rate=0.0)  # the own law
+
+
+KINDS = {  # and the autocorrelation of the noise from sample to sample
+    "microscale and relaxation": 0.0,
+    "rounded kinks": 0.0,
+    "rate effect": 0.0,
+    "own law": 0.0,
+    "own law, correlated noise": 0.9,
+}
+
+
+def measured(kind: str, draw: int | None, folder: Path) -> Path:
+    """Write a test with fresh noise, or with none, as a user would have it."""
+    test, rho = curves(kind.split(",")[0]), KINDS[kind]
+    stress, motion = test.stress, test.displacement
+    if draw is not None:
+        rng = np.random.default_rng([draw, list(KINDS).index(kind)])
+
+        def noise(values: np.ndarray) -> np.ndarray:
+            white = rng.standard_normal(values.size + 500)
+            own = lfilter([np.sqrt(1.0 - rho**2)], [1.0, -rho], white)[500:]
+            return values + NOISE * np.ptp(values) * own
+
+        stress = noise(stress)
+        motion = motion if test.striker is None else noise(motion)
+    path = folder / "test.csv"
+    table = {"time (s)": test.time, "stress (Pa)": stress, "displacement (m)": motion}
+    pd.DataFrame(table).to_csv(path, index=False)
+    text = f'[specimen]\nheight = "{test.height} m"\narea = "{test.area} m^2"\n'
+    if test.striker is not None:
+        mass, velocity = test.striker
+        text += f'[striker]\nmass = "{mass} kg"\nvelocity = "{velocity} m/s"\n'
+    path.with_suffix(".toml").write_text(text)
+    return path
+
+
+def fitted(kind: str, draw: int | None) -> ff.FitResult:
+    """Write, read and fit one test."""
+    with tempfile.TemporaryDirectory() as folder:
+        return ff.fit(ff.read_test(measured(kind, draw, Path(folder))))
+
+
+def draws_of(kind: str, draws: int, raw: Path | None) -> pd.DataFrame:
+    """A row for each parameter and draw; `raw` is gone on with."""
+    rows = pd.read_csv(raw) if raw is not None and raw.exists() else pd.DataFrame()
+    done = set(rows.loc[rows["kind"] == kind, "draw"]) if len(rows) else set()
+    without = fitted(kind, None)
+    for draw in sorted(set(range(draws)) - done):
+        began = time.perf_counter()
+        result = fitted(kind, draw)
+        seconds = time.perf_counter() - began
+        found = any(item["law_error"] is not None for item in result.noise.values())
+        new = [
+            {
+                "kind": kind, "draw": draw, "parameter": name, "value": item.value,
+                "best without noise": without.parameters[name].value,
+                "low": (item.ci95 or (np.nan, np.nan))[0],
+                "high": (item.ci95 or (np.nan, np.nan))[1],
+                "ranged": item.range is not None, "state": item.state, "found": found,
+                "seconds": seconds,
+            }
+            for name, item in result.parameters.items()
+            if item.vary
+        ]  # fmt: skip
+        rows = pd.concat([rows, pd.DataFrame(new)], ignore_index=True)
+        if raw is not None and draw % 20 == 19:
+            rows.to_csv(raw, index=False)
+    if raw is not None:
+        rows.to_csv(raw, index=False)
+    return rows[(rows["kind"] == kind) & (rows["draw"] < draws)]
+
+
+def coverage(rows: pd.DataFrame) -> Iterator[dict[str, object]]:
+    """How often `ci95` holds the best fit without noise, and its width over what refits scatter."""
+    for (kind, name), own in rows.groupby(["kind", "parameter"], sort=False):
+        given = own[own["low"].notna()]
+        truth = own["best without noise"]
+        holds = (given["low"] <= truth[given.index]) & (truth[given.index] <= given["high"])
+        scatter = own["value"].quantile(0.975) - own["value"].quantile(0.025)
+        width = (given["high"] - given["low"]).median()
+        yield {
+            "kind": kind,
+            "parameter": name,
+            "draws": own["draw"].nunique(),
+            "intervals": len(given),
+            "holds": holds.mean() if len(given) else np.nan,
+            "width over scatter": width / scatter if scatter > 0.0 else np.nan,
+            "error of the law found": own["found"].mean(),
+            "with a range": own["ranged"].mean(),
+            "determined": (own["state"] == "determined").mean(),
+            "seconds": own["seconds"].median(),
+        }
+
+
+# ---------------------------------------------------------------- twins
+
+TWINS = {  # diameter and height, mm, of those that are not in specimens.csv
+    "turbo-comp-1": (7.63, 10.53),
+    "turbo-comp-2": (7.68, 9.66),
+    "leap-comp-2": (7.62, 10.65),
+    "leap-comp-3": (7.80, 10.68),
+}
+COLUMNS = """\
+[columns]
+force = { column = "Normal force (N)", unit = "N" }
+displacement = { column = "Gap (um)", counts_down = true }
+"""
+
+
+def twins(data: Path, foams: tuple[str, ...] = ()) -> pd.DataFrame:
+    """First cycles of these foams, or of all, by one bistable spring: a row per parameter."""
+    table = pd.read_csv(data / "shoe-foam-twins" / "specimens.csv", index_col="test")
+    sizes = {name: (row.diameter_mm, row.height_mm) for name, row in table.iterrows()} | TWINS
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        toml = Path(folder) / "specimen.toml"
+        for name, (diameter, height) in sizes.items():
+            if foams and name.rpartition("-")[0] not in foams:
+                continue
+            raw = data / "shoe-foam-twins" / f"{name}_raw.txt"
+            path = raw if raw.exists() else data / "shoe-foam" / f"{name}_cycle1.csv"
+            specimen = f'[specimen]\nheight = "{height} mm"\ndiameter = "{diameter} mm"\n'
+            toml.write_text(specimen + (COLUMNS if path == raw else ""))
+            result = ff.fit(ff.read_test(path, toml), drive="displacement")
+            for parameter, item in result.parameters.items():
+                if item.vary:
+                    rows.append(
+                        {
+                            "foam": name.rpartition("-")[0], "specimen": name,
+                            "parameter": parameter, "value": item.value,
+                            "low": (item.range or (np.nan, np.nan))[0],
+                            "high": (item.range or (np.nan, np.nan))[1],
+                            "state": item.state, "misfit": result.misfit["stress_strain"],
+                        }
+                    )  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def repeat(rows: pd.DataFrame) -> pd.DataFrame:
+    """Scatter of each parameter over the specimens of a foam, and their states."""
+    out = []
+    for (foam, name), own in rows.groupby(["foam", "parameter"], sort=False):
+        states = own["state"].value_counts()
+        out.append(
+            {
+                "foam": foam, "parameter": name, "specimens": len(own),
+                "scatter": own["value"].std() / abs(own["value"].mean()),
+                **{state: states.get(state, 0) for state in STATES}, "same": states.max(),
+            }
+        )  # fmt: skip
+    return pd.DataFrame(out)
+
+
+STATES = ("determined", "weak", "not determined")
+
+
+# ---------------------------------------------------------------- page
+
+
+def markdown(table: pd.DataFrame) -> str:
+    """A table in Markdown."""
+    lines = [list(table.columns), ["---"] * len(table.columns), *table.to_numpy().tolist()]
+    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
+
+
+def summary_of(table: pd.DataFrame) -> pd.DataFrame:
+    """A line for each kind."""
+    groups = table.groupby("kind", sort=False)
+    holds, width = groups["holds"], groups["width over scatter"]
+    return pd.DataFrame(
+        {
+            "test": list(groups.groups),
+            "draws": groups["draws"].max(),
+            "ci95 holds the best fit without noise (%)": [
+                f"{100 * mean:.1f} ({100 * low:.1f} to {100 * high:.1f})"
+                for mean, low, high in zip(holds.mean(), holds.min(), holds.max(), strict=True)
+            ],
+            "width of ci95 over the scatter of refits": [
+                f"{low:.2f} to {high:.2f}"
+                for low, high in zip(width.min(), width.max(), strict=True)
+            ],
+            "error of the law found (%)": (100 * groups["error of the law found"].mean()).round(1),
+            "median fit (s)": groups["seconds"].median().round(2),
+        }
+    )
+
+
+def page(table: pd.DataFrame, twin_rows: pd.DataFrame | None) -> str:
+    """The page of this study."""
+    told = "The twins were not there."
+    if twin_rows is not None:
+        cells = repeat(twin_rows)
+        close, near = cells[cells["scatter"] <= 0.10], cells[cells["scatter"] <= 0.15]
+        wide = cells[cells["scatter"] > 0.5]
+        shown = cells.assign(scatter=[f"{100 * s:.1f} %" for s in cells["scatter"]])
+        told = (
+            f"{cells['same'].sum()} of {cells['specimens'].sum()} states "
+            f"({cells['same'].sum() / cells['specimens'].sum():.0%}) are those of most specimens "
+            f"of the foam. Of what repeats within 15 % {near['not determined'].sum()} of "
+            f"{near['specimens'].sum()} are not determined; of what repeats within 10 % "
+            f"{close['determined'].sum()} of {close['specimens'].sum()} are determined; of what "
+            f"scatters by more than half {wide['determined'].sum()} of {wide['specimens'].sum()}."
+            f"\n\n{markdown(shown)}"
+        )
+    template = (HERE / "page.template.md").read_text()
+    return template.format(
+        foamfit=ff.__version__, python=platform.python_version(), machine=platform.machine(),
+        noise=f"{100 * NOISE:g} %", summary=markdown(summary_of(table)), twins=told,
+    )  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--draws", type=int, default=200)
+    parser.add_argument("--out", type=Path, default=HERE)
+    parser.add_argument("--raw", type=Path, help="one row per parameter and draw; resumed")
+    options = parser.parse_args()
+    parts = []
+    for kind in KINDS:
+        began = time.perf_counter()
+        # Of the own law there is experiments/recovery; here a quarter of the draws is enough.
+        draws = options.draws // 4 if kind.startswith("own law") else options.draws
+        parts.append(pd.DataFrame(coverage(draws_of(kind, draws, options.raw))))
+        print(f"{kind}: {time.perf_counter() - began:.0f} s", file=sys.stderr, flush=True)
+        print(parts[-1].round(3).to_string(index=False), file=sys.stderr, flush=True)
+    table = pd.concat(parts)
+    table.to_csv(options.out / "law_error.csv", index=False, float_format="%.4g")
+    path, data = options.out / "twins.csv", Path(os.environ.get("FOAMFIT_DATA", ""))
+    if (data / "shoe-foam-twins").is_dir():
+        twins(data).to_csv(path, index=False, float_format="%.4g")
+    rows = pd.read_csv(path) if path.exists() else None
+    (options.out / "README.md").write_text(page(table, rows))
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(HERE.parent))
+    from unchanged import keep_unchanged
+
+    with keep_unchanged(HERE):
+        main()

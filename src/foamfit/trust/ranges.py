@@ -1,0 +1,151 @@
+"""What the error of a law leaves open: parameters that follow the curves about as well.
+
+Where a law misses part of the curves, its best point depends on what is asked of it: another weight
+of the samples, a window of them, another minimum of the cost. The range of a parameter is the hull
+of its values over such descriptions.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from foamfit.arrays import Array
+from foamfit.fitting.search import Tracker
+from foamfit.trust.best_point import BestPoint
+from foamfit.trust.profile import BETTER
+from foamfit.trust.refit import ENOUGH, Refit
+
+# A description follows the curves about as well if the RMS of what it misses of them, the noise
+# taken off, is larger by this factor at most.
+ALIKE = 1.2
+# Weight of some samples over that of the others, and windows that are left out in turn.
+HEAVIER, WINDOWS = 4.0, 3
+# Iterations of a refit, and trials to find one that follows the curves about as well.
+ITERATIONS, TRIALS = 6, 4
+# Iterations of a descent to another minimum.
+DESCENT = 15
+
+
+def tolerance(best: BestPoint) -> float:
+    """Rise of the cost up to which a description follows the curves about as well."""
+    pairs = zip(best.errors, best.problem.objective.sizes, strict=True)
+    return (ALIKE**2 - 1.0) * sum(size * error.law**2 for error, size in pairs)
+
+
+def alike(
+    best: BestPoint, minima: Sequence[Array], tracker: Tracker, budget: float = math.inf
+) -> list[Array]:
+    """Descriptions that follow the curves about as well as the best point, which is the first.
+
+    Ends of the search's descents (`minima`); refits with each parameter held as far off as it can
+    be, starting from where it would be if the law were linear; and refits with other weights of the
+    samples, moved back towards the best point where they miss too much. After `budget` evaluations
+    no further refit is begun.
+    """
+    rise, refit = tolerance(best), Refit(best, tracker)
+    refit.enough = 0.01 * rise
+    allowed = tracker.objective.evaluations + budget
+    out = [best.values, *(point for point in minima if _rise(best, refit, point) <= rise)]
+    start = refit.start()
+    inverse = np.linalg.pinv(start.jacobian.T @ start.jacobian, rcond=1e-12, hermitian=True)
+    for column, name in enumerate(best.names):
+        for sign, limit in zip((-1.0, 1.0), best.limits(name), strict=True):
+            if tracker.objective.evaluations < allowed:
+                out += _held(best, refit, column, sign, limit, inverse[column], rise)
+    for weights in _weights(best):
+        if tracker.objective.evaluations < allowed:
+            out += _towards(best, refit, weights, rise)
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class Open:
+    """What the error of a law leaves open: nothing where only noise is left of the curves."""
+
+    ranges: dict[str, tuple[float, float]] = field(default_factory=dict)  # of each parameter
+    minima: tuple[Array, ...] = ()  # to which descriptions that follow the curves descend
+    better: Array | None = None  # a point of lower cost: the fit should go on from there
+
+
+def left_open(
+    best: BestPoint, minima: Sequence[Array], tracker: Tracker, budget: float = math.inf
+) -> Open:
+    """Ranges of the parameters, and minima near by that the search has not found; see `alike`."""
+    if not best.misfits:
+        return Open()
+    allowed = tracker.objective.evaluations + budget
+    points = alike(best, minima, tracker, budget)
+    refit, further = Refit(best, tracker), []
+    for point in points[1:]:
+        new = not any(point is other for other in minima)
+        if new and tracker.objective.evaluations < allowed:
+            found = refit.run(point, iterations=DESCENT)
+            further += [] if found is None else [found.point]
+    values = np.array(points)[:, refit.places] + 0.0  # no -0
+    ends = zip(values.min(axis=0).tolist(), values.max(axis=0).tolist(), strict=True)
+    better, gain = tracker.best_values, best.cost - tracker.best_cost
+    lowest = refit.enough / ENOUGH * BETTER  # of a cut
+    return Open(
+        dict(zip(best.names, ends, strict=True)),
+        tuple(further),
+        better if gain > lowest else None,
+    )
+
+
+def _rise(best: BestPoint, refit: Refit, point: Array) -> float:
+    residual = refit.residual(point)
+    return math.inf if residual is None else float(residual @ residual) - best.cost
+
+
+def _weights(best: BestPoint) -> Iterator[Array]:
+    """Weights of the counted samples: loading, unloading, low or high stress heavier; windows."""
+    objective = best.problem.objective
+    stress = objective.measurement.stress
+    assert stress is not None
+    number = np.arange(stress.size)
+    loading, low = number <= int(np.argmax(stress)), stress < 0.5 * float(np.max(stress))
+    heavy = [loading, ~loading, low, ~low]
+    heavy += [number * WINDOWS // stress.size != window for window in range(WINDOWS)]
+    for samples in heavy:
+        kept = [samples[objective.kept(name)] for name in objective.counted]
+        yield np.where(np.concatenate(kept), HEAVIER, 1.0)
+
+
+def _towards(best: BestPoint, refit: Refit, weights: Array, rise: float) -> list[Array]:
+    """Refit with other weights, moved towards the best point until it follows the curves."""
+    found = refit.run(best.values, weights=weights, iterations=ITERATIONS)
+    if found is None:
+        return []
+    step, share = refit.taken(found.point), 1.0
+    for _ in range(TRIALS):
+        point = refit.moved(refit.start(), share * step)
+        missed = _rise(best, refit, point)
+        if missed <= rise:
+            return [point]
+        share *= min(max(math.sqrt(rise / missed), 0.3), 0.9) if math.isfinite(missed) else 0.5
+    return []
+
+
+def _held(
+    best: BestPoint, refit: Refit, column: int, sign: float, limit: float, along: Array, rise: float
+) -> list[Array]:
+    """Refit with one parameter held as far off as the curves are followed about as well."""
+    size, value = best.sizes[column], best.values[refit.places[column]]
+    if not along[column] > 0.0:
+        return []
+    off = min(math.sqrt(rise * along[column]), abs(limit - value) / size)
+    for _ in range(TRIALS):
+        if off <= 0.0:
+            break
+        point = refit.moved(refit.start(), sign * off * along / along[column])
+        hold = (column, value + sign * off * size)
+        found = refit.run(point, hold, iterations=ITERATIONS)
+        missed = math.inf if found is None else found.cost - best.cost
+        if found is not None and missed <= rise:
+            return [found.point]
+        off *= min(max(math.sqrt(rise / missed), 0.3), 0.8) if math.isfinite(missed) else 0.5
+    return []

@@ -1,0 +1,254 @@
+"""Chains in which springs remember, by the explicit integrator, against an independent one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import foamfit as ff
+from foamfit.springs.chain import Drive
+from foamfit.springs.spring import Spring
+from memory_reference import Array, follow
+
+AREA = 1.9635e-5
+TIME = np.linspace(0.0, 3e-3, 61)
+MICRO = ff.MicroscaleSpring(5.5e6, 2.5e6, 0.3, 1.3e6, 0.4, 5.5e5, 0.6)
+FOAM = ff.MicroscaleSpring(5.5e6, 2.5e6, 0.08, 1.3e6, 0.41, 5.5e5, 0.77)
+SHARP = ff.MicroscaleSpring(5.5e6, 2.5e6, 0.3, 1.0e6, 1e-3, 5.5e5, 2e-3)
+WIDE = ff.MicroscaleSpring(5.5e6, 2.5e6, 0.3, 1.3e6, 2.0, 2.5e5, 1.7)
+CROSSED = ff.MicroscaleSpring(5.5e6, 2.5e6, 0.3, 9.0e5, 0.3, 7.0e5, 0.8)  # hysteretic below
+ABOVE = ff.MicroscaleSpring(5.5e6, 2.5e6, 0.3, 9.0e5, 0.8, 7.0e5, 0.4)  # hysteretic above
+REVERSIBLE = ff.MicroscaleSpring(5.5e6, 2.5e6, 0.3, 6.0e5, 0.5, 7.0e5, 0.5)
+BISTABLE = ff.BistableSpring(5.5e6, 82.5e6, -0.17907e6, 0.14, 0.31, 14.3e6, 2.3375e6)
+LINEAR = ff.LinearSpring(60e6)
+ONE, TWO = [(0.5, 2e-4)], [(0.4, 5e-5), (0.6, 1e-3)]
+IMPACT = ff.Impact(7e-3, 1.5)
+
+
+def chain(springs: list[Spring], masses: list[float] | None = None, site: float = 0.0) -> ff.Chain:
+    heights = [1.19e-3] if len(springs) == 1 else [0.7e-3, 0.49e-3, 0.3e-3][: len(springs)]
+    return ff.Chain(springs, heights, AREA, masses, site)
+
+
+def damped(spring: Spring, eta: float) -> Spring:
+    return replace(spring, eta=eta)
+
+
+def relaxing(spring: Spring, terms: list[tuple[float, float]] = ONE) -> Spring:
+    return replace(spring, relaxation=terms)
+
+
+def cycles(t: Array, size: float) -> Array:
+    """Loading and unloading with inner loops, linear between few corners."""
+    corners = np.array([0.0, 0.6, 0.35, 0.8, 0.2, 0.7, 1.0, 0.05, 0.5, 0.0, -0.03])
+    return size * np.interp(t, np.linspace(t[0], t[-1], corners.size), corners)
+
+
+def motion(size: float) -> Drive:
+    return ff.DisplacementDrive(cycles(TIME, size))
+
+
+def stress(size: float) -> Drive:
+    return ff.StressDrive(cycles(TIME, size))
+
+
+MOVED = motion(0.5e-3)
+SCENES: dict[str, tuple[ff.Chain, Drive]] = {
+    "impact": (chain([MICRO]), IMPACT),
+    "impact, relaxation": (chain([relaxing(MICRO)]), IMPACT),
+    "impact, two terms, dashpot, onsite damper": (
+        chain([damped(relaxing(FOAM, TWO), 30.0)], site=20.0), IMPACT),
+    "impact, sharp": (chain([SHARP]), IMPACT),
+    "impact, wide": (chain([relaxing(WIDE)]), IMPACT),
+    "impact, hysteretic below": (chain([CROSSED]), ff.Impact(7e-3, 2.0)),
+    "impact, hysteretic above": (chain([relaxing(ABOVE)]), ff.Impact(7e-3, 2.5)),
+    "impact, reversible": (chain([REVERSIBLE]), IMPACT),
+    "impact, wholly snapped": (chain([MICRO]), ff.Impact(7e-3, 6.0)),
+    "impact, sharp and wholly snapped": (chain([relaxing(SHARP)]), ff.Impact(7e-3, 4.0)),
+    "impact, bistable relaxing": (chain([relaxing(BISTABLE)]), ff.Impact(7e-3, 2.3)),
+    "impact, bistable relaxing, dashpot": (
+        chain([damped(relaxing(BISTABLE, TWO), 50.0)]), ff.Impact(7e-3, 2.3)),
+    "impact on two": (chain([LINEAR, relaxing(MICRO)]), IMPACT),
+    "impact on two microscale": (chain([FOAM, relaxing(MICRO)]), IMPACT),
+    "impact, one of two damped": (chain([relaxing(FOAM), damped(MICRO, 100.0)]), IMPACT),
+    "impact, both damped": (chain([damped(relaxing(FOAM), 50.0), damped(MICRO, 80.0)]), IMPACT),
+    "impact, interior mass": (chain([LINEAR, relaxing(MICRO)], [1e-3, 0.0]), IMPACT),
+    "impact, interior mass, two microscale": (
+        chain([relaxing(FOAM), relaxing(MICRO, TWO)], [2e-3, 0.0], 20.0), IMPACT),
+    "impact, interior mass, dashpots": (
+        chain([damped(relaxing(FOAM), 30.0), damped(MICRO, 30.0)], [1e-3, 0.0]), IMPACT),
+    "impact on three": (chain([FOAM, LINEAR, relaxing(MICRO)], [0.0, 1e-3, 0.0]), IMPACT),
+    "motion of two": (chain([LINEAR, MICRO]), MOVED),
+    "motion of two, relaxing": (chain([relaxing(FOAM), relaxing(MICRO, TWO)]), MOVED),
+    "motion of two, bistable": (chain([relaxing(BISTABLE), relaxing(MICRO)]), MOVED),
+    "motion of two, one damped": (chain([relaxing(FOAM), damped(MICRO, 200.0)]), MOVED),
+    "motion of two, both damped": (
+        chain([damped(relaxing(FOAM), 200.0), damped(MICRO, 200.0)]), MOVED),
+    "motion of two, interior mass": (chain([LINEAR, relaxing(MICRO)], [1e-3, 0.0]), MOVED),
+    "stress, relaxing": (chain([relaxing(MICRO)]), stress(2e6)),
+    "stress, dashpot": (chain([damped(MICRO, 200.0)]), stress(2e6)),
+    "stress on two, relaxing": (chain([relaxing(FOAM), relaxing(MICRO, TWO)]), stress(2e6)),
+    "stress on two, one damped": (chain([relaxing(FOAM), damped(MICRO, 200.0)]), stress(2e6)),
+    "stress, viscous top": (chain([relaxing(FOAM), MICRO], site=1e3), stress(2e6)),
+    "stress on a mass": (chain([relaxing(FOAM), MICRO], [0.0, 1e-4]), stress(1.5e6)),
+    "stress, bistable relaxing": (chain([relaxing(BISTABLE)]), stress(5e6)),
+}  # fmt: skip
+
+
+def difference(one: Array, other: Array) -> float:
+    """Largest difference over the range of the first, rest included."""
+    return float(np.abs(one - other).max()) / (max(one.max(), 0.0) - min(one.min(), 0.0))
+
+
+def names_of(given: ff.Chain) -> list[str]:
+    """All parameters of a chain that has these springs."""
+    names = []
+    for i, spring in enumerate(given.springs, start=1):
+        own = [n for n in spring.__dataclass_fields__ if n not in ("relaxation", "unilateral")]
+        for k in range(1, len(spring.relaxation) + 1):
+            own += [f"g{k}", f"tau{k}"]
+        names += [f"s{i}_{n}" for n in [*own, "height"]]
+    return [*names, "site_eta"]
+
+
+def value_of(given: ff.Chain, name: str) -> float:
+    if name == "site_eta":
+        return given.site_damping
+    i, short = int(name[1]) - 1, name.split("_", 1)[1]
+    if short == "height":
+        return given.heights[i]
+    if short.startswith(("g", "tau")):
+        return given.springs[i].relaxation[int(short[-1]) - 1][short.startswith("tau")]
+    return float(getattr(given.springs[i], short))
+
+
+def with_value(given: ff.Chain, name: str, value: float) -> ff.Chain:
+    springs, heights, site = list(given.springs), list(given.heights), given.site_damping
+    i, short = (int(name[1]) - 1, name.split("_", 1)[1]) if name != "site_eta" else (0, "site_eta")
+    if short == "site_eta":
+        site = value
+    elif short == "height":
+        heights[i] = value
+    elif short.startswith(("g", "tau")):
+        terms = [list(pair) for pair in springs[i].relaxation]
+        terms[int(short[-1]) - 1][short.startswith("tau")] = value
+        springs[i] = replace(springs[i], relaxation=terms)
+    else:
+        springs[i] = replace(springs[i], **{short: value})
+    return ff.Chain(springs, heights, AREA, given.masses, site)
+
+
+# The others differ in little; all are within the error that is asked for.
+QUICK = [
+    "impact, sharp", "impact, wide", "impact, hysteretic below", "impact, hysteretic above",
+    "impact, reversible", "impact, sharp and wholly snapped", "impact, bistable relaxing, dashpot",
+    "impact on two microscale", "impact, one of two damped",
+    "impact, interior mass, two microscale", "impact on three", "motion of two, bistable",
+    "motion of two, both damped", "stress, relaxing", "stress on two, one damped",
+    "stress, viscous top",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_a_motion_is_as_exact_as_asked_for(name: str) -> None:
+    given, drive = SCENES[name]
+    moved, pressed, end, _ = follow(given, drive, TIME)
+    for rtol in (1e-4, 1e-6, 1e-8):
+        got = ff.simulate(given, drive, TIME, rtol)
+        assert difference(pressed, got.base_stress) < rtol
+        assert max(map(difference, moved, got.displacement)) < rtol
+        assert got.method == "Taylor series"
+        if not np.isnan(end):
+            assert got.contact_end == pytest.approx(end, rel=rtol)
+
+
+EXACT = [
+    "impact, two terms, dashpot, onsite damper", "impact, wide", "impact, hysteretic below",
+    "impact, hysteretic above", "impact, bistable relaxing", "impact on three",
+    "motion of two, relaxing", "motion of two, both damped", "motion of two, interior mass",
+    "stress on two, one damped", "stress, viscous top",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_derivatives_by_all_parameters_are_those_of_differences(name: str) -> None:
+    given, drive = SCENES[name]
+    names = [n for n in names_of(given) if value_of(given, n) != 0.0]
+    run = ff.simulate(given, drive, TIME, 1e-10, sensitivities=names)
+    away = np.abs(TIME - (run.contact_end or -1.0)) > 6e-5  # at the end of contact they jump
+    for short in names:
+        value = value_of(given, short)
+        step = 1e-4 * value
+        near = [
+            ff.simulate(with_value(given, short, value + k * step), drive, TIME, 1e-10)
+            for k in (-2, -1, 1, 2)
+        ]
+        for what in ("displacement", "base_stress"):
+            low, lower, higher, high = (getattr(r, what) for r in near)
+            wanted = (low - 8.0 * lower + 8.0 * higher - high) / (12.0 * step)
+            got = getattr(run.sensitivities[short], what)
+            size = max(np.abs(got).max(), 1e-5 * np.abs(getattr(run, what)).max() / abs(value))
+            assert np.abs(wanted - got)[..., away].max() < 1e-6 * size, (short, what)
+
+
+@pytest.mark.parametrize("moved", [True, False])
+def test_a_chain_may_start_loaded(moved: bool) -> None:
+    """It starts in equilibrium, as if brought there quickly and held: nothing has relaxed yet."""
+    given = chain([relaxing(MICRO), relaxing(BISTABLE), FOAM])
+    shape = 0.3 + 0.5 * np.sin(np.linspace(0.0, 6.0, TIME.size))
+    drive: Drive = ff.DisplacementDrive(4e-4 * shape) if moved else ff.StressDrive(1.2e6 * shape)
+    names = [n for n in names_of(given) if value_of(given, n) != 0.0]
+    run = ff.simulate(given, drive, TIME, 1e-10, sensitivities=names)
+    strain = np.diff(run.displacement[:, 0], prepend=0.0) / given.heights
+    loaded = [s.stress(np.array([0.0, e]))[-1] for s, e in zip(given.springs, strain, strict=True)]
+    assert loaded == pytest.approx([run.base_stress[0]] * 3, rel=1e-12)
+    for short in names:
+        value = value_of(given, short)
+        low, high = (
+            ff.simulate(with_value(given, short, value * k), drive, TIME, 1e-10)
+            for k in (1.0 - 3e-5, 1.0 + 3e-5)
+        )
+        for what in ("displacement", "base_stress"):
+            wanted = (getattr(high, what) - getattr(low, what)) / (6e-5 * value)
+            got = getattr(run.sensitivities[short], what)
+            size = max(np.abs(got).max(), 1e-4 * np.abs(getattr(run, what)).max() / abs(value))
+            assert np.abs(wanted - got).max() < 2e-6 * size, (short, what)
+
+
+def test_contact_ends_where_the_whole_stress_does() -> None:
+    """Relaxation takes it to zero while the law still presses."""
+    given = chain([relaxing(MICRO)])
+    run = ff.simulate(given, IMPACT, TIME, 1e-8)
+    assert run.contact_end is not None
+    last = int(np.searchsorted(TIME, run.contact_end)) - 1
+    strain = run.displacement[0, : last + 1] / given.height
+    assert MICRO.stress(strain)[-1] > 0.1 * run.base_stress.max()
+    assert run.base_stress[last] < 0.1 * run.base_stress.max()
+
+
+def test_a_wholly_snapped_spring_without_spread_is_on_branch_c() -> None:
+    run = ff.simulate(chain([SHARP]), ff.Impact(7e-3, 4.0), TIME, 1e-10)
+    strain = run.displacement[0] / 1.19e-3
+    snapped = run.base_stress > 1.01 * SHARP.sigma_plus
+    x = strain[snapped] - SHARP.eps_star
+    assert snapped.sum() > 3
+    assert run.base_stress[snapped] == pytest.approx(SHARP.kc * x / (1.0 - x), rel=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("given", "drive", "culprit"),
+    [
+        (chain([relaxing(MICRO, [(0.5, 1e-12)])]), IMPACT, "s1_tau1 = 1e-12 s"),
+        (chain([LINEAR, relaxing(MICRO, [(0.5, 1e-11)])]), MOVED, "s2_tau1 = 1e-11 s"),
+        (chain([damped(MICRO, 1e-7), FOAM]), MOVED, "dashpot"),
+        (chain([MICRO, FOAM], [1e-18, 0.0]), IMPACT, "light mass"),
+    ],
+)
+def test_what_explicit_steps_cannot_follow_is_refused_by_name(
+    given: ff.Chain, drive: Drive, culprit: str
+) -> None:
+    with pytest.raises(ff.SimulationError, match="too fast") as refused:
+        ff.simulate(given, drive, TIME)
+    assert culprit in str(refused.value)

@@ -1,0 +1,187 @@
+"""Springs with memory: the judge by brute force, and answers held against it and closed forms."""
+
+from __future__ import annotations
+
+import math
+import sys
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+from scipy.special import ndtr
+
+import foamfit as ff
+from conftest import EXPERIMENTS
+
+sys.path.insert(0, str(EXPERIMENTS / "stability"))
+import fresh
+import independent_memory
+from energy import rebound_of
+from independent import over_range
+from independent_memory import follow
+
+# Spreads that meet far away; snap-through wider than snap-back, and the other way round; a snap
+# within a thousandth of a stress; snap-back above snap-through at most ranks.
+LAWS = [
+    (5.5e5, 2.5e5, 0.08, 1.3e5, 0.4, 5.5e4, 0.77),
+    (5.5e5, 5.5e6, 0.60, 1.3e5, 0.9, 4.0e4, 0.20),
+    (5.5e5, 8.0e5, 0.30, 1.0e5, 1e-3, 6.0e4, 1e-3),
+    (5.5e5, 5.5e6, 0.55, 0.8e5, 0.3, 1.2e5, 0.60),
+]
+H, AREA = 20e-3, 1e-3
+TURNS = [0.0, 0.5, 0.1, 0.6, 0.05, 0.7, 0.3, 0.4, 0.0]
+TERMS = [(0.7, 0.05), (0.2, 0.4)]
+# Fresh scenes of all drives.
+FRESH = {
+    "microscale": (0, 1, 2, 4, 11),
+    "relaxation": (0, 1, 2, 11),
+    "microscale+relaxation": (0, 1, 2, 11),
+    "mixed": (0, 3, 4, 11),
+}
+
+
+def alone(law: tuple[float, ...], **more: Any) -> ff.Chain:
+    return ff.Chain([ff.MicroscaleSpring(*law, **more)], [H], AREA)
+
+
+def to_and_fro(law: tuple[float, ...], samples: int) -> tuple[np.ndarray, np.ndarray]:
+    """Time and strain of a history with inner loops."""
+    time = np.linspace(0.0, 1.0, samples)
+    turns = np.linspace(0.0, 1.0, len(TURNS))
+    return time, np.interp(time, turns, (0.6 + law[2]) * np.array(TURNS))
+
+
+def by_roots(spring: ff.MicroscaleSpring, strains: np.ndarray) -> np.ndarray:
+    """The law, one bracketed root at each strain."""
+
+    def rank(s: float, sign: str) -> float:
+        place, wide = getattr(spring, f"sigma_{sign}"), getattr(spring, f"spread_{sign}")
+        return float(ndtr(math.log(s / place) / wide)) if s > 0.0 else 0.0
+
+    p, out = 0.0, []
+
+    def snapped(s: float) -> float:
+        return min(max(p, rank(s, "plus")), max(rank(s, "plus"), rank(s, "minus")))
+
+    def miss(s: float, eps: float) -> float:
+        q = snapped(s)
+        a, c = s / (spring.k0 + s), spring.eps_star + s / (spring.kc + s)
+        return (1.0 - q) * a + q * c - eps
+
+    for eps in strains:
+        high = spring.k0
+        while miss(high, eps) < 0.0:
+            high *= 2.0
+        s = float(brentq(miss, -0.5 * spring.k0, high, (eps,), xtol=1e-9, rtol=1e-14))
+        p = snapped(s)
+        out.append(s)
+    return np.array(out)
+
+
+# ------------------------------------------------------------------------------------- the judge
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_the_judge_follows_the_law(law: tuple[float, ...]) -> None:
+    time, strain = to_and_fro(law, 41)
+    chain = alone(law)
+    truth = follow(chain, SimpleNamespace(displacement=H * strain), time)
+    want = by_roots(chain.springs[0], strain)
+    assert over_range(truth.base_stress, want) <= 1e-11
+    assert over_range(truth.displacement, H * strain[None]) <= 1e-11
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_the_judge_keeps_energy(law: tuple[float, ...]) -> None:
+    chain = ff.Chain([ff.LinearSpring(3e6), ff.MicroscaleSpring(*law)], [H / 4, H], AREA)
+    drive = ff.Impact(0.5, 2.0)
+    bounced = rebound_of(chain, drive)
+    assert bounced is not None
+    time = np.linspace(0.0, 1.5 * bounced[0], 60)
+    truth = follow(chain, drive, time)
+    assert truth.contact_end == pytest.approx(bounced[0], rel=1e-10)
+    flown = np.diff(truth.displacement[-1, -2:])[0] / np.diff(time[-2:])[0]
+    assert -flown == pytest.approx(bounced[1], rel=1e-9)
+    assert bounced[1] < drive.velocity  # the loop keeps something
+
+
+def test_the_judge_agrees_with_that_of_springs_without_memory() -> None:
+    for family, number in (("base", 20), ("turns", 4), ("long", 24)):
+        scene = fresh.scene_from(fresh.spec_of(family, number))
+        one, other = fresh.follow(*scene), independent_memory.follow(*scene)
+        assert over_range(other.base_stress, one.base_stress) <= 1e-11
+        assert over_range(other.displacement, one.displacement) <= 1e-11
+        if one.contact_end is not None:
+            assert other.contact_end == pytest.approx(one.contact_end, rel=1e-11)
+
+
+# ----------------------------------------------------------------------------------- closed forms
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("soft", [0.0, 3e6])
+def test_an_impact_keeps_what_the_loop_takes(law: tuple[float, ...], soft: float) -> None:
+    springs: list[Any] = [ff.MicroscaleSpring(*law)]
+    chain = ff.Chain([ff.LinearSpring(soft), *springs] if soft else springs,
+                     [H / 4, H] if soft else [H], AREA)  # fmt: skip
+    drive = ff.Impact(0.5, 2.0)
+    bounced = rebound_of(chain, drive)
+    assert bounced is not None
+    time = np.linspace(0.0, 1.5 * bounced[0], 60)
+    for rtol in (1e-4, 1e-6, 1e-8):
+        answer = ff.simulate(chain, drive, time, rtol=rtol)
+        assert answer.contact_end == pytest.approx(bounced[0], rel=rtol)
+        flown = np.diff(answer.displacement[-1, -2:])[0] / np.diff(time[-2:])[0]
+        assert -flown == pytest.approx(bounced[1], rel=3.0 * rtol)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_the_stress_comes_back_to_where_it_turned(law: tuple[float, ...]) -> None:
+    """Whatever inner loops lie between two visits of one strain."""
+    time = np.arange(9.0)
+    strain = (0.6 + law[2]) * np.array([0.0, 0.7, 0.2, 0.5, 0.3, 0.5, 0.2, 0.7, 0.75])
+    bare = alone(law)
+    stress = ff.simulate(bare, ff.DisplacementDrive(H * strain), time).base_stress
+    assert stress[5] == pytest.approx(stress[3], rel=1e-12)
+    assert stress[6] == pytest.approx(stress[2], rel=1e-12)
+    assert stress[7] == pytest.approx(stress[1], rel=1e-12)
+    direct = ff.simulate(bare, ff.DisplacementDrive(H * strain[[0, 8]]), time[:2]).base_stress
+    assert stress[8] == pytest.approx(direct[1], rel=1e-12)
+    # the same in a chain that takes steps
+    chain = ff.Chain([ff.LinearSpring(4e6), *bare.springs], [H / 10, H], AREA)
+    stepped = ff.simulate(chain, ff.DisplacementDrive(H * strain), time, rtol=1e-9).base_stress
+    assert stepped[[5, 6, 7]] == pytest.approx(stepped[[3, 2, 1]], rel=1e-8)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_what_relaxes_dies_out(law: tuple[float, ...]) -> None:
+    """Held at a strain, each term fades by its own time, and the law in equilibrium remains."""
+    time = np.concatenate((np.linspace(0.0, 1.0, 20), 1.0 + np.linspace(0.1, 8.0, 20)))
+    strain = (0.5 + law[2]) * np.minimum(time, 1.0)
+    drive = ff.DisplacementDrive(H * strain)
+    answer = ff.simulate(alone(law, relaxation=TERMS), drive, time, rtol=1e-8)
+    rest = by_roots(alone(law).springs[0], strain[-1:])[0]
+    over = answer.base_stress[19:] - rest
+    fades = np.exp(-(time[19:, None] - 1.0) / np.array([tau for _, tau in TERMS]))
+    parts, *_ = np.linalg.lstsq(fades, over, rcond=None)
+    assert np.abs(fades @ parts - over).max() <= 1e-7 * rest
+    assert (parts > 0.0).all()
+
+
+# -------------------------------------------------------------------------------------- judgement
+
+
+@pytest.mark.parametrize("family", FRESH)
+def test_fresh_scenes_with_memory(family: str) -> None:
+    judged = 0
+    for number in FRESH[family]:
+        for line in fresh.lines_of((family, number, (1e-6,)), 400_000):
+            if line["judge"] != "judged":
+                continue
+            judged += 1
+            assert line["outcome"] == "answer", line
+            assert line["error"] <= 1.0, line
+            assert not line["energy"] > 3.0, line
+    assert judged >= 3

@@ -1,0 +1,335 @@
+"""Springs that relax, against an integration of high order on laws written anew."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import quad, solve_ivp
+from scipy.optimize import brentq
+from scipy.special import ndtr
+
+import foamfit as ff
+from foamfit.solve.relaxation import relaxed_along
+from reference import law
+
+Terms = list[tuple[float, float]]
+
+
+@dataclass
+class Law:
+    """The microscale law of model.md, anew; its state is the rank w."""
+
+    k0: float
+    kc: float
+    eps_star: float
+    sigma_plus: float
+    spread_plus: float
+    sigma_minus: float
+    spread_minus: float
+
+    def ranks(self, s: float) -> tuple[float, float]:
+        if s <= 0.0:
+            return -math.inf, -math.inf
+        return (
+            math.log(s / self.sigma_plus) / self.spread_plus,
+            math.log(s / self.sigma_minus) / self.spread_minus,
+        )
+
+    def after(self, w: float, s: float) -> float:
+        plus, minus = self.ranks(s)
+        return min(max(w, plus), max(plus, minus))
+
+    def strain(self, w: float, s: float) -> float:
+        on_a, on_c = s / (self.k0 + s), self.eps_star + s / (self.kc + s)
+        return float(ndtr(-w) * on_a + ndtr(w) * on_c)
+
+    def stress(self, w: float, eps: float) -> float:
+        if eps <= 0.0:
+            return self.k0 * eps / (1 - eps)
+        high = self.k0
+        while self.strain(self.after(w, high), high) < eps:
+            high *= 2
+        return float(
+            brentq(
+                lambda s: self.strain(self.after(w, s), s) - eps, 0, high, xtol=1e-300, rtol=1e-15
+            )
+        )
+
+    def flexibility(self, s: float, held: bool, back: bool, w: float) -> float:
+        """dε/dσ."""
+        snapping = 0.0
+        if s <= 0.0:
+            w = -math.inf
+        elif not held:
+            spread = self.spread_minus if back else self.spread_plus
+            w = self.ranks(s)[1 if back else 0]
+            gap = self.eps_star + s / (self.kc + s) - s / (self.k0 + s)
+            snapping = gap * math.exp(-w * w / 2) / math.sqrt(2 * math.pi) / (spread * s)
+        on_a, on_c = self.k0 / (self.k0 + s) ** 2, self.kc / (self.kc + s) ** 2
+        return float(snapping + ndtr(-w) * on_a + ndtr(w) * on_c)
+
+
+def integrated(law: Law, eps: np.ndarray, t: np.ndarray, terms: Terms) -> np.ndarray:
+    """Stress by integrating dσ/dt and dq/dt, anew from every kink (and from beads between)."""
+    g, tau = np.array(terms).T
+    fixed = []
+    if law.spread_minus != law.spread_plus:
+        z = math.log(law.sigma_plus / law.sigma_minus) / (law.spread_minus - law.spread_plus)
+        fixed.append(law.sigma_plus * math.exp(min(law.spread_plus * z, 700.0)))
+    for z in (-8.3, -5, -2, 0, 2, 5, 8):
+        fixed.append(law.sigma_plus * math.exp(law.spread_plus * z))
+        fixed.append(law.sigma_minus * math.exp(law.spread_minus * z))
+    w = -math.inf
+    s = law.stress(w, eps[0])
+    w, q, out = law.after(w, s), np.zeros(len(terms)), [s]
+    for (e0, e1), h in zip(itertools.pairwise(eps), np.diff(t), strict=True):
+        s1, rate, state = law.stress(w, e1), (e1 - e0) / h, w
+        kinks = list(fixed)
+        if w > -40:
+            kinks.append(law.sigma_plus * math.exp(law.spread_plus * w))
+            kinks.append(law.sigma_minus * math.exp(law.spread_minus * w))
+        inside = sorted({k for k in kinks if min(s, s1) < k < max(s, s1)}, reverse=bool(s1 < s))
+        stops = [s, *inside, s1]
+        times = [
+            0.0,
+            *((law.strain(law.after(w, k), k) - e0) / rate for k in inside),
+            h,
+        ]
+        for (a, b), (sa, sb) in zip(
+            itertools.pairwise(times), itertools.pairwise(stops), strict=True
+        ):
+            if b - a <= 1e-15 * h:
+                continue
+            middle = 0.5 * (sa + sb)
+            now = law.after(state, middle)
+            held, back = now == state, now != law.ranks(middle)[0]
+
+            def motion(
+                _: float, y: Any, held: bool = held, back: bool = back, w: float = state,
+                rate: float = rate,
+            ) -> Any:  # fmt: skip
+                ds = rate / law.flexibility(y[0], held, back, w)
+                return np.concatenate([[ds], g * ds - y[1:] / tau])
+
+            stiff = tau.min() < 0.01 * (b - a)
+            q = solve_ivp(
+                motion, (a, b), [sa, *q], method="Radau" if stiff else "DOP853",
+                rtol=1e-11 if stiff else 1e-12, atol=1e-12 * law.k0,
+            ).y[1:, -1]  # fmt: skip
+        w, s = law.after(w, s1), s1
+        out.append(s + q.sum())
+    return np.array(out)
+
+
+def loops(turns: tuple[float, ...], samples: int) -> np.ndarray:
+    """Samples from turning point to turning point, the turns among them."""
+    legs = [np.linspace(a, b, samples + 1)[1:] for a, b in itertools.pairwise(turns)]
+    return np.concatenate([[turns[0]], *legs])
+
+
+def chain(spring: Any, height: float = 2e-2) -> ff.Chain:
+    return ff.Chain([spring], [height], 1e-4)
+
+
+def stress_of(
+    spring: Any, eps: np.ndarray, t: np.ndarray, rtol: float = 1e-6, **more: Any
+) -> ff.Response:
+    return ff.simulate(chain(spring), ff.DisplacementDrive(2e-2 * eps), t, rtol, **more)
+
+
+SHOE = (5.5e5, 2.5e5, 0.08, 1.3e5, 0.4, 5.5e4, 0.77)
+LAWS = {
+    "shoe foam": SHOE,
+    "reversible at low ranks": (5e5, 1e6, 0.3, 1e5, 1.2, 5e4, 0.1),
+    "narrow": (5e5, 5e5, 0.2, 1e5, 3e-3, 5e4, 0.05),
+}
+TURNS = (0.0, 0.5, 0.2, 0.4, 0.05, 0.6, -0.02, 0.3)
+
+
+@pytest.mark.parametrize("own", LAWS.values(), ids=LAWS)
+@pytest.mark.parametrize(
+    ("terms", "samples"),
+    [
+        ([(0.5, 0.2)], 4),
+        ([(0.5, 0.2)], 40),
+        ([(0.5, 1e-2), (1.0, 1e4)], 4),
+        ([(0.7, 1e-4)], 4),
+    ],
+    ids=["one, coarse", "one, fine", "fast and slow", "very fast"],
+)
+def test_stress_is_within_rtol(own: tuple[float, ...], terms: Terms, samples: int) -> None:
+    eps = loops(TURNS, samples)
+    t = np.linspace(0.0, 1.0, eps.size)
+    want = integrated(Law(*own), eps, t, terms)
+    for rtol in (1e-4, 1e-6, 1e-9):
+        got = stress_of(ff.MicroscaleSpring(*own, relaxation=terms), eps, t, rtol).base_stress
+        assert np.abs(got - want).max() <= rtol * np.ptp(want)
+
+
+def test_a_bistable_spring_relaxes_about_its_own_law() -> None:
+    """The term is g (σ - σ(0) exp(-t/τ) - ∫ σ exp(-(t-u)/τ) du/τ), here by quadrature."""
+    spring = ff.BistableSpring(5.5e6, 82.5e6, -0.17907e6, 0.14, 0.31, 14.3e6, 2.3375e6)
+    turns = np.array([0.01, 0.4, 0.2, 0.25, 0.05, 0.2])
+    t = np.linspace(0.0, 1.0, turns.size)
+    got = stress_of(replace(spring, relaxation=[(0.6, 0.15)]), turns, t, 1e-9).base_stress
+    followed = law(spring)
+
+    def stress(at: float) -> float:
+        past = int(np.searchsorted(t, at))
+        return float(followed.stress([*turns[:past], float(np.interp(at, t, turns))])[-1])
+
+    grid = np.linspace(0.0, 1.0, 2001)
+    slopes = np.diff([stress(u) for u in grid])
+    corners = grid[1:-1][np.abs(np.diff(slopes)) > 1e-2 * np.abs(slopes).max()]
+    for j in (1, 3, 5):
+        ends = np.unique([0.0, *t[: j + 1], *(c for c in corners if c < t[j])])
+        memory = sum(
+            quad(lambda u, at=t[j]: stress(u) * math.exp((u - at) / 0.15) / 0.15, a, b)[0]
+            for a, b in itertools.pairwise(ends)
+        )
+        term = 0.6 * (stress(t[j]) - stress(0.0) * math.exp(-t[j] / 0.15) - memory)
+        assert got[j] == pytest.approx(stress(t[j]) + term, abs=2e-5 * got.max())
+
+
+def test_a_held_strain_relaxes_exponentially() -> None:
+    """Loaded in no time to speak of: the overstress is g σ exp(-t/τ)."""
+    spring = ff.MicroscaleSpring(*SHOE, relaxation=[(0.5, 0.2), (0.0, 1.0)])
+    t = np.array([0.0, 1e-9, 0.1, 0.3, 5.0])
+    got = stress_of(spring, np.array([0.0, 0.4, 0.4, 0.4, 0.4]), t).base_stress
+    rest = spring.stress(0.4)
+    np.testing.assert_allclose(got[1:], rest * (1 + 0.5 * np.exp(-t[1:] / 0.2)), rtol=1e-8)
+    below = stress_of(spring, np.array([0.4, 0.4]), np.array([0.0, 1.0])).base_stress
+    np.testing.assert_allclose(below, rest, rtol=1e-15)  # at the start nothing has relaxed yet
+
+
+NAMES = ("k0", "kc", "eps_star", "sigma_plus", "spread_plus", "sigma_minus", "spread_minus", "eta")
+OF_BISTABLE = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus", "eta")
+
+
+@pytest.mark.parametrize("terms", [[(0.5, 0.2)], [(0.5, 0.02), (0.0, 3.0)], []])
+@pytest.mark.parametrize("kind", ["microscale", "bistable"])
+def test_sensitivities_against_differences(kind: str, terms: Terms) -> None:
+    eps = loops((0.0, 0.43, 0.21, 0.4, 0.06, 0.6, 0.01), 13)
+    spring: Any = ff.MicroscaleSpring(*SHOE, eta=300.0, relaxation=terms)
+    short = [*NAMES, "height"]
+    if kind == "bistable":
+        eps *= 0.6
+        spring = ff.BistableSpring(
+            5.5e6, 82.5e6, -0.17907e6, 0.14, 0.31, 14.3e6, 2.3375e6, eta=300.0, relaxation=terms
+        )
+        short = [*OF_BISTABLE, "height"]
+    t = np.linspace(0.0, 1.0, eps.size)
+    short += [f"{name}{k + 1}" for k in range(len(terms)) for name in ("g", "tau")]
+    names = [f"s1_{name}" for name in short]
+    got = stress_of(spring, eps, t, 1e-10, sensitivities=names).sensitivities
+
+    def run(name: str, change: float) -> np.ndarray:
+        height, changed = 2e-2, spring
+        if name == "height":
+            height += change
+        elif name in ("g1", "tau1", "g2", "tau2"):
+            at = [list(pair) for pair in terms]
+            at[int(name[-1]) - 1][name[0] == "t"] += change
+            changed = replace(spring, relaxation=at)
+        else:
+            changed = replace(spring, **{name: getattr(spring, name) + change})
+        drive = ff.DisplacementDrive(2e-2 * eps)
+        return ff.simulate(chain(changed, height), drive, t, 1e-10).base_stress
+
+    for name in short:
+        size = 1e-5 * (1.0 if name[0] == "g" else 2e-2 if name == "height" else 0.0)
+        if name[:3] == "tau":
+            size = 1e-4 * terms[int(name[-1]) - 1][1]
+        size = size or 2e-5 * abs(getattr(spring, name))
+        if name == "g2":  # from zero on
+            want = (-3 * run(name, 0) + 4 * run(name, size) - run(name, 2 * size)) / (2 * size)
+        else:
+            ends = [run(name, k * size) for k in (-2, -1, 1, 2)]
+            want = (ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * size)
+        miss = np.abs(got[f"s1_{name}"].base_stress - want).max()
+        rounding = 1e-9 * np.abs(spring.stress(eps)).max() / size if name == "tau2" else 0.0
+        assert miss <= 2e-6 * np.abs(want).max() + rounding, name
+
+
+def test_a_term_of_no_strength_is_left_out() -> None:
+    """The solver is that of the spring without it, also where it is a chain under an impact."""
+    bistable = ff.BistableSpring(5.5e6, 82.5e6, -0.17907e6, 0.14, 0.31, 14.3e6, 2.3375e6)
+    t = np.linspace(0.0, 1e-3, 50)
+    runs = [
+        ff.simulate(ff.Chain([spring], [1.19e-3], 2e-5), ff.Impact(7e-3, 2.0), t)
+        for spring in (bistable, replace(bistable, relaxation=[(0.0, 1e-4)]))
+    ]
+    np.testing.assert_array_equal(runs[0].base_stress, runs[1].base_stress)
+    eps = loops(TURNS, 10)
+    spring = ff.MicroscaleSpring(*SHOE)
+    got = stress_of(replace(spring, relaxation=[(0.0, 0.1)]), eps, np.linspace(0, 1, eps.size))
+    np.testing.assert_array_equal(got.base_stress, stress_of(spring, eps, got.time).base_stress)
+
+
+def test_moments_of_short_and_long_steps_meet() -> None:
+    """One step of any length over a straight line: q = g τ (1 - exp(-t/τ)) dσ/dt, σ linear."""
+    flat = ff.BistableSpring(1e9, 2e9, -1.0, 0.5, 0.9, 1e6, 1e6, relaxation=[(1.0, 1.0)])
+    row = chain(flat).arrays.rows[0].copy()
+    for x in (1e-12, 1e-3, 0.9999, 1.0001, 3.0, 50.0, 1e4):
+        eps, t = np.array([0.0, 1e-9]), np.array([0.0, x])
+        got = relaxed_along(row, eps, t, 1e-6, True)
+        want = 1.0 * (1.0 - math.expm1(-x) / x) if x > 0 else 2.0
+        assert got[0][1] == pytest.approx(want, rel=1e-8)
+        by_tau = -math.exp(-x) - math.expm1(-x) / x
+        assert got[4][0, 1] == pytest.approx(by_tau, rel=1e-7, abs=1e-15)
+
+
+# ------------------------------------------------------------------------ prescribed stress
+
+
+def test_springs_in_series_under_a_stress() -> None:
+    springs = [
+        ff.MicroscaleSpring(*SHOE),
+        ff.LinearSpring(6e6),
+        ff.BistableSpring(2e5, 4e6, -1e4, 0.2, 0.5, 2e5, 1.2e5),
+    ]
+    heights = [1e-2, 2e-3, 5e-3]
+    stress = loops((0.0, 1.9e5, 3e4, 1.5e5, 2e4, 3e5, 0.0), 12)
+    t = np.linspace(0.0, 1.0, stress.size)
+    names = [
+        "s1_sigma_minus", "s1_spread_plus", "s1_height", "s2_k0", "s3_kh_plus", "s3_height",
+    ]  # fmt: skip
+
+    def run(springs: list[Any], heights: list[float], **more: Any) -> ff.Response:
+        return ff.simulate(ff.Chain(springs, heights, 1e-4), ff.StressDrive(stress), t, **more)
+
+    got = run(springs, heights, sensitivities=names)
+    strains = [spring.strain(stress) for spring in springs]
+    want = np.cumsum([h * e for h, e in zip(heights, strains, strict=True)], axis=0)
+    np.testing.assert_allclose(got.displacement, want, rtol=1e-14, atol=1e-18)
+    np.testing.assert_array_equal(got.base_stress, stress)
+    for name in names:
+        i, short = int(name[1]) - 1, name[3:]
+        ends = []
+        for factor in (1 - 1e-6, 1 + 1e-6):
+            one, h = list(springs), list(heights)
+            if short == "height":
+                h[i] *= factor
+            else:
+                one[i] = replace(one[i], **{short: getattr(one[i], short) * factor})
+            ends.append(run(one, h).displacement)
+        size = 2e-6 * (heights[i] if short == "height" else getattr(springs[i], short))
+        by = got.sensitivities[name]
+        rough = (ends[1] - ends[0]) / size
+        assert np.abs(by.displacement - rough).max() <= 1e-6 * np.abs(rough).max(), name
+        assert not by.base_stress.any()
+
+
+def test_what_a_spring_cannot_bear_is_refused() -> None:
+    pulled = ff.StressDrive(np.array([0.0, -6e5]))
+    with pytest.raises(ff.SimulationError, match="no longer finite"):
+        ff.simulate(chain(ff.MicroscaleSpring(*SHOE)), pulled, [0.0, 1.0])
+    for terms in ([], [(0.5, 0.2)]):
+        spring = ff.MicroscaleSpring(*SHOE, relaxation=terms)
+        with pytest.raises(ff.SimulationError, match="no longer finite"):
+            stress_of(spring, np.array([0.0, 0.5, 1.08, 0.3]), np.arange(4.0))

@@ -1,0 +1,311 @@
+"""Noise told from an error of the law, and what such an error leaves open."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.signal import lfilter
+from scipy.stats import binom
+
+import foamfit as ff
+from conftest import DATA, EXPERIMENTS, needs_data
+from foamfit.api import FitResult
+from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
+from foamfit.fitting.problem import Problem, make_problem
+from foamfit.fitting.search import Loop, Scales, Tracker, read_spring
+from foamfit.one_model import Options, identify, judge
+from foamfit.report.folder import load_result
+from foamfit.report.readable import readable
+from foamfit.trust.best_point import BestPoint
+from foamfit.trust.covariance import NOTHING, RULE, WEAK, covariance
+from foamfit.trust.law_error import curve_errors
+from foamfit.trust.noise_process import NoiseProcess
+from foamfit.trust.ranges import ALIKE, alike, left_open, tolerance
+from foamfit.trust.refit import Refit
+from foamfit.trust.resample import bootstrap
+
+sys.path.insert(0, str(EXPERIMENTS / "law_error"))
+
+import law_error
+
+
+def noise(rng: np.random.Generator, n: int, rho: float) -> np.ndarray:
+    white = rng.standard_normal(n + 500)
+    return lfilter([np.sqrt(1 - rho**2)], [1.0, -rho], white)[500:]
+
+
+def wave(n: int) -> np.ndarray:
+    """What a law leaves of a curve with kinks: slow, and nothing of a polynomial of degree 7."""
+    x = np.linspace(-1, 1, n)
+    kinks = np.abs(x + 0.4) - 1.7 * np.abs(x - 0.1) + np.abs(x - 0.6)
+    basis = np.polynomial.legendre.legvander(x, 7)
+    kinks -= basis @ np.linalg.lstsq(basis, kinks, rcond=None)[0]
+    return kinks / kinks.std()
+
+
+def of(residual: np.ndarray):
+    basis = np.polynomial.legendre.legvander(np.linspace(-1, 1, residual.size), 7)
+    residual = residual - basis @ np.linalg.lstsq(basis, residual, rcond=None)[0]
+    return curve_errors(residual, basis, (residual.size,))[0]
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.5, 7 / 9, 0.9])
+@pytest.mark.parametrize("n", [300, 1000])
+def test_noise_of_first_order_is_no_error_of_the_law(n, rho):
+    """Nine records of each; the process is then that of the residual, as it was."""
+    rng = np.random.default_rng(11)
+    found = [of(noise(rng, n, rho)) for _ in range(9)]
+    assert not any(one.found for one in found)
+    assert all(one.evidence < 0.0 for one in found)
+
+
+@pytest.mark.parametrize("size", [1.0, 3.0, 30.0])
+def test_the_noise_beside_an_error_of_the_law_is_that_of_the_high_frequencies(size):
+    rng = np.random.default_rng(3)
+    found = [of(size * wave(800) + noise(rng, 800, 0.0)) for _ in range(5)]
+    assert all(one.found for one in found)
+    power = [one.noise.variance * one.noise.tau for one in found]
+    assert np.mean(power) == pytest.approx(1.0, rel=0.1)
+    assert np.mean([one.law for one in found]) == pytest.approx(size, rel=0.15)
+
+
+def test_an_error_below_that_of_the_simulation_is_none():
+    assert not of(1e-3 * wave(800)).found
+    assert curve_errors(np.zeros(100), np.ones((100, 1)), (100,))[0].evidence is None
+    assert curve_errors(np.ones(20), np.ones((20, 1)), (20,))[0].evidence is None
+
+
+def test_the_curvature_that_a_residual_leaves_is_in_the_covariance():
+    """Curves b² t and 5 b fitted to others: variance by White's formula in closed form.
+
+    J = (2 b t, 5), so that H = JᵀJ + 2 Σ t r with r the residual of the first curve.
+    """
+    t = np.linspace(0.0, 1.0, 400)
+    y = 0.3 * t + 0.5 * np.sin(9.0 * t)
+
+    def residual(b: np.ndarray) -> np.ndarray:
+        return np.concatenate([b[0] ** 2 * t - y, np.full(400, 5.0 * (b[0] - 1.0))])
+
+    def slopes(b: np.ndarray) -> np.ndarray:
+        return np.concatenate([2.0 * b[0] * t, np.full(400, 5.0)])[:, None]
+
+    best = least_squares(residual, [0.8], jac=slopes, xtol=1e-15, ftol=1e-15, gtol=1e-15).x
+    left, jacobian = residual(best), slopes(best)
+    white = [NoiseProcess(np.empty(0), 1e-4)] * 2
+    found = covariance(
+        jacobian, left, (400, 400), np.ones(1), white,
+        lambda step: slopes(best + step).T @ residual(best + step),
+    )  # fmt: skip
+    square = float(np.sum(jacobian**2))
+    curvature = square + 2.0 * float(t @ left[:400])
+    assert abs(curvature / square - 1.0) > 5e-3
+    assert found.matrix[0, 0] == pytest.approx(1e-4 * square / curvature**2, rel=1e-4)
+    # A rise of the cost by a χ² of one is one standard error on its parabola.
+    assert found.inflation[0] == pytest.approx(found.matrix[0, 0] * curvature, rel=1e-4)
+    plain = covariance(jacobian, left, (400, 400), np.ones(1), white)
+    assert plain.with_some(np.array([0]), found).matrix[0, 0] == pytest.approx(
+        max(plain.matrix[0, 0], found.matrix[0, 0])
+    )
+
+
+# ---------------------------------------------------------------- on tests
+
+
+@cache
+def micro(draw: int | None, law: str = "microscale and relaxation") -> Measurement:
+    """A test of another law with 0.5 % noise on the stress, every second sample."""
+    curves = law_error.curves(law)
+    stress = curves.stress[::2]
+    if draw is not None:
+        white = np.random.default_rng([4, draw]).standard_normal(stress.size)
+        stress = stress + 0.005 * np.ptp(stress) * white
+    return Measurement(
+        name="microscale", path=None, data_sha256="", time=curves.time[::2], stress=stress,
+        displacement=curves.displacement[::2], specimen=Specimen(curves.height, curves.area),
+        motion="measured",
+    )  # fmt: skip
+
+
+@cache
+def fitted(draw: int | None):
+    found = identify(micro(draw), "bistable", None, Options(), lambda *_: None)
+    return *judge(found, Options().choice, lambda _: None), found
+
+
+@cache
+def strikes(kind: str) -> Problem:
+    """An impact of a foam of another law, 251 samples, or of the own law, without noise."""
+    curves = law_error.curves(kind)
+    test = Measurement(
+        name=kind, path=None, data_sha256="", time=curves.time[::2], stress=curves.stress[::2],
+        displacement=curves.displacement[::2], specimen=Specimen(curves.height, curves.area),
+        striker=Striker(*curves.striker), motion="measured",
+    )  # fmt: skip
+    return make_problem(test, "bistable", "impact", None, None, False)
+
+
+def refitted(problem: Problem, values: np.ndarray, names: tuple[str, ...]) -> BestPoint:
+    around = BestPoint(problem, values, names)
+    end = Refit(around, Tracker(problem.objective)).run(values)
+    return BestPoint(problem, end.point, names)
+
+
+@pytest.mark.parametrize("kind", ["rate effect", "own law"])
+def test_the_interval_holds_the_best_fit_without_noise(kind):
+    """Of 20 independent intervals of k_c 14 or less hold with p < 1e-3, if 95 % do.
+
+    They are no wider than 2.5 times what refits scatter, which the residual of the rate effect,
+    taken for correlated noise, makes them by far.
+    """
+    assert binom.cdf(14, 20, 0.95) < 1e-3
+    clean = strikes(kind)
+    start = np.array([*law_error.SPRING.seven, 0.0, 0.0])
+    names = clean.free()[:7]
+    best = refitted(clean, start, names)
+    column, at = names.index("s1_kc"), best.index["s1_kc"]
+    values, halves, found, old = [], [], 0, []
+    for draw in range(20):
+        rng = np.random.default_rng([9, draw])
+        test = clean.measurement
+        stress, motion = (
+            x + 0.005 * np.ptp(x) * rng.standard_normal(x.size)
+            for x in (test.stress, test.displacement)
+        )
+        noisy = replace(test, stress=stress, displacement=motion, noise=Noise())
+        around = refitted(
+            make_problem(noisy, "bistable", "impact", None, None, False), best.values, names
+        )
+        values.append(around.values[at])
+        halves.append(around.halves[column])
+        found += around.misfits
+        plain = covariance(
+            around.jacobian, around.residual, around.problem.objective.sizes, around.sizes
+        )
+        old.append(plain.stderr[column])
+    held = np.abs(np.array(values) - best.values[at]) <= halves
+    assert held.sum() > 14
+    assert 0.5 < np.median(halves) / (1.96 * np.std(values, ddof=1)) < 2.5
+    if kind == "own law":
+        assert found == 0
+    else:
+        assert found > 14
+        assert np.median(old) > 2.5 * np.std(values, ddof=1)
+
+
+def test_every_description_in_the_range_follows_the_curves_about_as_well():
+    result, best, found = fitted(0)
+    assert best.misfits
+    points = alike(best, found.tracker.ends, found.tracker)
+    costs = [float(np.sum(best.problem.objective.residual(point) ** 2)) for point in points]
+    law = sum(n * e.law**2 for e, n in zip(best.errors, best.problem.objective.sizes, strict=True))
+    assert tolerance(best) == pytest.approx((ALIKE**2 - 1.0) * law)
+    assert max(costs) <= best.cost + 1.001 * tolerance(best)
+    assert len(points) > 10
+    opened = left_open(best, found.tracker.ends, found.tracker)
+    for name, item in result.parameters.items():
+        if item.range is not None:
+            assert item.range == pytest.approx(opened.ranges[name], rel=0.05, abs=1e-3)
+            assert item.range[0] <= item.value <= item.range[1]
+            # What refits with fresh noise scatter is less than what the law leaves open.
+            assert item.ci95 is None or np.ptp(item.range) > 0.0
+
+
+def test_the_range_decides_where_it_is_wider():
+    result, best, _ = fitted(0)
+    for name, item in result.parameters.items():
+        if item.range is None or item.state == "fixed" or name == "s1_dsigma":
+            continue
+        size = float(best.problem.sizes((name,), best.values)[0])
+        half = 0.5 * max(np.ptp(item.range), np.ptp(item.ci95)) / size
+        expected = "determined" if half <= WEAK else "weak" if half <= NOTHING else "not determined"
+        assert item.state == expected
+        assert "its range is" in item.why or "95 % interval" in item.why
+
+
+def test_the_result_says_what_was_decided(tmp_path):
+    result, best, _ = fitted(0)
+    told = result.noise["stress_strain"]
+    assert told["law_error_evidence"] > 10.0
+    missed = result.misfit["stress_strain"] * np.ptp(
+        best.problem.objective.measured["stress_strain"]
+    )
+    assert told["law_error"] == pytest.approx(missed, rel=0.1)
+    (check,) = [check for check in result.checklist if check.key == "structure"]
+    assert check.answer is False
+    assert "the law misses" in check.warnings[0]
+    folder = FitResult(**vars(result)).save(tmp_path / "out")
+    content = load_result(folder)
+    kept = content["parameters"]["s1_kc"]
+    assert kept["range"] == pytest.approx(result.parameters["s1_kc"].range)
+    header, row = (folder / "parameters.csv").read_text().splitlines()[:2]
+    assert header.split(",")[3:7] == ["ci95_low", "ci95_high", "range_low", "range_high"]
+    assert float(row.split(",")[5]) == result.parameters["s1_k0"].range[0]
+    report = (folder / "report.html").read_text()
+    assert all(line.replace("'", "&#39;") in report for line in RULE)
+    assert '<th class="num">range</th>' in report
+    assert " to " in readable("s1_kc", result.parameters["s1_kc"]).range
+
+
+def test_there_is_no_range_where_the_law_follows_the_curves():
+    rng = np.random.default_rng(0)
+    curves = law_error.curves("own law")
+    stress = curves.stress + 0.005 * np.ptp(curves.stress) * rng.standard_normal(501)
+    test = replace(
+        micro(None), stress=stress, time=curves.time, displacement=curves.displacement,
+        specimen=Specimen(curves.height, curves.area),
+    )  # fmt: skip
+    result = ff.fit(test, starts=4)
+    assert all(item.range is None for item in result.parameters.values())
+    assert result.noise["stress_strain"]["law_error"] is None
+    report = readable("s1_kc", result.parameters["s1_kc"])
+    assert report.range == ""
+
+
+def test_the_bootstrap_adds_noise_to_the_curve_and_keeps_the_error_of_the_law():
+    """Refits scatter about the best point as its covariance says, where there is one minimum."""
+    best = fitted(0)[1]
+    chosen = ("s1_k0", "s1_kc", "s1_kh_plus")
+    around = BestPoint(best.problem, best.values, chosen)
+    drawn = bootstrap(around, 40, seed=2).values
+    assert drawn.mean(axis=0) == pytest.approx(
+        around.values[[around.index[n] for n in chosen]], abs=float("inf"), rel=0.01
+    )
+    ratio = drawn.std(axis=0) / around.spread.stderr
+    assert np.all((ratio > 0.5) & (ratio < 1.6))
+
+
+def test_a_loop_has_two_branches_c():
+    """Both pass through C1 and C2 as they were read, the soft one close to its pole."""
+    spring = ff.BistableSpring(6.8e5, 5.9e4, -1.3e4, 0.088, 0.19, 3.35e5, 2.6e5)
+    strain = np.concatenate([np.linspace(0, 0.5, 200), np.linspace(0.5, 0, 200)[1:]])
+    loop, scales = Loop(strain, spring.stress(strain)), Scales(2e5, 0.5, 1.0, 0.01)
+    marks = np.array([0.2, 0.9, 0.4, 0.5, 0.0])
+    stiff, soft = (read_spring(loop, marks, scales, soft=value) for value in (False, True))
+    others = np.arange(8) != 1
+    assert soft[others] == pytest.approx(stiff[others])
+    assert soft[1] < stiff[1]
+    one, two = (ff.BistableSpring(*seven[:7]) for seven in (stiff, soft))
+    assert two.sigma_hat_c == pytest.approx(one.sigma_hat_c, rel=1e-6)
+    assert two.eps_hat_c == pytest.approx(one.eps_hat_c, rel=1e-6)
+
+
+def test_the_search_finds_the_soft_branch_c():
+    """Without starts on it the best of 16 descents misses 1.9 % of the range, not 1.15 %."""
+    best = fitted(None)[1]
+    assert best.problem.objective.misfit(best.simulated)["stress_strain"] < 0.012
+
+
+@needs_data
+def test_twins_get_the_same_states():
+    rows = law_error.twins(DATA, ("turbo-comp", "leap-comp", "worn-heel-comp"))
+    cells = law_error.repeat(rows)
+    assert cells["same"].sum() >= 0.85 * cells["specimens"].sum()
+    near, close = cells[cells["scatter"] <= 0.15], cells[cells["scatter"] <= 0.10]
+    assert near["not determined"].sum() <= 0.05 * near["specimens"].sum()
+    assert close["determined"].sum() >= 2 / 3 * close["specimens"].sum()
+    assert cells[cells["scatter"] > 0.5]["determined"].sum() == 0
