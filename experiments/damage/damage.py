@@ -77,9 +77,9 @@ over five specimens ± standard deviation:
 ### Cycles {cycles} together
 
 Each specimen is one fit of three cycles; which parameters each cycle has of its own is chosen by
-BIC summed over the ten specimens ({n_eff} effective samples: stretches in which a cycle's own fit
-lies on one side of its curve). Misfit: RMS of the stress over its range, least to largest of the
-ten specimens.
+BIC summed over the ten specimens (one parameter more in each
+step, then exchanges; {n_eff} effective samples: stretches in which a cycle's own fit lies on one
+side of its curve). Misfit: RMS of the stress over its range, least to largest of the ten specimens.
 
 {steps}
 
@@ -260,7 +260,7 @@ def draw_twins(table: pd.DataFrame) -> None:
             ax.set_ylim(bottom=0)
             ax.set_xlabel("cycle")
             ax.set_xticks(range(1, 7))
-        axes.flat[0].legend()
+        axes.flat[0].legend(loc="lower right")
         save(figure, HERE / "twins.png")
 
 
@@ -336,8 +336,8 @@ def draw_lattices(table: pd.DataFrame, found: dict[str, ff.CycleFits]) -> None:
         axes[0, 0].legend(fontsize=6)
         shown = {
             "start_strain": ("start strain (%)", 100.0, False),
-            "peak_stress": ("peak stress over that of cycle 1", 1.0, True),
-            "dissipated_energy": ("dissipated energy over that of cycle 1", 1.0, True),
+            "peak_stress": ("peak stress over cycle 1", 1.0, True),
+            "dissipated_energy": ("dissipated energy over cycle 1", 1.0, True),
         }
         for ax, (column, (title, scale, relative)) in zip(axes[1], shown.items(), strict=True):
             for name, group in table.groupby("specimen"):
