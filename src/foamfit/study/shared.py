@@ -24,6 +24,7 @@ BLOCKS = 50
 # Steps of the descents that only rank the candidates, and the vectors that more than one test's
 # shared parameters start from.
 TRIAL, MOST_STARTS = 12, 4
+EXCHANGES = 3  # Rounds of them after a step, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +118,8 @@ def select_own(groups: Sequence[Group], *, progress: Progress | None = None) -> 
 
     Begins with all parameters shared. In each step every shared parameter is tried as an own one,
     and that of the lowest BIC is taken, as long as BIC falls: BIC = n_eff ln(χ²/n) + k ln(n_eff),
-    summed over the groups, where n_eff is that of `effective_samples`.
+    summed over the groups, where n_eff is that of `effective_samples`. Parameters compensate each
+    other, so that after each step own ones are exchanged for shared ones as long as BIC falls.
 
     Parameters
     ----------
@@ -130,7 +132,14 @@ def select_own(groups: Sequence[Group], *, progress: Progress | None = None) -> 
     -------
     Selection
     """
-    tell = progress or (lambda *_: None)
+    done = 0.0
+
+    def tell(fraction: float, what: str) -> None:
+        nonlocal done
+        done = max(done, fraction) if fraction == fraction else done  # exchanges take no share
+        if progress is not None:
+            progress(done, what)
+
     names = groups[0].problems[0].free()
     steps, chosen = [step_of(groups, ())], 0
     rounds = len(names) * (len(names) + 1) / 2
@@ -140,14 +149,14 @@ def select_own(groups: Sequence[Group], *, progress: Progress | None = None) -> 
         rest = [name for name in names if name not in now.own]
         trials = list[Step]()
         for name in rest:
-            done = sum(len(names) - i for i in range(len(steps) - 1)) + len(trials)
-            tell(min(done / rounds, 1.0), f"shared or own: {name}")
+            count = sum(len(names) - i for i in range(len(steps) - 1)) + len(trials)
+            tell(min(count / rounds, 1.0), f"shared or own: {name}")
             trials.append(step_of(groups, (*now.own, name), near, TRIAL))
         found = min(trials, key=lambda step: step.bic)
         starts = [
             [list(fit.values), *group.starts] for fit, group in zip(found.fits, groups, strict=True)
         ]
-        steps.append(step_of(groups, found.own, starts))
+        steps.append(_exchanged(groups, step_of(groups, found.own, starts), tell))
         chosen += steps[-1].bic < now.bic
     n_alone = sum(len(names) * len(group.problems) for group in groups)
     alone = sum(group.alone for group in groups)
@@ -155,6 +164,27 @@ def select_own(groups: Sequence[Group], *, progress: Progress | None = None) -> 
     tell(1.0, "done")
     n_eff = sum(group.n_eff for group in groups)
     return Selection(tuple(steps), chosen, n_eff, alone, n_alone, bic)
+
+
+def _exchanged(groups: Sequence[Group], step: Step, tell: Progress) -> Step:
+    """Exchange an own parameter for a shared one as long as this lowers BIC."""
+    shared = step.fits[0].shared
+    for _ in range(EXCHANGES if len(step.own) > 1 else 0):
+        near = [[list(fit.values)] for fit in step.fits]
+        trials = []
+        for out in step.own:
+            kept = tuple(name for name in step.own if name != out)
+            tell(math.nan, f"{out} shared, another own")
+            trials += [step_of(groups, (*kept, name), near, TRIAL) for name in shared]
+        best = min(trials, key=lambda trial: trial.bic)
+        starts = [
+            [list(fit.values), *group.starts] for fit, group in zip(best.fits, groups, strict=True)
+        ]
+        best = step_of(groups, best.own, starts)
+        if best.bic >= step.bic:
+            break
+        step, shared = best, best.fits[0].shared
+    return step
 
 
 def step_of(
