@@ -426,9 +426,9 @@ def _choice_sentences(tried: Sequence[Tried], decision: Decision, ended: str) ->
     ]
     if decision.by_prediction:
         said.append(
-            "What is left is more than noise, so AICc and BIC do not hold. Each model was fitted to "
-            f"the test without one of {BLOCKS} blocks in time, in turn, and predicted that block; "
-            f"each further parameter must lower this predicted misfit by {percent(SHARE)}."
+            "What is left is more than noise, so AICc and BIC do not hold. Each model was fitted "
+            f"to the test without one of {BLOCKS} blocks in time, in turn, and predicted that "
+            f"block; each further parameter must lower this predicted misfit by {percent(SHARE)}."
         )
         return said
     if found[best].rank < one.varied:
