@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
-from functools import cached_property
 from importlib.metadata import version
 from typing import Any
 
@@ -285,14 +284,14 @@ class Fit:
         """The model and its relaxation in words."""
         return law_in_words(self.model, self.relaxation)
 
-    @cached_property
+    @property
     def strain(self) -> Array | None:
         """Overall strain along the fitted curves; None if neither simulated nor measured."""
         c = self.curves
         moved = c.displacement if c.displacement is not None else c.measured_displacement
         return None if moved is None else moved / self.measurement.specimen.height
 
-    @cached_property
+    @property
     def snapping(self) -> dict[str, Snapping]:
         """How each microscale spring snapped, where that is known; see `snapping_of`."""
         stress = self.curves.measured_stress if self.drive == "stress" else self.curves.stress
