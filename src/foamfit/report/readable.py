@@ -72,7 +72,8 @@ def readable(name: str, p: ParameterEstimate) -> Readable:
         if p.ci95 is not None:
             interval = " to ".join(_fixed(bound / factor, places) for bound in p.ci95)
     if p.range is not None:  # an error of the law leaves two digits
-        span = " to ".join(f"{bound / factor + 0.0:.2g}".replace("-", "−") for bound in p.range)
+        ends = (float(f"{bound / factor + 0.0:.2g}") for bound in p.range)
+        span = " to ".join(f"{end:g}".replace("-", "−") for end in ends)
     unit = {"": "–", "1": "–", "-": "–", "Pa s": "Pa·s", "Pa*s": "Pa·s"}.get(unit, unit)
     method = p.ci95_method or ""
     return Readable(
