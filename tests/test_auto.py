@@ -442,6 +442,26 @@ def test_only_models_that_the_test_allows_are_tried(monkeypatch):
         ff.fit(replace(test, interior={5: test.displacement}), model="auto")
 
 
+@pytest.mark.parametrize(("microscale", "tried"), [(0.021, True), (0.023, False)])
+def test_chains_of_microscale_springs_need_one_that_follows_the_curves(microscale, tried):
+    """As closely as a bistable spring does, or nearly."""
+    misfits = {("bistable", 0): 0.02, ("microscale", 0): microscale, ("microscale", 1): 0.001}
+    before = [
+        SimpleNamespace(result=SimpleNamespace(model=model, relaxation=terms), misfit=misfit)
+        for (model, terms), misfit in misfits.items()
+    ]
+    why = auto._hopeless(Model.parse("linear+microscale"), before)
+    assert why == (
+        ""
+        if tried
+        else "one microscale spring misses the curves by 2.3 % of the range, "
+        "one bistable spring by 2 %"
+    )
+    for model in (Model.parse("linear+bistable"), Model.parse("microscale", 1)):
+        assert auto._hopeless(model, before) == ""
+    assert auto._hopeless(Model.parse("linear+microscale"), before[1:]) == ""
+
+
 def test_a_drive_without_dampers_has_one_rung_for_each_model():
     result = ff.fit(synthetic_loop()[1], model="auto", starts=4)
     assert [(rung.model, rung.damping) for rung in result.ladder.rungs] == [("bistable", "none")]

@@ -61,6 +61,9 @@ LADDER = (
 )
 # So many groups in a row without a gain end the comparison.
 WITHOUT_GAIN = 2
+# Chains with microscale springs, which take minutes in an impact, are not tried where one such
+# spring misses the curves by so many times more than one bistable spring.
+HOPELESS = 1.1
 
 
 def _dampers(params: lmfit.Parameters) -> list[str]:
@@ -128,6 +131,9 @@ def compare_models(
         for i, group in enumerate(groups):
             below = len(tried)
             for k, model in enumerate(group):
+                if why := _hopeless(model, tried):
+                    skipped.append(f"{rung_name(model.name, 'none', model.relaxation)}: {why}")
+                    continue
                 done = (i + k / len(group)) / len(groups)
                 family = state.family(model, done, tried, skipped)
                 if state.stopped or any(one.structureless for one in family):
@@ -156,6 +162,25 @@ def compare_models(
     progress(1.0, "done")
     ended = f"it was stopped by {stopped}" if stopped else ended
     return _conclude(tried, ended, stopped, tuple(skipped), time.perf_counter() - state.began)
+
+
+def _hopeless(model: Model, tried: Sequence[Tried]) -> str:
+    """Why a chain with microscale springs cannot win; "" where it may, and of other models."""
+    if len(model.kinds) == 1 or "microscale" not in model.kinds:
+        return ""
+    least = {
+        kind: min(
+            (one.misfit for one in tried if one.result.model == kind and not one.result.relaxation),
+            default=math.nan,
+        )
+        for kind in ("microscale", "bistable")
+    }
+    if not least["microscale"] > HOPELESS * least["bistable"]:
+        return ""
+    return (
+        f"one microscale spring misses the curves by {percent(least['microscale'])} of the range, "
+        f"one bistable spring by {percent(least['bistable'])}"
+    )
 
 
 def _has_gained(tried: Sequence[Tried], below: int) -> bool:
