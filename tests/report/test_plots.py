@@ -322,3 +322,17 @@ def test_shakes_of_a_measured_motion_are_no_branch_of_their_own() -> None:
     assert [(cut.branches, cut.start, cut.stop) for cut in kept] == [
         ("snap-through", 0, 600), ("held", 600, 640), ("snap-back", 640, 1000)
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize("k0", [4e5, 3e6, 1e7])
+def test_names_of_branches_stay_in_their_panel(k0: float) -> None:
+    spring = replace(fabricated.MICRO, k0=k0, sigma_plus=1.5e5, spread_plus=0.2)
+    chain = fabricated.Chain(springs=[spring], heights=[fabricated.HEIGHT], area=fabricated.AREA)
+    result = fabricated.microscale_result(chain=chain)
+    strain = result.curves.measured_displacement / fabricated.HEIGHT
+    stress = np.asarray(spring.stress(strain))
+    figure = plot_fit(with_curves(result, stress=stress, stress_along=stress))
+    image(figure, "png", 100)
+    loop = figure.axes[-1]
+    (name,) = (text for text in loop.texts if text.get_text() == "snap-through")
+    assert name.get_window_extent().x0 >= loop.get_window_extent().x0

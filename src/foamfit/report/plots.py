@@ -276,6 +276,11 @@ class _Labels:
         self.ax.plot(*places.T, "o", ms=3.2, color="black", zorder=5)
         self.marks += [places, places]
 
+    def has_room(self, name: str, at: Array, wanted: tuple[float, float]) -> bool:
+        """Whether a name beside a place stays in the width of the panel."""
+        anchor, width = (at[0] - self.corner[0]) * self.span[0], 5.5 * len(name) + abs(wanted[0])
+        return bool(anchor > width if wanted[0] < 0 else anchor + width < PANEL[0])
+
     def write(
         self, name: str, at: Array, wanted: tuple[float, float], *, stay: bool = False, **style: Any
     ) -> None:
@@ -400,8 +405,11 @@ def _name_branches(labels: _Labels, panel: _Panel, result: Fit) -> None:
                 ha="center", va="center", zorder=6, **style,
             )  # fmt: skip
         elif branch in IN_WORDS:
-            at = np.array([x[middle], y[middle]])
-            labels.write(branch, at, IN_WORDS[branch], stay=True, fontsize=7, **style)
+            inner = np.column_stack((x, y))[_evenly(x, y, 9)]
+            around = sorted(inner, key=lambda at: float(abs(at[0] - x[middle])))
+            wanted = IN_WORDS[branch]
+            at = next((at for at in around if labels.has_room(branch, at, wanted)), around[0])
+            labels.write(branch, at, wanted, stay=True, fontsize=7, **style)
 
 
 def _first_visits(result: Fit, fitted: _Line) -> Iterator[tuple[str, int, int]]:
