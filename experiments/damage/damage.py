@@ -5,7 +5,7 @@ The measurements are not part of this repository. Give their folder:
     FOAMFIT_DATA=path/to/data python experiments/damage/damage.py
 
 It holds shoe-foam-twins/ (arXiv:2602.12694, LivingMatterLab/CANN: five specimens each of the heel
-of a new and of a worn shoe, compressed 6 to 7 times) and lattice-cycles/ (printed TPU lattices,
+of a new and of a worn shoe, compressed 6 times) and lattice-cycles/ (printed TPU lattices,
 mev43/FYP-Cyclic-Compression-Data-Analysis: 1000 cycles, of which 145 are recorded).
 
 Writes damage.md, twins.csv, twins.png, lattice.csv and lattice.png beside this file.
@@ -64,7 +64,7 @@ first contact, is taken off.
 
 ## Ten specimens of running-shoe foam (measurements: arXiv:2602.12694)
 
-Five specimens each of the heel of a new and of a worn shoe, 6 to 7 cycles, one microscale spring
+Five specimens each of the heel of a new and of a worn shoe, 6 cycles, one microscale spring
 with one relaxation term (9 parameters), each cycle of each specimen on its own (`twins.csv`). Mean
 over five specimens ± standard deviation:
 
