@@ -45,7 +45,7 @@ from foamfit.springs.kernels import (
     maker,
     piece,
 )
-from foamfit.springs.law import LEAST_RANK, MICROSCALE
+from foamfit.springs.law import MICROSCALE
 from foamfit.springs.microscale_kernels import (
     BRANCH,
     CARRIED,
