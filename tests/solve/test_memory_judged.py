@@ -219,5 +219,5 @@ def test_derivatives_may_begin_behind_masses() -> None:
 
 def test_a_refusal_names_what_is_too_fast_only_where_something_is() -> None:
     """Here springs are thrown against the ends of their branches."""
-    with pytest.raises(ff.SimulationError, match="end of (its|a) branch"):
+    with pytest.raises(ff.SimulationError, match=r"end of (its|a) branch"):
         ff.simulate(*fresh.scene_from(fresh.spec_of("mixed", 89)), 1e-4)
