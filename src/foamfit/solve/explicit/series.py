@@ -756,14 +756,17 @@ def _own_strain(law: Array, i: int, stress: float, memory: Memory) -> tuple[floa
 
 @inner
 def _share_under(
-    law: Array, i0: int, i1: int, eps: Array, stress: float, memory: Memory
+    law: Array, i0: int, i1: int, eps: Array, softs: Array, stress: float, memory: Memory
 ) -> tuple[float, float, float]:
-    """Give the undamped springs of a group a stress; elongation, its size, and compliance."""
+    """Give the undamped springs of a group a stress; elongation, its size, and compliance.
+
+    Fills their strains, and the slopes dε/dΣ in `softs`.
+    """
     total = size = compliance = 0.0
     for i in range(i0, i1):
         if law[i, DASHPOT] == 0.0:
             own, soft = _own_strain(law, i, stress, memory)
-            eps[i, 0] = own
+            eps[i, 0], softs[i, 0] = own, soft
             total += law[i, HEIGHT] * own
             size += law[i, HEIGHT] * abs(own)
             compliance += law[i, HEIGHT] * soft
@@ -779,7 +782,7 @@ def settle_together(
     A spring that is nearly rigid, or about to snap all at once, feels the least difference of
     stress; without this, truncation of the strains lets their stresses part.
     """
-    law, eps = links.law, s[EPS]
+    law, eps, softs = links.law, s[EPS], s[SIG]  # until the next series, stresses are not used
     for g in range(links.ends.size):
         i0, i1 = springs_of(links.ends, g)
         stressed = g == links.ends.size - 1 and links.top == STRESS
@@ -798,20 +801,22 @@ def settle_together(
         stress = push[0] + push[1] * span if stressed else value_at(s[GROUP, g], order, span)
         for i in range(i0, i1):
             s[TILT, i, 0] = eps[i, 0]
-        found = False
+        found, before, more = False, math.inf, 0.0
         for _ in range(20):
-            total, size, compliance = _share_under(law, i0, i1, eps, stress, memory)
-            found = stressed or abs(total - rest) <= 4e-16 * (size + abs(rest))
-            if found or not math.isfinite(total):
+            total, size, compliance = _share_under(law, i0, i1, eps, softs, stress, memory)
+            miss = abs(total - rest)
+            more = 0.0 if stressed else (rest - total) / compliance
+            found = miss <= 4e-16 * (size + abs(rest)) or abs(more) <= 4e-15 * abs(stress)
+            found = found or 0.5 * before <= miss <= 1e-14 * size  # no better than rounding allows
+            if found or not math.isfinite(total + more):
                 break
-            step = (total - rest) / compliance
-            found = abs(total - rest) <= 1e-14 * size and abs(step) <= 1e-15 * abs(stress)
-            if found:
-                break
-            stress -= step
-        if not (found and math.isfinite(total)):
-            for i in range(i0, i1):
+            before = miss
+            stress += more
+        for i in range(i0, i1):
+            if not (found and math.isfinite(total)):
                 eps[i, 0] = s[TILT, i, 0]
+            elif law[i, DASHPOT] == 0.0:
+                eps[i, 0] += softs[i, 0] * more  # what no number for the stress is fine enough for
 
 
 @inner
