@@ -46,7 +46,7 @@ def _calls() -> dict[Any, tuple[Any, ...]]:
     from numba import typeof
 
     from foamfit.solve import plan, polynomial, scene
-    from foamfit.solve.explicit import series, taylor
+    from foamfit.solve.explicit import samples, series, tangents, taylor
     from foamfit.springs import kernels, sensitivities
 
     calls: dict[Any, tuple[Any, ...]] = {}
@@ -60,7 +60,9 @@ def _calls() -> dict[Any, tuple[Any, ...]]:
         return call
 
     with ExitStack() as uncompiled, np.errstate(all="ignore"):
-        for module in (kernels, sensitivities, polynomial, scene, series, taylor, plan):
+        for module in (
+            kernels, sensitivities, polynomial, scene, series, tangents, samples, taylor, plan,
+        ):  # fmt: skip
             names = {name: loop for name, loop in vars(module).items() if hasattr(loop, "py_func")}
             called = {}
             for name, loop in names.items():

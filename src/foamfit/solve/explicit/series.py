@@ -1,12 +1,8 @@
-"""The Taylor series in time of a chain on fixed branches, and of its derivatives by parameters.
+"""The Taylor series in time of a chain on fixed branches.
 
 On one branch the law is either a straight line or σ (1 - x) = k x, so every coefficient of strains,
-stresses and motion follows from the lower ones by a short recurrence. The recurrence of the
-derivatives is the same one, linearised about the motion: with T the series of the slope dσ/dε,
-
-    δσ_n = Σ_j T_{n-j} δx_j + (∂σ/∂k)_n δk,      x = ε - x0.
-
-The law is continuous at its switches, so the derivatives pass from branch to branch without a jump.
+stresses and motion follows from the lower ones by a short recurrence. Springs with memory have
+recurrences of their own (`explicit.memory`), derivatives theirs (`explicit.tangents`).
 
 The nodes are those masses that are there. Between two of them lies a group of springs in series,
 which carry one stress: massless nodes have no state. In a group of several springs those without
@@ -22,7 +18,6 @@ from typing import NamedTuple
 import numpy as np
 
 from foamfit.solve.explicit.memory import (
-    BASE,
     EQ,
     GAIN,
     GIVE,
@@ -31,23 +26,16 @@ from foamfit.solve.explicit.memory import (
     advance_memory,
     advance_memory_tangents,
     enter_mixture,
-    fill_partials,
     finish_mixture,
     keep,
-    keep_tangent,
     relaxed,
-    relaxed_tangent,
     start_mixture,
-    start_relaxed,
-    start_relaxed_tangent,
     strain_at,
     strain_of_mixture,
-    tangent_of_mixture,
 )
 from foamfit.solve.polynomial import value_at
 from foamfit.solve.scene import FREE, MOTION, STRESS, VISCOUS
 from foamfit.springs.kernels import (
-    BACK,
     HELD,
     KIND,
     Array,
@@ -183,7 +171,7 @@ def springs_of(ends: Branches, g: int) -> tuple[np.int64, np.int64]:
 
 
 @inlined
-def _product(x: Array, y: Array, i: int, n: int) -> float:
+def product(x: Array, y: Array, i: int, n: int) -> float:
     """Σ x_j y_{n-j} of spring i for j from 1 to n - 1."""
     even = odd = 0.0  # two sums at once
     for j in range(1, n - 1, 2):
@@ -201,7 +189,7 @@ def _law_stress(law: Array, i: int, eps: Array, sig: Array, n: int) -> float:
     if n > 0:
         if law[i, CURVED] == 0.0:
             return k * eps[i, n]
-        known = _product(eps, sig, i, n)
+        known = product(eps, sig, i, n)
         return ((k + sig[i, 0]) * eps[i, n] + known) * law[i, INVERSE]
     x = eps[i, 0] - law[i, ORIGIN]
     if law[i, CURVED] == 0.0:
@@ -243,7 +231,7 @@ def _law_strain(law: Array, i: int, eps: Array, sig: Array, n: int) -> tuple[flo
     if law[i, CURVED] == 0.0:
         return 0.0, (1.0 / k if k > 0.0 else math.inf)
     stiff = k + sig[i, 0]
-    known = _product(eps, sig, i, n)
+    known = product(eps, sig, i, n)
     return -known / stiff, (1.0 - (eps[i, 0] - law[i, ORIGIN])) / stiff
 
 
@@ -504,225 +492,6 @@ def expand(
                 v[g, n] = (push_n - group[g, n]) / drag
                 w[g, n + 1] = v[g, n] * share
     return True
-
-
-# ---------------------------------------------------------------- its derivatives
-
-
-@inner
-def _fill_tilt(law: Array, i: int, sig: Array, tilt: Array, order: int) -> None:
-    """Series T of dσ/dε on a branch: k on a straight one, (k + σ)²/k on a curved one."""
-    k = law[i, SLOPE]
-    tilt[i, 0] = k
-    if law[i, CURVED] == 0.0:
-        for n in range(1, order + 1):
-            tilt[i, n] = 0.0
-        return
-    stiff = k + sig[i, 0]
-    tilt[i, 0] = stiff * stiff / k
-    for n in range(1, order + 1):
-        tilt[i, n] = (2.0 * stiff * sig[i, n] + _product(sig, sig, i, n)) / k
-
-
-@inlined
-def _known_tangent(
-    law: Array, s: Array, m: Array, d: Array, i: int, n: int, memory: Memory | None, p: int
-) -> float:
-    """Order n of δσ of a spring in direction p, but for the term T_0 δε_n."""
-    eps, sig, tilt, gain = s[EPS], s[SIG], s[TILT], 1.0
-    if memory is not None:
-        sig, gain = memory.series[EQ], memory.now[i, GAIN]
-    known = -tilt[i, n] * m[i, ORIGIN]
-    if law[i, CURVED] == 0.0:
-        known += gain * (eps[i, n] - (law[i, ORIGIN] if n == 0 else 0.0)) * m[i, SLOPE]
-        known += gain * m[i, OFFSET] if n == 0 else 0.0
-    elif law[i, CURVED] < HELD:
-        known += gain * sig[i, n] / law[i, SLOPE] * m[i, SLOPE]
-        if n > 0:
-            known += d[EPS, i, 0] * tilt[i, n] + _product(d[EPS], tilt, i, n)
-    if memory is not None:
-        if law[i, CURVED] >= HELD:
-            known = tangent_of_mixture(memory, p, i, law[i, CURVED] > HELD, tilt[i, 0], n)
-        memory.now[i, BASE] = relaxed_tangent(memory, p, i, n)
-        known += memory.now[i, BASE]
-    if law[i, DASHPOT] == 0.0 and n + 2 < tilt.shape[1]:  # a dashpot of zero: what it would take
-        known += (n + 1) * eps[i, n + 1] * m[i, DASHPOT]
-        if memory is not None:
-            memory.now[i, BASE] += (n + 1) * eps[i, n + 1] * m[i, DASHPOT]
-    return known
-
-
-@inner
-def _share_tangent(
-    law: Array, tilt: Array, d: Array, i0: int, i1: int, rest: float, n: int
-) -> float:
-    """Order n of the derivative of a group's stress, where some springs have no dashpot.
-
-    `rest` is that of the elongation, but for the moves of the springs. Fills their δε and δσ, whose
-    known parts must be in d[SIG].
-    """
-    eps, sig = d[EPS], d[SIG]
-    compliance, flat = 0.0, -1
-    for i in range(i0, i1):
-        if law[i, DASHPOT] > 0.0:
-            rest -= law[i, HEIGHT] * eps[i, n]
-        elif tilt[i, 0] > 0.0:
-            compliance += law[i, HEIGHT] / tilt[i, 0]
-            rest += law[i, HEIGHT] / tilt[i, 0] * sig[i, n]
-        elif flat < 0:
-            flat = i
-    common = sig[flat, n] if flat >= 0 else rest / compliance
-    for i in range(i0, i1):
-        if law[i, DASHPOT] == 0.0 and i != flat:
-            soft = 1.0 / tilt[i, 0] if tilt[i, 0] > 0.0 else 0.0
-            eps[i, n] = (common - sig[i, n]) * soft
-            sig[i, n] = common
-    if flat >= 0:  # the flat branch takes up all that the others leave
-        eps[flat, n] = (rest - common * compliance) / law[flat, HEIGHT]
-    return common
-
-
-@inner
-def _damped_tangent(
-    links: Links, s: Array, m: Array, drag: float, d: Array, g: int, i0: int, i1: int, n: int
-) -> float:
-    """Order n of the derivative of `_damped_term`."""
-    law, viscous = links.law, g == links.ends.size - 1 and links.top == VISCOUS
-    total, weight = (0.0 if viscous else d[V, g, n]), 0.0
-    if g > 0:
-        total -= d[V, g - 1, n]
-    if viscous:  # v of the top is (push - Σ)/drag
-        total -= s[V, g, n] / links.drag * drag
-        weight = 1.0 / links.drag
-    for i in range(i0, i1):
-        share = law[i, HEIGHT] / law[i, DASHPOT]
-        change = (m[i, HEIGHT] - share * m[i, DASHPOT]) / law[i, DASHPOT]
-        total += share * d[SIG, i, n] + change * (s[SIG, i, n] - s[GROUP, g, n])
-        weight += share
-    return total / weight
-
-
-@inlined
-def _group_tangent(
-    links: Links,
-    s: Array,
-    m: Array,
-    drag: float,
-    d: Array,
-    g: int,
-    n: int,
-    memory: Memory | None,
-    p: int,
-) -> None:
-    """Order n of the derivative of a group's stress and of its strains that are no state."""
-    law, tilt = links.law, s[TILT]
-    i0, i1 = springs_of(links.ends, g)
-    stressed = g == links.ends.size - 1 and links.top == STRESS
-    rest = d[W, g, n] - (d[W, g - 1, n] if g > 0 else 0.0)
-    single = i1 - i0 == 1 and not stressed
-    damped = 0
-    for i in range(i0, i1):
-        damped += law[i, DASHPOT] > 0.0
-        rest -= s[EPS, i, n] * m[i, HEIGHT]
-        known = _known_tangent(law, s, m, d, i, n, memory, p)
-        if single:
-            d[EPS, i, n] = rest * (1.0 / law[i, HEIGHT])
-        elif stressed and law[i, DASHPOT] == 0.0:
-            d[EPS, i, n] = -known / tilt[i, 0]
-        if single or stressed or law[i, DASHPOT] > 0.0:
-            known += tilt[i, 0] * d[EPS, i, n]
-        d[SIG, i, n] = known
-    if stressed:
-        d[GROUP, g, n] = 0.0
-    elif damped == i1 - i0:
-        d[GROUP, g, n] = _damped_tangent(links, s, m, drag, d, g, i0, i1, n)
-    elif single:
-        d[GROUP, g, n] = d[SIG, i0, n]
-    else:
-        d[GROUP, g, n] = _share_tangent(law, tilt, d, i0, i1, rest, n)
-
-
-@once
-def _expand_tangent(
-    links: Links,
-    s: Array,
-    m: Array,
-    drag: float,
-    d: Array,
-    order: int,
-    memory: Memory | None,
-    p: int,
-) -> None:
-    """Fill the derivatives in direction p, that moves `m` and `drag`, up to `order`."""
-    law, last = links.law, links.ends.size - 1
-    w, v = d[W], d[V]
-    for n in range(order + 1):
-        share = 1.0 / (n + 1)
-        for g in range(last + 1):
-            _group_tangent(links, s, m, drag, d, g, n, memory, p)
-            i0, i1 = springs_of(links.ends, g)
-            if memory is not None:
-                for i in range(i0, i1):
-                    keep_tangent(memory, p, i, n, d[SIG, i, n])
-            if i1 - i0 > 1 or (g == last and links.top == STRESS):
-                for i in range(i0, i1):
-                    if law[i, DASHPOT] > 0.0:
-                        flow = (s[GROUP, g, n] - s[SIG, i, n]) / law[i, DASHPOT]
-                        net = d[GROUP, g, n] - d[SIG, i, n] - flow * m[i, DASHPOT]
-                        d[EPS, i, n + 1] = net * share / law[i, DASHPOT]
-        for g in range(last + 1):
-            net = -d[GROUP, g, n]
-            if g < last:
-                net += d[GROUP, g + 1, n]
-            elif links.top == VISCOUS:
-                v[g, n] = (net - s[V, g, n] * drag) / links.drag
-            elif links.drag > 0.0 or drag != 0.0:
-                net -= links.drag * v[g, n] + s[V, g, n] * drag
-            if g < last or links.top == FREE:
-                v[g, n + 1] = net * (share / links.mass[g])
-            if g < last or links.top in (FREE, VISCOUS):
-                w[g, n + 1] = v[g, n] * share
-
-
-@piece
-def expand_tangents(
-    links: Links, s: Array, d: SeriesTangents, order: int, memory: Memory | None
-) -> None:
-    """Fill the derivatives up to `order`, after `expand`; those that are still zero stay so."""
-    for i in range(links.law.shape[0]):
-        if memory is None:
-            _fill_tilt(links.law, i, s[SIG], s[TILT], order)
-        else:
-            kind = links.law[i, CURVED]
-            if kind >= HELD:
-                s[TILT, i, 0] = fill_partials(
-                    memory, i, kind > HELD, kind == BACK, s[EPS, i], order
-                )
-            else:
-                _fill_tilt(links.law, i, memory.series[EQ], s[TILT], order)
-                for n in range(order + 1):
-                    s[TILT, i, n] *= memory.now[i, GAIN]
-    for p in range(d.drag.size):
-        if d.live[p] > 0.0:
-            _expand_tangent(links, s, d.law[p], d.drag[p], d.series[p], order, memory, p)
-
-
-@inner
-def start_relaxing(law: Array, i: int, s: Array, d: SeriesTangents, memory: Memory) -> None:
-    """Let nothing have relaxed yet of the stress at which a spring starts: q_k = 0."""
-    sig, tilt = s[SIG], s[TILT]
-    _stress_term(law, i, s[EPS], sig, 0, memory)
-    kind, stress = law[i, CURVED], memory.series[EQ, i, 0]
-    if kind >= HELD:
-        tilt[i, 0] = fill_partials(memory, i, kind > HELD, kind == BACK, s[EPS, i], 0)
-    else:
-        _fill_tilt(law, i, memory.series[EQ], tilt, 0)
-        tilt[i, 0] *= memory.now[i, GAIN]
-    for p in range(d.drag.size):
-        change = _known_tangent(law, s, d.law[p], d.series[p], i, 0, memory, p)
-        change += tilt[i, 0] * d.series[p, EPS, i, 0] - memory.now[i, BASE]
-        start_relaxed_tangent(memory, p, i, change / memory.now[i, GAIN])
-    start_relaxed(memory, i, stress)
 
 
 # ---------------------------------------------------------------- the end of a step

@@ -1,0 +1,154 @@
+"""What a step of the explicit integrator writes: samples, their derivatives, the end of contact."""
+
+# mypy: disallow-untyped-decorators=False, warn-return-any=False
+from __future__ import annotations
+
+from foamfit.solve.explicit.series import (
+    EPS,
+    GROUP,
+    HEIGHT,
+    Links,
+    SeriesTangents,
+    V,
+    W,
+    advance,
+    advance_tangents,
+)
+from foamfit.solve.polynomial import (
+    fill_values,
+    slope_at,
+    value_at,
+)
+from foamfit.solve.scene import (
+    STRESS,
+    Samples,
+    fill_line,
+    fly,
+)
+from foamfit.springs.kernels import (
+    Array,
+    inner,
+    piece,
+)
+
+
+@piece
+def sample(
+    links: Links, s: Array, order: int, out: Samples, first: int, last: int, now: float, c: Array
+) -> None:
+    """Write base stress and displacements at the samples first … last-1 of a step; c is scratch."""
+    law, nodes = links.law, out.curves.shape[0] - 1
+    fill_values(s[GROUP, 0], order, out.t, first, last, now, out.curves[0])
+    if nodes == 1 and links.top != STRESS:
+        fill_values(s[W, links.ends.size - 1], order, out.t, first, last, now, out.curves[1])
+        return
+    for n in range(order + 1):
+        c[n] = 0.0
+    count = law.shape[0]
+    for i in range(count):
+        for n in range(order + 1):
+            c[n] += law[i, HEIGHT] * s[EPS, i, n]
+        if nodes > 1 or i == count - 1:
+            fill_values(c, order, out.t, first, last, now, out.curves[min(1 + i, nodes)])
+
+
+@piece
+def sample_tangents(
+    links: Links,
+    s: Array,
+    d: SeriesTangents,
+    order: int,
+    out: Samples,
+    first: int,
+    last: int,
+    now: float,
+    c: Array,
+) -> None:
+    """Write the derivatives of base stress and displacements at some samples of a step."""
+    law, nodes, top = links.law, out.curves.shape[0] - 1, links.ends.size - 1
+    count = law.shape[0]
+    for p in range(d.drag.size):
+        slopes = out.slopes[p]
+        if d.live[p] == 0.0:
+            for i in range(nodes + 1):
+                fill_line(0.0, 0.0, out.t[first:last], now, slopes[i, first:last])
+            continue
+        fill_values(d.series[p, GROUP, 0], order, out.t, first, last, now, slopes[0])
+        if nodes == 1 and links.top != STRESS:
+            fill_values(d.series[p, W, top], order, out.t, first, last, now, slopes[1])
+            continue
+        for n in range(order + 1):
+            c[n] = 0.0
+        for i in range(count):
+            for n in range(order + 1):
+                c[n] += law[i, HEIGHT] * d.series[p, EPS, i, n] + d.law[p, i, HEIGHT] * s[EPS, i, n]
+            if nodes > 1 or i == count - 1:
+                fill_values(c, order, out.t, first, last, now, slopes[min(1 + i, nodes)])
+
+
+@inner
+def mend_kink(out: Samples, s: Array, d: SeriesTangents, knot: int) -> None:
+    """A dashpot feels the mean rate where the prescribed motion has a kink."""
+    before, after = out.t[knot] - out.t[knot - 1], out.t[knot + 1] - out.t[knot]
+    share = before / (before + after)
+    out.curves[0, knot] += share * (s[GROUP, 0, 0] - out.curves[0, knot])
+    for p in range(d.drag.size):
+        out.slopes[p, 0, knot] += share * (d.series[p, GROUP, 0, 0] - out.slopes[p, 0, knot])
+
+
+# ---------------------------------------------------------------- the end of contact
+
+
+@inner
+def delay(s: Array, d: SeriesTangents, order: int, span: float, late: Array) -> None:
+    """Derivative of the time at which the base stress meets zero at the end of a step.
+
+    Where a unilateral spring has just opened it is that of the step before, which brought it there.
+    """
+    fall = slope_at(s[GROUP, 0], order, span)
+    for p in range(d.drag.size if fall != 0.0 else 0):
+        late[p] = -value_at(d.series[p, GROUP, 0], order, span) / fall
+
+
+@piece
+def depart(
+    links: Links,
+    s: Array,
+    d: SeriesTangents,
+    order: int,
+    more: int,
+    span: float,
+    now: float,
+    out: Samples,
+    done: int,
+    scratch: Array,
+) -> None:
+    """Fill the samples after contact, which ends at the end of this step, at the time `now`.
+
+    A later end (scratch[0], by direction) leaves the nodes as they move until then, and the top
+    with the velocity that it has then. The rest of `scratch` (3, …) is scratch.
+    """
+    late, rate, place = scratch[0], scratch[1], scratch[2]
+    law, nodes, groups = links.law, out.curves.shape[0] - 1, links.ends.size
+    count, top = law.shape[0], groups - 1
+    pull = slope_at(s[V, top], order, span)
+    speed = moved = 0.0
+    for i in range(count):
+        speed += law[i, HEIGHT] * slope_at(s[EPS, i], order, span)
+        rate[min(i, nodes - 1)] = speed
+    advance(s, groups, order, span, None)
+    advance_tangents(d, groups, more, span, None)
+    for i in range(count):
+        moved += law[i, HEIGHT] * s[EPS, i, 0]
+        place[min(i, nodes - 1)] = moved
+    away = s[V, top, 0]
+    fly(out.curves, out.t, done, now, place, away)
+    for p in range(d.drag.size):
+        moved = 0.0
+        for i in range(count):
+            moved += law[i, HEIGHT] * d.series[p, EPS, i, 0] + d.law[p, i, HEIGHT] * s[EPS, i, 0]
+            place[min(i, nodes - 1)] = moved
+        for node in range(nodes):
+            place[node] += (rate[node] - away) * late[p]
+        faster = d.series[p, V, top, 0] + pull * late[p]
+        fly(out.slopes[p], out.t, done, now, place, faster)
