@@ -27,7 +27,7 @@ import pandas as pd
 import foamfit as ff
 from foamfit.one_model import Options
 from foamfit.report.figures import BLUE, VERMILION, drawing, save
-from foamfit.study.shared import Group, Selection, Step, select_own, step_of
+from foamfit.study.shared import Group, Selection, select_own
 from foamfit.text import significant
 
 HERE = Path(__file__).parent
@@ -35,8 +35,6 @@ MODEL = {"model": "microscale", "relaxation": 1}
 LAW = ("k0", "kc", "eps_star", "sigma_plus", "spread_plus", "sigma_minus", "spread_minus")
 NAMES = tuple(f"s1_{name}" for name in (*LAW, "g1", "tau1"))
 TOGETHER = (1, 2, 4)
-# Parameters of snap-through and relaxation alone, to compare the choice with.
-SNAPPING = ("s1_sigma_plus", "s1_spread_plus", "s1_g1")
 LATTICES, LATTICE_CYCLES = ("tpu87-20", "tpu87-35", "tpu87-50"), (1, 2, 10, 100, 1000)
 TWIN = """\
 [specimen]
@@ -205,16 +203,15 @@ def twins_told(table: pd.DataFrame) -> str:
     return "\n".join(lines)
 
 
-def steps_table(selection: Selection, compared: Step) -> str:
+def steps_table(selection: Selection) -> str:
     head = ["of each cycle", "parameters", "BIC", *(f"misfit of cycle {n}" for n in TOGETHER)]
     rows = [[*head, "of what sharing costs, won back"]]
     tests = len(selection.best.fits)
-    for step in (*selection.steps, compared):
+    for step in selection.steps:
         off = np.array([[m["stress_strain"] for m in fit.misfits] for fit in step.fits], float)
         ends = [f"{100 * a:.2f}–{100 * b:.2f} %" for a, b in np.transpose([off.min(0), off.max(0)])]
         own = ", ".join(name[3:] for name in step.own) or "nothing"
         mark = " (chosen)" if step is selection.best else ""
-        mark = " (to compare)" if step is compared else mark
         counts = str(step.n_vary // tests)
         won = percent(selection.explained(step))
         rows.append([own + mark, counts, f"{step.bic:.0f}", *ends, won])
@@ -364,7 +361,7 @@ def main() -> None:
     selection = select_own(groups, progress=lambda _, what: print(what, file=sys.stderr))
     page = PAGE.format(
         twins=twin_table(twins), told=twins_told(twins), cycles=", ".join(map(str, TOGETHER)),
-        n_eff=selection.n_eff, steps=steps_table(selection, step_of(groups, SNAPPING)),
+        n_eff=selection.n_eff, steps=steps_table(selection),
         chosen=chosen_told(selection), lattice=lattice_table(lattices),
         lattice_told=lattice_told(lattices),
     )  # fmt: skip

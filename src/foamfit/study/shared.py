@@ -24,7 +24,8 @@ BLOCKS = 50
 # Steps of the descents that only rank the candidates, and the vectors that more than one test's
 # shared parameters start from.
 TRIAL, MOST_STARTS = 12, 4
-EXCHANGES = 3  # Rounds of them after a step, at most
+# Rounds of exchanges after a step at most, and how many of a round are fitted to the end.
+EXCHANGES, PROMISING = 3, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,17 +171,23 @@ def _exchanged(groups: Sequence[Group], step: Step, tell: Progress) -> Step:
     """Exchange an own parameter for a shared one as long as this lowers BIC."""
     shared = step.fits[0].shared
     for _ in range(EXCHANGES if len(step.own) > 1 else 0):
-        near = [[list(fit.values)] for fit in step.fits]
-        trials = []
+        # Also from the own fits: what was compensated by the parameter that is exchanged must move.
+        near = [
+            [list(fit.values), list(group.vectors)]
+            for fit, group in zip(step.fits, groups, strict=True)
+        ]
+        trials = list[Step]()
         for out in step.own:
             kept = tuple(name for name in step.own if name != out)
             tell(math.nan, f"{out} shared, another own")
             trials += [step_of(groups, (*kept, name), near, TRIAL) for name in shared]
-        best = min(trials, key=lambda trial: trial.bic)
-        starts = [
-            [list(fit.values), *group.starts] for fit, group in zip(best.fits, groups, strict=True)
-        ]
-        best = step_of(groups, best.own, starts)
+        best = step
+        for trial in sorted(trials, key=lambda trial: trial.bic)[:PROMISING]:
+            starts = [
+                [list(fit.values), *group.starts]
+                for fit, group in zip(trial.fits, groups, strict=True)
+            ]
+            best = min(best, step_of(groups, trial.own, starts), key=lambda one: one.bic)
         if best.bic >= step.bic:
             break
         step, shared = best, best.fits[0].shared
