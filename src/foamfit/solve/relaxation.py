@@ -65,6 +65,11 @@ _BEND = 0.25 * math.sqrt(5.0)
 MARGIN = 2.0
 # The least step, as a share of the time between two samples.
 LEAST_PACE = 1e-9
+# Where the cubic at four nodes has an error below this share of the wanted one, and the slope of
+# the stress changes by less than the share EVEN over a step (of rtol 1e-6; it goes with the root),
+# the next steps take the cubic through values and slopes at both ends, which needs one stress and
+# not three; after so many of them the four nodes are looked at again.
+PLAIN, EVEN, CHECKED = 1e-2, 0.1, 8
 # Columns of the table of a term: its step h, exp(-x), the weights of the four nodes, their
 # derivatives by x, and what the cubic leaves out of higher polynomials.
 STEP, DECAY, WEIGHT, BY_X, OF_FOURTH, OF_FIFTH, OF_SIXTH, TABLE = 0, 1, 2, 6, 10, 11, 12, 13
@@ -206,6 +211,29 @@ def _truncation(
     return fourth * error
 
 
+@inner
+def _fill_by_slopes(
+    nodes: Array, state: Array, origin: float, flexibility: float, even: float
+) -> bool:
+    """Fill the last three nodes by the cubic through values and slopes at both ends of a step.
+
+    The spring is settled at its end. False where the slope is not known or changes too much.
+    """
+    if not (flexibility > 0.0 and state[FLEXIBILITY] > 0.0):
+        return False
+    longer = state[EPS] - origin
+    begins, ends_with = longer / flexibility, longer / state[FLEXIBILITY]
+    if not abs(ends_with - begins) <= even * abs(begins):
+        return False
+    nodes[3] = state[SIGMA]
+    rise = nodes[3] - nodes[0]
+    for i in range(1, 3):
+        r = NODES[i]
+        bent = (1.0 - r) * (begins - rise) - r * (ends_with - rise)
+        nodes[i] = nodes[0] + r * (rise + (1.0 - r) * bent)
+    return True
+
+
 @compiled
 def relaxed_along(
     row: Row, eps: Array, t: Array, rtol: float, derive: bool
@@ -242,14 +270,15 @@ def relaxed_along(
     y, y_tau, d_y = np.zeros(terms), np.zeros(terms), np.zeros((terms, CARRIED))
     d_rank, d_nodes = np.zeros(CARRIED), np.zeros((4, CARRIED))
     _begin(row, state)
-    largest, span, entered = 0.0, t[n - 1] - t[0], True
+    largest, span, entered, plain = 0.0, t[n - 1] - t[0], True, 0
+    even = EVEN * min(1.0, math.sqrt(1e6 * rtol))
     for j in range(n):
         before, start, done = state[EPS], j == 0, 0.0
         while True:
             up, leaving = eps[j] > state[EPS], _leaves(row, state, eps[j])
             if leaving and row[KIND] == MICROSCALE and micro.turned(state, up):
                 _switch(row, state, up)
-                entered = True
+                entered, plain = True, 0
                 continue
             end = (state[HIGH] if up else state[LOW]) if leaving else eps[j]
             until = 1.0
@@ -268,7 +297,15 @@ def relaxed_along(
                 last = pace == until - done
                 nodes[0], origin = state[SIGMA], state[EPS]
                 flexibility, curvature = state[FLEXIBILITY], state[CURVATURE]
-                for i in range(1, 4):
+                short = False
+                if plain > 0 and last and pace == 1.0 and not derive:
+                    _settle(row, state, end)
+                    plain -= 1
+                    short = _fill_by_slopes(nodes, state, origin, flexibility, even)
+                    if not short:
+                        state[EPS], state[SIGMA] = origin, nodes[0]
+                        state[FLEXIBILITY], state[CURVATURE] = flexibility, curvature
+                for i in range(1, 1 if short else 4):
                     way = (done + pace * NODES[i] - at) / (until - at)
                     _settle(row, state, end if last and i == 3 else first + way * (end - first))
                     nodes[i] = state[SIGMA]
@@ -280,7 +317,7 @@ def relaxed_along(
                     if not abs(h - table[k, STEP]) <= 1e-13 * h:
                         _tabulate(h, row[N_COLUMNS + 2 * k + 1], moments, table[k])
                 error, begins, ends_with = 0.0, 0.0, 0.0
-                if pace > LEAST_PACE:
+                if pace > LEAST_PACE and not short:
                     if flexibility > 0.0 and state[FLEXIBILITY] > 0.0:
                         begins = (state[EPS] - origin) / flexibility
                         ends_with = (state[EPS] - origin) / state[FLEXIBILITY]
@@ -290,6 +327,9 @@ def relaxed_along(
                     state[FLEXIBILITY], state[CURVATURE] = flexibility, curvature
                     pace *= 0.5
                     continue
+                if not short:
+                    fine = MARGIN * error <= PLAIN * rtol * largest and begins != 0.0
+                    plain = CHECKED if fine and ends_with != 0.0 else 0
                 if derive:
                     d_nodes[0] = d_nodes[3]
                     here = state[SIGMA], state[EPS]
@@ -321,7 +361,7 @@ def relaxed_along(
                 return sigma, branches, by, by_g, by_tau
             if leaving:
                 _switch(row, state, up)
-                entered = True
+                entered, plain = True, 0
                 continue
             if state[EPS] != end:  # so near the end of a branch that no time is left
                 _settle(row, state, end)
