@@ -19,7 +19,7 @@ from foamfit.fitting.problem import Problem
 from foamfit.trust import covariance
 from foamfit.trust.covariance import Covariance
 from foamfit.trust.law_error import CurveError, curve_errors
-from foamfit.trust.noise_process import parts
+from foamfit.trust.noise_process import noise_processes, parts
 
 
 def m_estimate(residual: Array, sizes: tuple[int, ...], loss: str) -> tuple[Array, Array]:
@@ -90,9 +90,17 @@ class BestPoint:
 
     @cached_property
     def errors(self) -> tuple[CurveError, ...]:
-        """What the residual of each counted curve is made of: noise, or an error of the law too."""
+        """What the residual of each counted curve is made of: noise, or an error of the law too.
+
+        The noise of a driving stress comes through the springs as slow waves of the displacement,
+        which look like an error of the law and are none.
+        """
         jacobian, pseudo = self._weighted
-        return tuple(curve_errors(pseudo, jacobian * self.sizes, self.problem.objective.sizes))
+        scaled, objective = jacobian * self.sizes, self.problem.objective
+        if objective.drive == "stress":
+            noise = noise_processes(pseudo, scaled, objective.sizes)
+            return tuple(CurveError(process) for process in noise)
+        return tuple(curve_errors(pseudo, scaled, objective.sizes))
 
     @property
     def misfits(self) -> bool:
