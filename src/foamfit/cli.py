@@ -270,14 +270,15 @@ def _params(
     return params
 
 
-def _interval_method(profile: bool, bootstrap: int | None, mcmc: int | None) -> str:
+def _intervals(profile: bool, bootstrap: int | None, mcmc: int | None) -> dict[str, Any]:
     """Return the way of making intervals that --profile, --bootstrap or --mcmc names."""
     given = {"profile": profile or None, "bootstrap": bootstrap, "mcmc": mcmc}
     ways = [name for name, value in given.items() if value is not None]
     if len(ways) > 1:
         names = " and ".join(f"--{name}" for name in ways)
         raise InputError(f"{names} exclude each other; choose one way to make the intervals")
-    return ways[0] if ways else "auto"
+    draws = mcmc if bootstrap is None else bootstrap
+    return {"intervals": ways[0] if ways else "auto", "draws": draws}
 
 
 @main.command()
@@ -321,7 +322,6 @@ def _interval_method(profile: bool, bootstrap: int | None, mcmc: int | None) -> 
 def fit(
     test: Path, specimen: Path | None, cycle: str | None, model: str, out: Path | None,
     fix: dict[str, float], vary: tuple[str, ...],
-    profile: bool, bootstrap: int | None, mcmc: int | None,
     as_json: bool, quiet: bool, verbose: bool, **search: Any,
 ) -> int:  # fmt: skip
     """Identify the parameters of TEST.csv and write a result folder.
@@ -345,8 +345,7 @@ def fit(
     from foamfit.data.csv_file import read_test
     from foamfit.springs.model import Model
 
-    search["intervals"] = _interval_method(profile, bootstrap, mcmc)
-    search["draws"] = mcmc if bootstrap is None else bootstrap
+    search |= _intervals(**{way: search.pop(way) for way in ("profile", "bootstrap", "mcmc")})
     model = "auto" if model.strip() == "auto" else Model.parse(model).name
     alone, several = _cycles(cycle)
     with _compiling(quiet or as_json) as compile_rest:

@@ -219,7 +219,7 @@ class Plan(NamedTuple):
         cache.announce(taylor.integrate_with_memory, "the solver of springs with memory")
         for most in (min(FEW_EXPLICIT, self.max_steps), self.max_steps):
             ending = taylor.integrate_with_memory(
-                *given, self.margin * rtol, most, directions, start, curves, slopes, log
+                given, self.margin * rtol, most, directions, start, curves, slopes, log
             )
             if ending[0] not in _STIFF:
                 break

@@ -74,6 +74,7 @@ from foamfit.solve.scene import (
     STRESS,
     TOO_MANY_STEPS,
     Samples,
+    SceneTuple,
     before_contact,
     first_past,
     log_switch,
@@ -415,15 +416,7 @@ def _reached(links: Links, s: Array, w_scale: float) -> tuple[float, float]:
 
 @once
 def _integrated(
-    rows: Array,
-    heights: Array,
-    ends: Branches,
-    mass: Array,
-    drag: float,
-    top: int,
-    values: Array,
-    speed: float,
-    t: Array,
+    given: SceneTuple,
     tol: float,
     max_steps: int,
     directions: Branches,
@@ -434,6 +427,7 @@ def _integrated(
     memory: Memory | None,
 ) -> tuple[int, float, int, int]:
     """Integrate a chain of springs with or without memory; see `integrate`."""
+    rows, heights, ends, mass, drag, top, values, speed, t = given
     tol = max(tol, LEAST_TRUNCATION)
     count, groups, size = heights.size, ends.size, directions.shape[0]
     struck, tangent, order = speed > 0.0, size > 0, order_for(tol, MOST_ORDERS)
@@ -578,23 +572,13 @@ def integrate(
         Outcome, end of contact (NaN if none; where there is no answer, how far it came), steps
         taken, switches (also those past the log).
     """
-    return _integrated(
-        rows, heights, ends, mass, drag, top, values, speed, t, tol, max_steps, directions, start,
-        curves, slopes, log, None,
-    )  # fmt: skip
+    given = (rows, heights, ends, mass, drag, top, values, speed, t)
+    return _integrated(given, tol, max_steps, directions, start, curves, slopes, log, None)
 
 
 @compiled
 def integrate_with_memory(
-    rows: Array,
-    heights: Array,
-    ends: Branches,
-    mass: Array,
-    drag: float,
-    top: int,
-    values: Array,
-    speed: float,
-    t: Array,
+    given: SceneTuple,
     tol: float,
     max_steps: int,
     directions: Branches,
@@ -605,8 +589,5 @@ def integrate_with_memory(
 ) -> tuple[int, float, int, int]:
     """Integrate a chain in which springs relax or are microscale, as `integrate` does others."""
     order = order_for(max(tol, LEAST_TRUNCATION), MOST_ORDERS)
-    memory = make_memory(rows, order, directions)
-    return _integrated(
-        rows, heights, ends, mass, drag, top, values, speed, t, tol, max_steps, directions, start,
-        curves, slopes, log, memory,
-    )  # fmt: skip
+    memory = make_memory(given[0], order, directions)
+    return _integrated(given, tol, max_steps, directions, start, curves, slopes, log, memory)
