@@ -56,6 +56,7 @@ class Curve:
     failures: int = 0
     penalty: float = 1e3
     loss: str = "linear"
+    drive: str = "displacement"
 
     def __post_init__(self) -> None:
         self.sizes = (self.time.size,)
