@@ -9,7 +9,8 @@ dy/dt = -(y + σ)/τ, or over a time h
 The strain is linear between samples, so that the spring goes through pieces of one branch each, on
 which σ is a smooth function of time. There it is taken for the cubic through its values at the four
 Lobatto nodes, and the integral of that is exact for any x. Derivatives by parameters follow from
-those of σ at the same nodes. A step on which the cubic bends too much is halved.
+those of σ at the same nodes. A step on which the cubic bends too much is halved; where it hardly
+bends and no derivative is wanted, the cubic is that through values and slopes at both ends.
 """
 
 # mypy: disallow-untyped-decorators=False, warn-return-any=False
