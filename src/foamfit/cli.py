@@ -192,7 +192,7 @@ def check(
     from foamfit.report.outlook import outlook_of
     from foamfit.report.outlook_text import outlook_text
 
-    with _compiling(quiet=False) as compile_rest:
+    with _compiling(False, model, relaxation) as compile_rest:
         compile_rest()
     outlook = outlook_of(
         test, specimen, model, drive, published_set=published_set, result=params,
@@ -348,7 +348,7 @@ def fit(
     search |= _intervals(**{way: search.pop(way) for way in ("profile", "bootstrap", "mcmc")})
     model = "auto" if model.strip() == "auto" else Model.parse(model).name
     alone, several = _cycles(cycle)
-    with _compiling(quiet or as_json) as compile_rest:
+    with _compiling(quiet or as_json, model, search["relaxation"]) as compile_rest:
         measurement = read_test(test, specimen, alone)
         folder = _result_folder(out, test, specimen, model)
         from foamfit import api
@@ -446,7 +446,9 @@ def _result_folder(out: Path | None, test: Path, specimen: Path | None, model: s
 
 
 @contextmanager
-def _compiling(quiet: bool) -> Iterator[Callable[[], None]]:
+def _compiling(
+    quiet: bool, model: str = "bistable", relaxation: int = 0
+) -> Iterator[Callable[[], None]]:
     """Compile at first use, beside the body; it calls what is given before it simulates."""
     import logging
 
@@ -454,12 +456,15 @@ def _compiling(quiet: bool) -> Iterator[Callable[[], None]]:
 
     if quiet:  # what is compiled later is announced by the log
         logging.getLogger("foamfit").setLevel(logging.ERROR)
-    if cache.compiled():
+    memory = model == "auto" or "microscale" in model or relaxation > 0
+    integrator = (model == "auto" or not memory) and not cache.compiled()
+    memory = memory and not cache.compiled("relaxed_along")
+    if not (integrator or memory):
         yield lambda: None
         return
     if not quiet:
         say("foamfit: compiling the solver, once after installation", err=True)
-    with precompile.side_by_side() as finish:
+    with precompile.side_by_side(integrator, memory) as finish:
         yield finish
 
 
