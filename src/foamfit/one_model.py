@@ -199,8 +199,9 @@ def _assess(
             better = None
             # What is left open is not that of the point before.
             if choice.ranges and best.cost < MOVED * there:
-                left, there = left_open(best, tracker.ends, tracker, budget), best.cost
-                better = None if choice.method == "local" else left.better
+                other = choice.method != "local"  # which goes by this one minimum
+                left = left_open(best, tracker.ends, tracker, budget, other)
+                better, there = left.better if other else None, best.cost
             made = Intervals(better=better)
             if better is None:
                 made = assess(

@@ -23,6 +23,7 @@ from foamfit.report.folder import load_result
 from foamfit.report.readable import readable
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import NOTHING, RULE, WEAK, covariance, half_width
+from foamfit.trust.intervals import Choice
 from foamfit.trust.law_error import curve_errors
 from foamfit.trust.noise_process import NoiseProcess
 from foamfit.trust.ranges import ALIKE, alike, left_open, tolerance
@@ -246,6 +247,24 @@ def test_every_description_in_the_range_follows_the_curves_about_as_well():
             assert item.range[0] <= item.value <= item.range[1]
             # What refits with fresh noise scatter is less than what the law leaves open.
             assert item.ci95 is None or np.ptp(item.range) > 0.0
+
+
+def test_local_intervals_look_for_no_further_minima():
+    """Only the other intervals go by them; the ranges are the same."""
+    _, best, found = fitted(0)
+    objective, ends = found.problem.objective, found.tracker.ends
+    counts = [objective.evaluations]
+    whole = left_open(best, ends, found.tracker)
+    counts.append(objective.evaluations)
+    alone = left_open(best, ends, found.tracker, descents=False)
+    counts.append(objective.evaluations)
+    judge(found, Choice("local"), lambda _: None)
+    counts.append(objective.evaluations)
+    whole_cost, _, local_cost = np.diff(counts)
+    assert alone.ranges == whole.ranges
+    assert whole.minima
+    assert alone.minima == ()
+    assert local_cost < 0.6 * whole_cost
 
 
 def test_the_range_decides_where_it_is_wider():
