@@ -8,7 +8,7 @@ chi-square is at most 1.02 times that of the true parameters. Beside the interva
 same noise makes of a problem that is linear about the truth and whose noise is known: there each
 interval holds in exactly 95 % of cases, so what that is off is the luck of the draw.
 
-    python experiments/noise_floor/microscale.py             # 400 cases and their table
+    python experiments/noise_floor/microscale.py             # 200 cases and their table
     python experiments/noise_floor/microscale.py --cases 10
 """
 
@@ -112,7 +112,7 @@ def fit_case(case: int, seed: int, folder: Path) -> dict[str, object]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--cases", type=int, default=400)
+    parser.add_argument("--cases", type=int, default=200)
     parser.add_argument("--seed", type=int, default=2014)
     parser.add_argument("--out", type=Path, default=HERE)
     options = parser.parse_args()
