@@ -21,9 +21,9 @@ from foamfit.solve.explicit.memory import (
     EQ,
     GAIN,
     GIVE,
+    PER_GIVE,
     SOFT,
     Memory,
-    advance_memory,
     advance_memory_tangents,
     enter_mixture,
     finish_mixture,
@@ -198,20 +198,19 @@ def _law_stress(law: Array, i: int, eps: Array, sig: Array, n: int) -> float:
     return k * x * law[i, INVERSE]
 
 
-@inner
+@inlined
 def _remembered_stress(law: Array, i: int, eps: Array, n: int, memory: Memory) -> float:
     """Order n of the stress of a spring in a chain with memory; see `_stress_term`."""
-    moving = law[i, CURVED] > HELD
+    moving, now, m = law[i, CURVED] > HELD, memory.now[i], memory.series[i]
     if law[i, CURVED] < HELD:
-        s_n = _law_stress(law, i, eps, memory.series[EQ], n)
+        s_n = _law_stress(law, i, eps, memory.series[:, :, EQ], n)
     elif n == 0:
         s_n = start_mixture(memory, i, moving, eps[i, 0])
     else:
-        s_n = eps[i, n] - strain_of_mixture(memory, i, moving, n)
-        s_n *= 1.0 / memory.now[i, GIVE]
-        finish_mixture(memory, i, moving, n, s_n)
-    keep(memory, i, n, s_n)
-    return memory.now[i, GAIN] * s_n + relaxed(memory, i, n)
+        s_n = (eps[i, n] - strain_of_mixture(now, m, moving, n)) * now[PER_GIVE]
+        finish_mixture(now, m, moving, n, s_n)
+    keep(memory.rows[i], m, n, s_n)
+    return now[GAIN] * s_n + relaxed(m, n)
 
 
 @inlined
@@ -235,19 +234,19 @@ def _law_strain(law: Array, i: int, eps: Array, sig: Array, n: int) -> tuple[flo
     return -known / stiff, (1.0 - (eps[i, 0] - law[i, ORIGIN])) / stiff
 
 
-@inner
+@inlined
 def _remembered_strain(
     law: Array, i: int, eps: Array, n: int, memory: Memory
 ) -> tuple[float, float]:
     """Order n >= 1 of the strain of a spring in a chain with memory; see `_strain_term`."""
+    now, m = memory.now[i], memory.series[i]
     if law[i, CURVED] < HELD:
-        known, soft = _law_strain(law, i, eps, memory.series[EQ], n)
+        known, soft = _law_strain(law, i, eps, memory.series[:, :, EQ], n)
     else:
-        known = strain_of_mixture(memory, i, law[i, CURVED] > HELD, n)
-        soft = memory.now[i, GIVE]
-    soft /= memory.now[i, GAIN]
-    memory.now[i, SOFT] = soft
-    return (known - soft * relaxed(memory, i, n) if soft < math.inf else known), soft
+        known, soft = strain_of_mixture(now, m, law[i, CURVED] > HELD, n), now[GIVE]
+    soft /= now[GAIN]
+    now[SOFT] = soft
+    return (known - soft * relaxed(m, n) if soft < math.inf else known), soft
 
 
 @inlined
@@ -263,13 +262,14 @@ def _strain_term(
     return _remembered_strain(law, i, eps, n, memory)
 
 
-@inner
+@inlined
 def _settle_stress(law: Array, i: int, n: int, s_n: float, memory: Memory) -> None:
     """Take down order n >= 1 of the stress of a spring whose strain came from `_strain_term`."""
-    own = (s_n - relaxed(memory, i, n)) / memory.now[i, GAIN]
+    now, m = memory.now[i], memory.series[i]
+    own = (s_n - relaxed(m, n)) / now[GAIN]
     if law[i, CURVED] >= HELD:
-        finish_mixture(memory, i, law[i, CURVED] > HELD, n, own)
-    keep(memory, i, n, own)
+        finish_mixture(now, m, law[i, CURVED] > HELD, n, own)
+    keep(memory.rows[i], m, n, own)
 
 
 @once
@@ -301,7 +301,7 @@ def _share_elongation(
             flat = i
     s_n = 0.0 if flat >= 0 else rest / compliance
     if memory is not None and flat >= 0:
-        s_n = relaxed(memory, flat, n)
+        s_n = relaxed(memory.series[flat], n)
         rest -= s_n * compliance
     for i in range(i0, i1):
         if law[i, DASHPOT] == 0.0:
@@ -513,7 +513,7 @@ def share_a_stress(law: Array, ends: Branches, i: int, j: int, memory: Memory) -
 def _own_strain(law: Array, i: int, stress: float, memory: Memory) -> tuple[float, float]:
     """Strain of a spring under a stress on the branch that it is on, and its slope dε/dΣ."""
     gain, k = memory.now[i, GAIN], law[i, SLOPE]
-    s = (stress - relaxed(memory, i, 0)) / gain
+    s = (stress - relaxed(memory.series[i], 0)) / gain
     if law[i, CURVED] >= HELD:
         eps, soft = strain_at(memory, i, law[i, CURVED] > HELD, s)
         return eps, soft / gain
@@ -589,13 +589,11 @@ def settle_together(
 
 
 @inner
-def advance(s: Array, groups: int, order: int, span: float, memory: Memory | None) -> None:
+def advance(s: Array, groups: int, order: int, span: float) -> None:
     """Carry the state, order 0 of W, V and EPS, over a step of length `span`."""
     for row in range(W, EPS + 1):
         for i in range(s.shape[1] if row == EPS else groups):
             s[row, i, 0] = value_at(s[row, i], order, span)
-    if memory is not None:
-        advance_memory(memory, order, span)
 
 
 @piece
@@ -605,6 +603,6 @@ def advance_tangents(
     """Carry the derivatives of the state over a step of length `span`."""
     for p in range(d.drag.size):
         if d.live[p] > 0.0:
-            advance(d.series[p], groups, order, span, None)
+            advance(d.series[p], groups, order, span)
             if memory is not None:
                 advance_memory_tangents(memory, p, order, span)

@@ -80,7 +80,7 @@ def _known_tangent(
     """Order n of δσ of a spring in direction p, but for the term T_0 δε_n."""
     eps, sig, tilt, gain = s[EPS], s[SIG], s[TILT], 1.0
     if memory is not None:
-        sig, gain = memory.series[EQ], memory.now[i, GAIN]
+        sig, gain = memory.series[:, :, EQ], memory.now[i, GAIN]
     known = -tilt[i, n] * m[i, ORIGIN]
     if law[i, CURVED] == 0.0:
         known += gain * (eps[i, n] - (law[i, ORIGIN] if n == 0 else 0.0)) * m[i, SLOPE]
@@ -248,7 +248,7 @@ def expand_tangents(
                     memory, i, kind > HELD, kind == BACK, s[EPS, i], order
                 )
             else:
-                _fill_tilt(links.law, i, memory.series[EQ], s[TILT], order)
+                _fill_tilt(links.law, i, memory.series[:, :, EQ], s[TILT], order)
                 for n in range(order + 1):
                     s[TILT, i, n] *= memory.now[i, GAIN]
     for p in range(d.drag.size):
@@ -261,11 +261,11 @@ def start_relaxing(law: Array, i: int, s: Array, d: SeriesTangents, memory: Memo
     """Let nothing have relaxed yet of the stress at which a spring starts: q_k = 0."""
     sig, tilt = s[SIG], s[TILT]
     _stress_term(law, i, s[EPS], sig, 0, memory)
-    kind, stress = law[i, CURVED], memory.series[EQ, i, 0]
+    kind, stress = law[i, CURVED], memory.series[i, 0, EQ]
     if kind >= HELD:
         tilt[i, 0] = fill_partials(memory, i, kind > HELD, kind == BACK, s[EPS, i], 0)
     else:
-        _fill_tilt(law, i, memory.series[EQ], tilt, 0)
+        _fill_tilt(law, i, memory.series[:, :, EQ], tilt, 0)
         tilt[i, 0] *= memory.now[i, GAIN]
     for p in range(d.drag.size):
         change = _known_tangent(law, s, d.law[p], d.series[p], i, 0, memory, p)

@@ -13,7 +13,9 @@ import math
 import numpy as np
 
 from foamfit.solve.explicit.memory import (
+    SCALE,
     Memory,
+    advance_memory,
     first_turn,
     leave,
     load,
@@ -473,7 +475,8 @@ def _integrated(
             return NOT_FINITE, now, step, switches
         if memory is not None:
             for i in range(count):
-                span = longest(memory, i, order, span) if branches[i] > HELD else span
+                if branches[i] > HELD:
+                    span = longest(memory.series[i], memory.now[i, SCALE], order, span)
         span, spring, side = first_switch(law, s, order, span)
         if memory is not None:
             span, turning = first_turn(branches, s[EPS], order, span, c)
@@ -512,21 +515,24 @@ def _integrated(
             depart(links, s, d, order, more, span, end, out, done, scratch)
             return DONE, end, step + 1, switches
         now = end
-        advance(s, groups, order, span, memory)
+        advance(s, groups, order, span)
+        if memory is not None:
+            advance_memory(memory.state, memory.series, order, span)
         if tangent:
             advance_tangents(d, groups, more, span, memory)
         w_scale, total = _reached(links, s, w_scale)
         if not math.isfinite(total):
             return NOT_FINITE, now, step, switches
-        settle(links, s, memory)
-        if memory is not None:
-            settle_together(links, s, order, span, push, memory)
+        if not bare:
+            settle(links, s, memory)
+            if memory is not None:
+                settle_together(links, s, order, span, push, memory)
         if spring >= 0:
             switches = switch(
                 rows, branches, law, s, d, directions, order, span, now, spring, side, log,
                 switches, ends, memory,
             )  # fmt: skip
-            if memory is not None:
+            if memory is not None and not bare:
                 settle_together(links, s, order, span, push, memory)
     return TOO_MANY_STEPS, now, max_steps, switches
 
