@@ -244,7 +244,7 @@ def _remembered_strain(
         known, soft = _law_strain(law, i, eps, memory.series[:, :, EQ], n)
     else:
         known, soft = strain_of_mixture(now, m, law[i, CURVED] > HELD, n), now[GIVE]
-    soft /= now[GAIN]
+    soft *= 1.0 / now[GAIN]
     now[SOFT] = soft
     return (known - soft * relaxed(m, n) if soft < math.inf else known), soft
 
@@ -266,7 +266,7 @@ def _strain_term(
 def _settle_stress(law: Array, i: int, n: int, s_n: float, memory: Memory) -> None:
     """Take down order n >= 1 of the stress of a spring whose strain came from `_strain_term`."""
     now, m = memory.now[i], memory.series[i]
-    own = (s_n - relaxed(m, n)) / now[GAIN]
+    own = (s_n - relaxed(m, n)) * (1.0 / now[GAIN])
     if law[i, CURVED] >= HELD:
         finish_mixture(now, m, law[i, CURVED] > HELD, n, own)
     keep(memory.rows[i], m, n, own)
@@ -281,7 +281,6 @@ def _share_elongation(
     sig: Array,
     u_n: float,
     n: int,
-    memory: Memory | None,
 ) -> float:
     """Order n >= 1 of the common stress of a group that has springs without dashpot.
 
@@ -292,7 +291,7 @@ def _share_elongation(
         if law[i, DASHPOT] > 0.0:
             rest -= law[i, HEIGHT] * eps[i, n]
             continue
-        known, soft = _strain_term(law, i, eps, sig, n, memory)
+        known, soft = _law_strain(law, i, eps, sig, n)
         eps[i, n] = known  # so far
         rest -= law[i, HEIGHT] * known
         if soft < math.inf:
@@ -300,21 +299,46 @@ def _share_elongation(
         elif flat < 0:
             flat = i
     s_n = 0.0 if flat >= 0 else rest / compliance
-    if memory is not None and flat >= 0:
+    for i in range(i0, i1):
+        if law[i, DASHPOT] == 0.0:
+            sig[i, n] = s_n
+            if law[i, CURVED] != 0.0:
+                x = eps[i, 0] - law[i, ORIGIN]
+                eps[i, n] += (1.0 - x) / (law[i, SLOPE] + sig[i, 0]) * s_n
+            elif law[i, SLOPE] > 0.0:
+                eps[i, n] += s_n / law[i, SLOPE]
+    if flat >= 0:
+        eps[flat, n] = rest / law[flat, HEIGHT]
+    return s_n
+
+
+@inlined
+def _share_remembered(
+    law: Array, i0: int, i1: int, eps: Array, sig: Array, u_n: float, n: int, memory: Memory
+) -> float:
+    """Share an elongation among springs with memory as `_share_elongation` does."""
+    compliance, rest, flat = 0.0, u_n, -1
+    for i in range(i0, i1):
+        if law[i, DASHPOT] > 0.0:
+            rest -= law[i, HEIGHT] * eps[i, n]
+            continue
+        known, soft = _remembered_strain(law, i, eps, n, memory)
+        eps[i, n] = known  # so far
+        rest -= law[i, HEIGHT] * known
+        if soft < math.inf:
+            compliance += law[i, HEIGHT] * soft
+        elif flat < 0:
+            flat = i
+    s_n = rest * (1.0 / compliance)
+    if flat >= 0:
         s_n = relaxed(memory.series[flat], n)
         rest -= s_n * compliance
     for i in range(i0, i1):
         if law[i, DASHPOT] == 0.0:
             sig[i, n] = s_n
-            if memory is not None:
-                if memory.now[i, SOFT] < math.inf:
-                    eps[i, n] += memory.now[i, SOFT] * s_n
-                _settle_stress(law, i, n, s_n, memory)
-            elif law[i, CURVED] != 0.0:
-                x = eps[i, 0] - law[i, ORIGIN]
-                eps[i, n] += (1.0 - x) / (law[i, SLOPE] + sig[i, 0]) * s_n
-            elif law[i, SLOPE] > 0.0:
-                eps[i, n] += s_n / law[i, SLOPE]
+            if memory.now[i, SOFT] < math.inf:
+                eps[i, n] += memory.now[i, SOFT] * s_n
+            _settle_stress(law, i, n, s_n, memory)
     if flat >= 0:
         eps[flat, n] = rest / law[flat, HEIGHT]
     return s_n
@@ -380,7 +404,9 @@ def _group_term(
         return _damped_term(law, i0, i1, sig, rate_n, push_n, drag, n)
     if n == 0:
         return sig[first, 0]
-    return _share_elongation(law, i0, i1, eps, sig, u_n, n, memory)
+    if memory is None:
+        return _share_elongation(law, i0, i1, eps, sig, u_n, n)
+    return _share_remembered(law, i0, i1, eps, sig, u_n, n, memory)
 
 
 @once
@@ -409,13 +435,28 @@ def _stressed_term(
     return True
 
 
+@inlined
+def _bare_term(
+    law: Array, i0: int, i1: int, eps: Array, sig: Array, u_n: float, n: int, memory: Memory
+) -> float:
+    """Order n of the common stress of a group of undamped springs with memory."""
+    if n > 0:
+        return _share_remembered(law, i0, i1, eps, sig, u_n, n, memory)
+    first = -1
+    for i in range(i0, i1):
+        sig[i, 0] = _stress_term(law, i, eps, sig, 0, memory)
+        if first < 0 or (law[i, CURVED] == 0.0 and law[i, SLOPE] == 0.0):
+            first = i  # see `_group_term`
+    return sig[first, 0]
+
+
 @inner
-def is_bare(links: Links) -> bool:
-    """Whether every spring is undamped and alone between two masses."""
-    if links.top != FREE or links.ends.size != links.law.shape[0]:
+def is_bare(links: Links, memory: Memory | None) -> bool:
+    """Whether every spring is undamped and, but for those with memory, alone between two masses."""
+    if links.top != FREE or (memory is None and links.ends.size != links.law.shape[0]):
         return False
     damped = 0
-    for i in range(links.ends.size):
+    for i in range(links.law.shape[0]):
         damped += links.law[i, DASHPOT] > 0.0
     return damped == 0
 
@@ -423,24 +464,30 @@ def is_bare(links: Links) -> bool:
 @inlined
 def expand_bare(links: Links, s: Array, push: Array, order: int, memory: Memory | None) -> None:
     """Fill the series of a chain that `is_bare`, as `expand` does, asking less at each order."""
-    law, _, mass, drag, _ = links
+    law, ends, mass, drag, _ = links
     w, v, eps, sig, group = s[W], s[V], s[EPS], s[SIG], s[GROUP]
     last = mass.size - 1
     for n in range(order + 1):
         share = 1.0 / (n + 1)
-        for i in range(last + 1):
-            eps[i, n] = (w[i, n] - (w[i - 1, n] if i > 0 else 0.0)) * (1.0 / law[i, HEIGHT])
-            sig[i, n] = group[i, n] = _stress_term(law, i, eps, sig, n, memory)
-        for i in range(last + 1):
-            net = -sig[i, n]
-            if i < last:
-                net += sig[i + 1, n]
+        for g in range(last + 1):
+            u_n, i = w[g, n] - (w[g - 1, n] if g > 0 else 0.0), g
+            if memory is not None:
+                i, i1 = springs_of(ends, g)
+                if i1 - i > 1:
+                    group[g, n] = _bare_term(law, i, i1, eps, sig, u_n, n, memory)
+                    continue
+            eps[i, n] = u_n * (1.0 / law[i, HEIGHT])
+            sig[i, n] = group[g, n] = _stress_term(law, i, eps, sig, n, memory)
+        for g in range(last + 1):
+            net = -group[g, n]
+            if g < last:
+                net += group[g + 1, n]
             else:
                 net += push[n] if n < 2 else 0.0
                 if drag > 0.0:
-                    net -= drag * v[i, n]
-            v[i, n + 1] = net * (share / mass[i])
-            w[i, n + 1] = v[i, n] * share
+                    net -= drag * v[g, n]
+            v[g, n + 1] = net * (share / mass[g])
+            w[g, n + 1] = v[g, n] * share
 
 
 @inner

@@ -444,7 +444,7 @@ def _integrated(
     for p in range(size):
         late[p] = 0.0
     begin(rows, heights, start, directions, branches, law, s, d, memory)
-    bare, apart = is_bare(links), is_apart(links)
+    bare, apart = is_bare(links, memory), is_apart(links)
     w_scale, s_scale, b_scale, pressed, knot, stalled, done = 0.0, 0.0, math.inf, False, 0, 0, 0
     switches = count - count  # a whole number, and no constant: one type to compile for
     now = 0.0 if struck else t[0]
@@ -523,7 +523,7 @@ def _integrated(
         w_scale, total = _reached(links, s, w_scale)
         if not math.isfinite(total):
             return NOT_FINITE, now, step, switches
-        if not bare:
+        if groups < count or top == STRESS:
             settle(links, s, memory)
             if memory is not None:
                 settle_together(links, s, order, span, push, memory)
@@ -532,7 +532,7 @@ def _integrated(
                 rows, branches, law, s, d, directions, order, span, now, spring, side, log,
                 switches, ends, memory,
             )  # fmt: skip
-            if memory is not None and not bare:
+            if memory is not None and (groups < count or top == STRESS):
                 settle_together(links, s, order, span, push, memory)
     return TOO_MANY_STEPS, now, max_steps, switches
 
