@@ -77,11 +77,13 @@ PER_A, PER_C, PER_S, RATE_A, RATE_C, RATE_U, GAP, N_NOW = range(9, 17)
 MARGIN = 1e-13
 # A spring that turns within so small a part of a step turns at its start.
 NOW = 1e-8
-# Beyond this normal score P is 0 or 1 to rounding. Within it the score u may change in a step by so
-# much over u as its series have orders, times a share (they are those of exp(-u²/2), whose terms
-# fall only from the order u δu on), and by so much at most.
-FAR = 8.0
-SHARE_OF_ORDER, MOST_SCORE = 0.7, 3.0
+# Beyond the normal score FAR, P is 0 or 1 to rounding; it is from somewhere beyond NEAR on where
+# what it adds to a strain is below the share NEGLIGIBLE (a tenth of it: P is about exp(-u²/2)/10)
+# of the truncation. Within, the score u may change in a step by so much over u as its series have
+# orders, times a share (they are those of exp(-u²/2), whose terms fall only from the order u δu
+# on), and by so much at most; a stress by so much of itself. How exactly these bounds are met.
+NEAR, FAR, NEGLIGIBLE = 4.0, 8.0, 0.1
+SHARE_OF_ORDER, MOST_SCORE, MOST_GROWTH, LOOSE = 0.7, 3.0, 0.8, 0.05
 
 
 class Memory(NamedTuple):
@@ -322,22 +324,29 @@ def keep(row: Array, m: Array, n: int, s_n: float) -> None:
 
 
 @inner
-def longest(m: Array, scale: float, order: int, span: float) -> float:
+def longest(m: Array, now: Array, order: int, tol: float, span: float) -> float:
     """Longest step, within `span`, over which the logarithm of a stress has a good series.
 
-    `m` is the spring's own of `Memory.series`. Where nearly none, or all, have snapped, the series
-    do not show how soon the others do: a step from beyond `FAR` ends there.
+    `m` and `now` are the spring's own of `Memory.series` and `Memory.now`. Where nearly none, or
+    all, have snapped, the series do not show how soon the others do: a step from there ends where
+    these begin to count, at the truncation `tol`.
     """
-    s, u = m[0, EQ], abs(m[0, SCORE])
-    within = min(MOST_SCORE, SHARE_OF_ORDER * order / u) if u > 0.0 else MOST_SCORE
-    most = s * min(0.8, 1.0 - math.exp(-scale * max(within, u - FAR)))  # also where it falls
-    for _ in range(400):
-        moved = 0.0
+    s, u, scale = m[0, EQ], abs(m[0, SCORE]), now[SCALE]
+    change = min(MOST_SCORE, SHARE_OF_ORDER * order / u) if u > 0.0 else MOST_SCORE
+    if u > NEAR:
+        few = -2.0 * math.log(NEGLIGIBLE * tol * now[GIVE] * s / now[GAP])
+        change = max(change, u - math.sqrt(min(max(few, NEAR * NEAR), FAR * FAR)))
+    rise = s * min(MOST_GROWTH, math.exp(scale * change) - 1.0)
+    fall = s * min(MOST_GROWTH, 1.0 - math.exp(-scale * change))
+    for _ in range(40):  # Newton's method from above, for what grows faster than in proportion
+        up = down = up_slope = down_slope = 0.0
         for n in range(order, 0, -1):
-            moved = (moved + abs(m[n, EQ])) * span
-        if moved <= most:
+            up_slope, down_slope = up_slope * span + up, down_slope * span + down
+            up, down = up * span + max(m[n, EQ], 0.0), down * span + max(-m[n, EQ], 0.0)
+        over, under = up * span - rise, down * span - fall
+        if over <= LOOSE * rise and under <= LOOSE * fall:
             break
-        span *= 0.75
+        span -= max(over / (up + up_slope * span), under / (down + down_slope * span), 0.0)
     return span
 
 

@@ -13,7 +13,6 @@ import math
 import numpy as np
 
 from foamfit.solve.explicit.memory import (
-    SCALE,
     Memory,
     advance_memory,
     first_turn,
@@ -445,6 +444,8 @@ def _integrated(
         late[p] = 0.0
     begin(rows, heights, start, directions, branches, law, s, d, memory)
     bare, apart = is_bare(links, memory), is_apart(links)
+    shared = groups < count or top == STRESS  # springs have one stress, or are given it
+    fine = 0.0 if tangent else tol  # a derivative may be of what is negligible
     w_scale, s_scale, b_scale, pressed, knot, stalled, done = 0.0, 0.0, math.inf, False, 0, 0, 0
     switches = count - count  # a whole number, and no constant: one type to compile for
     now = 0.0 if struck else t[0]
@@ -476,7 +477,7 @@ def _integrated(
         if memory is not None:
             for i in range(count):
                 if branches[i] > HELD:
-                    span = longest(memory.series[i], memory.now[i, SCALE], order, span)
+                    span = longest(memory.series[i], memory.now[i], order, fine, span)
         span, spring, side = first_switch(law, s, order, span)
         if memory is not None:
             span, turning = first_turn(branches, s[EPS], order, span, c)
@@ -523,7 +524,7 @@ def _integrated(
         w_scale, total = _reached(links, s, w_scale)
         if not math.isfinite(total):
             return NOT_FINITE, now, step, switches
-        if groups < count or top == STRESS:
+        if shared:
             settle(links, s, memory)
             if memory is not None:
                 settle_together(links, s, order, span, push, memory)
@@ -532,7 +533,7 @@ def _integrated(
                 rows, branches, law, s, d, directions, order, span, now, spring, side, log,
                 switches, ends, memory,
             )  # fmt: skip
-            if memory is not None and (groups < count or top == STRESS):
+            if memory is not None and shared:
                 settle_together(links, s, order, span, push, memory)
     return TOO_MANY_STEPS, now, max_steps, switches
 
