@@ -47,6 +47,7 @@ from foamfit.solve.explicit.series import (
     enter_tangents,
     expand,
     expand_bare,
+    expand_remembered,
     is_bare,
     make_series,
     settle_together,
@@ -464,7 +465,10 @@ def _integrated(
                 fresh = True
             horizon = _prescribe(top, values, t, knot, now, push, motion)
         if bare:
-            expand_bare(links, s, push, order, memory)
+            if memory is None:
+                expand_bare(links, s, push, order)
+            else:
+                expand_remembered(links, s, push, order, memory)
         elif not expand(links, s, push, motion, order, memory):
             return FLAT_UNDER_STRESS, now, step, switches
         if step > 0:
