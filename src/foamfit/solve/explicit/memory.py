@@ -40,6 +40,7 @@ from foamfit.springs.kernels import (
     SPREAD_PLUS,
     Array,
     Branches,
+    Row,
     inlined,
     inner,
     maker,
@@ -61,18 +62,18 @@ from foamfit.springs.microscale_kernels import (
 from foamfit.springs.parameters import OWN_ETA, OWN_RELAXATION
 
 # Columns of `Memory.series`, which stand side by side at each order since the recurrences read them
-# all: equilibrium stress s; 1 - a, 1 + eps_star - c; their difference; P; n u_n, u_n, φ, h. Then
-# follow the z of the relaxation terms.
-EQ, BELOW_A, BELOW_C, BETWEEN, SNAPPED, PACE, SCORE, DENSITY, BEND, N_MEMORY = range(10)
+# all: equilibrium stress s; Σ z_k; 1 - a, 1 + eps_star - c; their difference; P; n u_n, u_n, φ, h.
+# Then follow the z of the relaxation terms.
+EQ, RELAXED, BELOW_A, BELOW_C, BETWEEN, SNAPPED, PACE, SCORE, DENSITY, BEND, N_MEMORY = range(11)
 # Rows of `Memory.partials`: the derivatives of the strain at fixed stress by the seven parameters
 # of the law, by p, and by the stress; then what these are made of.
 BY_RANK, BY_STRESS, SQUARE_A, SQUARE_C, WIDTH, STEEP, N_PARTIALS = range(7, 14)
 # Columns of `Memory.now`: place and scale of the normal distribution that is followed, p and 1 - p
-# where the step starts, 1 + Σ g; dε/ds there, its inverse, and dε/dΣ; what of a derivative of Σ is
-# not of s. Then what the orders of a step share: 1/(k0 + s), 1/(kc + s), 1/s; the derivatives of a,
-# c and u by s; c - a.
-PLACE, SCALE, FRACTION, LEFT, GAIN, GIVE, PER_GIVE, SOFT, BASE = range(9)
-PER_A, PER_C, PER_S, RATE_A, RATE_C, RATE_U, GAP, N_NOW = range(9, 17)
+# where the step starts, 1 + Σ g and its inverse; dε/ds there, its inverse, and dε/dΣ; what of a
+# derivative of Σ is not of s. Then what the orders of a step share: 1/(k0 + s) (on a curved branch
+# of another spring that of its k), 1/(kc + s), 1/s; the derivatives of a, c and u by s; c - a.
+PLACE, SCALE, FRACTION, LEFT, GAIN, PER_GAIN, GIVE, PER_GIVE, SOFT, BASE = range(10)
+PER_A, PER_C, PER_S, RATE_A, RATE_C, RATE_U, GAP, N_NOW = range(10, 18)
 # A held spring is past where it turned if its strain is, by so much of itself.
 MARGIN = 1e-13
 # A spring that turns within so small a part of a step turns at its start.
@@ -127,7 +128,7 @@ def make_memory(rows: Array, order: int, directions: Branches) -> Memory:
         gain = 1.0
         for k in range(terms):
             gain += rows[i, N_COLUMNS + 2 * k]
-        memory.now[i, GAIN] = gain
+        memory.now[i, GAIN], memory.now[i, PER_GAIN] = gain, 1.0 / gain
         if rows[i, KIND] == MICROSCALE:
             micro.begin(rows[i], memory.state[i])
     return memory
@@ -210,8 +211,12 @@ def first_turn(
 @inner
 def start_relaxed(memory: Memory, i: int, s: float) -> None:
     """Nothing has relaxed yet of the stress at which a spring starts."""
+    total = 0.0
     for k in range(memory.series.shape[2] - N_MEMORY):
-        memory.series[i, 0, N_MEMORY + k] = -memory.rows[i, N_COLUMNS + 2 * k] * s
+        z = -memory.rows[i, N_COLUMNS + 2 * k] * s
+        memory.series[i, 0, N_MEMORY + k] = z
+        total += z
+    memory.series[i, 0, RELAXED] = total
 
 
 @inner
@@ -251,6 +256,7 @@ def start_mixture(memory: Memory, i: int, moving: bool, eps: float) -> float:
     now[GAP] = row[EPS_STAR] + below_a - below_c
     now[GIVE] = q * now[RATE_A] + p * now[RATE_C] + now[GAP] * steep
     now[PER_GIVE] = 1.0 / now[GIVE]
+    now[SOFT] = now[GIVE] * now[PER_GAIN]
     return s
 
 
@@ -306,21 +312,15 @@ def finish_mixture(now: Array, m: Array, moving: bool, n: int, s_n: float) -> No
 
 
 @inlined
-def relaxed(m: Array, n: int) -> float:
-    """Order n of Σ z_k of a spring, from its own of `Memory.series`."""
-    total = 0.0
-    for k in range(N_MEMORY, m.shape[1]):
-        total += m[n, k]
-    return total
-
-
-@inlined
-def keep(row: Array, m: Array, n: int, s_n: float) -> None:
+def keep(row: Row, m: Array, n: int, s_n: float) -> None:
     """Write order n of a spring's equilibrium stress, and what relaxes in the next."""
-    m[n, EQ] = s_n
+    m[n, EQ], total = s_n, 0.0
     for k in range(m.shape[1] - N_MEMORY):
         g, tau = row[N_COLUMNS + 2 * k], row[N_COLUMNS + 2 * k + 1]
-        m[n + 1, N_MEMORY + k] = -(m[n, N_MEMORY + k] + g * s_n) * (1.0 / (tau * (n + 1)))
+        z = -(m[n, N_MEMORY + k] + g * s_n) * (1.0 / (tau * (n + 1)))
+        m[n + 1, N_MEMORY + k] = z
+        total += z
+    m[n + 1, RELAXED] = total
 
 
 @inner
@@ -351,9 +351,11 @@ def longest(m: Array, now: Array, order: int, tol: float, span: float) -> float:
 
 
 @inner
-def strain_at(memory: Memory, i: int, moving: bool, s: float) -> tuple[float, float]:
-    """Strain of a mixture at a stress (NaN where its law ends), and its slope dε/ds."""
-    row, state, now = memory.rows[i], memory.state[i], memory.now[i]
+def strain_at(row: Row, state: Array, now: Array, moving: bool, s: float) -> tuple[float, float]:
+    """Strain of a mixture at a stress (NaN where its law ends), and its slope dε/ds.
+
+    What it takes is the spring's own of a `Memory`.
+    """
     p, q, steep = state[micro.SNAPPED], state[REST], 0.0
     if moving:
         if not s > 0.0:
@@ -377,8 +379,12 @@ def advance_memory(state: Array, series: Array, order: int, span: float) -> None
             reached = value_at(series[i, :, EQ], order, span)
             state[i, FLEXIBILITY] = 0.0
             state[i, SIGMA] = reached if reached > 0.0 else state[i, SIGMA]
+        total = 0.0
         for k in range(N_MEMORY, series.shape[2]):
-            series[i, 0, k] = value_at(series[i, :, k], order, span)
+            z = value_at(series[i, :, k], order, span)
+            series[i, 0, k] = z
+            total += z
+        series[i, 0, RELAXED] = total
 
 
 # ---------------------------------------------------------------- its derivatives

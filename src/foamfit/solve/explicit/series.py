@@ -21,14 +21,16 @@ from foamfit.solve.explicit.memory import (
     EQ,
     GAIN,
     GIVE,
+    PER_A,
+    PER_GAIN,
     PER_GIVE,
+    RELAXED,
     SOFT,
     Memory,
     advance_memory_tangents,
     enter_mixture,
     finish_mixture,
     keep,
-    relaxed,
     start_mixture,
     strain_at,
     strain_of_mixture,
@@ -204,13 +206,19 @@ def _remembered_stress(law: Array, i: int, eps: Array, n: int, memory: Memory) -
     moving, now, m = law[i, CURVED] > HELD, memory.now[i], memory.series[i]
     if law[i, CURVED] < HELD:
         s_n = _law_stress(law, i, eps, memory.series[:, :, EQ], n)
+        if n == 0:
+            now[PER_A] = 1.0 / (law[i, SLOPE] + s_n)
+            soft = (1.0 - (eps[i, 0] - law[i, ORIGIN])) * now[PER_A]
+            if law[i, CURVED] == 0.0:
+                soft = 1.0 / law[i, SLOPE] if law[i, SLOPE] > 0.0 else math.inf
+            now[SOFT] = soft * now[PER_GAIN]
     elif n == 0:
         s_n = start_mixture(memory, i, moving, eps[i, 0])
     else:
         s_n = (eps[i, n] - strain_of_mixture(now, m, moving, n)) * now[PER_GIVE]
         finish_mixture(now, m, moving, n, s_n)
     keep(memory.rows[i], m, n, s_n)
-    return now[GAIN] * s_n + relaxed(m, n)
+    return now[GAIN] * s_n + m[n, RELAXED]
 
 
 @inlined
@@ -239,14 +247,13 @@ def _remembered_strain(
     law: Array, i: int, eps: Array, n: int, memory: Memory
 ) -> tuple[float, float]:
     """Order n >= 1 of the strain of a spring in a chain with memory; see `_strain_term`."""
-    now, m = memory.now[i], memory.series[i]
-    if law[i, CURVED] < HELD:
-        known, soft = _law_strain(law, i, eps, memory.series[:, :, EQ], n)
-    else:
-        known, soft = strain_of_mixture(now, m, law[i, CURVED] > HELD, n), now[GIVE]
-    soft *= 1.0 / now[GAIN]
-    now[SOFT] = soft
-    return (known - soft * relaxed(m, n) if soft < math.inf else known), soft
+    now, m, known = memory.now[i], memory.series[i], 0.0
+    if law[i, CURVED] >= HELD:
+        known = strain_of_mixture(now, m, law[i, CURVED] > HELD, n)
+    elif law[i, CURVED] != 0.0:
+        known = -product(eps, memory.series[:, :, EQ], i, n) * now[PER_A]
+    soft = now[SOFT]
+    return (known - soft * m[n, RELAXED] if soft < math.inf else known), soft
 
 
 @inlined
@@ -266,7 +273,7 @@ def _strain_term(
 def _settle_stress(law: Array, i: int, n: int, s_n: float, memory: Memory) -> None:
     """Take down order n >= 1 of the stress of a spring whose strain came from `_strain_term`."""
     now, m = memory.now[i], memory.series[i]
-    own = (s_n - relaxed(m, n)) * (1.0 / now[GAIN])
+    own = (s_n - m[n, RELAXED]) * now[PER_GAIN]
     if law[i, CURVED] >= HELD:
         finish_mixture(now, m, law[i, CURVED] > HELD, n, own)
     keep(memory.rows[i], m, n, own)
@@ -331,7 +338,7 @@ def _share_remembered(
             flat = i
     s_n = rest * (1.0 / compliance)
     if flat >= 0:
-        s_n = relaxed(memory.series[flat], n)
+        s_n = memory.series[flat, n, RELAXED]
         rest -= s_n * compliance
     for i in range(i0, i1):
         if law[i, DASHPOT] == 0.0:
@@ -561,13 +568,14 @@ def share_a_stress(law: Array, ends: Branches, i: int, j: int, memory: Memory) -
     return False
 
 
-@inner
+@inlined
 def _own_strain(law: Array, i: int, stress: float, memory: Memory) -> tuple[float, float]:
     """Strain of a spring under a stress on the branch that it is on, and its slope dε/dΣ."""
     gain, k = memory.now[i, GAIN], law[i, SLOPE]
-    s = (stress - relaxed(memory.series[i], 0)) / gain
+    s = (stress - memory.series[i, 0, RELAXED]) / gain
     if law[i, CURVED] >= HELD:
-        eps, soft = strain_at(memory, i, law[i, CURVED] > HELD, s)
+        moving, row = law[i, CURVED] > HELD, memory.rows[i]
+        eps, soft = strain_at(row, memory.state[i], memory.now[i], moving, s)
         return eps, soft / gain
     if law[i, CURVED] == 0.0:
         return law[i, ORIGIN] + (s - law[i, OFFSET]) / k, 1.0 / (k * gain)
