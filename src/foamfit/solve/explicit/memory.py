@@ -481,7 +481,7 @@ def relaxed_tangent(memory: Memory, k: int, i: int, n: int) -> float:
 @inlined
 def keep_tangent(memory: Memory, k: int, i: int, n: int, d_sig: float) -> None:
     """Write order n of the derivative of the equilibrium stress, and the next of what relaxes."""
-    d_s = (d_sig - memory.now[i, BASE]) * (1.0 / memory.now[i, GAIN])  # waits for no quotient
+    d_s = (d_sig - memory.now[i, BASE]) * memory.now[i, PER_GAIN]
     memory.tangents[k, 0, i, n] = d_s
     for term in range(memory.tangents.shape[1] - 1):
         g, tau = memory.rows[i, N_COLUMNS + 2 * term], memory.rows[i, N_COLUMNS + 2 * term + 1]
