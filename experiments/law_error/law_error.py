@@ -31,7 +31,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from foamfit.trust.noise_process import NoiseProcess, parts
+from foamfit.trust.residuals.noise_process import NoiseProcess, parts
 from scipy.integrate import solve_ivp
 from scipy.signal import lfilter
 from scipy.special import ndtr
