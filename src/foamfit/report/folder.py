@@ -27,6 +27,8 @@ RESULT_FILES = (
     "fit.pdf", "report.html",
 )  # fmt: skip
 CYCLES_FILES = ("cycles.json", "cycles.csv", "cycles.png")
+# What `studies.batch` writes beside the folders of the tests, and into each of them.
+BATCH_FILES = ("summary.csv", "summary.html", "batch.json")
 
 
 def save_result(result: Fit, folder: str | Path) -> Path:
