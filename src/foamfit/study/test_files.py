@@ -8,14 +8,12 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from foamfit.errors import InputError
-from foamfit.report.folder import BATCH_FILES, CYCLES_FILES, RESULT_FILES
+from foamfit.report.folder import BATCH_FILES, CYCLES_FILES, MARKS, RESULT_FILES
 from foamfit.text import listed
 
 ENDINGS = (".csv", ".txt", ".tsv", ".dat")
 # Stems of tables that say what the specimens are, beside the tests.
 _SPECIMENS = ("specimen", "specimens")
-# What marks a folder as one that foamfit wrote: its tables are results.
-_MARKS = ("fit.json", "cycles.json", "batch.json", "summary.html")
 _WRITTEN = (*RESULT_FILES, *CYCLES_FILES, *BATCH_FILES)
 
 
@@ -86,7 +84,9 @@ def _is_test(path: Path) -> bool:
         return False
     if path.name.startswith("."):
         return False
-    is_result = path.name in _WRITTEN and any((path.parent / mark).is_file() for mark in _MARKS)
+    is_result = path.name in _WRITTEN and any(
+        (path.parent / mark).is_file() for mark in (*MARKS, "summary.html")
+    )
     return not is_result
 
 
