@@ -68,6 +68,10 @@ def batch(
         raise InputError("--jobs and --scheduler exclude each other; leave one of them out")
     search |= intervals_of(**{way: search.pop(way) for way in ("profile", "bootstrap", "mcmc")})
     alone, several = cycles_of(cycle)
+    from foamfit.study import processes
+
+    if scheduler is None:
+        processes.prepare((*processes.FITS, *(() if no_report else processes.PAGES)))
     from foamfit.report.studies.batch import summary_words, table_rows
     from foamfit.study.batch import run
     from foamfit.study.batch_work import Recipe

@@ -31,7 +31,7 @@ from foamfit.study.batch_work import (
     stored,
     work,
 )
-from foamfit.study.processes import EndedError, Processes, cores
+from foamfit.study.processes import FITS, PAGES, EndedError, Processes, cores
 from foamfit.study.test_files import find_tests
 from foamfit.terminal import without_ctrl_c
 from foamfit.text import counted
@@ -44,10 +44,6 @@ _LOG = logging.getLogger(__name__)
 MOST_AHEAD, MOST_BYTES = 1000, 2**28
 # Seconds between two summaries, and how much longer than one takes to write.
 PAUSE, SHARE = 30.0, 50.0
-# What a process of this machine imports once for all.
-PRELOAD = ("foamfit.study.batch_work", "foamfit.data.csv_file", "pandas", "pint")
-PAGES = ("matplotlib.backends.backend_agg", "matplotlib.backends.backend_pdf", "jinja2")
-
 Tests = str | Path | Iterable[str | Path]
 Cycles = int | Sequence[int] | Literal["all"] | None
 
@@ -277,7 +273,7 @@ def _executor(given: Executor | None, jobs: int | None, made: Batch) -> Iterator
         with precompile.side_by_side() as finish:
             finish()
     count = min(jobs or cores(), max(len(made.tests), 1))
-    pool = Processes(count, (*PRELOAD, *(PAGES if made.recipe.pages else ())))
+    pool = Processes(count, (*FITS, *(PAGES if made.recipe.pages else ())))
     try:
         yield pool
     except BaseException:
