@@ -231,7 +231,8 @@ class Column:
     unit: str
     factor: float
     strip: str  # path of SVG: the intervals of all tests side by side
-    dots: str  # their values
+    dots: str  # the values that are determined
+    unsure: str  # and those that are not
     ends: tuple[str, str]  # of the strip's axis
 
 
@@ -279,14 +280,17 @@ def _columns(rows: Sequence[Row]) -> Iterator[Column]:
             y = STRIP_HEIGHT * (high - min(max(value, low), high)) / (high - low)
             return round(y, 1)
 
-        bars, dots = [], []
+        bars, dots, unsure = list[str](), list[str](), list[str]()
         for i, cell in there:
             x = round((i + 0.5) * STRIP_WIDTH / len(rows), 1)
             if cell[2] is not None and cell[3] is not None:
                 bars.append(f"M{x:g} {pixel(cell[2]):g}V{pixel(cell[3]):g}")
-            dots.append(f"M{x:g} {pixel(cell[0]):g}h0")
+            mark = f"M{x:g} {pixel(cell[0]):g}h0"
+            (unsure if cell[4] in ("weak", "not determined") else dots).append(mark)
         ends = number(high / factor), number(low / factor)
-        yield Column(name, symbol(name), unit, factor, "".join(bars), "".join(dots), ends)
+        yield Column(
+            name, symbol(name), unit, factor, "".join(bars), "".join(dots), "".join(unsure), ends
+        )
 
 
 def _cell(row: Row, column: Column) -> tuple[str, str, str, str]:
@@ -297,5 +301,5 @@ def _cell(row: Row, column: Column) -> tuple[str, str, str, str]:
     value, _, low, high, state, _ = found
     interval = ""
     if low is not None and high is not None:
-        interval = f"{low / column.factor:.4g} to {high / column.factor:.4g}"
-    return f"{value / column.factor:.4g}", f"{value:.6g}", interval, state
+        interval = f"{low / column.factor:.4g} to {high / column.factor:.4g}".replace("-", "−")
+    return f"{value / column.factor:.4g}".replace("-", "−"), f"{value:.6g}", interval, state
