@@ -115,6 +115,11 @@ def _cluster(address: str) -> Iterator[Executor]:
         raise InputError(
             '--scheduler needs Dask, which is not installed: pip install "foamfit[dask]"'
         ) from None
+    import logging
+
+    logging.getLogger("distributed").setLevel(
+        logging.CRITICAL
+    )  # what matters is said in a sentence
     connect: Any = Client  # which has no types
     try:
         client = connect(address, timeout=PATIENCE, set_as_default=False)

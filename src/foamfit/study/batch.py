@@ -407,8 +407,8 @@ class _Run:
         self.took = self.saved - began
 
     def _ended(self, error: BaseException) -> InputError:
-        told = " ".join(f"{type(error).__name__}: {error}".split())
-        return InputError(f"the executor has ended ({told}); {self._done_words()}")
+        told = " ".join(str(error).split()) or "it has given up the tests"
+        return InputError(f"the executor has ended: {told}; {self._done_words()}")
 
     def _done_words(self) -> str:
         done, count = len(self.batch.rows), counted(len(self.batch.tests), "test")
