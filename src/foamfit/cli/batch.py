@@ -7,7 +7,6 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +20,8 @@ from foamfit.errors import InputError
 from foamfit.terminal import say
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from foamfit.study.batch import State
 
 # Seconds in which a scheduler must answer.
