@@ -206,13 +206,7 @@ def measure_page(place: Path) -> dict[str, Any]:
         "document.title = `load ${shown} sort ${performance.now() - shown}`;}, 0));</script>"
     )
     (place / "timed.html").write_text(page.replace("</body>", script + "</body>"))
-    command = [
-        browser,
-        "--headless",
-        "--no-sandbox",
-        "--disable-gpu",
-        "--virtual-time-budget=20000",
-    ]
+    words = ["--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=20000"]
     (place / "empty.html").write_text("<!DOCTYPE html><title>x</title>")
     used = []
     for name in ("empty.html", "timed.html"):
