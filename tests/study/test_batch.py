@@ -394,7 +394,7 @@ def test_killed_and_called_again_nothing_is_lost_or_done_twice(here):
     done = stamps("out")
     result = run(*words)
     assert result.exit_code == 2  # bad.csv
-    assert "1 of 7 have no acceptable fit" in result.stderr
+    assert "1 of 7 tests has no acceptable fit" in result.stderr
     after = stamps("out")
     assert {name: after[name] for name in done} == done
     assert len(after) == 7
@@ -409,7 +409,7 @@ def test_the_command_prints_counts_parameters_and_refusals(here, tried, monkeypa
     assert "\nbad: tests/bad.csv: " in result.stdout
     assert re.search(r"\ns1_k0 +5\.5 +5\.5 +5\.5 +3 of 3 +MPa\n", result.stdout)
     assert result.stdout.endswith("written to out: open out/summary.html\n")
-    assert result.stderr == "foamfit: 1 of 4 have no acceptable fit; see out/summary.csv\n"
+    assert result.stderr == "foamfit: 1 of 4 tests has no acceptable fit; see out/summary.csv\n"
     words = ("--specimen", "foam.toml", "--no-report", "--out", "out")
     result = run("batch", "tests/a.csv", *words, "--json")
     assert result.exit_code == 0

@@ -102,7 +102,7 @@ def batch(
         say(f"\nwritten to {found.out}: open {found.out / 'summary.html'}")
     wrong = sum(not row.has_fit for row in rows)
     if wrong:
-        told = f"{wrong} of {len(rows)} have no acceptable fit"
+        told = f"{wrong} of {len(rows)} tests {'has' if wrong == 1 else 'have'} no acceptable fit"
         say(f"foamfit: {told}; see {found.out / 'summary.csv'}", err=True)
     return NOT_ACCEPTABLE if wrong else 0
 
