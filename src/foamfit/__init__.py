@@ -25,6 +25,7 @@ _HOME = {
     "read_test": "data.csv_file",
     "CycleFits": "study.cycles",
     "fit_cycles": "study.cycles",
+    "batch": "study.batch",
     "FitResult": "api",
     "fit": "api",
     "make_params": "fitting.problem",

@@ -27,6 +27,10 @@ RESULT_FILES = (
     "fit.pdf", "report.html",
 )  # fmt: skip
 CYCLES_FILES = ("cycles.json", "cycles.csv", "cycles.png")
+# What `studies.batch` writes beside the folders of the tests, and into each of them.
+BATCH_FILES = ("summary.csv", "summary.html", "batch.json")
+# One of these is in every result.
+MARKS = ("fit.json", "cycles.json", "batch.json")
 
 
 def save_result(result: Fit, folder: str | Path) -> Path:
@@ -39,12 +43,15 @@ def save_result(result: Fit, folder: str | Path) -> Path:
     return save_whole(folder, lambda fresh: write_result(result, fresh))
 
 
-def save_whole(folder: str | Path, write: Callable[[Path], None]) -> Path:
-    """Let `write` fill a new folder, which replaces an older result at the end; returns it."""
+def save_whole(folder: str | Path, write: Callable[[Path], None], *, swept: bool = False) -> Path:
+    """Let `write` fill a new folder, which replaces an older result at the end; returns it.
+
+    `swept` is that of `foamfit.files.replacing`.
+    """
     folder = Path(folder)
     check_target(folder)
     try:
-        with replacing(folder.resolve()) as fresh:
+        with replacing(folder.resolve(), swept=swept) as fresh:
             write(fresh)
             check_target(folder)  # what has been put there in the meantime stays
     except OSError as error:
@@ -85,7 +92,7 @@ def _check_replaceable(folder: Path, place: Path) -> None:
     if place.is_mount():
         raise InputError(f"{folder} is a mount point and cannot be replaced; name a folder in it")
     there = sorted(place.iterdir())
-    if there and not any(_is_of_fit(place / name) for name in ("fit.json", "cycles.json")):
+    if there and not any(_is_of_fit(place / name) for name in MARKS):
         raise InputError(
             f"{folder} is not empty and holds no foamfit result (no fit.json of foamfit), so it is "
             "not replaced; choose a new or an empty folder"
@@ -105,7 +112,7 @@ def is_written(path: Path) -> bool:
     if re.fullmatch(r"cycle-\d+", path.name) and path.is_dir():
         within = list(path.iterdir())
         return all(inner.name in RESULT_FILES and is_written(inner) for inner in within)
-    return path.name in (*RESULT_FILES, *CYCLES_FILES) and path.is_file()
+    return path.name in (*RESULT_FILES, *CYCLES_FILES, "batch.json") and path.is_file()
 
 
 def _is_of_fit(path: Path) -> bool:
@@ -143,8 +150,8 @@ def load_result(folder: str | Path) -> dict[str, Any]:
     return content
 
 
-def write_result(result: Fit, folder: Path) -> None:
-    """Write all files of a result into a folder that is there."""
+def write_result(result: Fit, folder: Path, *, pages: bool = True) -> None:
+    """Write all files of a result into a folder that is there; the report and figures if wanted."""
     text = json.dumps(result.to_json_dict(), indent=2, ensure_ascii=False, allow_nan=False)
     # A name that is no UTF-8 keeps its bytes as an escape of JSON.
     (folder / "fit.json").write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
@@ -154,6 +161,8 @@ def write_result(result: Fit, folder: Path) -> None:
         write_table(folder / "profiles.csv", _profile_rows(result.intervals))
     if result.ladder is not None:
         write_table(folder / "ladder.csv", result.ladder.rows())
+    if not pages:
+        return
     figure = plot_fit(result)
     with laid_out(figure):
         png, pdf = image(figure, "png"), image(figure, "pdf")
