@@ -82,6 +82,7 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         stopped=record.stopped,
         loss=objective.loss,
         relaxation=problem.model.relaxation,
+        interior_mass=objective.interior_mass,
         noise=_noise(best),
         intervals=intervals,
     )
