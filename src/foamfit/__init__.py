@@ -25,6 +25,8 @@ _HOME = {
     "read_test": "data.csv_file",
     "CycleFits": "study.cycles",
     "fit_cycles": "study.cycles",
+    "Prediction": "study.predict",
+    "predict": "study.predict",
     "FitResult": "api",
     "fit": "api",
     "make_params": "fitting.problem",

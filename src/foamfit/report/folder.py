@@ -8,7 +8,7 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import Outliers, interior_channel
@@ -29,6 +29,20 @@ RESULT_FILES = (
 CYCLES_FILES = ("cycles.json", "cycles.csv", "cycles.png")
 
 
+class Contents(NamedTuple):
+    """What foamfit writes into a folder, so that it may be replaced by another of its kind."""
+
+    marks: tuple[str, ...]  # One of these, with a schema, shows that foamfit wrote it
+    files: tuple[str, ...]
+
+
+RESULT = Contents(("fit.json", "cycles.json"), (*RESULT_FILES, *CYCLES_FILES))
+PREDICTION = Contents(
+    ("prediction.json",),
+    ("prediction.json", "prediction.csv", "prediction.png", "prediction.pdf"),
+)
+
+
 def save_result(result: Fit, folder: str | Path) -> Path:
     """Write the result folder whole, replacing an older one at the end.
 
@@ -39,14 +53,16 @@ def save_result(result: Fit, folder: str | Path) -> Path:
     return save_whole(folder, lambda fresh: write_result(result, fresh))
 
 
-def save_whole(folder: str | Path, write: Callable[[Path], None]) -> Path:
+def save_whole(
+    folder: str | Path, write: Callable[[Path], None], contents: Contents = RESULT
+) -> Path:
     """Let `write` fill a new folder, which replaces an older result at the end; returns it."""
     folder = Path(folder)
-    check_target(folder)
+    check_target(folder, contents)
     try:
         with replacing(folder.resolve()) as fresh:
             write(fresh)
-            check_target(folder)  # what has been put there in the meantime stays
+            check_target(folder, contents)  # what has been put there in the meantime stays
     except OSError as error:
         raise InputError(
             f"the result cannot be written to {folder}: {reason(error)}; choose another folder"
@@ -54,7 +70,7 @@ def save_whole(folder: str | Path, write: Callable[[Path], None]) -> Path:
     return folder
 
 
-def check_target(folder: str | Path) -> None:
+def check_target(folder: str | Path, contents: Contents = RESULT) -> None:
     """Raise InputError unless `folder` is free, empty or an older result that may be replaced."""
     folder = Path(folder)
     try:
@@ -66,7 +82,7 @@ def check_target(folder: str | Path) -> None:
                 "as a whole; choose a folder of its own"
             )
         if place.is_dir():
-            _check_replaceable(folder, place)
+            _check_replaceable(folder, place, contents)
         elif os.path.lexists(place):
             raise InputError(f"{folder} is a file; choose a new or an empty folder")
         for there in (place, next(path for path in place.parents if path.exists())):
@@ -80,32 +96,33 @@ def check_target(folder: str | Path) -> None:
         ) from error
 
 
-def _check_replaceable(folder: Path, place: Path) -> None:
+def _check_replaceable(folder: Path, place: Path, contents: Contents) -> None:
     """Refuse a folder that is there, at `place`, and must not or cannot be replaced."""
     if place.is_mount():
         raise InputError(f"{folder} is a mount point and cannot be replaced; name a folder in it")
     there = sorted(place.iterdir())
-    if there and not any(_is_of_fit(place / name) for name in ("fit.json", "cycles.json")):
+    if there and not any(_is_of_fit(place / name) for name in contents.marks):
+        what = "result" if contents is RESULT else contents.marks[0].removesuffix(".json")
         raise InputError(
-            f"{folder} is not empty and holds no foamfit result (no fit.json of foamfit), so it is "
-            "not replaced; choose a new or an empty folder"
+            f"{folder} is not empty and holds no foamfit {what} (no {contents.marks[0]} of "
+            "foamfit), so it is not replaced; choose a new or an empty folder"
         )
     for path in there:
-        if not is_written(path):
+        if not is_written(path, contents):
             raise InputError(
                 f"{folder} holds {path.name}, which foamfit did not write, so it is not replaced; "
                 "move that or choose another folder"
             )
 
 
-def is_written(path: Path) -> bool:
-    """Whether something in a result folder is what a fit writes there."""
+def is_written(path: Path, contents: Contents = RESULT) -> bool:
+    """Whether something in a result folder is what foamfit writes there."""
     if path.is_symlink():
         return False
-    if re.fullmatch(r"cycle-\d+", path.name) and path.is_dir():
+    if contents is RESULT and re.fullmatch(r"cycle-\d+", path.name) and path.is_dir():
         within = list(path.iterdir())
         return all(inner.name in RESULT_FILES and is_written(inner) for inner in within)
-    return path.name in (*RESULT_FILES, *CYCLES_FILES) and path.is_file()
+    return path.name in contents.files and path.is_file()
 
 
 def _is_of_fit(path: Path) -> bool:
