@@ -25,7 +25,7 @@ from foamfit.report.summary import summary_text
 from foamfit.springs.model import Model
 from foamfit.trust import evidence, prediction
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.residual_tests import find_structure, neighbours_test, runs_test
+from foamfit.trust.residuals.residual_tests import find_structure, neighbours_test, runs_test
 
 HEIGHT, AREA = 1.2e-3, 1.9635e-5
 

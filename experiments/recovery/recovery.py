@@ -41,7 +41,7 @@ import foamfit as ff
 from foamfit.data.measurement import Measurement
 from foamfit.fitting.problem import make_problem
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.noise_process import NoiseProcess, parts
+from foamfit.trust.residuals.noise_process import NoiseProcess, parts
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent / "noise_floor"))

@@ -42,7 +42,7 @@ from foamfit.trust.evidence import (
 )
 from foamfit.trust.intervals import Announce, Choice
 from foamfit.trust.prediction import BLOCKS, predicted_misfit
-from foamfit.trust.residual_tests import BENT, find_structure, neighbours_test, runs_test
+from foamfit.trust.residuals.residual_tests import BENT, find_structure, neighbours_test, runs_test
 
 # From the simplest up, in groups: one spring; a linear spring below it or its relaxation; two
 # springs; three; two that relax. More springs have more parameters (23 and more) than a loop has

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 import foamfit as ff
 from conftest import DATA, needs_data, without_pictures
 from foamfit.cli import main
-from foamfit.report import cycles as cycles_report
+from foamfit.report.studies import cycles as cycles_report
 
 HEIGHT, AREA = 10e-3, 1e-4
 FRESH = ff.BistableSpring(

@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 from foamfit.trust.covariance import covariance, half_width, state
-from foamfit.trust.noise_process import autocorrelation_time
+from foamfit.trust.residuals.noise_process import autocorrelation_time
 
 
 def ar1(n: int, rho: float, seed: int) -> np.ndarray:

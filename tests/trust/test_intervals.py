@@ -33,11 +33,11 @@ from foamfit.trust import intervals, resample
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
 from foamfit.trust.intervals import Choice, assess
-from foamfit.trust.noise_process import NoiseProcess, noise_process
 from foamfit.trust.profile import departures, profile
 from foamfit.trust.ranges import Open
 from foamfit.trust.refit import Refit
 from foamfit.trust.resample import block_length, bootstrap, mcmc
+from foamfit.trust.residuals.noise_process import NoiseProcess, noise_process
 
 
 def autoregressive(rng: np.random.Generator, n: int, rho: float) -> np.ndarray:

@@ -23,11 +23,11 @@ from foamfit.report.folder import load_result
 from foamfit.report.readable import readable
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import NOTHING, RULE, WEAK, covariance
-from foamfit.trust.law_error import curve_errors
-from foamfit.trust.noise_process import NoiseProcess
 from foamfit.trust.ranges import ALIKE, alike, left_open, tolerance
 from foamfit.trust.refit import Refit
 from foamfit.trust.resample import bootstrap
+from foamfit.trust.residuals.law_error import curve_errors
+from foamfit.trust.residuals.noise_process import NoiseProcess
 
 sys.path.insert(0, str(EXPERIMENTS / "law_error"))
 

@@ -20,8 +20,8 @@ from foamfit.report.plots import plot_fit
 from foamfit.results import SCHEMA, Curves, Fit, ParameterEstimate, plain
 from foamfit.trust.intervals import Intervals
 
-# All that `save_result` may write, and what `report.cycles.save_cycles` writes beside the folder of
-# each cycle.
+# All that `save_result` may write, and what `studies.cycles.save_cycles` writes beside the folders
+# of the cycles.
 RESULT_FILES = (
     "fit.json", "parameters.csv", "curves.csv", "profiles.csv", "ladder.csv", "fit.png",
     "fit.pdf", "report.html",

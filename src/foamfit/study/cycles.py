@@ -15,7 +15,7 @@ from foamfit.data.csv_file import read_test
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError
 from foamfit.one_model import Keywords, Options, Progress
-from foamfit.report.cycles import save_cycles
+from foamfit.report.studies.cycles import save_cycles
 from foamfit.study.cycle_fits import FittedCycles, loop_misfits
 from foamfit.study.shared import Group, Selection, select_own
 from foamfit.text import counted, listed, percent

@@ -18,8 +18,8 @@ from foamfit.fitting.objective import Simulated
 from foamfit.fitting.problem import Problem
 from foamfit.trust import covariance
 from foamfit.trust.covariance import Covariance
-from foamfit.trust.law_error import CurveError, curve_errors
-from foamfit.trust.noise_process import noise_processes, parts
+from foamfit.trust.residuals.law_error import CurveError, curve_errors
+from foamfit.trust.residuals.noise_process import noise_processes, parts
 
 
 def m_estimate(residual: Array, sizes: tuple[int, ...], loss: str) -> tuple[Array, Array]:

@@ -17,7 +17,7 @@ from scipy import stats
 
 from foamfit.arrays import Array
 from foamfit.text import percent
-from foamfit.trust.noise_process import NoiseProcess, noise_processes, parts
+from foamfit.trust.residuals.noise_process import NoiseProcess, noise_processes, parts
 
 # Half widths of the 95 % interval, over the scale of a parameter (`fitting.box.Scales`), past which
 # it is weak, and past which the test does not determine it.

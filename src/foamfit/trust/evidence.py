@@ -22,9 +22,9 @@ from foamfit.fitting.losses import soften, softness
 from foamfit.results import Fit, rung_name
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import NOTHING
-from foamfit.trust.noise_process import autocorrelation_time
 from foamfit.trust.prediction import misfit_of
-from foamfit.trust.residual_tests import neighbours_test, runs_test
+from foamfit.trust.residuals.noise_process import autocorrelation_time
+from foamfit.trust.residuals.residual_tests import neighbours_test, runs_test
 
 # Residuals are structureless where neither test of their order rejects it at this level.
 LEVEL = 0.05

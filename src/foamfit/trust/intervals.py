@@ -18,9 +18,9 @@ from foamfit.arrays import Array
 from foamfit.errors import InputError
 from foamfit.fitting.search import Tracker
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.noise_process import parts
 from foamfit.trust.profile import PLACED, Profile, Tracing, departures
 from foamfit.trust.resample import bootstrap, check_emcee, mcmc, walkers
+from foamfit.trust.residuals.noise_process import parts
 
 # The default profiles a parameter if the root of the cost departs from a straight line by this
 # share at the end of its local interval.

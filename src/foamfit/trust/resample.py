@@ -13,8 +13,8 @@ from foamfit.arrays import Array
 from foamfit.errors import InputError
 from foamfit.fitting.search import STOPPING, Tracker, what_stopped
 from foamfit.trust.best_point import BestPoint, m_estimate
-from foamfit.trust.noise_process import NoiseProcess
 from foamfit.trust.refit import Refit
+from foamfit.trust.residuals.noise_process import NoiseProcess
 
 # Farthest that a walker of a Markov chain begins from the best point along a direction that the
 # test does not fix, over the scales of the parameters; and how often its way there is halved where

@@ -15,7 +15,13 @@ import numpy as np
 from scipy.fft import dct
 
 from foamfit.arrays import Array
-from foamfit.trust.noise_process import NoiseProcess, basis_of, levinson, noise_processes, parts
+from foamfit.trust.residuals.noise_process import (
+    NoiseProcess,
+    basis_of,
+    levinson,
+    noise_processes,
+    parts,
+)
 
 # RMS of an error of the law that is told from that of the simulation, in units of the residual.
 SMALLEST = 2e-3

@@ -1,0 +1,158 @@
+"""`foamfit fit`: identify the parameters of a test, or of the cycles of a record."""
+
+# ruff: noqa: D301  (a \b keeps click from joining the lines of an example)
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from foamfit.cli.fit_options import fit_options, intervals_of, params_of
+from foamfit.cli.group import NOT_ACCEPTABLE, main
+from foamfit.cli.options import CYCLE, FILE, SPECIMEN, TEST, compiling, progress_bar
+from foamfit.errors import InputError
+from foamfit.terminal import say, without_ctrl_c
+
+if TYPE_CHECKING:
+    from foamfit.api import FitResult
+    from foamfit.study.cycles import CycleFits
+
+
+@main.command()
+@TEST
+@SPECIMEN
+@CYCLE
+@click.option("--out", type=FILE, help="Result folder. Default: fits/<test>/<model>.")
+@fit_options
+@click.option("--json", "as_json", is_flag=True, help="Print fit.json on stdout, nothing else.")
+@click.option("--quiet", is_flag=True, help="Print nothing but warnings of failure.")
+@click.option(
+    "--verbose", is_flag=True, help="Print the checklist, reasons, notes and all models too."
+)
+def fit(
+    test: Path, specimen: Path | None, cycle: str | None, model: str, out: Path | None,
+    fix: dict[str, float], vary: tuple[str, ...],
+    as_json: bool, quiet: bool, verbose: bool, **search: Any,
+) -> int:  # fmt: skip
+    """Identify the parameters of TEST.csv and write a result folder.
+
+    With several cycles the folder holds one result folder for each, cycles.csv, cycles.png and
+    cycles.json: what changes from cycle to cycle, by one fit of them together.
+
+    Exit code 0: a fit was made; 1: the input or the call is wrong; 2: no acceptable fit was found
+    (what was found is written); 70: a defect of foamfit; 130 and 143: ended by Ctrl-C before
+    anything was found, and by SIGTERM.
+
+    \b
+    Examples:
+        foamfit fit TEST.csv
+        foamfit fit TEST.csv --model auto
+        foamfit fit TEST.csv --model microscale --relaxation 1
+        foamfit fit TEST.csv --model microscale --relaxation 1 --cycle all
+        foamfit fit TEST.csv --drive displacement --out results/today
+        foamfit fit TEST.csv --model linear+bistable --fix s1_k0=60e6
+    """
+    from foamfit.data.csv_file import read_test
+    from foamfit.springs.model import Model
+
+    search |= intervals_of(**{way: search.pop(way) for way in ("profile", "bootstrap", "mcmc")})
+    model = "auto" if model.strip() == "auto" else Model.parse(model).name
+    alone, several = _cycles(cycle)
+    with compiling(quiet or as_json) as compile_rest:
+        measurement = read_test(test, specimen, alone)
+        folder = _result_folder(out, test, specimen, model)
+        from foamfit import api
+
+        params = params_of(measurement, model, search, fix, vary)
+        compile_rest()
+        tell = None if quiet else lambda told: say(f"foamfit: {told}", err=True)
+        with progress_bar(quiet or as_json) as progress:
+            if several is not None:
+                from foamfit.study.cycles import fit_cycles
+
+                found = fit_cycles(
+                    test, specimen, cycles=several or None, model=model, progress=progress,
+                    tell=tell, **search,
+                    params=lambda one: params_of(one, model, search, fix, vary),
+                )  # fmt: skip
+            else:
+                result = api.fit(
+                    measurement, model=model, params=params, progress=progress, tell=tell, **search
+                )
+        if several is not None:
+            return _tell_cycles(found, folder, as_json, quiet)
+        try:
+            with without_ctrl_c():
+                result.save(folder)
+        except InputError:  # the numbers are not lost with the folder
+            _tell_result(result, as_json, quiet, verbose)
+            raise
+    _tell_result(result, as_json, quiet, verbose)
+    if not quiet and not as_json:
+        say(f"\nwritten to {folder}: open {folder / 'report.html'}")
+    if result.status == "failed":
+        say(f"foamfit: no acceptable fit was found; see {folder}", err=True)
+        return NOT_ACCEPTABLE
+    return 0
+
+
+def _cycles(text: str | None) -> tuple[int | None, tuple[int, ...] | None]:
+    """Read --cycle: the one cycle that is named, or the several that are ("all" names none)."""
+    if text is None or text.strip().lower() == "all":
+        return None, None if text is None else ()
+    parts = text.split(",")
+    if not all(part.strip().isdecimal() and int(part) > 0 for part in parts):
+        raise InputError(f"--cycle {text!r} must be a number from 1 up, several as 1,2,10, or all")
+    numbers = tuple(int(part) for part in parts)
+    return (None, numbers) if len(numbers) > 1 else (numbers[0], None)
+
+
+def _tell_cycles(found: CycleFits, folder: Path, as_json: bool, quiet: bool) -> int:
+    """Write and print the fits of several cycles; returns the exit code."""
+    import json
+
+    from foamfit.report.studies.cycles import cycles_text
+
+    content = found.to_json_dict()
+    content["cycles"] = {n: one.to_json_dict() for n, one in sorted(found.results.items())}
+    shown = json.dumps(content, allow_nan=False) if as_json else cycles_text(found)
+    try:
+        with without_ctrl_c():
+            found.save(folder)
+    finally:  # the numbers are not lost with the folder
+        if as_json or not quiet:
+            say(shown)
+    if not quiet and not as_json:
+        say(f"\nwritten to {folder}: open {folder / 'cycles.png'}")
+    good = [n for n, one in found.results.items() if one.status != "failed"]
+    if not good:
+        say(f"foamfit: no acceptable fit of any cycle was found; see {folder}", err=True)
+    return 0 if good else NOT_ACCEPTABLE
+
+
+def _tell_result(result: FitResult, as_json: bool, quiet: bool, verbose: bool) -> None:
+    """Print a result."""
+    if as_json:
+        import json
+
+        say(json.dumps(result.to_json_dict(), allow_nan=False))
+    elif not quiet:
+        from foamfit.report.summary import summary_text
+
+        say(summary_text(result, verbose=verbose))
+
+
+def _result_folder(out: Path | None, test: Path, specimen: Path | None, model: str) -> Path:
+    """Return the folder for a result, which must not be one that would be lost."""
+    from foamfit.report.folder import check_target
+
+    folder = Path("fits", test.stem, model) if out is None else out
+    check_target(folder)
+    for path in (test, specimen or test.with_suffix(".toml")):
+        if folder.resolve() in path.resolve().parents and folder.is_dir():
+            raise InputError(
+                f"{folder} holds {path.name} and would be replaced as a whole; choose another --out"
+            )
+    return folder

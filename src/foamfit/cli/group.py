@@ -1,0 +1,105 @@
+"""The command `foamfit` itself: its help, its exit codes, and how every refusal is one sentence."""
+
+# ruff: noqa: D301  (a \b keeps click from joining the lines of an example)
+
+from __future__ import annotations
+
+import atexit
+import functools
+import gc
+import os
+import signal
+import sys
+from typing import Any, NoReturn
+
+import click
+
+from foamfit.errors import InputError, SimulationError
+from foamfit.terminal import TerminatedError, ending_cleanly, say, show_all
+
+# Exit codes: the input or the call is wrong; no acceptable fit; a defect (EX_SOFTWARE of
+# sysexits.h). The number of a signal that ended the command is added to the last.
+WRONG, NOT_ACCEPTABLE, DEFECT, SIGNALLED = 1, 2, 70, 128
+
+
+class _Group(click.Group):
+    """A command group whose every refusal is one sentence with its exit code."""
+
+    def main(self, *args: Any, **kwargs: Any) -> Any:
+        kwargs["standalone_mode"] = False
+        _spare_the_collector()
+        show_all()
+        try:
+            with ending_cleanly():
+                code = super().main(*args, **kwargs)
+                say("", newline=False)  # what click has printed
+        except click.ClickException as error:
+            _leave(WRONG, _one_sentence(error))
+        except (InputError, SimulationError) as error:
+            _leave(WRONG, str(error))
+        except (click.Abort, KeyboardInterrupt):
+            _leave(SIGNALLED + signal.SIGINT, "interrupted by Ctrl-C")
+        except TerminatedError as error:
+            _leave(SIGNALLED + error.number, f"ended by {signal.Signals(error.number).name}")
+        except Exception as error:
+            if os.environ.get("FOAMFIT_TRACEBACK"):
+                raise
+            told = f"{type(error).__name__}: {error}"
+            _leave(
+                DEFECT,
+                f"this is a defect of foamfit, please report it ({told}); FOAMFIT_TRACEBACK=1 "
+                "shows where it is",
+            )
+        sys.exit(code if isinstance(code, int) else 0)
+
+
+@functools.cache
+def _spare_the_collector() -> None:
+    """Keep the garbage collector from going through what the imports have made.
+
+    These are some hundred thousand objects that all stay; to collect them took a quarter of a fit.
+    """
+    gc.set_threshold(100_000, 20, 10)
+    atexit.register(gc.freeze)
+
+
+def _leave(code: int, message: str) -> NoReturn:
+    """Print one line on stderr and leave."""
+    say(f"foamfit: {' '.join(message.split())}", err=True)
+    sys.exit(code)
+
+
+def _one_sentence(error: click.ClickException) -> str:
+    """Return what click refuses, and where the right call is told, where click does not tell it."""
+    message = error.format_message()
+    if isinstance(error, click.UsageError) and not isinstance(error, click.BadParameter):
+        path = error.ctx.command_path if error.ctx else "foamfit"
+        message = message.replace(". Did you", ", did you").replace(". (Did you", " (did you")
+        message = f"{message.rstrip('.?')}; see {path} --help"
+    return message
+
+
+@click.group(
+    "foamfit",
+    cls=_Group,
+    invoke_without_command=True,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+@click.version_option(package_name="foamfit", message="foamfit %(version)s")
+@click.pass_context
+def main(context: click.Context) -> None:
+    """Identify the parameters of a foam from an impact or compression test.
+
+    \b
+    Look at a test, then fit it:
+        foamfit check experiments/foam-1/model-1-2.0mps-reconstruction.csv
+        foamfit fit experiments/foam-1/model-1-2.0mps-reconstruction.csv
+    Two springs, fixed seed, result as JSON:
+        foamfit fit TEST.csv --model linear+bistable --seed 1 --json
+    A forward run:
+        foamfit simulate SCENE.toml --plot scene.png
+
+    The model is that of Thevamaran, Fraternali & Daraio (2014), J. Appl. Mech. 81, 121006.
+    """
+    if context.invoked_subcommand is None:
+        say(context.get_help())

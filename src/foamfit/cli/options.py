@@ -1,0 +1,83 @@
+"""What several commands share: options, the compilation at first use, progress, files to write."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import click
+
+from foamfit.errors import InputError
+from foamfit.files import check_file
+from foamfit.terminal import say
+
+FILE = click.Path(path_type=Path)
+TEST = click.argument("test", metavar="TEST.csv", type=FILE)
+SPECIMEN = click.option(
+    "--specimen", metavar="FILE.toml", type=FILE,
+    help="Specimen, striker, columns, noise, window, data. Default: TEST.toml beside the CSV.",
+)  # fmt: skip
+CYCLE = click.option(
+    "--cycle", metavar="N|all",
+    help="Cycle of a slow record: a number, several as 1,2,10, or all. Default: the first.",
+)  # fmt: skip
+PLOT = click.option("--plot", type=FILE, help="Also draw a PNG, PDF or SVG.")
+DRIVE = click.option(
+    "--drive",
+    type=click.Choice(["impact", "stress", "displacement"]),
+    help="Default: impact if striker and time are known, else displacement.",
+)  # fmt: skip
+RELAXATION = click.option(
+    "--relaxation", type=click.IntRange(min=0), default=0, show_default=True, metavar="N",
+    help="Relaxation terms of every bistable and microscale spring; auto tries one by itself.",
+)  # fmt: skip
+
+
+@contextmanager
+def compiling(quiet: bool) -> Iterator[Callable[[], None]]:
+    """Compile at first use, beside the body; it calls what is given before it simulates."""
+    import logging
+
+    from foamfit.solve import cache, precompile
+
+    if quiet:  # what is compiled later is announced by the log
+        logging.getLogger("foamfit").setLevel(logging.ERROR)
+    if cache.compiled():
+        yield lambda: None
+        return
+    if not quiet:
+        say("foamfit: compiling the solver, once after installation", err=True)
+    with precompile.side_by_side() as finish:
+        yield finish
+
+
+@contextmanager
+def progress_bar(quiet: bool) -> Iterator[Callable[[float, str], None]]:
+    """Give a progress bar on stderr; silent when stderr is no terminal."""
+    if quiet or not sys.stderr.isatty():
+        yield lambda fraction, what: None
+        return
+    with click.progressbar(length=1000, label="fit", file=sys.stderr, show_eta=False) as bar:
+
+        def progress(fraction: float, what: str) -> None:
+            bar.label = f"fit: {what:<10}"
+            bar.update(round(1000 * fraction) - bar.pos)
+
+        yield progress
+
+
+def check_files(table: Path | None, plot: Path | None, inputs: Iterable[Path]) -> None:
+    """Refuse files that could not be written, or that are read too, before anything is computed."""
+    given = [path for path in (table, plot) if path is not None]
+    for path in given:
+        check_file(path)
+        if path.resolve() in [source.resolve() for source in inputs]:
+            raise InputError(f"{path} is read by this command and would be lost; name another file")
+    if len({path.resolve() for path in given}) < len(given):
+        raise InputError(f"{given[0]} cannot be two things; name two files")
+    if plot is not None:
+        from foamfit.report.figures import figure_format
+
+        figure_format(plot)

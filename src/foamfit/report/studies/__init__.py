@@ -1,0 +1,1 @@
+"""What a person reads of several tests at once: tables, pages and pictures of `foamfit.study`."""
