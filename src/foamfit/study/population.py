@@ -169,6 +169,8 @@ class Population:
     def nearest(self, admissible: Callable[[Array], bool]) -> Array | None:
         """Values with the own parameters of the admissible test nearest to their means."""
         names, mean, off = self._own
+        if not names:
+            return None
         scale = np.sqrt(np.mean(off**2, axis=0))
         for row in off[np.argsort(np.sum((off / scale) ** 2, axis=1))]:
             values = {name: self._at_rate(name, one.value, one.b) for name, one in self._items}

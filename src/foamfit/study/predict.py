@@ -199,8 +199,8 @@ def _point(population: Population, problem: Problem, warnings: list[str]) -> Arr
     nearest = population.nearest(lambda values: _admissible(problem, values))
     if nearest is None:
         raise SimulationError(
-            f"{population.source.where}: the common values are no admissible spring, nor are those "
-            "of a test"
+            f"{population.source.where}: its common values are no admissible spring, nor are those "
+            "of a test; give the result of a fit as foamfit wrote it"
         )
     warnings.append(
         "The medians of the own parameters are no admissible spring together; the curve is that of "
