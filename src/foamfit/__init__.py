@@ -25,6 +25,8 @@ _HOME = {
     "read_test": "data.csv_file",
     "CycleFits": "study.cycles",
     "fit_cycles": "study.cycles",
+    "JointResult": "study.joint",
+    "joint": "study.joint",
     "FitResult": "api",
     "fit": "api",
     "make_params": "fitting.problem",
