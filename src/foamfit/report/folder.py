@@ -28,8 +28,10 @@ RESULT_FILES = (
 )  # fmt: skip
 CYCLES_FILES = ("cycles.json", "cycles.csv", "cycles.png")
 JOINT_FILES = ("joint.json", "joint.html", "joint.png")
-# One of these says whose folder it is.
-_MARKS = ("fit.json", "cycles.json", "joint.json")
+# What `studies.batch` writes beside the folders of the tests, and into each of them.
+BATCH_FILES = ("summary.csv", "summary.html", "batch.json")
+# One of these is in every result.
+MARKS = ("fit.json", "cycles.json", "joint.json", "batch.json")
 
 
 def save_result(result: Fit, folder: str | Path) -> Path:
@@ -88,7 +90,7 @@ def _check_replaceable(folder: Path, place: Path) -> None:
     if place.is_mount():
         raise InputError(f"{folder} is a mount point and cannot be replaced; name a folder in it")
     there = sorted(place.iterdir())
-    if there and not any(_is_of_fit(place / name) for name in _MARKS):
+    if there and not any(_is_of_fit(place / name) for name in MARKS):
         raise InputError(
             f"{folder} is not empty and holds no foamfit result (no fit.json of foamfit), so it is "
             "not replaced; choose a new or an empty folder"
@@ -158,8 +160,8 @@ def load_result(folder: str | Path) -> dict[str, Any]:
     return content
 
 
-def write_result(result: Fit, folder: Path) -> None:
-    """Write all files of a result into a folder that is there."""
+def write_result(result: Fit, folder: Path, *, pages: bool = True) -> None:
+    """Write all files of a result into a folder that is there; the report and figures if wanted."""
     text = json.dumps(result.to_json_dict(), indent=2, ensure_ascii=False, allow_nan=False)
     # A name that is no UTF-8 keeps its bytes as an escape of JSON.
     (folder / "fit.json").write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
@@ -169,6 +171,8 @@ def write_result(result: Fit, folder: Path) -> None:
         write_table(folder / "profiles.csv", _profile_rows(result.intervals))
     if result.ladder is not None:
         write_table(folder / "ladder.csv", result.ladder.rows())
+    if not pages:
+        return
     figure = plot_fit(result)
     with laid_out(figure):
         png, pdf = image(figure, "png"), image(figure, "pdf")
