@@ -27,6 +27,8 @@ _HOME = {
     "fit_cycles": "study.cycles",
     "Prediction": "study.predict",
     "predict": "study.predict",
+    "JointResult": "study.joint",
+    "joint": "study.joint",
     "FitResult": "api",
     "fit": "api",
     "make_params": "fitting.problem",

@@ -53,7 +53,7 @@ def fit_content(**changes) -> dict:
     }
     parameters["s1_sigma_plus"] |= {"stderr": 1e3, "vary": True, "state": "determined"}
     return {
-        "schema": 1, "test": "fitted", "model": "microscale", "relaxation": 0,
+        "schema": 1, "foamfit": "0", "test": "fitted", "model": "microscale", "relaxation": 0,
         "drive": "displacement", "status": "ok", "data": {"rate": 0.25}, "parameters": parameters,
         "misfit": {"stress_strain": 0.01}, "noise": {},
         "correlation": {"names": ["s1_sigma_plus"], "matrix": [[1.0]]},
@@ -497,7 +497,7 @@ def test_the_command_replaces_predictions_and_nothing_else(tmp_path, monkeypatch
     before = (result / "fit.json").read_bytes()
     done = run("predict", result, record, "--out", result, "--draws", DRAWS)
     assert done.exit_code == 1
-    assert "no prediction.json" in done.stderr
+    assert "holds fit.json, which is no part of a prediction" in done.stderr
     assert (result / "fit.json").read_bytes() == before
     out = tmp_path / "out"
     for seed in (0, 1):

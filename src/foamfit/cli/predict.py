@@ -63,11 +63,11 @@ def predict(
         foamfit predict joint/new-heel OTHER.csv --cycle 2 --out predictions/second
     """
     from foamfit.data.csv_file import read_test
-    from foamfit.report.folder import PREDICTION, check_target
+    from foamfit.report.studies.prediction import check_replaceable
     from foamfit.study.identified import read_source
 
     folder = Path("predictions", test.stem) if out is None else out
-    check_target(folder, PREDICTION)
+    check_replaceable(folder)
     for path in (test, specimen or test.with_suffix(".toml"), result):
         if folder.resolve() in path.resolve().parents and folder.is_dir():
             raise InputError(

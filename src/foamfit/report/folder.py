@@ -6,9 +6,9 @@ import csv
 import json
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import Outliers, interior_channel
@@ -27,20 +27,13 @@ RESULT_FILES = (
     "fit.pdf", "report.html",
 )  # fmt: skip
 CYCLES_FILES = ("cycles.json", "cycles.csv", "cycles.png")
-
-
-class Contents(NamedTuple):
-    """What foamfit writes into a folder, so that it may be replaced by another of its kind."""
-
-    marks: tuple[str, ...]  # One of these, with a schema, shows that foamfit wrote it
-    files: tuple[str, ...]
-
-
-RESULT = Contents(("fit.json", "cycles.json"), (*RESULT_FILES, *CYCLES_FILES))
-PREDICTION = Contents(
-    ("prediction.json",),
-    ("prediction.json", "prediction.csv", "prediction.png", "prediction.pdf"),
-)
+JOINT_FILES = ("joint.json", "joint.html", "joint.png")
+# What `studies.batch` writes beside the folders of the tests, and into each of them.
+BATCH_FILES = ("summary.csv", "summary.html", "batch.json")
+PREDICTION_FILES = ("prediction.json", "prediction.csv", "prediction.png", "prediction.pdf")
+# One of these is in every result.
+MARKS = ("fit.json", "cycles.json", "joint.json", "batch.json", "prediction.json")
+_FILES = (*RESULT_FILES, *CYCLES_FILES, *JOINT_FILES, *PREDICTION_FILES)
 
 
 def save_result(result: Fit, folder: str | Path) -> Path:
@@ -53,16 +46,14 @@ def save_result(result: Fit, folder: str | Path) -> Path:
     return save_whole(folder, lambda fresh: write_result(result, fresh))
 
 
-def save_whole(
-    folder: str | Path, write: Callable[[Path], None], contents: Contents = RESULT
-) -> Path:
+def save_whole(folder: str | Path, write: Callable[[Path], None]) -> Path:
     """Let `write` fill a new folder, which replaces an older result at the end; returns it."""
     folder = Path(folder)
-    check_target(folder, contents)
+    check_target(folder)
     try:
         with replacing(folder.resolve()) as fresh:
             write(fresh)
-            check_target(folder, contents)  # what has been put there in the meantime stays
+            check_target(folder)  # what has been put there in the meantime stays
     except OSError as error:
         raise InputError(
             f"the result cannot be written to {folder}: {reason(error)}; choose another folder"
@@ -70,7 +61,7 @@ def save_whole(
     return folder
 
 
-def check_target(folder: str | Path, contents: Contents = RESULT) -> None:
+def check_target(folder: str | Path) -> None:
     """Raise InputError unless `folder` is free, empty or an older result that may be replaced."""
     folder = Path(folder)
     try:
@@ -82,7 +73,7 @@ def check_target(folder: str | Path, contents: Contents = RESULT) -> None:
                 "as a whole; choose a folder of its own"
             )
         if place.is_dir():
-            _check_replaceable(folder, place, contents)
+            _check_replaceable(folder, place)
         elif os.path.lexists(place):
             raise InputError(f"{folder} is a file; choose a new or an empty folder")
         for there in (place, next(path for path in place.parents if path.exists())):
@@ -96,33 +87,44 @@ def check_target(folder: str | Path, contents: Contents = RESULT) -> None:
         ) from error
 
 
-def _check_replaceable(folder: Path, place: Path, contents: Contents) -> None:
+def _check_replaceable(folder: Path, place: Path) -> None:
     """Refuse a folder that is there, at `place`, and must not or cannot be replaced."""
     if place.is_mount():
         raise InputError(f"{folder} is a mount point and cannot be replaced; name a folder in it")
     there = sorted(place.iterdir())
-    if there and not any(_is_of_fit(place / name) for name in contents.marks):
-        what = "result" if contents is RESULT else contents.marks[0].removesuffix(".json")
+    if there and not any(_is_of_fit(place / name) for name in MARKS):
         raise InputError(
-            f"{folder} is not empty and holds no foamfit {what} (no {contents.marks[0]} of "
-            "foamfit), so it is not replaced; choose a new or an empty folder"
+            f"{folder} is not empty and holds no foamfit result (no fit.json of foamfit), so it is "
+            "not replaced; choose a new or an empty folder"
         )
+    tests = _tests_of(place)
     for path in there:
-        if not is_written(path, contents):
+        if not is_written(path, tests):
             raise InputError(
                 f"{folder} holds {path.name}, which foamfit did not write, so it is not replaced; "
                 "move that or choose another folder"
             )
 
 
-def is_written(path: Path, contents: Contents = RESULT) -> bool:
-    """Whether something in a result folder is what foamfit writes there."""
+def is_written(path: Path, tests: Collection[str] = ()) -> bool:
+    """Whether something in a result folder is what a fit writes there.
+
+    `tests` are the names of the folders that a joint fit says to be its own.
+    """
     if path.is_symlink():
         return False
-    if contents is RESULT and re.fullmatch(r"cycle-\d+", path.name) and path.is_dir():
+    if path.is_dir() and (re.fullmatch(r"cycle-\d+", path.name) or path.name in tests):
         within = list(path.iterdir())
         return all(inner.name in RESULT_FILES and is_written(inner) for inner in within)
-    return path.name in contents.files and path.is_file()
+    return path.name in _FILES and path.is_file()
+
+
+def _tests_of(place: Path) -> Collection[str]:
+    """Names of the tests whose folders a joint fit has written here."""
+    if not _is_of_fit(place / "joint.json"):
+        return ()
+    tests = json.loads((place / "joint.json").read_text(encoding="utf-8")).get("tests")
+    return tests.keys() if isinstance(tests, dict) else ()
 
 
 def _is_of_fit(path: Path) -> bool:
@@ -160,8 +162,8 @@ def load_result(folder: str | Path) -> dict[str, Any]:
     return content
 
 
-def write_result(result: Fit, folder: Path) -> None:
-    """Write all files of a result into a folder that is there."""
+def write_result(result: Fit, folder: Path, *, pages: bool = True) -> None:
+    """Write all files of a result into a folder that is there; the report and figures if wanted."""
     text = json.dumps(result.to_json_dict(), indent=2, ensure_ascii=False, allow_nan=False)
     # A name that is no UTF-8 keeps its bytes as an escape of JSON.
     (folder / "fit.json").write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
@@ -171,6 +173,8 @@ def write_result(result: Fit, folder: Path) -> None:
         write_table(folder / "profiles.csv", _profile_rows(result.intervals))
     if result.ladder is not None:
         write_table(folder / "ladder.csv", result.ladder.rows())
+    if not pages:
+        return
     figure = plot_fit(result)
     with laid_out(figure):
         png, pdf = image(figure, "png"), image(figure, "pdf")

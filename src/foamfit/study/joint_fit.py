@@ -9,7 +9,7 @@ value and the spread (`trust.scatter`): in turn until the spread stands still (L
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -19,11 +19,11 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.fitting.links import Links
 from foamfit.fitting.problem import Problem
-from foamfit.fitting.together import ITERATIONS, Together, fit_linked
+from foamfit.fitting.together import Together, fit_linked
 from foamfit.study.shared import bic, effective_samples
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.joint_covariance import JointCovariance, JointPoint
-from foamfit.trust.law_error import CurveError, curve_errors
+from foamfit.trust.residuals.law_error import CurveError, curve_errors
 from foamfit.trust.scatter import Spread, common_and_spread
 
 # Rounds between the best values and the spreads at most, and the change of the logarithm of a
@@ -145,32 +145,24 @@ class Alternative:
     chosen: bool
     bic: float
     n_vary: int
-    chisqr: float
+    chi2: float
 
 
 def evidence(
-    fit: Together, names: Sequence[str], n_eff: int, kinds: Sequence[str]
-) -> tuple[list[Alternative], dict[str, Together]]:
-    """Fit each of these parameters as each of these kinds, the others as they are."""
-    out, best = list[Alternative](), dict[str, Together]()
+    fit: Together, names: Sequence[str], n_eff: int, kinds: Sequence[str],
+    near: Sequence[Sequence[Array]],
+) -> Iterator[Alternative]:  # fmt: skip
+    """Evidence for each of these kinds of each of these parameters, the others as they are.
+
+    The fits start at that fit, and at the points `near`.
+    """
     for name in names:
         own = fit.links.kind(name)
-        fits = {
-            kind: fit if kind == own else _other(fit, name, kind)
-            for kind in dict.fromkeys((own, *kinds))
-        }
-        scores = {kind: bic(one.cost, one.n_data, one.n_vary, n_eff) for kind, one in fits.items()}
-        best[name] = fits[min(scores, key=lambda kind: scores[kind])]
-        out += [
-            Alternative(name, kind, kind == own, scores[kind], one.n_vary, one.cost)
-            for kind, one in fits.items()
-        ]
-    return out, best
-
-
-def _other(fit: Together, name: str, kind: str) -> Together:
-    links = replace(fit.links, kinds={**fit.links.kinds, name: kind})
-    return fit_linked(fit.problems, links, [fit.values], iterations=ITERATIONS)
+        for kind in dict.fromkeys((own, *kinds)):
+            links = replace(fit.links, kinds={**fit.links.kinds, name: kind})
+            one = fit if kind == own else fit_linked(fit.problems, links, [fit.values, *near])
+            score = bic(one.cost, one.n_data, one.n_vary, n_eff)
+            yield Alternative(name, kind, kind == own, score, one.n_vary, one.cost)
 
 
 def choose_kinds(

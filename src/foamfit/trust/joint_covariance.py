@@ -21,8 +21,8 @@ from foamfit.fitting.links import RATES, law_bend, law_slopes
 from foamfit.fitting.together import Together
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import AT_LIMIT, FLATTEST
-from foamfit.trust.law_error import CurveError
-from foamfit.trust.noise_process import NoiseProcess, parts
+from foamfit.trust.residuals.law_error import CurveError
+from foamfit.trust.residuals.noise_process import NoiseProcess, parts
 
 # Directions whose curvature is below this share of the largest are not seen.
 UNSEEN = 1e-13

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from foamfit.errors import InputError
 from foamfit.report.figures import BLUE, GREY, INSIDE, VERMILION, drawing, image, laid_out
-from foamfit.report.folder import PREDICTION, save_whole, write_table
+from foamfit.report.folder import PREDICTION_FILES, check_target, save_whole, write_table
 from foamfit.report.readable import readable_unit
 from foamfit.text import aligned, percent, wrapped
 
@@ -39,7 +40,23 @@ def save_prediction(found: PredictedTest, folder: str | Path) -> Path:
             (fresh / "prediction.png").write_bytes(image(figure, "png"))
             (fresh / "prediction.pdf").write_bytes(image(figure, "pdf"))
 
-    return save_whole(folder, write, PREDICTION)
+    check_replaceable(folder)
+    return save_whole(folder, write)
+
+
+def check_replaceable(folder: str | Path) -> None:
+    """Raise InputError unless `folder` is free, empty or an older prediction.
+
+    A result of another kind is not replaced: it may be the one that is predicted from.
+    """
+    check_target(folder)
+    place = Path(folder)
+    there = sorted(path.name for path in place.iterdir()) if place.is_dir() else []
+    if others := [name for name in there if name not in PREDICTION_FILES]:
+        raise InputError(
+            f"{folder} holds {others[0]}, which is no part of a prediction, so it is not replaced; "
+            "choose a new or an empty folder"
+        )
 
 
 # ------------------------------------------------------------------------------- in words

@@ -1,0 +1,113 @@
+"""From files, folders and globs to named tests."""
+
+from __future__ import annotations
+
+import glob
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from foamfit.errors import InputError
+from foamfit.report.folder import BATCH_FILES, CYCLES_FILES, RESULT_FILES
+from foamfit.text import listed
+
+ENDINGS = (".csv", ".txt", ".tsv", ".dat")
+# Stems of tables that say what the specimens are, beside the tests.
+_SPECIMENS = ("specimen", "specimens")
+# What marks a folder as one that foamfit wrote: its tables are results.
+_MARKS = ("fit.json", "cycles.json", "batch.json", "summary.html")
+_WRITTEN = (*RESULT_FILES, *CYCLES_FILES, *BATCH_FILES)
+
+
+def find_tests(
+    patterns: str | Path | Iterable[str | Path], base: str | Path = "."
+) -> list[tuple[str, Path]]:
+    """Find the tests that files, folders and globs name.
+
+    Parameters
+    ----------
+    patterns : str, Path or several of them
+        Files, folders, globs ("**" goes into folders). Of a folder, and of what a glob matches,
+        tables are taken (`ENDINGS`) that are no list of specimens and no result of foamfit. A file
+        that is named itself is always taken.
+    base : str or Path
+        The folder that relative ones start from.
+
+    Returns
+    -------
+    list of (str, Path)
+        Names and files in the order of the files, each file once. A name is the stem of its file;
+        where two have the same, parent folders stand before it, joined by "-".
+
+    Raises
+    ------
+    InputError
+        If a glob matches no test, or a folder has none; the message names it.
+    """
+    given = [patterns] if isinstance(patterns, str | Path) else list(patterns)
+    if not given:
+        raise InputError("no test is named; give files, folders or globs")
+    found = {path.resolve(): path for one in given for path in _matches(one, Path(base))}
+    paths = sorted(found.values())
+    return list(zip(_names(paths), paths, strict=True))
+
+
+def _matches(pattern: str | Path, base: Path) -> list[Path]:
+    """The files of one pattern."""
+    path = base / pattern
+    if path.is_dir():
+        there = _tests_in(path)
+        if not there:
+            raise InputError(
+                f"{pattern}: the folder has no test; a test is a table that ends in "
+                f"{listed(ENDINGS)}"
+            )
+        return there
+    if path.exists() or not glob.has_magic(str(pattern)):
+        return [path]  # one that is not there is refused where it is read
+    hits = [Path(hit) for hit in glob.glob(str(path), recursive=True)]
+    there = [hit for hit in hits if hit.is_file() and _is_test(hit)]
+    there += [inner for hit in hits if hit.is_dir() for inner in _tests_in(hit)]
+    if not there:
+        why = "matches no file" if not hits else "matches no test"
+        raise InputError(
+            f"{pattern}: the glob {why}; a test is a table that ends in {listed(ENDINGS)}"
+        )
+    return there
+
+
+def _tests_in(folder: Path) -> list[Path]:
+    return [path for path in folder.iterdir() if path.is_file() and _is_test(path)]
+
+
+def _is_test(path: Path) -> bool:
+    """Whether a file is taken where it is not named itself."""
+    if path.suffix.lower() not in ENDINGS or path.stem.lower() in _SPECIMENS:
+        return False
+    if path.name.startswith("."):
+        return False
+    is_result = path.name in _WRITTEN and any((path.parent / mark).is_file() for mark in _MARKS)
+    return not is_result
+
+
+def _names(paths: list[Path]) -> Iterator[str]:
+    """Name each file by its stem, and by as many parents as tell it from the others."""
+    wholes = [path.resolve() for path in paths]
+    beside = Counter((whole.parent, whole.stem.casefold()) for whole in wholes)
+    stems = [
+        w.stem if beside[w.parent, w.stem.casefold()] == 1 else w.name.replace(".", "-")
+        for w in wholes
+    ]
+    names = list(stems)
+    for depth in range(1, max((len(whole.parts) for whole in wholes), default=0)):
+        counts = Counter(name.casefold() for name in names)
+        for i, whole in enumerate(wholes):
+            if counts[names[i].casefold()] > 1:
+                names[i] = "-".join([*whole.parent.parts[1:][-depth:], stems[i]])
+    taken = set[str]()
+    for name in names:
+        unique, count = name, 1
+        while unique.casefold() in taken:  # "a-b.csv" beside "a/b.csv"
+            unique, count = f"{name}-{count + 1}", count + 1
+        taken.add(unique.casefold())
+        yield unique

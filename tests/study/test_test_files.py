@@ -1,0 +1,66 @@
+"""Files, folders and globs become named tests."""
+
+import pytest
+
+from foamfit.errors import InputError
+from foamfit.study.test_files import find_tests
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """Tests of two days, what lies beside them, and a result."""
+    monkeypatch.chdir(tmp_path)
+    files = (
+        "monday/a.csv monday/a.toml monday/b.txt monday/specimens.csv monday/picture.png "
+        "monday/.hidden.csv tuesday/a.csv tuesday/c.dat tuesday/fits/fit.json "
+        "tuesday/fits/curves.csv empty/notes.md"
+    )
+    for name in files.split():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("x")
+    return tmp_path
+
+
+def names(*patterns, **options):
+    return [name for name, _ in find_tests(patterns, **options)]
+
+
+def test_a_folder_gives_its_tables_but_no_list_of_specimens_and_no_result(here):
+    found = [(name, path.as_posix()) for name, path in find_tests("monday")]
+    assert found == [("a", "monday/a.csv"), ("b", "monday/b.txt")]
+    with pytest.raises(InputError, match="tuesday/fits: the folder has no test"):
+        find_tests("tuesday/fits")
+
+
+def test_names_that_collide_get_their_parents(here):
+    assert names("monday", "tuesday") == ["monday-a", "b", "tuesday-a", "c"]
+    (here / "monday/a.txt").write_text("x")
+    assert names("monday") == ["a-csv", "a-txt", "b"]
+    (here / "monday-a.csv").write_text("x")
+    found = names("**/*.csv")
+    assert len({name.casefold() for name in found}) == len(found) == 3
+
+
+def test_each_file_is_taken_once_and_in_order(here):
+    assert names("tuesday/c.dat", "monday/*", "monday/a.csv", "tuesday/*.csv") == [
+        "monday-a", "b", "tuesday-a", "c",
+    ]  # fmt: skip
+    assert names("monday/*.csv", "monday/specimens.csv") == ["a", "specimens"]
+    assert names("a.csv", base=here / "monday") == ["a"]
+
+
+def test_a_file_that_is_not_there_is_left_to_its_reader(here):
+    assert names("monday/none.csv") == ["none"]
+
+
+@pytest.mark.parametrize("pattern", ["monday/z*.csv", "monday/*.png", "none/**/*.csv", "empty"])
+def test_what_matches_nothing_is_named(here, pattern):
+    with pytest.raises(InputError) as error:
+        find_tests(["monday", pattern])
+    assert str(error.value).startswith(f"{pattern}: the ")
+    assert "a test is a table that ends in .csv, .txt, .tsv and .dat" in str(error.value)
+
+
+def test_a_name_with_brackets_is_a_file_where_there_is_one(here):
+    (here / "monday/run[1].csv").write_text("x")
+    assert names("monday/run[1].csv") == ["run[1]"]
