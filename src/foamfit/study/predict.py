@@ -31,8 +31,8 @@ from foamfit.text import counted, listed, percent
 DRAWS, FEWEST = 400, 40
 # By how much the rate of a test may lie outside the fitted ones, as a factor.
 RATE_FACTOR = 1.25
-# Draws that are tried for each that is wanted, before it is given up.
-TRIES = 50
+# Draws that are tried for each that is wanted, before the others are given up.
+TRIES = 5
 BAND = (0.025, 0.975)
 
 
