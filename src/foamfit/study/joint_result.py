@@ -228,5 +228,4 @@ class JointData:
             "redchi": found.cost / max(found.n_data - found.n_vary, 1),
             "n_effective": self.fit.covariance.effective,
             "n_eff": self.n_eff,
-            "nfev": sum(problem.objective.evaluations for problem in self.problems),
         }
