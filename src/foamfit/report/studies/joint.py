@@ -7,10 +7,15 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from foamfit.report.figures import image
 from foamfit.report.folder import save_whole, write_result
+from foamfit.report.studies.joint_page import joint_page
+from foamfit.report.studies.joint_plot import plot_joint
 
 if TYPE_CHECKING:
     from foamfit.study.joint_result import JointData, TestFit
+
+DPI = 180  # of the picture
 
 
 def save_joint(
@@ -28,6 +33,10 @@ def save_joint(
         folders = [fresh / name for name in found.tests]
         for _ in each(_write_test, found.test_fits(), folders, [reports] * len(folders)):
             pass
+        png = image(plot_joint(found), "png", DPI)
+        (fresh / "joint.png").write_bytes(png)
+        page = joint_page(found, png, linked=reports)
+        (fresh / "joint.html").write_text(page, encoding="utf-8", errors="replace")
 
     return save_whole(folder, write)
 

@@ -9,6 +9,7 @@ import numpy as np
 from foamfit.fitting.links import RATES, law_values
 from foamfit.report.figures import BLUE, GREY, VERMILION, drawing
 from foamfit.report.readable import readable_unit
+from foamfit.report.studies.joint_text import in_unit
 from foamfit.text import percent
 
 if TYPE_CHECKING:
@@ -16,11 +17,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from foamfit.arrays import Array
-    from foamfit.study.joint_result import JointData, JointParameter
+    from foamfit.study.joint_result import JointData
 
 # Columns of the picture, and inches of a loop and of a parameter.
 LOOPS, LOOP, COLUMNS, PANEL = 6, (1.25, 1.15), 3, (2.5, 1.6)
-MOST_LOOPS = 24
+MOST_LOOPS = 60
 MOST_NAMES = 12  # of tests that stand at an axis
 # Points of a drawn curve, and the share of the largest range that intervals may run out of.
 POINTS = 400
@@ -34,8 +35,10 @@ def plot_joint(found: JointData) -> Figure:
     between specimens.
     """
     shown = _shown(found)
-    names = [name for name, one in found.parameters.items() if one.kind != "fixed"]
-    rows, low = -(-len(shown) // LOOPS), -(-len(names) // COLUMNS)
+    names = [n for n, one in found.parameters.items() if one.kind not in ("fixed", "shared")]
+    shared = [n for n, one in found.parameters.items() if one.kind == "shared"]
+    panels = len(names) + bool(shared)
+    rows, low = -(-len(shown) // LOOPS), -(-panels // COLUMNS)
     heights = [rows * LOOP[1], low * PANEL[1]]
     with drawing(max(LOOPS * LOOP[0], COLUMNS * PANEL[0]), sum(heights) + 0.55) as figure:
         top, bottom = figure.subfigures(2, 1, height_ratios=heights, squeeze=False)[:, 0]
@@ -45,6 +48,8 @@ def plot_joint(found: JointData) -> Figure:
             _parameter(ax, found, name)
         for ax in axes[len(names) :]:
             ax.set_axis_off()
+        if shared:
+            _list(axes[len(names)], found, shared)
         more = (
             f"; {len(shown)} of {len(found.tests)} drawn" if len(shown) < len(found.tests) else ""
         )
@@ -106,8 +111,7 @@ def _parameter(ax: Axes, found: JointData, name: str) -> None:
     by_rate = found.rate0 is not None and len({f"{r:.2g}" for r in found.rates if r}) > 1
     factor, unit = readable_unit(abs(one.value), one.unit)
     x = np.array(found.rates, dtype=float) if by_rate else np.arange(1.0, len(found.tests) + 1)
-    title = name if "+" in found.study.model else name.removeprefix("s1_")
-    ax.set_title(f"{title}{f' ({unit})' if unit else ''}: {one.kind}")
+    ax.set_title(f"{_title(found, name)}{f' ({unit})' if unit else ''}: {one.kind}")
     middle, ends = [], list[float]()
     for at, test in zip(x, found.tests, strict=True):
         value = one.tests[test] if one.tests else None
@@ -151,14 +155,12 @@ def _common(ax: Axes, found: JointData, name: str, x: Array, factor: float) -> N
         told = f"b = {one.b:.3g}"
         if one.b_ci95 is not None:
             told += f" ({one.b_ci95[0]:.3g} to {one.b_ci95[1]:.3g})"
-        _say(ax, told)
+        _say(ax, told, below=one.b > 0.0)
         return
     ax.plot(span, [one.value / factor] * 2, color=VERMILION, linewidth=1.0, zorder=0)
     if one.ci95 is not None:
         low, high = (end / factor for end in one.ci95)
         ax.fill_between(span, low, high, color=VERMILION, alpha=0.18, linewidth=0, zorder=0)
-        if one.kind == "shared":
-            _room(ax, one, factor)
     if one.scatter:
         for sign in (-1.0, 1.0):
             edge = one.value * np.exp(sign * one.scatter) / factor
@@ -166,18 +168,28 @@ def _common(ax: Axes, found: JointData, name: str, x: Array, factor: float) -> N
         _say(ax, f"spread {percent(one.scatter)}")
 
 
-def _room(ax: Axes, one: JointParameter, factor: float) -> None:
-    """Leave room about the interval of a shared value, and say it."""
-    assert one.ci95 is not None
-    half = 0.5 * (one.ci95[1] - one.ci95[0]) / factor
-    middle = one.value / factor
-    ax.set_ylim(middle - max(3.0 * half, 1e-9), middle + max(3.0 * half, 1e-9))
-    if middle:
-        _say(ax, f"±{percent(abs(half / middle))}")
+def _list(ax: Axes, found: JointData, names: list[str]) -> None:
+    """Write the values that all tests share."""
+    lines = [["shared by all tests", "", ""]]
+    for name in names:
+        one = found.parameters[name]
+        half = None if one.ci95 is None else 0.5 * (one.ci95[1] - one.ci95[0])
+        error = f"±{percent(half / abs(one.value))}" if half and one.value else one.state or ""
+        lines.append([_title(found, name), in_unit((one.value,), one.unit), error])
+    size = min(7.0, 90.0 / len(lines))
+    for column, x in ((0, 0.0), (1, 0.42), (2, 0.78)):
+        told = "\n".join(line[column] for line in lines)
+        ax.text(x, 1.0, told, transform=ax.transAxes, va="top", fontsize=size, linespacing=1.5)
 
 
-def _say(ax: Axes, told: str) -> None:
-    ax.text(0.97, 0.96, told, transform=ax.transAxes, ha="right", va="top", fontsize=6.5)
+def _title(found: JointData, name: str) -> str:
+    """Name of a parameter, without the spring where there is one alone."""
+    return name if "+" in found.study.model else name.removeprefix("s1_")
+
+
+def _say(ax: Axes, told: str, *, below: bool = False) -> None:
+    y, side = (0.05, "bottom") if below else (0.97, "top")
+    ax.text(0.98, y, told, transform=ax.transAxes, ha="right", va=side, fontsize=6.5)
 
 
 def _limit(ax: Axes, values: list[float], ends: list[float]) -> None:

@@ -9,7 +9,7 @@ from foamfit.report.readable import readable_unit
 from foamfit.text import aligned, number, percent, wrapped
 
 if TYPE_CHECKING:
-    from foamfit.study.joint_result import JointData
+    from foamfit.study.joint_result import JointData, JointParameter
 
 MOST_ROWS = 60  # of the table of tests
 
@@ -41,20 +41,24 @@ def parameter_rows(found: JointData) -> list[list[str]]:
     for name, one in found.parameters.items():
         if one.kind == "fixed" and one.value == 0.0:
             continue
-        more = ""
-        if one.kind == "scatter" and one.scatter is not None and one.scatter_ci95 is not None:
-            low, high = one.scatter_ci95
-            more = f"scatters by {percent(one.scatter)} ({percent(low)} to {percent(high)})"
-        elif one.b is not None:
-            more = f"b = {one.b:.3g}"
-            if one.b_ci95 is not None:
-                more += f" ({one.b_ci95[0]:.3g} to {one.b_ci95[1]:.3g})"
-        elif one.kind == "own" and one.tests:
-            values = [at.value for at in one.tests.values()]
-            more = in_unit((min(values), max(values)), one.unit)
         ends = "" if one.ci95 is None else in_unit(one.ci95, one.unit)
-        rows.append([name, one.kind, in_unit((one.value,), one.unit), ends, one.state or "", more])
+        rows.append([name, one.kind, in_unit((one.value,), one.unit), ends, one.state or "",
+                     between(one)])  # fmt: skip
     return rows
+
+
+def between(one: JointParameter) -> str:
+    """What a parameter does from test to test."""
+    if one.kind == "scatter" and one.scatter is not None and one.scatter_ci95 is not None:
+        low, high = one.scatter_ci95
+        return f"scatters by {percent(one.scatter)} ({percent(low)} to {percent(high)})"
+    if one.b is not None:
+        ends = "" if one.b_ci95 is None else f" ({one.b_ci95[0]:.3g} to {one.b_ci95[1]:.3g})"
+        return f"b = {one.b:.3g}{ends}"
+    if one.kind == "own" and one.tests:
+        values = [at.value for at in one.tests.values()]
+        return in_unit((min(values), max(values)), one.unit)
+    return ""
 
 
 def in_unit(values: Sequence[float], unit: str) -> str:
