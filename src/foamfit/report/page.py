@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import base64
+import functools
 import math
 from collections.abc import Iterator
 from importlib.metadata import version
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from foamfit.fitting.branches import covered
 from foamfit.report.figures import DPI, image
@@ -19,6 +20,9 @@ from foamfit.springs.parameters import KINDS
 from foamfit.springs.spring import BistableSpring, MicroscaleSpring
 from foamfit.text import engineering, percent
 from foamfit.trust.covariance import RULE
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
 
 DRIVES = {
     "impact": "The motion follows from the mass and the velocity of the striker; nothing measured "
@@ -79,63 +83,73 @@ CITATION = (
 )
 
 
-def render_report(result: Fit, *, fit_png: bytes | None = None) -> str:
-    """Return the report as one HTML page that needs nothing else.
-
-    `fit_png` is the figure of `plots.plot_fit` as PNG, if it is there already.
-    """
+@functools.cache
+def environment() -> Environment:
+    """The templates of all pages."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    environment = Environment(
+    made = Environment(
         loader=PackageLoader("foamfit.report"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"number": number, "percent": percent}
+    made.filters |= {"number": number, "percent": percent}
+    return made
+
+
+def render_report(result: Fit, *, fit_png: bytes | None = None) -> str:
+    """Return the report as one HTML page that needs nothing else.
+
+    `fit_png` is the figure of `plots.plot_fit` as PNG, if it is there already.
+    """
     plain = result.to_json_dict()
     energy = plain["energy"]
     profiled = result.intervals is not None and result.intervals.profiles
     matrix = None if result.correlation is None else result.correlation.matrix
     insight = None if result.insight is None else plot_insight(result.insight, matrix)
-    return environment.get_template("report.html").render(
-        result=result,
-        version=version("foamfit"),
-        origin=origin_word(result),
-        conclusions=conclusions(result),
-        misfits=misfits(result),
-        statistics={
-            STATISTICS.get(name, name.replace("_", " ")): value
-            for name, value in plain["statistics"].items()
-            if name not in ("nfev", "n_starts")  # the page says these where it says how
-        },
-        visited=_visited(result),
-        marks=[MARKS[kind] for kind in MARKS if kind in result.model.split("+")],
-        parameters=[readable(name, p) for name, p in result.parameters.items()],
-        ranged=any(p.range for p in result.parameters.values()),
-        rule=RULE,
-        points={
-            f"Points of the law, spring {name}": _points(spring)
-            for name, spring in result.bistable_springs.items()
-        }
-        | {
-            f"Snapping of spring {name}": list(_snapping(result, name, spring))
-            for name, spring in result.microscale_springs.items()
-        },
-        energy_sentences=energy.pop("sentences", None) or [],
-        energy=dict(_energies(energy)),
-        drive_meaning=DRIVES.get(result.drive, ""),
-        ladder=result.ladder,
-        ladder_header=LADDER,
-        ladder_rows=[] if result.ladder is None else ladder_cells(result.ladder),
-        fit_figure=_figure(fit_png or image(plot_fit(result), "png")),
-        answers=ANSWERS,
-        badges=BADGES,
-        insight_figure=insight and _figure(image(insight, "png", COARSE), COARSE),
-        residual_figure=_figure(image(plot_residuals(result), "png")),
-        profile_figure=_figure(image(plot_profiles(result), "png")) if profiled else None,
-        citation=CITATION,
+    return (
+        environment()
+        .get_template("report.html")
+        .render(
+            result=result,
+            version=version("foamfit"),
+            origin=origin_word(result),
+            conclusions=conclusions(result),
+            misfits=misfits(result),
+            statistics={
+                STATISTICS.get(name, name.replace("_", " ")): value
+                for name, value in plain["statistics"].items()
+                if name not in ("nfev", "n_starts")  # the page says these where it says how
+            },
+            visited=_visited(result),
+            marks=[MARKS[kind] for kind in MARKS if kind in result.model.split("+")],
+            parameters=[readable(name, p) for name, p in result.parameters.items()],
+            ranged=any(p.range for p in result.parameters.values()),
+            rule=RULE,
+            points={
+                f"Points of the law, spring {name}": _points(spring)
+                for name, spring in result.bistable_springs.items()
+            }
+            | {
+                f"Snapping of spring {name}": list(_snapping(result, name, spring))
+                for name, spring in result.microscale_springs.items()
+            },
+            energy_sentences=energy.pop("sentences", None) or [],
+            energy=dict(_energies(energy)),
+            drive_meaning=DRIVES.get(result.drive, ""),
+            ladder=result.ladder,
+            ladder_header=LADDER,
+            ladder_rows=[] if result.ladder is None else ladder_cells(result.ladder),
+            fit_figure=_figure(fit_png or image(plot_fit(result), "png")),
+            answers=ANSWERS,
+            badges=BADGES,
+            insight_figure=insight and _figure(image(insight, "png", COARSE), COARSE),
+            residual_figure=_figure(image(plot_residuals(result), "png")),
+            profile_figure=_figure(image(plot_profiles(result), "png")) if profiled else None,
+            citation=CITATION,
+        )
     )
 
 

@@ -76,9 +76,7 @@ def readable(name: str, p: ParameterEstimate) -> Readable:
         span = " to ".join(f"{end:g}".replace("-", "−") for end in ends)
     unit = {"": "–", "1": "–", "-": "–", "Pa s": "Pa·s", "Pa*s": "Pa·s"}.get(unit, unit)
     method = p.ci95_method or ""
-    return Readable(
-        name, _symbol(name), shown, stderr, interval, unit, p.state, p.why, method, span
-    )
+    return Readable(name, symbol(name), shown, stderr, interval, unit, p.state, p.why, method, span)
 
 
 def number(value: float | None) -> str:
@@ -88,7 +86,7 @@ def number(value: float | None) -> str:
     return text.number(value) if isinstance(value, float) else str(value)
 
 
-def _symbol(name: str) -> tuple[str, str]:
+def symbol(name: str) -> tuple[str, str]:
     """Return the symbol of a parameter and its index: k and "c,2" of s2_kc."""
     spring, _, base = name.partition("_")
     term = re.fullmatch(r"(g|tau)(\d+)", base)

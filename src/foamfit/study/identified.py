@@ -211,9 +211,15 @@ def _parameter(item: object, joint: bool, where: str) -> Identified:
         raise InputError(f"{where}: kind is {kind!r}; it must be one of {', '.join(KINDS)}")
     tests: tuple[float, ...] = ()
     if kind in ("own", "scatter"):
-        each = _mapping(item, "tests", where)
-        values = [one.get("value") if isinstance(one, Mapping) else one for one in each.values()]
-        tests = tuple(_number(value, f"{where}: tests") for value in values)
+        each = [
+            one if isinstance(one, Mapping) else {}
+            for one in _mapping(item, "tests", where).values()
+        ]
+        # the spread is that of the tests that determine it
+        sure = [one for one in each if one.get("stderr") is not None]
+        if kind == "scatter" and len(sure) > 1:
+            each = sure
+        tests = tuple(_number(one.get("value"), f"{where}: tests") for one in each)
     scatter = item.get("scatter") if kind == "scatter" else 0.0
     return Identified(
         kind,

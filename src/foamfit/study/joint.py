@@ -20,6 +20,7 @@ from foamfit.fitting.links import KINDS, RATES, Links
 from foamfit.fitting.problem import Problem, make_params
 from foamfit.fitting.search import Tracker, descend
 from foamfit.one_model import Options, Progress, identify
+from foamfit.report.folder import check_target
 from foamfit.report.studies.joint import save_joint
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import unit_of
@@ -34,15 +35,17 @@ from foamfit.study.joint_fit import (
 )
 from foamfit.study.joint_result import JointData, JointParameter, TestValue
 from foamfit.study.study_file import AUTO, Study, read_study
+from foamfit.study.workers import workers
 from foamfit.text import counted, listed, percent
 from foamfit.trust import covariance
 from foamfit.trust.checklist import POOR, UNACCEPTABLE
-from foamfit.workers import workers
 
 # Tests that are searched as a fit of their own is; the others start at what these have found.
 SEARCHED = 3
 # Up to so many tests are fitted in this process: each takes some tenths of a second.
 FEW = 20
+# Up to so many result folders are written in this process: each takes a second or two.
+FEW_FOLDERS = 3
 # Reduced χ² of a test over the largest of those, past which it is searched as well.
 FAR = 2.0
 # Steps of a descent from what another test has found.
@@ -58,13 +61,15 @@ DOMINANT = 0.5
 class JointResult(JointData):
     """Everything that a joint fit found, and how it is written; its fields are `JointData`'s."""
 
-    def save(self, folder: str | Path, *, jobs: int | None = 1) -> Path:
+    def save(self, folder: str | Path, *, jobs: int | None = None, reports: bool = True) -> Path:
         """Write joint.json, joint.html, joint.png and a result folder per test; returns the folder.
 
         An older result there is replaced as a whole, at the end. The folders of the tests are made
-        by `jobs` processes (None: one for each core).
+        by `jobs` processes (by default one for each core), without `reports` with tables alone.
         """
-        return save_joint(self, folder, jobs)
+        check_target(folder)
+        with workers(jobs, len(self.tests), FEW_FOLDERS) as each:
+            return save_joint(self, folder, each, reports=reports)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,9 +86,10 @@ class _Test:
 def joint(
     path: str | Path,
     *,
-    jobs: int | None = 1,
+    jobs: int | None = None,
     out: str | Path | None = None,
     seed: int | None = None,
+    reports: bool = True,
     progress: Progress | None = None,
 ) -> JointResult:
     """Fit the tests of a study together.
@@ -94,10 +100,9 @@ def joint(
         STUDY.toml: tests, model, drive, and what each parameter is: "shared", "own", "scatter",
         "log rate", "power rate" or "auto", or a number that it is held at.
     jobs : int, optional
-        Processes, None for one on each core; a script that asks for more than one must begin below
-        ``if __name__ == "__main__":``. The numbers are the same with any.
+        Processes; by default one for each core. The numbers are the same with any.
     out : str or Path, optional
-        Folder to write the result to, as `JointResult.save` does.
+        Folder to write the result to, as `JointResult.save` does, with or without `reports`.
     seed : int, optional
         Of the search; by default that of the study, or 0.
     progress : callable, optional
@@ -116,6 +121,8 @@ def joint(
         If no start of the joint fit can be simulated.
     """
     began, study, tell = time.perf_counter(), read_study(path), progress or (lambda *_: None)
+    if out is not None:
+        check_target(out)
     seed = study.seed if seed is None else seed
     options = Options(
         drive=study.drive, seed=seed, starts=study.starts, relaxation=study.relaxation
@@ -133,7 +140,7 @@ def joint(
     result = _conclude(study, seed, tests, fit, alternatives, n_eff, refused, began)
     tell(1.0, "done")
     if out is not None:
-        result.save(out, jobs=jobs)
+        result.save(out, jobs=jobs, reports=reports)
     return result
 
 

@@ -21,9 +21,9 @@ from foamfit.fitting.links import Links
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.together import Together, fit_linked
 from foamfit.study.shared import bic, effective_samples
-from foamfit.trust.best_point import BestPoint
 from foamfit.trust.joint_covariance import JointCovariance, JointPoint
 from foamfit.trust.residuals.law_error import CurveError, curve_errors
+from foamfit.trust.residuals.noise_process import noise_processes
 from foamfit.trust.scatter import Spread, common_and_spread
 
 # Rounds between the best values and the spreads at most, and the change of the logarithm of a
@@ -121,16 +121,18 @@ def _still(before: Mapping[str, Spread], now: Mapping[str, Spread]) -> bool:
 
 def errors_of(found: Together, each: Map = map) -> tuple[tuple[CurveError, ...], ...]:
     """What the residual of each curve of each test is made of; see `BestPoint.errors`."""
-    bests = [
-        BestPoint(problem, values)
-        for problem, values in zip(found.problems, found.values, strict=True)
-    ]
-    plain = [best for best in bests if best.problem.objective.drive != "stress"]
+    point = JointPoint(found)
     work = [
-        (best.residual, best.jacobian * best.sizes, best.problem.objective.sizes) for best in plain
+        (best.residual, best.jacobian * best.sizes, best.problem.objective.sizes, point.taken(t))
+        for t, best in enumerate(point.bests)
     ]
-    made = iter(each(curve_errors, *zip(*work, strict=True)) if work else ())
-    return tuple(tuple(next(made)) if best in plain else best.errors for best in bests)
+    driven = [best.problem.objective.drive == "stress" for best in point.bests]
+    plain = [items for items, by_stress in zip(work, driven, strict=True) if not by_stress]
+    made = iter(each(curve_errors, *zip(*plain, strict=True)) if plain else ())
+    return tuple(
+        tuple(map(CurveError, noise_processes(*items)) if by_stress else next(made))
+        for items, by_stress in zip(work, driven, strict=True)
+    )
 
 
 # ------------------------------------------------------------------------------- evidence

@@ -20,10 +20,13 @@ from foamfit.study.joint_fit import Alternative, JointFit
 from foamfit.study.study_file import Study
 from foamfit.text import counted
 from foamfit.trust.best_point import BestPoint
+from foamfit.trust.checklist import status_of, warnings_of
 from foamfit.trust.conclude import conclude
 
 # Keys of a parameter that only some kinds have.
 _SCATTER = ("scatter", "scatter_stderr", "scatter_ci95")
+# Questions to a search of one test.
+_OF_A_SEARCH = ("ended", "agree")
 _RATE = ("b", "b_stderr", "b_ci95")
 
 
@@ -92,7 +95,11 @@ class TestFit:
         self.problem.put(self.values)
         record = SearchRecord(self.seed, 0, time.perf_counter())
         made = conclude(BestPoint(self.problem, self.values), record)
-        return replace(made, parameters=self.parameters, notes=(self.note, *made.notes))
+        checklist = tuple(check for check in made.checklist if check.key not in _OF_A_SEARCH)
+        return replace(
+            made, parameters=self.parameters, notes=(self.note, *made.notes), checklist=checklist,
+            status=status_of(checklist), warnings=warnings_of(checklist),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,5 +228,4 @@ class JointData:
             "redchi": found.cost / max(found.n_data - found.n_vary, 1),
             "n_effective": self.fit.covariance.effective,
             "n_eff": self.n_eff,
-            "nfev": sum(problem.objective.evaluations for problem in self.problems),
         }

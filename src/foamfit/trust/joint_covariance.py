@@ -228,6 +228,13 @@ class Arrow:
         cross = -(inverse @ side + gain @ v)
         return np.block([[v, cross.T], [cross, inverse @ inner @ inverse]])
 
+    def inverse(self, test: int) -> Array:
+        """Block of a test of the inverse curvature, (s + q, s + q)."""
+        own, gain, _ = self._own[test]
+        bread = self._shared[0]
+        cross = -gain @ bread
+        return np.block([[bread, cross.T], [cross, own - cross @ gain.T]])
+
     def errors(self, test: int) -> Array:
         """What each sample of a test does to shared and own coordinates, (n, s + q)."""
         block, s = self.blocks[test], self.s
@@ -272,7 +279,7 @@ class JointPoint:
     """
 
     found: Together
-    errors: tuple[tuple[CurveError, ...], ...]
+    errors: tuple[tuple[CurveError, ...], ...] = ()
     inflations: Mapping[str, Array] = field(default_factory=dict)
 
     @cached_property
@@ -345,12 +352,24 @@ class JointPoint:
         none = np.zeros((0, through.shape[1]))
         return _Block(
             best, best.names, jacobian, through, bend, np.array(rows) if rows else none,
-            np.array(wide) if wide else none, tuple(error.noise for error in self.errors[t]),
+            np.array(wide) if wide else none,
+            tuple(error.noise for error in self.errors[t]) if self.errors else (),
         )  # fmt: skip
 
     @cached_property
     def _plain(self) -> Arrow:
         return Arrow(self.blocks)
+
+    def taken(self, test: int) -> Array:
+        """What the joint fit took of the noise of a test; see `noise_processes`.
+
+        Along a direction that several tests determine it took a share of each one's noise only.
+        """
+        block = self.blocks[test]
+        inverse = block.through @ self._plain.inverse(test) @ block.through.T
+        basis, triangle = np.linalg.qr(block.jacobian)
+        share, axes = np.linalg.eigh(triangle @ inverse @ triangle.T)
+        return np.asarray((basis @ axes) * np.sqrt(np.clip(share, 0.0, 1.0)))
 
     @cached_property
     def _held(self) -> list[NDArray[np.bool_]]:

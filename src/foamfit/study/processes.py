@@ -1,0 +1,143 @@
+"""Processes of this machine that work one call at a time each: an executor.
+
+`concurrent.futures.ProcessPoolExecutor` gives up everything when one of its processes ends. Here
+each process has a pool of its own: the call it was at is known, and only that one is tried again.
+"""
+
+from __future__ import annotations
+
+import gc
+import logging
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor
+from concurrent.futures import ThreadPoolExecutor as Threads
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing import connection
+from types import ModuleType
+from typing import Any
+from unittest.mock import patch
+
+# Times that a call is tried whose process ends.
+ATTEMPTS = 2
+# One thread in each process: the processes are as many as the cores.
+ONE_THREAD = {
+    f"{name}_NUM_THREADS": "1"
+    for name in ("OMP", "OPENBLAS", "MKL", "NUMBA", "NUMEXPR", "VECLIB", "BLIS")
+}
+_STARTING = threading.Lock()
+
+
+class EndedError(RuntimeError):
+    """The process of a call has ended each time that it was tried."""
+
+
+def cores() -> int:
+    """Count the cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+class Processes(Executor):
+    """Processes of this machine with one thread each, which end with the one that started them.
+
+    A call whose process ends is tried again in another one, `ATTEMPTS` times in all, and then
+    raises `EndedError`; the calls of other processes go on. The functions must be those of modules;
+    the script that is running is not imported again, so it needs no guard.
+
+    Parameters
+    ----------
+    count : int
+        How many processes.
+    preload : tuple of str
+        Modules that are imported once, before the processes part from each other.
+    """
+
+    def __init__(self, count: int, preload: tuple[str, ...] = ()) -> None:
+        methods = multiprocessing.get_all_start_methods()
+        self._context: Any = multiprocessing.get_context(
+            "forkserver" if "forkserver" in methods else "spawn"
+        )
+        self._context.set_forkserver_preload(list(preload))
+        self._threads = Threads(count, thread_name_prefix="foamfit")
+        self._here = threading.local()  # the pool of each thread
+        self._pools = list[ProcessPoolExecutor]()
+        self._stop, self._stopping = self._context.Pipe(duplex=False)
+        self._stopped = False
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Have a function called in one of the processes."""
+        return self._threads.submit(self._call, fn, args, kwargs)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Let the calls end that are under way, and the processes then."""
+        self._threads.shutdown(wait, cancel_futures=cancel_futures)
+        for pool in self._pools:
+            pool.shutdown(wait)
+        self._stopping.close()
+        self._stop.close()
+
+    def stop(self) -> None:
+        """End the processes at once, whatever they are at."""
+        self._stopped = True
+        self._stopping.close()
+        self.shutdown(cancel_futures=True)
+
+    def _call(self, fn: Callable[..., Any], args: Any, kwargs: Any) -> Any:
+        """Call in the process of this thread; run by one of the threads."""
+        for _ in range(ATTEMPTS):
+            if self._stopped:
+                raise CancelledError
+            try:
+                return self._submitted(fn, args, kwargs).result()
+            except BrokenProcessPool:
+                self._here.pool.shutdown()
+                self._pools.remove(self._here.pool)
+                self._here.pool = None
+        if self._stopped:
+            raise CancelledError
+        raise EndedError(f"its process ended {ATTEMPTS} times before it was done")
+
+    def _submitted(self, fn: Callable[..., Any], args: Any, kwargs: Any) -> Future[Any]:
+        pool: ProcessPoolExecutor | None = getattr(self._here, "pool", None)
+        if pool is not None:
+            return pool.submit(fn, *args, **kwargs)
+        pool = ProcessPoolExecutor(1, self._context, _begin, (self._stop,))
+        self._here.pool = pool
+        self._pools.append(pool)
+        with _starting():
+            return pool.submit(fn, *args, **kwargs)
+
+
+@contextmanager
+def _starting() -> Iterator[None]:
+    """Start a process with one thread that does not import the running script again."""
+    script = ModuleType("__main__")
+    with (
+        _STARTING,
+        patch.dict(os.environ, ONE_THREAD),
+        patch.dict(sys.modules, {"__main__": script}),
+    ):
+        yield
+
+
+def _begin(stop: connection.Connection) -> None:
+    """Make a process ready: Ctrl-C is for the one that started it, whose end is its own."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    gc.freeze()  # what the imports have made stays
+    gc.set_threshold(100_000, 20, 10)
+    logging.getLogger("foamfit").setLevel(logging.ERROR)
+    threading.Thread(target=_end_with, args=(stop,), daemon=True).start()
+
+
+def _end_with(stop: connection.Connection) -> None:
+    """End this process at once when it is told to, or when the one that started it has ended."""
+    parent = multiprocessing.parent_process()
+    connection.wait([stop, *([] if parent is None else [parent.sentinel])])
+    os._exit(1)
