@@ -64,7 +64,7 @@ def predict(
     """
     from foamfit.data.csv_file import read_test
     from foamfit.report.studies.prediction import check_replaceable
-    from foamfit.study.identified import read_source
+    from foamfit.study.prediction.identified import read_source
 
     folder = Path("predictions", test.stem) if out is None else out
     check_replaceable(folder)

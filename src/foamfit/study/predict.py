@@ -17,9 +17,9 @@ from foamfit.fitting.curves import check_drive, choose_drive
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.report.studies.prediction import save_prediction
-from foamfit.study.identified import HasContent, Source, read_source
-from foamfit.study.population import NORMAL, Population
-from foamfit.study.predicted import (
+from foamfit.study.prediction.identified import HasContent, Source, read_source
+from foamfit.study.prediction.population import NORMAL, Population
+from foamfit.study.prediction.predicted import (
     PARTS,
     PredictedCurve,
     PredictedParameter,

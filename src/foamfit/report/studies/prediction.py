@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from foamfit.arrays import Array
-    from foamfit.study.predicted import PredictedCurve, PredictedTest
+    from foamfit.study.prediction.predicted import PredictedCurve, PredictedTest
 
 PANEL = (2.6, 2.2)  # inches
 # Colour of each part of the band.

@@ -20,7 +20,7 @@ from foamfit.errors import InputError
 from foamfit.fitting.box import is_logarithmic
 from foamfit.fitting.links import RATES, law
 from foamfit.springs.parameters import split_name
-from foamfit.study.identified import Identified, Pair, Source
+from foamfit.study.prediction.identified import Identified, Pair, Source
 
 NORMAL = 1.959964  # half of the 95 % interval of a normal distribution over its standard deviation
 
