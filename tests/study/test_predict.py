@@ -157,6 +157,33 @@ def test_the_band_holds_new_specimens(make):
     assert 0.90 < shares_of_new_specimens(make) < 0.99
 
 
+def test_own_values_that_change_with_the_rate_are_taken_at_that_of_the_test():
+    rng = np.random.default_rng(2)
+    rates = np.array([0.025, 0.025, 0.025, 1.0, 1.0, 1.0, 1.0, 1.0])
+    values = 1.1e5 * (rates / 0.25) ** 0.3 * np.exp(0.1 * rng.standard_normal(8))
+    content = own(values).content
+    found = {}
+    for name, at in (("rising", rates), ("unknown", [None] * 8)):
+        made = copy.deepcopy(content)
+        for test, rate in zip(made["tests"].values(), at, strict=True):
+            test["rate"] = None if rate is None else float(rate)
+        found[name] = ff.predict(InMemory(made), loop(rate=0.25, seed=0), draws=200)
+    rising, unknown = (found[name].parameters["s1_sigma_plus"] for name in ("rising", "unknown"))
+    assert rising.value == pytest.approx(1.1e5, rel=0.1)
+    assert unknown.value == pytest.approx(np.median(values))
+    assert np.log(rising.hi / rising.lo) < 0.5 * np.log(unknown.hi / unknown.lo)
+    assert any("change" in one for one in found["rising"].sentences)
+
+
+def test_own_values_that_do_not_change_with_the_rate_have_one_mean():
+    content = own(1.1e5 * np.exp(0.2 * np.random.default_rng(3).standard_normal(8))).content
+    for i, test in enumerate(content["tests"].values()):
+        test["rate"] = (0.025, 1.0)[i % 2]
+    found = ff.predict(InMemory(content), loop(seed=0), draws=DRAWS)
+    item = content["parameters"]["s1_sigma_plus"]
+    assert found.parameters["s1_sigma_plus"].value == pytest.approx(item["value"])
+
+
 def test_without_the_scatter_it_would_not():
     def shared(values):
         content = scatter(values).content
@@ -239,6 +266,15 @@ def test_draws_that_are_not_admissible_are_drawn_again_and_counted():
     assert 0.2 * DRAWS < found.redrawn < 2 * DRAWS
     assert found.parameters["s1_eps_star"].lo >= 0.0
     assert found.to_json_dict()["redrawn"] == found.redrawn
+
+
+def test_draws_lie_within_the_limits_of_a_fit_of_the_test():
+    values = np.array([1e4, 1e5, 1e6])  # of three tests: Student's t reaches from 1e-30 to 1e30
+    found = ff.predict(own(values), loop(seed=0), draws=DRAWS)
+    params = ff.make_params(loop(), "microscale")
+    drawn = found.parameters["s1_sigma_plus"]
+    assert params["s1_sigma_plus"].min <= drawn.lo < drawn.hi <= params["s1_sigma_plus"].max
+    assert found.redrawn > 0
 
 
 def test_draws_that_are_never_admissible_are_refused():

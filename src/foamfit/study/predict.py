@@ -14,7 +14,6 @@ from foamfit.data.measurement import Measurement
 from foamfit.data.rate import loading_rate
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.curves import check_drive, choose_drive
-from foamfit.fitting.objective import Objective
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.report.studies.prediction import save_prediction
 from foamfit.study.prediction.identified import HasContent, Source, read_source
@@ -106,7 +105,7 @@ def predict(
         raise SimulationError(
             f"{measurement.name} cannot be predicted from {source.where}: {error}"
         ) from None
-    drawn = _draw(population, objective, draws, seed)
+    drawn = _draw(population, problem, _limits(problem, point), draws, seed)
     curves = {
         name: _curve(problem, name, simulated.curves[name], drawn, source)
         for name in objective.counted
@@ -129,7 +128,7 @@ def predict(
         draws=min((len(one.values) for one in drawn.values()), default=0),
         redrawn=sum(one.redrawn for one in drawn.values()),
         held=population.held,
-        sentences=tuple(_sentences(source, curves)),
+        sentences=(*_of_curves(curves), *_of_trends(population)),
         warnings=tuple(warnings),
     )
 
@@ -230,7 +229,22 @@ class _Drawn:
     redrawn: int
 
 
-def _draw(population: Population, objective: Objective, draws: int, seed: int) -> dict[str, _Drawn]:
+Limits = tuple[Array, Array]
+
+
+def _limits(problem: Problem, point: Array) -> Limits:
+    """Limits of a draw: those of a fit of the test, and the common values.
+
+    Far beyond them lie values that no test can show, from what one test left undetermined.
+    """
+    params = [problem.params[name] for name in problem.names]
+    low, high = np.array([one.min for one in params]), np.array([one.max for one in params])
+    return np.minimum(low, point), np.maximum(high, point)
+
+
+def _draw(
+    population: Population, problem: Problem, limits: Limits, draws: int, seed: int
+) -> dict[str, _Drawn]:
     """Draws of each of the first two parts, and of both together."""
     wanted = {"parameters": population.uncertain, "scatter": bool(population.scattering)}
     out = dict[str, _Drawn]()
@@ -238,26 +252,28 @@ def _draw(population: Population, objective: Objective, draws: int, seed: int) -
         if there:
             rng = np.random.default_rng([seed, i])
             out[part] = _simulate(
-                population, objective, draws, rng, part == "parameters", part == "scatter"
+                population, problem, limits, draws, rng, part == "parameters", part == "scatter"
             )
     if len(out) == 2:
         rng = np.random.default_rng([seed, 2])
-        out["both"] = _simulate(population, objective, draws, rng, True, True)
+        out["both"] = _simulate(population, problem, limits, draws, rng, True, True)
     elif out:
         out["both"] = next(iter(out.values()))
     return out
 
 
 def _simulate(
-    population: Population, objective: Objective, draws: int, rng: np.random.Generator,
-    open_: bool, scatter: bool,
+    population: Population, problem: Problem, limits: Limits, draws: int,
+    rng: np.random.Generator, open_: bool, scatter: bool,
 ) -> _Drawn:  # fmt: skip
     """Draw and simulate until there are so many; what is not admissible is drawn again."""
     values, curves = list[Array](), list[dict[str, Array]]()
-    tried = 0
+    (low, high), objective, tried = limits, problem.objective, 0
     while len(values) < draws and tried < TRIES * draws:
         tried += 1
         one = population.draw(rng, open_=open_, scatter=scatter)
+        if not np.all((low <= one) & (one <= high)):
+            continue
         try:
             simulated = objective.simulate(one)
         except SimulationError:
@@ -352,7 +368,19 @@ def _warn(
         warnings.append(f"Only {fewest} of {draws} draws could be simulated; the band is rough.")
 
 
-def _sentences(source: Source, curves: dict[str, PredictedCurve]) -> list[str]:
+def _of_trends(population: Population) -> list[str]:
+    """What own parameters do with the rate."""
+    names = [name for name, slope in population.trends.items() if slope]
+    if not names:
+        return []
+    return [
+        f"{listed(names)}, own to each test, {'changes' if len(names) == 1 else 'change'} with the "
+        "rate of the fitted tests: the mean and the scatter are those about a line against the "
+        "logarithm of the rate, at the rate of this test."
+    ]
+
+
+def _of_curves(curves: dict[str, PredictedCurve]) -> list[str]:
     """What the prediction says of each curve."""
     out = []
     for curve in curves.values():

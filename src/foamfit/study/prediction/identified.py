@@ -58,6 +58,7 @@ class Identified:
     b_ci95: Pair | None = None
     scatter: float = 0.0
     tests: tuple[float, ...] = ()
+    rates: tuple[float | None, ...] = ()  # of these tests, 1/s
 
     @property
     def span(self) -> Pair | None:
@@ -164,8 +165,16 @@ def _source(content: Mapping[str, Any], where: str) -> Source:
     drive = content.get("drive")
     if drive not in (*DRIVES, None) or (drive is None and not joint):
         raise InputError(f"{where}: drive is {drive!r}; it must be one of {', '.join(DRIVES)}")
+    tests = _mapping(content, "tests", where) if joint else {}
+    data = content.get("data")
+    single = data.get("rate") if isinstance(data, Mapping) and not joint else None
+    given = {name: one.get("rate") for name, one in tests.items() if isinstance(one, Mapping)}
+    rates = {
+        name: None if rate is None else _number(rate, f"{where}: rate")
+        for name, rate in (given if joint else {"": single}).items()
+    }
     parameters = {
-        name: _parameter(item, joint, f"{where}: {name}")
+        name: _parameter(item, joint, rates, f"{where}: {name}")
         for name, item in content["parameters"].items()
     }
     for name in model.names:
@@ -177,11 +186,6 @@ def _source(content: Mapping[str, Any], where: str) -> Source:
     known = (*model.names, "time_shift")
     if unknown := [name for name in parameters if name not in known]:
         raise InputError(f"{where}: {unknown[0]} is no parameter of its model {model.name}")
-    tests = _mapping(content, "tests", where) if joint else {}
-    data = content.get("data") if not joint else None
-    single = data.get("rate") if isinstance(data, Mapping) else None
-    rates = [item.get("rate") if isinstance(item, Mapping) else None for item in tests.values()]
-    known_rates = [_number(r, f"{where}: rate") for r in (rates if joint else [single]) if r]
     rate0 = content.get("rate0")
     names, correlation = _correlation(content, joint, parameters, where)
     fits = list(tests.values()) if joint else [content]
@@ -193,7 +197,7 @@ def _source(content: Mapping[str, Any], where: str) -> Source:
         drive=drive,
         interior_mass=bool(content.get("interior_mass", False)),
         status=str(content.get("status")),
-        rates=tuple(known_rates),
+        rates=tuple(rate for rate in rates.values() if rate),
         rate0=None if rate0 is None else _number(rate0, f"{where}: rate0"),
         parameters=parameters,
         names=names,
@@ -202,24 +206,25 @@ def _source(content: Mapping[str, Any], where: str) -> Source:
     )
 
 
-def _parameter(item: object, joint: bool, where: str) -> Identified:
-    """One parameter of fit.json or joint.json."""
+def _parameter(
+    item: object, joint: bool, rates: Mapping[str, float | None], where: str
+) -> Identified:
+    """One parameter of fit.json or joint.json; `rates` are those of the tests."""
     if not isinstance(item, Mapping):
         raise InputError(f"{where} is {item!r}; it must be an object with a value")
     kind = item.get("kind") if joint else "shared" if item.get("vary") else "fixed"
     if kind not in KINDS:
         raise InputError(f"{where}: kind is {kind!r}; it must be one of {', '.join(KINDS)}")
-    tests: tuple[float, ...] = ()
+    tests, of_rates = tuple[float, ...](), tuple[float | None, ...]()
     if kind in ("own", "scatter"):
-        each = [
-            one if isinstance(one, Mapping) else {}
-            for one in _mapping(item, "tests", where).values()
-        ]
+        given = _mapping(item, "tests", where)
+        each = {name: one if isinstance(one, Mapping) else {} for name, one in given.items()}
         # the spread is that of the tests that determine it
-        sure = [one for one in each if one.get("stderr") is not None]
+        sure = {name: one for name, one in each.items() if one.get("stderr") is not None}
         if kind == "scatter" and len(sure) > 1:
             each = sure
-        tests = tuple(_number(one.get("value"), f"{where}: tests") for one in each)
+        tests = tuple(_number(one.get("value"), f"{where}: tests") for one in each.values())
+        of_rates = tuple(rates.get(name) for name in each)
     scatter = item.get("scatter") if kind == "scatter" else 0.0
     return Identified(
         kind,
@@ -233,6 +238,7 @@ def _parameter(item: object, joint: bool, where: str) -> Identified:
         _pair(item.get("b_ci95"), f"{where}: b_ci95"),
         _number(scatter, f"{where}: scatter"),
         tests,
+        of_rates,
     )
 
 

@@ -22,6 +22,9 @@ from foamfit.fitting.links import RATES, law
 from foamfit.springs.parameters import split_name
 from foamfit.study.prediction.identified import Identified, Pair, Source
 
+# Own parameters change with the rate if that lowers BIC by so much, over so many tests or more, of
+# which the logarithms of the rate spread by more than this.
+EVIDENCE, FEWEST_OF_TREND, SAME_RATE = 2.0, 5, 0.05
 NORMAL = 1.959964  # half of the 95 % interval of a normal distribution over its standard deviation
 
 
@@ -132,25 +135,28 @@ class Population:
         )
 
     @cached_property
-    def _own(self) -> tuple[list[str], Array, Array]:
-        """Own parameters, their means (k,) and what the tests are off them (n, k).
-
-        In logarithms where `_in_logarithms`.
-        """
+    def _own(self) -> _Own:
+        """Own parameters of the tests, in logarithms where `_in_logarithms`."""
         names = [name for name in self.scattering if self.source.parameters[name].kind == "own"]
         columns = []
         for name in names:
             tests = np.array(self.source.parameters[name].tests)
             columns.append(np.log(tests) if self._in_logarithms(name) else tests)
-        if not columns:
-            return [], np.empty(0), np.empty((0, 0))
         if len({column.size for column in columns}) > 1:
             raise InputError(
                 f"{self.source.where}: own parameters must have a value for each test, all of them "
                 "for the same tests"
             )
-        values = np.array(columns).T
-        return names, values.mean(axis=0), values - values.mean(axis=0)
+        rates = self.source.parameters[names[0]].rates if names else ()
+        return _Own.of(tuple(names), columns, rates, self.rate)
+
+    @property
+    def trends(self) -> dict[str, float]:
+        """Own parameters that change with the rate, and by how much per unit of its logarithm.
+
+        Of the logarithm of the parameter where `is_logarithmic`.
+        """
+        return dict(zip(self._own.names, self._own.slopes.tolist(), strict=True))
 
     def _in_logarithms(self, name: str) -> bool:
         tests = self.source.parameters[name].tests
@@ -161,21 +167,27 @@ class Population:
     @property
     def point(self) -> Array:
         """The common values, at the rate of the test."""
-        found = dict[str, float]()
-        for name, one in self._items:
-            found[name] = self._at_rate(name, one.value, one.b)
+        found = {name: self._at_rate(name, one.value, one.b) for name, one in self._items}
+        for name, mean, slope in zip(
+            self._own.names, self._own.mean, self._own.slopes, strict=True
+        ):
+            if slope:  # the median over the tests is that of no rate
+                found[name] = self._from_own(name, mean)
         return self._vector(found)
+
+    def _from_own(self, name: str, value: float) -> float:
+        return _exp(value) if self._in_logarithms(name) else float(value)
 
     def nearest(self, admissible: Callable[[Array], bool]) -> Array | None:
         """Values with the own parameters of the admissible test nearest to their means."""
-        names, mean, off = self._own
-        if not names:
+        own = self._own
+        if not own.names:
             return None
-        scale = np.sqrt(np.mean(off**2, axis=0))
-        for row in off[np.argsort(np.sum((off / scale) ** 2, axis=1))]:
+        scale = np.maximum(np.sqrt(np.mean(own.off**2, axis=0)), 1e-300)
+        for row in own.off[np.argsort(np.sum((own.off / scale) ** 2, axis=1))]:
             values = {name: self._at_rate(name, one.value, one.b) for name, one in self._items}
-            for name, value in zip(names, mean + row, strict=True):
-                values[name] = _exp(value) if self._in_logarithms(name) else float(value)
+            for name, value in zip(own.names, own.mean + row, strict=True):
+                values[name] = self._from_own(name, value)
             if admissible(found := self._vector(values)):
                 return found
         return None
@@ -183,9 +195,7 @@ class Population:
     def draw(self, rng: np.random.Generator, *, open_: bool, scatter: bool) -> Array:
         """Draw what the result leaves open, the scatter between specimens, or both.
 
-        The population is known from n tests: its deviates are Student's t with n - 1 degrees of
-        freedom, and of own parameters, whose mean has no standard error of its own, √(1 + 1/n)
-        wider.
+        A spread is known from n tests: its deviates are Student's t with n - 1 degrees of freedom.
         """
         values = {name: one.value for name, one in self._items}
         slopes = {name: one.b for name, one in self._items}
@@ -202,13 +212,10 @@ class Population:
                 if one.kind == "scatter":
                     z = rng.standard_t(max(len(one.tests) - 1, 1))
                     values[name] *= _exp(one.scatter * z)
-            own, mean, off = self._own
-            if own:
-                n = len(off)
-                weights = rng.standard_normal(n) / math.sqrt(n - 1)
-                tail = math.sqrt((1.0 + 1.0 / n) * (n - 1) / rng.chisquare(n - 1))
-                for name, value in zip(own, mean + tail * weights @ off, strict=True):
-                    values[name] = _exp(value) if self._in_logarithms(name) else float(value)
+            if self._own.names:
+                drawn = self._own.draw(rng)
+                for name, value in zip(self._own.names, drawn, strict=True):
+                    values[name] = self._from_own(name, value)
         return self._vector(
             {name: self._at_rate(name, value, slopes[name]) for name, value in values.items()}
         )
@@ -230,6 +237,59 @@ class Population:
             whole = sum(values[name] for name in heights)
             values |= {name: values[name] * self.specimen.height / whole for name in heights}
         return np.array([values[name] for name in self.names])
+
+
+@dataclass(frozen=True, eq=False)
+class _Own:
+    """Own parameters of n tests, as a sample of what specimens have.
+
+    Where there is evidence that one changes with the rate, its mean is on the line through its
+    values against the logarithm of the rate.
+    """
+
+    names: tuple[str, ...]
+    mean: Array  # (k,): at the rate of the test that is predicted
+    slopes: Array  # (k,): by the logarithm of the rate; 0 where there is no evidence
+    off: Array  # (n, k): what the tests are off their means
+    wider: Array  # (k,): √(1 + leverage), for the mean is not known exactly
+    freedom: int
+
+    @classmethod
+    def of(
+        cls, names: tuple[str, ...], columns: list[Array], rates: tuple[float | None, ...],
+        rate: float | None,
+    ) -> _Own:  # fmt: skip
+        """Means and deviations of the columns (n,), one for each name."""
+        if not names:
+            return cls((), np.empty(0), np.empty(0), np.empty((0, 0)), np.empty(0), 1)
+        values = np.array(columns).T
+        n, k = values.shape
+        mean, off = values.mean(axis=0), values - values.mean(axis=0)
+        slopes, leverage = np.zeros(k), np.full(k, 1.0 / n)
+        known = [one for one in rates if one]
+        if rate is not None and len(known) == n >= FEWEST_OF_TREND:
+            x = np.log(known)
+            at, x = math.log(rate) - x.mean(), x - x.mean()
+            square = float(x @ x)
+            if square > n * SAME_RATE**2:
+                steep = x @ off / square
+                left = off - np.outer(x, steep)
+                gain = n * np.log(
+                    np.maximum(np.sum(off**2, axis=0), 1e-300)
+                    / np.maximum(np.sum(left**2, axis=0), 1e-300)
+                ) - math.log(n)
+                sure = gain > EVIDENCE
+                slopes = np.where(sure, steep, 0.0)
+                mean, off = mean + slopes * at, np.where(sure, left, off)
+                leverage = leverage + sure * at**2 / square
+        freedom = n - 1 - bool(np.any(slopes))
+        return cls(names, mean, slopes, off, np.sqrt(1.0 + leverage), freedom)
+
+    def draw(self, rng: np.random.Generator) -> Array:
+        """Draw a specimen: a combination of the tests' deviations, Student's t each."""
+        weights = rng.standard_normal(len(self.off))
+        tail = math.sqrt(rng.chisquare(self.freedom))
+        return np.asarray(self.mean + self.wider * (weights @ self.off) / tail)
 
 
 def _wider(ci95: Pair | None, stderr: float) -> float:
