@@ -13,7 +13,8 @@ from foamfit.study.joint_fit import errors_of, fit_jointly
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.joint_covariance import JointPoint
 
-SPRING, LOOP = synthetic_loop(noise=0.0)
+SPRING, WHOLE = synthetic_loop(noise=0.0)
+LOOP = replace(WHOLE, displacement=WHOLE.displacement[::2], stress=WHOLE.stress[::2])
 NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
 X = np.log([0.1, 1.0, 10.0])
 
@@ -74,7 +75,7 @@ def test_blocks_give_the_dense_sandwich(point):
 def test_the_slope_of_a_law_has_its_error(point):
     error, freedom = point.covariance.of_common("s1_k0:b")
     assert 1e-4 < error < 0.02
-    assert freedom > 100
+    assert 20 < freedom < 600
     assert point.covariance.of_common("s1_eps_c")[0] != point.covariance.of_common("s1_eps_c")[0]
     assert point.covariance.of_test(0, "s1_eps_c")[0] > 0.0
 

@@ -44,9 +44,9 @@ def test_an_error_that_all_have_in_common_is_no_spread_but_one_of_the_mean():
 
 @pytest.mark.parametrize("tau", [0.0, 0.1, 1.0])
 def test_intervals_hold(tau):
-    """95 % of 400 groups of 8, of unequal errors; by chance within 3 %."""
+    """95 % of 200 groups of 8, of unequal errors; by chance within 3 %."""
     rng, hits = np.random.default_rng(1), []
-    for _ in range(400):
+    for _ in range(200):
         errors = 0.1 * np.exp(0.5 * rng.standard_normal(8))
         values = 2.0 + tau * rng.standard_normal(8) + errors * rng.standard_normal(8)
         one = common_and_spread(values, np.diag(errors**2))
