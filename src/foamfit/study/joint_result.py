@@ -17,6 +17,7 @@ from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import SearchRecord
 from foamfit.results import SCHEMA, Fit, ParameterEstimate, plain
 from foamfit.study.joint_fit import Alternative, JointFit
+from foamfit.study.shared import bic
 from foamfit.study.study_file import Study
 from foamfit.text import counted
 from foamfit.trust.best_point import BestPoint
@@ -79,6 +80,16 @@ class JointParameter:
 
 
 @dataclass(frozen=True, eq=False)
+class Alone:
+    """What the fits of the tests one by one come to, all together."""
+
+    chi2: float
+    n_vary: int
+    bic: float
+    misfits: tuple[dict[str, float | None], ...]  # As `Together.misfits`
+
+
+@dataclass(frozen=True, eq=False)
 class TestFit:
     """One test of a joint fit, and what its result is made of."""
 
@@ -117,6 +128,7 @@ class JointData:
     covariance: tuple[tuple[str, ...], Array]  # Names and matrix, SI; see `to_json_dict`
     evidence: tuple[Alternative, ...]
     n_eff: int  # Effective samples that the evidence counts
+    alone: Alone
     refused: Mapping[str, str]  # File and sentence
     status: str
     warnings: tuple[str, ...]
@@ -138,6 +150,12 @@ class JointData:
         """The drive; None where the tests have different ones."""
         drives = {problem.objective.drive for problem in self.problems}
         return drives.pop() if len(drives) == 1 else None
+
+    @property
+    def bic(self) -> float:
+        """Bayesian information criterion, counted as that of the tests one by one in `alone`."""
+        found = self.fit.found
+        return bic(found.cost, found.n_data, found.n_vary, self.n_eff)
 
     @property
     def shares(self) -> tuple[float, ...]:
@@ -228,4 +246,8 @@ class JointData:
             "redchi": found.cost / max(found.n_data - found.n_vary, 1),
             "n_effective": self.fit.covariance.effective,
             "n_eff": self.n_eff,
+            "bic": self.bic,
+            "bic_alone": self.alone.bic,
+            "n_vary_alone": self.alone.n_vary,
+            "chisqr_alone": self.alone.chi2,
         }

@@ -402,6 +402,10 @@ class JointPoint:
             held[:s] = shared
         return out
 
+    @cached_property
+    def _curvatures(self) -> list[Array | None]:
+        return [self._curved(t) for t in range(len(self.blocks))]
+
     def _curved(self, t: int) -> Array | None:
         """Curvature of half the cost of a test by its parameters; None where JᵀJ is taken.
 
@@ -449,7 +453,7 @@ class JointPoint:
     def _bent(self) -> Arrow:
         """The blocks with the curvature itself, what is pressed to a limit held."""
         blocks = [
-            replace(block, curvature=self._curved(t)).kept(np.flatnonzero(~self._held[t]))
+            replace(block, curvature=self._curvatures[t]).kept(np.flatnonzero(~self._held[t]))
             for t, block in enumerate(self.blocks)
         ]
         return Arrow(tuple(blocks), plain=False)
@@ -506,7 +510,7 @@ class JointPoint:
         for t, block in enumerate(self.blocks):
             columns = np.array([*free, *range(s, block.through.shape[1])], dtype=np.intp)
             none = np.zeros((0, columns.size))
-            curved = replace(block, curvature=self._curved(t)) if self._errs else block
+            curved = replace(block, curvature=self._curvatures[t]) if self._errs else block
             kept = replace(curved.kept(columns), pulls=none, drawn=none)
             blocks.append(kept)
         arrow = Arrow(tuple(blocks), plain=not self._errs)

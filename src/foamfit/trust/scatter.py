@@ -84,7 +84,7 @@ def common_and_spread(values: Array, errors: Array) -> Spread:
     scale = float(np.var(values, ddof=1))
     least = SMALLEST**2 * float(seen.variances[0])
     most = max(LARGEST**2 * scale, 2.0 * least)
-    grid = np.geomspace(max(least, 1e-9 * most), most, 60)
+    grid = np.geomspace(max(least, 1e-9 * most), most, 40)
     costs = [seen.criterion(0.0), *(seen.criterion(float(tau2)) for tau2 in grid)]
     at, tau2 = int(np.argmin(costs)), 0.0
     if at > 0:

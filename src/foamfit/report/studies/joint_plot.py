@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 # Columns of the picture, and inches of a loop and of a parameter.
 LOOPS, LOOP, COLUMNS, PANEL = 6, (1.25, 1.15), 3, (2.5, 1.6)
-MOST_LOOPS = 60
+MOST_LOOPS = 48
 MOST_NAMES = 12  # of tests that stand at an axis
 # Points of a drawn curve, and the share of the largest range that intervals may run out of.
 POINTS = 400
@@ -112,19 +112,23 @@ def _parameter(ax: Axes, found: JointData, name: str) -> None:
     factor, unit = readable_unit(abs(one.value), one.unit)
     x = np.array(found.rates, dtype=float) if by_rate else np.arange(1.0, len(found.tests) + 1)
     ax.set_title(f"{_title(found, name)}{f' ({unit})' if unit else ''}: {one.kind}")
-    middle, ends = [], list[float]()
-    for at, test in zip(x, found.tests, strict=True):
-        value = one.tests[test] if one.tests else None
-        if value is None or value.state == "fixed" or one.kind in RATES:
-            continue
-        middle.append(value.value / factor)
-        if value.ci95 is not None:
-            sides = [end / factor for end in value.ci95]
-            ends += sides
-            ax.plot([at, at], sides, color=GREY, linewidth=0.8, zorder=1)
-        face = BLUE if value.state == "determined" else "white"
+    there = [
+        (at, one.tests[test]) for at, test in zip(x, found.tests, strict=True)
+        if one.tests and one.tests[test].state != "fixed"
+    ]  # fmt: skip
+    bars = [(at, *v.ci95) for at, v in there if v.ci95 is not None]
+    ends = np.array(bars, dtype=float).reshape(-1, 3)
+    ends[:, 1:] /= factor
+    ax.vlines(ends[:, 0], ends[:, 1], ends[:, 2], color=GREY, linewidth=0.8, zorder=1)
+    middle = [v.value / factor for _, v in there]
+    if one.kind not in RATES:
         size = 3.5 if len(found.tests) < 60 else 1.5
-        ax.plot(at, value.value / factor, "o", color=BLUE, markerfacecolor=face, markersize=size)
+        for sure, face in ((True, BLUE), (False, "white")):
+            points = [
+                (at, v.value / factor) for at, v in there if (v.state == "determined") == sure
+            ]
+            ax.plot(*np.array(points).reshape(-1, 2).T, "o", color=BLUE, markerfacecolor=face,
+                    markersize=size)  # fmt: skip
     if by_rate:
         ax.set_xscale("log")
         ax.set_xlabel("strain rate (1/s)", labelpad=1)
@@ -134,7 +138,7 @@ def _parameter(ax: Axes, found: JointData, name: str) -> None:
             ax.set_xticks(x, [str(int(at)) for at in x])
     _common(ax, found, name, x, factor)
     if middle and one.kind not in RATES:
-        _limit(ax, middle, ends)
+        _limit(ax, middle, ends[:, 1:].ravel().tolist())
 
 
 def _common(ax: Axes, found: JointData, name: str, x: Array, factor: float) -> None:
@@ -147,11 +151,6 @@ def _common(ax: Axes, found: JointData, name: str, x: Array, factor: float) -> N
         span = np.geomspace(x.min(), x.max(), 50)
         values = law_values(one.kind, one.value, one.b, np.log(span / found.rate0))
         ax.plot(span, values / factor, color=VERMILION, linewidth=1.0)
-        for at, test in zip(x, found.tests, strict=True):
-            here = one.tests[test] if one.tests else None
-            if here is not None and here.ci95 is not None:
-                sides = [end / factor for end in here.ci95]
-                ax.plot([at, at], sides, color=GREY, linewidth=0.8, zorder=1)
         told = f"b = {one.b:.3g}"
         if one.b_ci95 is not None:
             told += f" ({one.b_ci95[0]:.3g} to {one.b_ci95[1]:.3g})"
