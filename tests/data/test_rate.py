@@ -38,3 +38,16 @@ def test_without_time_or_motion_there_is_none():
     test = held_triangle(0.25, 0.0)
     assert loading_rate(replace(test, time=None)) is None
     assert loading_rate(replace(test, displacement=None)) is None
+
+
+def test_noise_about_a_flat_peak_does_not_move_it():
+    """The largest sample lies up to a tenth of the time off."""
+    time, rng = np.linspace(0.0, 1e-3, 301), np.random.default_rng(0)
+    strain = 0.4 * np.sin(np.pi * time / time[-1])
+    test = replace(held_triangle(0.25, 0.0), time=time)
+    rates = [
+        loading_rate(replace(test, displacement=0.01 * (strain + 2e-3 * rng.standard_normal(301))))
+        for _ in range(50)
+    ]
+    assert np.mean(rates) == pytest.approx(800.0, rel=0.02)
+    assert np.std(rates) < 8.0
