@@ -23,7 +23,12 @@ if TYPE_CHECKING:
 
 PANEL = (2.6, 2.2)  # inches
 # Colour of each part of the band.
-COLOURS = {"parameters": BLUE, "scatter": VERMILION, "noise": GREY, "law_error": INSIDE[0]}
+COLOURS = {
+    "parameters": BLUE,
+    "scatter": INSIDE[1],
+    "noise": INSIDE[2],
+    "law_error": INSIDE[0],
+}
 
 
 def save_prediction(found: PredictedTest, folder: str | Path) -> Path:
