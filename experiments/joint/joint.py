@@ -218,7 +218,9 @@ def timing(folder: Path, jobs: int) -> Iterator[Row]:
 
 def coverage(hits: list[bool]) -> Row:
     interval = binomtest(sum(hits), len(hits)).proportion_ci(0.95, "wilson")
-    return {"share": float(np.mean(hits)), "low": interval.low, "high": interval.high}
+    return {
+        "share": float(np.mean(hits)), "low": float(interval.low), "high": float(interval.high),
+    }  # fmt: skip
 
 
 def table(rows: list[Row]) -> str:
@@ -228,9 +230,9 @@ def table(rows: list[Row]) -> str:
         "|---|---|---|---|---|---|",
     ]
     for row in rows:
-        mean = "" if "mean" not in row else f"{row['mean']:.3g}"
+        mean = "" if "mean" not in row else f"{float(row['mean']):.3g}"
         if "spread" in row:
-            mean += f" ± {row['spread']:.2f} standard errors"
+            mean += f" ± {float(row['spread']):.2f} standard errors"
         elif row["study"] == "time":
             mean += " s"
         share = "" if "share" not in row else f"{100 * float(row['share']):.0f} %"
@@ -243,6 +245,22 @@ def table(rows: list[Row]) -> str:
             f"| {row['study']} | {row['what']} | {row['draws']} | {mean} | {share} | {ends} |"
         )
     return "\n".join(lines)
+
+
+def save(rows: list[Row], folder: Path) -> None:
+    """Write joint.csv and joint.md; of studies that were not run now the older rows stay."""
+    path, now = folder / "joint.csv", {row["study"] for row in rows}
+    if path.is_file():
+        with path.open(newline="") as file:
+            older = [{k: v for k, v in row.items() if v} for row in csv.DictReader(file)]
+        rows = [*(row for row in older if row["study"] not in now), *rows]
+    keys = ("study", "what", "draws", "mean", "spread", "share", "low", "high")
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, keys, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    machine = f"{platform.machine()}, Python {platform.python_version()}"
+    (folder / "joint.md").write_text(f"{table(rows)}\n\n{machine}\n")
 
 
 def main() -> None:
@@ -267,14 +285,7 @@ def main() -> None:
                 for row in make(Path(folder)):
                     rows.append(row)
                     print(row, flush=True)
-    if given.only is None:
-        keys = list(dict.fromkeys(key for row in rows for key in row))
-        with (given.out / "joint.csv").open("w", newline="") as file:
-            writer = csv.DictWriter(file, keys)
-            writer.writeheader()
-            writer.writerows(rows)
-        machine = f"{platform.machine()}, Python {platform.python_version()}"
-        (given.out / "joint.md").write_text(f"{table(rows)}\n\n{machine}\n")
+    save(rows, given.out)
     print(table(rows))
 
 
