@@ -3,10 +3,14 @@
 Another machine, or another day on this one, changes last digits, run times and the pixels of a
 letter. A study that is remade inside `keep_unchanged` leaves such files as they were:
 
-- numbers agree to 1e-3, or to 1e-9 in size (rounding); counts agree exactly;
+- numbers agree to 1e-3, to one in the last digit where three or more are written, or to 1e-9 in
+  size (rounding); counts agree exactly;
 - run times and evaluations (in a column or behind a key named for them, or followed by the unit s,
-  ms or µs) agree within a factor of ten: machines are shared, and others are faster;
-- pictures have the same size, and one pixel in two hundred at most has plainly changed.
+  ms or µs) agree within a factor of ten, of a table all but one in twenty: machines are shared, and
+  others are faster;
+- machine and versions, which say where the figures were made, may be others;
+- pictures have the same size, and one pixel in two hundred at most has plainly changed; run times
+  are drawn from the table that was kept.
 """
 
 from __future__ import annotations
@@ -23,23 +27,43 @@ from pathlib import Path
 import matplotlib.image
 import numpy as np
 
-DIGITS, ROUNDING, RUN_TIMES, PIXELS, PLAIN = 1e-3, 1e-9, 10.0, 5e-3, 0.2
+DIGITS, THIRD, ROUNDING, RUN_TIMES, BUSY, PIXELS, PLAIN = 1e-3, 1e-2, 1e-9, 10.0, 0.05, 5e-3, 0.2
 TEXT = {".csv", ".json", ".md", ".toml", ".txt", ".gz"}
 
 _NUMBER = re.compile(r"[-−+]?\d[\d,]*\.?\d*(?:[eE][-+−]?\d+)?")
 _TIMED_KEY = re.compile(r"(?:seconds|runtime\w*|run time|nfev|evaluations|steps)[^\d]{0,6}$", re.I)
 _TIMED_UNIT = re.compile(r"\s?(?:s|ms|µs)\b")
-_TIMED_COLUMN = re.compile(r"seconds|runtime|nfev|evaluations|steps|(^|\W)(s|ms|µs)$", re.I)
+_TIMED_COLUMN = re.compile(
+    r"seconds|runtime|nfev|evaluations|steps|(^|\W)(s|ms|µs)$|^runs$|^ns per |/ (simulate|kernel)$"
+    r"|(median|quartile( \d)?|simulate|kernel|SciPy|fixed step) \(s\)$|^median fit \(s\)$",
+    re.I,
+)
+# Where something was made, and what stands for it: versions, the architecture, the processor.
+_CIRCUMSTANCES = (
+    (
+        re.compile(r"\b(foamfit|python|numpy|scipy|numba|lmfit)\b([\s\":]{1,4})\d+(\.\w+)+", re.I),
+        r"\1",
+    ),
+    (re.compile(r"\b(x86_64|amd64|arm64|aarch64)\b", re.I), "machine"),
+    (re.compile(r"^(# )?[^\n]* \(machine, \d+ cores\)", re.M), r"\1machine"),
+    (re.compile(r"\b(processor)\b[^\n]*?, \d+ cores, machine"), r"\1"),
+)
 
 
 @contextmanager
-def keep_unchanged(folder: Path) -> Iterator[None]:
-    """Put back, at the end, the files of a folder that the body wrote but did not really change."""
-    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    yield
-    for path, old in before.items():
-        if path.is_file() and (new := path.read_bytes()) != old and same(path, old, new):
-            path.write_bytes(old)
+def keep_unchanged(place: Path) -> Iterator[None]:
+    """Put back, at the end, what the body wrote but did not really change: a file, or of a folder.
+
+    Also where the body ends by an exception, as a study does that found something wrong.
+    """
+    paths = place.rglob("*") if place.is_dir() else [place]
+    before = {path: path.read_bytes() for path in paths if path.is_file()}
+    try:
+        yield
+    finally:
+        for path, old in before.items():
+            if path.is_file() and (new := path.read_bytes()) != old and same(path, old, new):
+                path.write_bytes(old)
 
 
 def same(path: Path, old: bytes, new: bytes) -> bool:
@@ -56,10 +80,16 @@ def same(path: Path, old: bytes, new: bytes) -> bool:
 
 def same_text(one: str, other: str) -> bool:
     """Whether two texts differ in numbers alone, and in these by no more than they mean."""
+    for pattern, name in _CIRCUMSTANCES:
+        one, other = pattern.sub(name, one), pattern.sub(name, other)
     if _NUMBER.sub("0", one) != _NUMBER.sub("0", other):
         return False
+    timed = _timed_columns(one)
     pairs = zip(_NUMBER.finditer(one), _NUMBER.finditer(other), strict=True)
-    return all(_same_number(a[0], b[0], _is_timed(one, a)) for a, b in pairs)
+    return all(
+        _same_number(a[0], b[0], _is_timed(one, a) or any(a.start() in cell for cell in timed))
+        for a, b in pairs
+    )
 
 
 def _is_timed(text: str, found: re.Match[str]) -> bool:
@@ -68,15 +98,44 @@ def _is_timed(text: str, found: re.Match[str]) -> bool:
     return bool(_TIMED_KEY.search(before) or _TIMED_UNIT.match(text, found.end()))
 
 
+def _timed_columns(text: str) -> list[range]:
+    """Where in a text the cells of tables in Markdown are whose columns hold run times."""
+    found, head, at = list[range](), list[str](), 0
+    for line in text.splitlines(keepends=True):
+        if not line.startswith("|"):
+            head = []
+        else:
+            cells = line.rstrip("\n").split("|")
+            head = head or [cell.strip() for cell in cells]
+            start = at
+            for name, cell in zip(head, cells, strict=False):
+                if _TIMED_COLUMN.search(name):
+                    found.append(range(start, start + len(cell)))
+                start += len(cell) + 1
+        at += len(line)
+    return found
+
+
 def _same_table(one: str, other: str) -> bool:
-    """Compare two CSV tables cell by cell; a column named for seconds holds run times."""
-    rows, others = (list(csv.reader(io.StringIO(text))) for text in (one, other))
+    """Compare two CSV tables cell by cell, and what stands above them behind #."""
+    (above, rows), (above_other, others) = _read_table(one), _read_table(other)
+    if list(map(len, rows)) != list(map(len, others)) or not same_text(above, above_other):
+        return False
     timed = [bool(_TIMED_COLUMN.search(name)) for name in (rows or [[]])[0]]
-    return len(rows) == len(others) and all(
-        a is not None and b is not None and (_same_number(a, b, bool(t)) or same_text(a, b))
+    cells = [
+        (a, b, bool(t))
         for row, new in zip(rows, others, strict=True)
         for a, b, t in zip_longest(row, new, timed[: len(row)])
-    )
+    ]
+    off = [t for a, b, t in cells if not (_same_number(a, b, t) or same_text(a, b))]
+    return all(off) and len(off) <= BUSY * sum(t for *_, t in cells)
+
+
+def _read_table(text: str) -> tuple[str, list[list[str]]]:
+    """Split the comments above a CSV table from its rows, names of the columns first."""
+    lines = text.splitlines(keepends=True)
+    first = next((i for i, line in enumerate(lines) if not line.startswith("#")), len(lines))
+    return "".join(lines[:first]), list(csv.reader(lines[first:]))
 
 
 def _same_number(one: str, other: str, timed: bool) -> bool:
@@ -89,7 +148,17 @@ def _same_number(one: str, other: str, timed: bool) -> bool:
         return max(a, b) <= RUN_TIMES * min(a, b)
     if one.isdigit() or other.isdigit():
         return a == b
-    return a == b or abs(a - b) <= max(DIGITS * abs(a), ROUNDING) or (a != a and b != b)
+    last = min(_last_digit(one), _last_digit(other))  # one may end in zeros that are left out
+    near = abs(a - b) <= max(
+        DIGITS * abs(a), ROUNDING, 1.01 * last if last <= THIRD * abs(a) else 0.0
+    )
+    return a == b or near or (a != a and b != b)
+
+
+def _last_digit(number: str) -> float:
+    """What one in the last digit of a number is worth."""
+    mantissa, _, power = number.lower().replace(",", "").replace("−", "-").partition("e")
+    return 10.0 ** (int(power or 0) - len(mantissa.partition(".")[2]))
 
 
 def _same_picture(old: bytes, new: bytes) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -29,11 +30,37 @@ needs_data = pytest.mark.skipif(
 )
 
 
-STIFF = """
-import foamfit as ff
-chain = ff.Chain([ff.LinearSpring(5e6, eta=1e8)], [1e-3], 2e-5)
-assert ff.simulate(chain, ff.Impact(7e-3, 2.0), [0.0, 1e-3]).method == "Radau IIA"
-"""
+# What compiles, in a process of its own, loops that a first fit does not need, and these loops.
+FIRST_USE = Path(__file__).with_name("first_use.py")
+LOOPS = {"implicit": "integrate_implicit", "memory": "integrate_with_memory"}
+
+
+def first_use(part: str) -> subprocess.Popen[bytes]:
+    """Begin to compile a part of what many tests need."""
+    return subprocess.Popen([sys.executable, str(FIRST_USE), part])
+
+
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """Folders, and so the whole suite, are tested by all cores; single files in this process."""
+    cores = min(os.cpu_count() or 1, 8)
+    files = all(Path(arg.partition("::")[0]).is_file() for arg in config.args)
+    return 0 if files or cores == 1 else cores
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compile what several processes will need before they start, once and on two cores."""
+    if hasattr(session.config, "workerinput"):
+        # One of several is begun without Ctrl-C, and would begin others without it in the tests.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    asked = session.config.option
+    if asked.collectonly or not getattr(asked, "numprocesses", None):
+        return
+    if not cache.compiled():
+        with precompile.side_by_side() as compile_rest:
+            compile_rest()
+    begun = [first_use(part) for part, loop in LOOPS.items() if not cache.compiled(loop)]
+    for process in begun:
+        assert process.wait() == 0
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -47,7 +74,7 @@ def compiled() -> Iterator[None]:
         return
     with precompile.side_by_side() as compile_rest:
         compile_rest()
-    with subprocess.Popen([sys.executable, "-c", STIFF]):
+    with first_use("implicit"):
         yield
 
 

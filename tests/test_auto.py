@@ -592,6 +592,26 @@ def climbed(wavy):
         return ff.fit(wavy, model="auto", starts=4)
 
 
+def test_ranges_are_made_of_the_chosen_model_alone(wavy, monkeypatch):
+    """Both models miss a wave; its table goes by the 95 % intervals of the other one."""
+    given = []
+    original = one_model.left_open
+
+    def watched(best, *rest):
+        given.append(best.problem.model.name)
+        return original(best, *rest)
+
+    monkeypatch.setattr(one_model, "left_open", watched)
+    monkeypatch.setattr(auto, "LADDER", groups("bistable", "linear+bistable"))
+    result = ff.fit(wavy, model="auto", starts=4, intervals="local")
+    assert set(given) == {result.model}
+    known = [p for p in result.parameters.values() if p.vary and p.ci95 is not None]
+    assert all(p.range is not None for p in known)
+    states = [name for name, p in result.parameters.items() if p.state == "weak"]
+    assert list(result.ladder.chosen.weak) == states
+    assert any("Ranges were made of the chosen" in text for text in result.ladder.sentences)
+
+
 def test_what_remains_is_said(climbed):
     warning = next(text for text in climbed.warnings if text.startswith("No model reaches"))
     assert "residuals of stress_strain have a structure of" in warning

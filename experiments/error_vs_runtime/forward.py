@@ -314,13 +314,18 @@ def markdown(table: pd.DataFrame) -> str:
     return head + "".join("| " + " | ".join(map(cell, row)) + " |\n" for row in rows)
 
 
-def write(table: pd.DataFrame, path: Path, heading: list[str]) -> None:
-    """Write a table as CSV (comments first) and as Markdown."""
-    with path.with_suffix(".csv").open("w") as file:
+def write(table: pd.DataFrame, path: Path, heading: list[str]) -> pd.DataFrame:
+    """Write a table as CSV (comments first) and as Markdown; return what is kept.
+
+    That is the older table where times are much the same, so that figure and summary are, too.
+    """
+    written, page = path.with_suffix(".csv"), path.with_suffix(".md")
+    with keep_unchanged(written), written.open("w") as file:
         file.writelines(f"# {line}\n" for line in heading)
         table.to_csv(file, index=False, float_format="%.4g")
-    text = f"# {heading[0]}\n\n" + "\n".join(heading[1:]) + "\n\n" + markdown(table)
-    path.with_suffix(".md").write_text(text)
+    kept = pd.read_csv(written, skiprows=len(heading))
+    page.write_text(f"# {heading[0]}\n\n" + "\n".join(heading[1:]) + "\n\n" + markdown(kept))
+    return kept
 
 
 def write_summary(
@@ -366,7 +371,7 @@ def main() -> None:
             f"stress, against {source}. Processor time: median and quartiles.",
             where,
         ]
-        write(table, options.out / scene.name, heading)
+        table = write(table, options.out / scene.name, heading)
         draw_scene(table, scene.title, WANTED, options.out / f"{scene.name}.png")
         rows.append(compare(scene, table))
         print(
@@ -377,8 +382,8 @@ def main() -> None:
         )
     if options.scenes:
         return
-    sizes = scaling(longest=4.0)
-    write(sizes, options.out / "scaling", ["Run time against springs and samples", where])
+    heading = ["Run time against springs and samples", where]
+    sizes = write(scaling(longest=4.0), options.out / "scaling", heading)
     draw_scaling(sizes, options.out / "scaling.png")
     write_summary(rows, sizes, where, options.out)
     print(markdown(pd.DataFrame(rows)))

@@ -10,6 +10,8 @@ of 0.25 % of the largest stress, which the TOML states.
   the common value and of the spread hold the truth?
 - log, power: 5 tests over two decades of rate, sigma_plus following a law: bias of value and slope
   over the standard error, coverage of their intervals, and what the evidence chooses.
+- impacts: foam-1 (model-1 of the paper, with a dashpot) struck at five velocities, its k_h+ free of
+  rate or following a power law: what does the evidence choose, and does it find the law?
 - time: seconds of a fit of 10, 20 and 50 tests with nine parameters, three of them shared, 1000
   samples each, with relaxation.
 
@@ -137,6 +139,62 @@ def rates(draws: int, folder: Path, kind: str, slope: float) -> Iterator[Row]:
                "share": chosen.count(name) / draws}  # fmt: skip
 
 
+VELOCITIES = (2.0, 2.3, 2.7, 3.2, 4.0)  # m/s
+BISTABLE = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus", "eta")
+
+
+def strike(path: Path, kh_plus: float, velocity: float, rng: np.random.Generator) -> float:
+    """Write an impact with 0.5 % noise, its TOML beside it; returns its mean strain rate."""
+    published, height, area = ff.published["foam-1/model-1"].bistable, 1.19e-3, 1.9635e-5
+    seven = dict(zip(BISTABLE, published.seven, strict=False))
+    spring = ff.BistableSpring(**seven | {"kh_plus": kh_plus}, eta=200.0)
+    clock = np.linspace(0.0, 1.5e-3 / velocity, 301)
+    run = ff.simulate(ff.Chain([spring], [height], area), ff.Impact(7e-3, velocity), clock)
+    clock = clock[clock <= run.contact_end]
+    noisy = [
+        curve[: clock.size] + 5e-3 * np.ptp(curve) * rng.standard_normal(clock.size)
+        for curve in (run.base_stress, run.displacement[-1])
+    ]
+    peak = int(np.argmax(run.displacement[-1]))
+    columns = np.column_stack([1e3 * clock, 1e-6 * noisy[0], 1e3 * noisy[1]])
+    header = "time (ms),stress (MPa),displacement (mm)"
+    np.savetxt(path, columns, fmt="%.10g", delimiter=",", header=header, comments="")
+    path.with_suffix(".toml").write_text(
+        f'[specimen]\nheight = "{height} m"\narea = "{area} m^2"\n'
+        f'[striker]\nmass = "7 g"\nvelocity = "{velocity} m/s"\n'
+    )
+    return float(run.displacement[-1][peak] / height / run.time[peak])
+
+
+def impacts(draws: int, folder: Path, slope: float) -> Iterator[Row]:
+    """What the evidence says of k_h+ in impacts at five velocities."""
+    chosen, off, hits, kh_plus = [], [], [], 14.3e6
+    kinds = dict.fromkeys(BISTABLE, "shared") | {"kh_plus": "auto"}
+    study = folder / "study.toml"
+    lines = [f's1_{name} = "{kind}"' for name, kind in kinds.items()]
+    study.write_text('tests = ["t*.csv"]\nmodel = "bistable"\n[parameters]\n' + "\n".join(lines))
+    for draw in range(draws):
+        rng = np.random.default_rng([5, draw])
+        middle = strike(folder / "t2.csv", kh_plus, VELOCITIES[2], rng)
+        for i, velocity in enumerate(VELOCITIES):
+            rate = middle * velocity / VELOCITIES[2]
+            for _ in range(5 if slope else 1):  # a stiffer branch changes the rate, too
+                factor = (rate / middle) ** slope if i != 2 else 1.0
+                rate = strike(folder / f"t{i}.csv", kh_plus * factor, velocity, rng)
+        one = ff.joint(study, jobs=1).parameters["s1_kh_plus"]
+        chosen.append(one.kind)
+        if one.kind == "power rate":
+            off.append((one.b - slope) / one.b_stderr)
+            hits.append(one.b_ci95[0] <= slope <= one.b_ci95[1])
+    name = f"impacts, b = {slope:g}"
+    for kind in ("shared", "power rate", "log rate", "own"):
+        yield {"study": name, "what": f"{kind} chosen", "draws": draws,
+               "share": chosen.count(kind) / draws}  # fmt: skip
+    if hits:
+        yield {"study": name, "what": "slope b", "draws": len(hits), "mean": float(np.mean(off)),
+               "spread": float(np.std(off))} | coverage(hits)  # fmt: skip
+
+
 def timing(folder: Path, jobs: int) -> Iterator[Row]:
     """Seconds of fits with nine parameters, three of them shared."""
     rng = np.random.default_rng(4)
@@ -160,7 +218,9 @@ def timing(folder: Path, jobs: int) -> Iterator[Row]:
 
 def coverage(hits: list[bool]) -> Row:
     interval = binomtest(sum(hits), len(hits)).proportion_ci(0.95, "wilson")
-    return {"share": float(np.mean(hits)), "low": interval.low, "high": interval.high}
+    return {
+        "share": float(np.mean(hits)), "low": float(interval.low), "high": float(interval.high),
+    }  # fmt: skip
 
 
 def table(rows: list[Row]) -> str:
@@ -170,9 +230,9 @@ def table(rows: list[Row]) -> str:
         "|---|---|---|---|---|---|",
     ]
     for row in rows:
-        mean = "" if "mean" not in row else f"{row['mean']:.3g}"
+        mean = "" if "mean" not in row else f"{float(row['mean']):.3g}"
         if "spread" in row:
-            mean += f" ± {row['spread']:.2f} standard errors"
+            mean += f" ± {float(row['spread']):.2f} standard errors"
         elif row["study"] == "time":
             mean += " s"
         share = "" if "share" not in row else f"{100 * float(row['share']):.0f} %"
@@ -187,10 +247,26 @@ def table(rows: list[Row]) -> str:
     return "\n".join(lines)
 
 
+def save(rows: list[Row], folder: Path) -> None:
+    """Write joint.csv and joint.md; of studies that were not run now the older rows stay."""
+    path, now = folder / "joint.csv", {row["study"] for row in rows}
+    if path.is_file():
+        with path.open(newline="") as file:
+            older = [{k: v for k, v in row.items() if v} for row in csv.DictReader(file)]
+        rows = [*(row for row in older if row["study"] not in now), *rows]
+    keys = ("study", "what", "draws", "mean", "spread", "share", "low", "high")
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, keys, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    machine = f"{platform.machine()}, Python {platform.python_version()}"
+    (folder / "joint.md").write_text(f"{table(rows)}\n\n{machine}\n")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--only", choices=("four", "scatter", "log", "power", "time"))
-    parser.add_argument("--draws", type=int, help="default: 20 of four, 100 of groups, 200 of laws")
+    parser.add_argument("--only", choices=("four", "scatter", "log", "power", "impacts", "time"))
+    parser.add_argument("--draws", type=int, help="default: 100 of groups, 200 of laws, 20 else")
     parser.add_argument("--jobs", type=int, default=2, help="processes of the timing")
     parser.add_argument("--out", type=Path, default=HERE)
     given = parser.parse_args()
@@ -200,6 +276,7 @@ def main() -> None:
         "scatter": [lambda at, s=s: scatter(given.draws or 100, at, s) for s in (0.1, 0.03)],
         "log": [lambda at: rates(given.draws or 200, at, "log rate", 0.05)],
         "power": [lambda at: rates(given.draws or 200, at, "power rate", 0.05)],
+        "impacts": [lambda at, b=b: impacts(given.draws or 20, at, b) for b in (0.0, 0.2)],
         "time": [lambda at: timing(at, given.jobs)],
     }
     for name, makers in studies.items():
@@ -208,14 +285,7 @@ def main() -> None:
                 for row in make(Path(folder)):
                     rows.append(row)
                     print(row, flush=True)
-    if given.only is None:
-        keys = list(dict.fromkeys(key for row in rows for key in row))
-        with (given.out / "joint.csv").open("w", newline="") as file:
-            writer = csv.DictWriter(file, keys)
-            writer.writeheader()
-            writer.writerows(rows)
-        machine = f"{platform.machine()}, Python {platform.python_version()}"
-        (given.out / "joint.md").write_text(f"{table(rows)}\n\n{machine}\n")
+    save(rows, given.out)
     print(table(rows))
 
 

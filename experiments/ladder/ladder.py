@@ -307,7 +307,8 @@ strong misfits, hence the second test, of neighbouring residuals.
 
 First cycles in the displacement drive, without dashpots. The data are not part of this repository.
 Misfit and predicted misfit (of blocks that were held back, each predicted by a fit to the rest) are
-in percent of the range of stress; n.d. counts parameters that are not determined.
+in percent of the range of stress; n.d. counts parameters that are not determined, by their 95 %
+intervals alone where a model was not chosen.
 
 {foams}
 

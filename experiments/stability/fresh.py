@@ -766,4 +766,8 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.path.insert(0, str(HERE.parent))
+    from unchanged import keep_unchanged
+
+    with keep_unchanged(HERE):
+        main()

@@ -67,6 +67,9 @@ HOPELESS = 1.1
 # Two of them take a minute even under a known motion: they are not tried where one, perhaps with
 # relaxation, misses the curves by no more than this share of the range.
 CLOSE = 0.01
+# Of a model that is compared: ranges and better intervals are made of the chosen one alone. They
+# cost as much as its search, and the comparison does not go by them.
+COMPARED = Choice("local", ranges=False)
 
 
 def _dampers(params: lmfit.Parameters) -> list[str]:
@@ -124,7 +127,8 @@ def compare_models(
     """Fit ever richer models until one holds; this is `foamfit.fit` with model="auto".
 
     The time limit is that of all models together; it and Ctrl-C keep what is done. Models have
-    local intervals; those that were asked for are made of the chosen one.
+    local intervals and states by these alone; the intervals that were asked for, and ranges, are
+    made of the chosen one.
     """
     state = _Comparison(measurement, options, progress)
     groups, skipped = _models(measurement)
@@ -158,8 +162,9 @@ def compare_models(
         stopped = "Ctrl-C"
     if not tried:
         raise SimulationError(f"{measurement.name}: no model could be tried: {'; '.join(skipped)}")
-    if stopped is None and options.choice.method != "local":
-        best = choose(tried).best
+    best = choose(tried).best
+    wanted = options.choice.method != "local" or tried[best].best.misfits
+    if stopped is None and wanted:
         result, point = one_model.judge(state.fits[best], options.choice, announce)
         tried[best] = replace(tried[best], result=result, best=point)  # it may be a better point
     progress(1.0, "done")
@@ -273,7 +278,7 @@ class _Comparison:
             replace(self.options, max_time=left, relaxation=model.relaxation),
             lambda share, what: self.progress(done + 0.1 * share, f"{label}: {what}"),
         )
-        result, best = one_model.judge(found, Choice("local"), lambda _: None)
+        result, best = one_model.judge(found, COMPARED, lambda _: None)
         predicted = None if result.stopped else self.predicted(best)
         return found, Tried(result, damping, best, time.perf_counter() - began, predicted)
 
@@ -453,6 +458,11 @@ def _choice_sentences(tried: Sequence[Tried], decision: Decision, ended: str) ->
         f"{one.name} was chosen of {counted(len(tried), 'model')}: {reason}. No more models were "
         f"tried because {ended}."
     ]
+    if any(item.range for item in one.result.parameters.values()):
+        said.append(
+            "Ranges were made of the chosen model alone; states of the others go by their 95 % "
+            "intervals."
+        )
     if decision.by_prediction:
         said.append(
             "What is left is more than noise, so AICc and BIC do not hold. Each model was fitted "
@@ -484,10 +494,15 @@ def _undetermined(tried: Sequence[Tried], decision: Decision) -> str:
     if decision.by_prediction:
         nearest = min(sound, key=lambda i: tried[i].misfit)
         off = f"misfit of {percent(tried[nearest].misfit)} of the range"
-        return f"{told}; all of {tried[nearest].name} are determined, at a {off}."
+        return f"{told}; {_all_of(tried[nearest])}, at a {off}."
     nearest = min(sound, key=lambda i: found[i].bic)
     higher = found[nearest].bic - found[best].bic
-    return f"{told}; all of {tried[nearest].name} are determined, at a BIC higher by {higher:.1f}."
+    return f"{told}; {_all_of(tried[nearest])}, at a BIC higher by {higher:.1f}."
+
+
+def _all_of(one: Tried) -> str:
+    """Say that a model that was not chosen has no parameter that is not determined."""
+    return f"by their 95 % intervals all of {one.name} are determined"
 
 
 def _structure_left(tried: Sequence[Tried], best: int) -> str:

@@ -164,7 +164,7 @@ def _why_not(problem: Problem) -> str:
 
 
 def judge(found: Found, choice: Choice, announce: Announce) -> tuple[Fit, BestPoint]:
-    """Make the intervals that were chosen, and the result of the best point."""
+    """Make the intervals (and ranges) that were chosen, and the result of the best point."""
     try:
         best, record, intervals = found.best(), found.record, Intervals()
         if record.stopped is None:
@@ -197,9 +197,11 @@ def _assess(
         before = tracker.best_cost
         try:
             better = None
-            if best.cost < MOVED * there:  # what is left open is not that of the point before
-                left, there = left_open(best, tracker.ends, tracker, budget), best.cost
-                better = None if choice.method == "local" else left.better
+            # What is left open is not that of the point before.
+            if choice.ranges and best.cost < MOVED * there:
+                other = choice.method != "local"  # which goes by this one minimum
+                left = left_open(best, tracker.ends, tracker, budget, other)
+                better, there = left.better if other else None, best.cost
             made = Intervals(better=better)
             if better is None:
                 made = assess(

@@ -156,7 +156,7 @@ class Rung:
     runs_p: float
     # p-value of the neighbours test: the same by size, where the runs test goes by sign.
     neighbours_p: float
-    # Names of the parameters in these states.
+    # Names of the parameters in these states, by the 95 % intervals alone where it was not chosen.
     not_determined: tuple[str, ...]
     weak: tuple[str, ...]
     seconds: float  # Run time

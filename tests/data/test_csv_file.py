@@ -168,9 +168,9 @@ def test_a_million_rows_take_seconds(tmp_path):
     path = write(tmp_path, toml=SPECIMEN + STRIKER)
     block = "\n".join(f"{a:.7f},{2 * b:.7f},{4 * b:.7f}" for a, b in zip(t, y, strict=True))
     path.write_text("time (ms),stress (MPa),displacement (mm)\n" + block)
-    begin = time.perf_counter()
+    begin = time.process_time()
     test = read_test(path)
-    assert time.perf_counter() - begin < 10  # about 1 s; the rest is for slow machines
+    assert time.process_time() - begin < 10  # about 1 s; the rest is for slow machines
     assert len(test.stress) <= 1000
     assert test.stress.max() == pytest.approx(2e6, rel=1e-3)
 

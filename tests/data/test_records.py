@@ -486,10 +486,10 @@ def test_the_unit_of_the_header_may_be_said_again(tmp_path):
 )
 def test_a_toml_that_no_one_would_write_is_refused_quickly(tmp_path, toml, words):
     path = write(tmp_path, table(*loop()), toml)
-    begin = time.perf_counter()
+    begin = time.process_time()
     with pytest.raises(InputError) as caught:
         read_test(path)
-    assert time.perf_counter() - begin < 2.0
+    assert time.process_time() - begin < 2.0
     message = str(caught.value)
     assert len(message) < 600
     assert all(word in message for word in words)
@@ -501,10 +501,10 @@ def test_a_toml_that_no_one_would_write_is_refused_quickly(tmp_path, toml, words
 def test_a_column_name_of_megabytes_is_refused_quickly(tmp_path, name):
     header, *rows = table(*loop(), loop()[0])
     path = write(tmp_path, [f"{header},{name}", *rows])
-    begin = time.perf_counter()
+    begin = time.process_time()
     with pytest.raises(InputError) as caught:
         read_test(path)
-    assert time.perf_counter() - begin < 2.0
+    assert time.process_time() - begin < 2.0
     assert len(str(caught.value)) < 600
     assert "row 1" in str(caught.value)
 

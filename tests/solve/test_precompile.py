@@ -7,24 +7,26 @@ import os
 import re
 import subprocess
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import click
+import numpy as np
 import pytest
 from click.testing import CliRunner
 from numba import types
 
 import fabricated
 import foamfit as ff
-from conftest import EXPERIMENTS, without_pictures
+from conftest import EXPERIMENTS, synthetic_loop, without_pictures
 from foamfit import api
 from foamfit.cli import main
-from foamfit.solve import cache, polynomial, precompile
+from foamfit.solve import cache, polynomial, precompile, relaxation
 from foamfit.solve.explicit import memory, taylor
 from foamfit.solve.implicit import vibration
-from foamfit.springs import kernels, sensitivities
+from foamfit.springs import kernels, microscale_kernels, sensitivities
 
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
 
@@ -56,6 +58,20 @@ def test_a_fit_calls_what_was_compiled_and_nothing_else() -> None:
         assert len(function.signatures) == 1, function.py_func.__name__
 
 
+def test_a_fit_of_springs_with_memory_calls_what_was_compiled_and_nothing_else() -> None:
+    for relaxed in (True, False):
+        precompile._memory(relaxed)
+    measurement = synthetic_loop()[1]
+    timed = replace(measurement, time=np.linspace(0.0, 1.0, measurement.stress.size))
+    ff.fit(timed, model="microscale", relaxation=1, starts=1, intervals="local")
+    ff.fit(timed, model="microscale", starts=1, intervals="local")
+    for function in (
+        relaxation.relaxed_along, microscale_kernels.fill_rows, microscale_kernels.stress_along,
+        microscale_kernels.stress_tangents_along,
+    ):  # fmt: skip
+        assert len(function.signatures) == 1, function.py_func.__name__
+
+
 def test_the_small_scenes_meet_every_loop_of_the_integrator() -> None:
     """Where the integrator itself was compiled, it left no loop in other types.
 
@@ -67,7 +83,8 @@ def test_the_small_scenes_meet_every_loop_of_the_integrator() -> None:
     read = set(re.findall(r"\w+", body)) & set(vars(taylor))
     loops = {vars(taylor)[name] for name in read if hasattr(vars(taylor)[name], "py_func")}
     without = {loop for loop in loops if loop.__module__ != memory.__name__}
-    assert without - {taylor.settle_together} <= set(calls)  # that one is of springs with memory
+    with_memory = {taylor.settle_together, taylor.expand_remembered}
+    assert without - with_memory <= set(calls)
     for function, arguments in calls.items():
         made = [kinds for kinds in function.signatures if not any(map(is_other, kinds))]
         assert made in ([], [arguments]), function.py_func.__name__
@@ -79,17 +96,47 @@ def test_the_first_use_says_that_it_compiles(
     done = []
 
     @contextmanager
-    def quickly() -> Any:
+    def quickly(*_: bool) -> Any:
         yield lambda: done.append("rest")
 
     monkeypatch.setattr(precompile, "side_by_side", quickly)
     monkeypatch.setattr(api, "fit", lambda *_, **__: fabricated.result())
     without_pictures(monkeypatch)
     for ready in (False, True):
-        monkeypatch.setattr(cache, "compiled", lambda ready=ready: ready)
+        monkeypatch.setattr(cache, "compiled", lambda *_, ready=ready: ready)
         told = CliRunner().invoke(main, ["fit", str(RECONSTRUCTION), "--out", str(tmp_path / "r")])
         assert ("compiling the solver" in told.stderr) == (not ready)
     assert done == ["rest"]
+
+
+@pytest.mark.parametrize(
+    ("model", "there", "asked"),
+    [
+        (["bistable"], (), [(True, False)]),
+        (["microscale"], (), [(False, True)]),
+        (["bistable", "--relaxation", "1"], ("integrate",), [(False, True)]),
+        (["auto"], (), [(True, True)]),
+        (["auto"], ("integrate",), [(False, True)]),
+        (["auto"], ("integrate", "relaxed_along"), []),
+    ],
+)
+def test_the_first_use_compiles_what_the_model_needs(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, model: list[str], there: Any, asked: Any
+) -> None:
+    done = []
+
+    @contextmanager
+    def quickly(*parts: bool) -> Any:
+        done.append(parts)
+        yield lambda: None
+
+    monkeypatch.setattr(precompile, "side_by_side", quickly)
+    monkeypatch.setattr(cache, "compiled", lambda name="integrate": name in there)
+    monkeypatch.setattr(api, "fit", lambda *_, **__: fabricated.result())
+    without_pictures(monkeypatch)
+    args = ["fit", str(RECONSTRUCTION), "--out", str(tmp_path / "r"), "--model", *model]
+    assert CliRunner().invoke(main, args).exit_code == 0
+    assert done == asked
 
 
 def test_the_other_process_finds_this_package_and_is_stopped(
@@ -101,7 +148,7 @@ def test_the_other_process_finds_this_package_and_is_stopped(
     class Other(subprocess.Popen):  # type: ignore[type-arg]
         def __init__(self, command: list[str], **options: Any) -> None:
             asked.append(options["env"]["PYTHONPATH"].split(":")[0])
-            assert command[1:] == ["-m", "foamfit.solve.precompile"]
+            assert command[1:] == ["-m", "foamfit.solve.precompile", "integrator"]
             super().__init__(["sleep", "60"], stdout=options["stdout"])
 
         def terminate(self) -> None:

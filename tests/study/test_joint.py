@@ -12,7 +12,6 @@ from click.testing import CliRunner
 import foamfit as ff
 from conftest import without_pictures
 from foamfit.cli import main
-from foamfit.study.joint import strain_rate
 
 HEIGHT, AREA, TOP = 10e-3, 1e-4, 0.5
 SPRING = {
@@ -228,11 +227,6 @@ def test_drives_and_noise_mix(tmp_path):
     assert result.fit.found.value("s1_eta")[1] == 0.0  # it does not vary in the slow loop
     assert result.fit.found.n_vary == 8
     assert result.parameters["s1_k0"].value == pytest.approx(5.5e6, rel=0.03)
-
-
-def test_rate_is_the_mean_strain_rate_on_loading(folder):
-    test = ff.read_test(folder / "t1.csv", folder / "foam.toml")
-    assert strain_rate(test) == pytest.approx(0.1)
 
 
 # ------------------------------------------------------------------------------- the command

@@ -22,7 +22,8 @@ from foamfit.one_model import Options, identify, judge
 from foamfit.report.folder import load_result
 from foamfit.report.readable import readable
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.covariance import NOTHING, RULE, WEAK, covariance
+from foamfit.trust.covariance import NOTHING, RULE, WEAK, covariance, half_width
+from foamfit.trust.intervals import Choice
 from foamfit.trust.ranges import ALIKE, alike, left_open, tolerance
 from foamfit.trust.refit import Refit
 from foamfit.trust.resample import bootstrap
@@ -155,6 +156,39 @@ def refitted(problem: Problem, values: np.ndarray, names: tuple[str, ...]) -> Be
     return BestPoint(problem, end.point, names)
 
 
+@pytest.mark.parametrize("rho", [0.0, 0.9])
+def test_the_noise_that_a_fit_has_taken_is_given_back(rho):
+    """Variances of the own law's parameters, off residuals, over those of the noise itself.
+
+    The fit takes what is slow: off the residuals as they are, noise of 0.9 from sample to sample
+    would give 0.6 of the variances.
+    """
+    clean = strikes("own law")
+    around = BestPoint(clean, np.array([*law_error.SPRING.seven, 0.0, 0.0]), clean.free()[:7])
+    jacobian, sizes = around.jacobian * around.sizes, clean.objective.sizes
+    pull, known = np.linalg.pinv(jacobian), NoiseProcess(np.array([rho] if rho else []), 1.0)
+    true = sum(known.forms(half.T) for half in np.split(pull, 2, axis=1))
+    rng, found, held = np.random.default_rng(0), [], []
+    for _ in range(40):
+        drawn = np.concatenate([noise(rng, size, rho) for size in sizes])
+        off = pull @ drawn
+        spread = covariance(jacobian, drawn - jacobian @ off, sizes, np.ones(7))
+        found.append(spread.stderr**2 / true)
+        halves = [half_width(*one) for one in zip(spread.stderr, spread.freedom, strict=True)]
+        held.append(np.abs(off) < halves)
+    assert np.mean(found) == pytest.approx(1.0, abs=0.15)
+    assert np.mean(held) > 0.9
+
+
+def test_a_linear_problem_of_known_noise_holds_in_95_percent():
+    """What the study compares the own law's intervals with; 1.2 % is its standard error."""
+    kind = "own law, correlated noise"
+    held = [list(law_error.linear(kind, draw).values()) for draw in range(200)]
+    assert np.shape(held) == (200, 7)
+    assert np.mean(held) == pytest.approx(0.95, abs=0.035)
+    assert law_error.linear("rate effect", 0) == {}
+
+
 @pytest.mark.parametrize("kind", ["rate effect", "own law"])
 def test_the_interval_holds_the_best_fit_without_noise(kind):
     """Of 20 independent intervals of k_c 14 or less hold with p < 1e-3, if 95 % do.
@@ -213,6 +247,24 @@ def test_every_description_in_the_range_follows_the_curves_about_as_well():
             assert item.range[0] <= item.value <= item.range[1]
             # What refits with fresh noise scatter is less than what the law leaves open.
             assert item.ci95 is None or np.ptp(item.range) > 0.0
+
+
+def test_local_intervals_look_for_no_further_minima():
+    """Only the other intervals go by them; the ranges are the same."""
+    _, best, found = fitted(0)
+    objective, ends = found.problem.objective, found.tracker.ends
+    counts = [objective.evaluations]
+    whole = left_open(best, ends, found.tracker)
+    counts.append(objective.evaluations)
+    alone = left_open(best, ends, found.tracker, descents=False)
+    counts.append(objective.evaluations)
+    judge(found, Choice("local"), lambda _: None)
+    counts.append(objective.evaluations)
+    whole_cost, _, local_cost = np.diff(counts)
+    assert alone.ranges == whole.ranges
+    assert whole.minima
+    assert alone.minima == ()
+    assert local_cost < 0.6 * whole_cost
 
 
 def test_the_range_decides_where_it_is_wider():

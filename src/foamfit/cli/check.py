@@ -76,7 +76,7 @@ def check(
     from foamfit.report.outlook import outlook_of
     from foamfit.report.outlook_text import outlook_text
 
-    with compiling(quiet=False) as compile_rest:
+    with compiling(False, model, relaxation) as compile_rest:
         compile_rest()
     outlook = outlook_of(
         test, specimen, model, drive, published_set=published_set, result=params,

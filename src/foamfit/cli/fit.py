@@ -60,7 +60,7 @@ def fit(
     search |= intervals_of(**{way: search.pop(way) for way in ("profile", "bootstrap", "mcmc")})
     model = "auto" if model.strip() == "auto" else Model.parse(model).name
     alone, several = _cycles(cycle)
-    with compiling(quiet or as_json) as compile_rest:
+    with compiling(quiet or as_json, model, search["relaxation"]) as compile_rest:
         measurement = read_test(test, specimen, alone)
         folder = _result_folder(out, test, specimen, model)
         from foamfit import api

@@ -36,7 +36,9 @@ RELAXATION = click.option(
 
 
 @contextmanager
-def compiling(quiet: bool) -> Iterator[Callable[[], None]]:
+def compiling(
+    quiet: bool, model: str = "bistable", relaxation: int = 0
+) -> Iterator[Callable[[], None]]:
     """Compile at first use, beside the body; it calls what is given before it simulates."""
     import logging
 
@@ -44,12 +46,15 @@ def compiling(quiet: bool) -> Iterator[Callable[[], None]]:
 
     if quiet:  # what is compiled later is announced by the log
         logging.getLogger("foamfit").setLevel(logging.ERROR)
-    if cache.compiled():
+    memory = model == "auto" or "microscale" in model or relaxation > 0
+    integrator = (model == "auto" or not memory) and not cache.compiled()
+    memory = memory and not cache.compiled("relaxed_along")
+    if not (integrator or memory):
         yield lambda: None
         return
     if not quiet:
         say("foamfit: compiling the solver, once after installation", err=True)
-    with precompile.side_by_side() as finish:
+    with precompile.side_by_side(integrator, memory) as finish:
         yield finish
 
 

@@ -365,7 +365,7 @@ class _Layout:
     def start(self, vectors: Sequence[Array]) -> _Point:
         """The point that has the own parameters of these vectors, and what is nearest in common."""
         table = np.array([t.encode(v) for t, v in zip(self.tests, vectors, strict=True)])
-        l, shared = len(self.slots.linked), np.empty(self.slots.count)  # noqa: E741
+        first, shared = len(self.slots.linked), np.empty(self.slots.count)
         for j, (at, kind) in enumerate(zip(self.slots.places, self.slots.kinds, strict=True)):
             there = [t for t, test in enumerate(self.tests) if test.present[j]]
             own = table[there, j]
@@ -382,12 +382,12 @@ class _Layout:
                  if name in p.free()]
             )  # fmt: skip
         low, high = self.box
-        return _Point(np.clip(shared, low.shared, high.shared), table[:, l:])
+        return _Point(np.clip(shared, low.shared, high.shared), table[:, first:])
 
     @cached_property
     def box(self) -> tuple[_Point, _Point]:
         """Lowest and highest coordinates."""
-        l, sides = len(self.slots.linked), list[_Point]()  # noqa: E741
+        first, sides = len(self.slots.linked), list[_Point]()
         for side, far in ((0, -1.0), (1, 1.0)):
             ends = np.array([test.box[side] for test in self.tests])
             there = np.array([test.present for test in self.tests])
@@ -396,7 +396,7 @@ class _Layout:
                 shared[at] = np.median(ends[there[:, j], j])
                 if kind in RATES:
                     shared[at + 1] = far * STEEPEST
-            sides.append(_Point(shared, ends[:, l:]))
+            sides.append(_Point(shared, ends[:, first:]))
         return sides[0], sides[1]
 
     def values(self, point: _Point) -> list[Array]:
@@ -543,11 +543,11 @@ def _residuals(layout: _Layout, point: _Point) -> list[Array] | None:
 def _normal(layout: _Layout, point: _Point, residuals: Sequence[Array]) -> _Normal:
     """Normal matrix and gradient of each test; no Jacobian is kept."""
     matrices, gradients = [], []
-    l, locals_ = len(layout.slots.linked), layout.local(point)  # noqa: E741
+    first, locals_ = len(layout.slots.linked), layout.local(point)
     for t, (test, local, residual) in enumerate(zip(layout.tests, locals_, residuals, strict=True)):
         values = test.decode(local)
         own = test.moves(local, values)
-        moves = np.hstack([own[:, :l] @ layout.through_slopes(t, point.shared), own[:, l:]])
+        moves = np.hstack([own[:, :first] @ layout.through_slopes(t, point.shared), own[:, first:]])
         jacobian = test.problem.objective.jacobian_along(values, moves)
         jacobian = np.vstack([jacobian, layout.pulled_slopes(t, values, moves)])
         matrices.append(jacobian.T @ jacobian)

@@ -244,7 +244,8 @@ def ladder_cells(ladder: Ladder) -> list[tuple[str, ...]]:
     The misfits are those of the curves in time where there are any, else that of stress-strain;
     "pred." is the predicted misfit, "gain" by how much it is below that of the best model with no
     more parameters; "rank" is rank over parameters varied, "p" the smaller p-value of the two tests
-    of the residuals, "n.d." parameters not determined over weak ones.
+    of the residuals, "n.d." parameters not determined over weak ones, by
+    the 95 % intervals alone where a model was not chosen.
     """
     cells = list[tuple[str, ...]]()
     for one in ladder.rungs:

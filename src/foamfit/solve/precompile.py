@@ -82,6 +82,25 @@ def _compile(calls: dict[Any, tuple[Any, ...]], cached: bool) -> None:
             loop.compile(types)
 
 
+def _memory(relaxed: bool) -> None:
+    """Call what a fit of springs with memory calls under a known motion or stress.
+
+    With `relaxed` the law along a motion, which takes longest; without, the rest.
+    """
+    from foamfit.solve import relaxation
+    from foamfit.springs import microscale_kernels as micro
+    from foamfit.springs.model import Model
+
+    rows = Model(("microscale",), 1).rows(np.array([5e5, 2e5, 0.1, 1e5, 0.4, 5e4, 0.7, 0, 0.5, 1]))
+    assert rows is not None
+    row, at = rows[0], np.zeros(2)
+    if relaxed:
+        relaxation.relaxed_along(row, at, np.arange(2.0), 1e-6, False)
+        return
+    micro.stress_tangents_along(row, at, *micro.stress_along(row, at))
+    micro.strain_tangents_along(row, at, *micro.strain_along(row, at)[1:])
+
+
 def _rest() -> None:
     """Call what else a fit calls; last what an impact on one spring does not need."""
     from foamfit.solve import scene
@@ -99,14 +118,17 @@ def _rest() -> None:
 
 
 @contextmanager
-def side_by_side() -> Iterator[Callable[[], None]]:
+def side_by_side(integrator: bool = True, memory: bool = False) -> Iterator[Callable[[], None]]:
     """Let another process compile beside the body, which calls what is given before it simulates.
 
-    At the end all that a fit needs is in the cache. The other process is stopped if the body fails.
+    At the end all that a fit needs is in the cache: with `integrator` one of springs without
+    memory, with `memory` one of others along a known motion or stress. The other process is stopped
+    if the body fails.
     """
     path = f"{PACKAGE.parent}{os.pathsep}{os.environ.get('PYTHONPATH', '')}".rstrip(os.pathsep)
+    parts = [part for part, asked in (("integrator", integrator), ("memory", memory)) if asked]
     with subprocess.Popen(
-        [sys.executable, "-m", "foamfit.solve.precompile"],
+        [sys.executable, "-m", "foamfit.solve.precompile", *parts],
         stdout=subprocess.PIPE,
         env=os.environ | {"PYTHONPATH": path},
         process_group=0,  # Ctrl-C is for the process that starts this one
@@ -114,11 +136,14 @@ def side_by_side() -> Iterator[Callable[[], None]]:
 
         def finish() -> None:
             gc.disable()  # what compiling makes stays
-            integrator, *calls = _calls().items()
-            _compile(dict(calls), cached=False)
-            if other.stdout is not None:
-                other.stdout.readline()  # the pieces are there, or the other process has failed
-            _compile(dict([integrator]), cached=True)
+            if integrator:
+                loop, *calls = _calls().items()
+                _compile(dict(calls), cached=False)
+                if other.stdout is not None:
+                    other.stdout.readline()  # the pieces are there, or the other process has failed
+                _compile(dict([loop]), cached=True)
+            else:
+                _memory(relaxed=True)
             gc.enable()
 
         try:
@@ -129,9 +154,19 @@ def side_by_side() -> Iterator[Callable[[], None]]:
             raise
 
 
-if __name__ == "__main__":
+def _main(parts: list[str]) -> None:
+    """Compile what the process that starts this one does not."""
     gc.disable()
-    _, *pieces = _calls().items()
-    _compile(dict(pieces), cached=True)
-    print("pieces", flush=True)
-    _rest()
+    if "integrator" in parts:
+        _, *pieces = _calls().items()
+        _compile(dict(pieces), cached=True)
+        print("pieces", flush=True)
+        _rest()
+    if "memory" in parts:
+        _memory(relaxed=False)
+        if "integrator" in parts:
+            _memory(relaxed=True)
+
+
+if __name__ == "__main__":
+    _main(sys.argv[1:])

@@ -36,6 +36,7 @@ from foamfit.study.joint_fit import (
 from foamfit.study.joint_result import Alone, JointData
 from foamfit.study.joint_words import sentences_of, warnings_of
 from foamfit.study.shared import bic
+from foamfit.study.strain_rate import strain_rate
 from foamfit.study.study_file import AUTO, Study, read_study
 from foamfit.study.workers import workers
 from foamfit.text import counted
@@ -174,18 +175,6 @@ def _too_few(study: Study, count: int, refused: Mapping[str, str]) -> NoReturn:
         f"{study.path}: {counted(count, 'test')} of {len(study.tests)} can be used, a joint fit "
         f"needs two: {told}"
     )
-
-
-def strain_rate(test: Measurement) -> float | None:
-    """Mean strain rate on loading, from contact to the largest strain, 1/s; None without time."""
-    if test.time is None or test.displacement is None:
-        return None
-    peak = int(np.argmax(test.displacement))
-    duration = float(test.time[peak] - test.time[0])
-    if duration <= 0.0:
-        return None
-    rise = float(test.displacement[peak] - test.displacement[0])
-    return rise / test.specimen.height / duration
 
 
 def _params(study: Study, tests: Sequence[Measurement]) -> list[lmfit.Parameters]:

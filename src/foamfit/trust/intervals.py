@@ -38,6 +38,7 @@ class Choice:
     method: str = "auto"  # One of `METHODS`; see `foamfit.fit`
     draws: int = 0  # Refits of the bootstrap, or steps of the Markov chain
     seed: int = 0  # Source of all chance
+    ranges: bool = True  # Whether ranges are made where the law has an error
 
     def __post_init__(self) -> None:
         """Refuse what is unknown or cannot be done."""

@@ -40,6 +40,7 @@ from foamfit.springs.kernels import (
     SPREAD_PLUS,
     Array,
     Branches,
+    Row,
     inlined,
     inner,
     maker,
@@ -60,31 +61,38 @@ from foamfit.springs.microscale_kernels import (
 )
 from foamfit.springs.parameters import OWN_ETA, OWN_RELAXATION
 
-# Rows of `Memory.series`: equilibrium stress s; 1 - a, 1 + eps_star - c; P; n u_n, u_n, φ, h.
-EQ, BELOW_A, BELOW_C, SNAPPED, PACE, SCORE, DENSITY, BEND, N_MEMORY = range(9)
+# Columns of `Memory.series`, which stand side by side at each order since the recurrences read them
+# all: equilibrium stress s; Σ z_k; 1 - a, 1 + eps_star - c; their difference; P; n u_n, u_n, φ, h.
+# Then follow the z of the relaxation terms.
+EQ, RELAXED, BELOW_A, BELOW_C, BETWEEN, SNAPPED, PACE, SCORE, DENSITY, BEND, N_MEMORY = range(11)
 # Rows of `Memory.partials`: the derivatives of the strain at fixed stress by the seven parameters
 # of the law, by p, and by the stress; then what these are made of.
 BY_RANK, BY_STRESS, SQUARE_A, SQUARE_C, WIDTH, STEEP, N_PARTIALS = range(7, 14)
 # Columns of `Memory.now`: place and scale of the normal distribution that is followed, p and 1 - p
-# where the step starts, 1 + Σ g; dε/ds there, and dε/dΣ; what of a derivative of Σ is not of s.
-PLACE, SCALE, FRACTION, LEFT, GAIN, GIVE, SOFT, BASE, N_NOW = range(9)
+# where the step starts, 1 + Σ g and its inverse; dε/ds there, its inverse, and dε/dΣ; what of a
+# derivative of Σ is not of s. Then what the orders of a step share: 1/(k0 + s) (on a curved branch
+# of another spring that of its k), 1/(kc + s), 1/s; the derivatives of a, c and u by s; c - a.
+PLACE, SCALE, FRACTION, LEFT, GAIN, PER_GAIN, GIVE, PER_GIVE, SOFT, BASE = range(10)
+PER_A, PER_C, PER_S, RATE_A, RATE_C, RATE_U, GAP, N_NOW = range(10, 18)
 # A held spring is past where it turned if its strain is, by so much of itself.
 MARGIN = 1e-13
 # A spring that turns within so small a part of a step turns at its start.
 NOW = 1e-8
-# Beyond this normal score P is 0 or 1 to rounding. Within it the score u may change in a step by so
-# much over u as its series have orders, times a share (they are those of exp(-u²/2), whose terms
-# fall only from the order u δu on), and by so much at most.
-FAR = 8.0
-SHARE_OF_ORDER, MOST_SCORE = 0.7, 3.0
+# Beyond the normal score FAR, P is 0 or 1 to rounding; it is from somewhere beyond NEAR on where
+# what it adds to a strain is below the share NEGLIGIBLE (a tenth of it: P is about exp(-u²/2)/10)
+# of the truncation. Within, the score u may change in a step by so much over u as its series have
+# orders, times a share (they are those of exp(-u²/2), whose terms fall only from the order u δu
+# on), and by so much at most; a stress by so much of itself. How exactly these bounds are met.
+NEAR, FAR, NEGLIGIBLE = 4.0, 8.0, 0.1
+SHARE_OF_ORDER, MOST_SCORE, MOST_GROWTH, LOOSE = 0.7, 3.0, 0.8, 0.05
 
 
 class Memory(NamedTuple):
     """What springs remember, and its series and derivatives.
 
     rows (springs, columns) are the springs, state (springs, STATE) that of the microscale ones,
-    now (springs, N_NOW) the numbers above, series (N_MEMORY, springs, order + 2), z (terms,
-    springs, order + 2) the relaxation. `partials` (N_PARTIALS, springs, order + 2) are filled where
+    now (springs, N_NOW) the numbers above, series (springs, order + 2, N_MEMORY + terms) also those
+    of the relaxation. `partials` (N_PARTIALS, springs, order + 2) are filled where
     derivatives are wanted; of these, in p `directions` (p, 2), `ranks` (p, springs) are those of
     what is held and `tangents` (p, 1 + terms, springs, order + 2) the series of s and z. `scratch`
     is (2, CARRIED).
@@ -94,7 +102,6 @@ class Memory(NamedTuple):
     state: Array
     now: Array
     series: Array
-    z: Array
     partials: Array
     directions: Branches
     ranks: Array
@@ -110,8 +117,7 @@ def make_memory(rows: Array, order: int, directions: Branches) -> Memory:
         rows,
         np.zeros((count, STATE)),
         np.zeros((count, N_NOW)),
-        np.zeros((N_MEMORY, count, order + 2)),
-        np.zeros((terms, count, order + 2)),
+        np.zeros((count, order + 2, N_MEMORY + terms)),
         np.zeros((N_PARTIALS, count, order + 2)),
         directions,
         np.zeros((size, count)),
@@ -122,7 +128,7 @@ def make_memory(rows: Array, order: int, directions: Branches) -> Memory:
         gain = 1.0
         for k in range(terms):
             gain += rows[i, N_COLUMNS + 2 * k]
-        memory.now[i, GAIN] = gain
+        memory.now[i, GAIN], memory.now[i, PER_GAIN] = gain, 1.0 / gain
         if rows[i, KIND] == MICROSCALE:
             micro.begin(rows[i], memory.state[i])
     return memory
@@ -205,18 +211,22 @@ def first_turn(
 @inner
 def start_relaxed(memory: Memory, i: int, s: float) -> None:
     """Nothing has relaxed yet of the stress at which a spring starts."""
-    for k in range(memory.z.shape[0]):
-        memory.z[k, i, 0] = -memory.rows[i, N_COLUMNS + 2 * k] * s
+    total = 0.0
+    for k in range(memory.series.shape[2] - N_MEMORY):
+        z = -memory.rows[i, N_COLUMNS + 2 * k] * s
+        memory.series[i, 0, N_MEMORY + k] = z
+        total += z
+    memory.series[i, 0, RELAXED] = total
 
 
 @inner
 def start_relaxed_tangent(memory: Memory, p: int, i: int, change: float) -> None:
     """Derivative in direction p of what `start_relaxed` writes, from that of the stress."""
     own = memory.directions[p, 1] if memory.directions[p, 0] == i else OWN_ETA
-    for k in range(memory.z.shape[0]):
+    for k in range(memory.tangents.shape[1] - 1):
         memory.tangents[p, 1 + k, i, 0] = -memory.rows[i, N_COLUMNS + 2 * k] * change
         if own == OWN_RELAXATION + 2 * k:
-            memory.tangents[p, 1 + k, i, 0] -= memory.series[EQ, i, 0]
+            memory.tangents[p, 1 + k, i, 0] -= memory.series[i, 0, EQ]
 
 
 # ---------------------------------------------------------------- the motion
@@ -225,121 +235,127 @@ def start_relaxed_tangent(memory: Memory, p: int, i: int, change: float) -> None
 @inner
 def start_mixture(memory: Memory, i: int, moving: bool, eps: float) -> float:
     """Order 0 of a microscale spring: the stress at a strain, and all that follows from it."""
-    row, state, now, m = memory.rows[i], memory.state[i], memory.now[i], memory.series
+    row, state, now, m = memory.rows[i], memory.state[i], memory.now[i], memory.series[i, 0]
     micro.settle(row, state, eps)
     s = state[SIGMA]
-    below_a, below_c = row[K0] / (row[K0] + s), row[KC] / (row[KC] + s)
-    m[BELOW_A, i, 0], m[BELOW_C, i, 0] = below_a, below_c
+    per_a, per_c = 1.0 / (row[K0] + s), 1.0 / (row[KC] + s)
+    below_a, below_c = row[K0] * per_a, row[KC] * per_c
+    m[BELOW_A], m[BELOW_C], m[BETWEEN] = below_a, below_c, below_a - below_c
     p, q, steep = state[micro.SNAPPED], state[REST], 0.0
     if moving:
         u = (math.log(s) - now[PLACE]) / now[SCALE]
         p, q, at = micro.share(u), micro.share(-u), micro.density(u)
-        m[SCORE, i, 0], m[DENSITY, i, 0], m[BEND, i, 0] = u, at, u * at
-        steep = at / (now[SCALE] * s)
-    m[SNAPPED, i, 0] = now[FRACTION] = p
+        m[SCORE], m[DENSITY], m[BEND] = u, at, u * at
+        now[PER_S] = 1.0 / s
+        now[RATE_U] = now[PER_S] / now[SCALE]
+        steep = at * now[RATE_U]
+    m[SNAPPED] = now[FRACTION] = p
     now[LEFT] = q
-    gap = row[EPS_STAR] + below_a - below_c
-    now[GIVE] = q * below_a / (row[K0] + s) + p * below_c / (row[KC] + s) + gap * steep
+    now[PER_A], now[PER_C] = per_a, per_c
+    now[RATE_A], now[RATE_C] = below_a * per_a, below_c * per_c
+    now[GAP] = row[EPS_STAR] + below_a - below_c
+    now[GIVE] = q * now[RATE_A] + p * now[RATE_C] + now[GAP] * steep
+    now[PER_GIVE] = 1.0 / now[GIVE]
+    now[SOFT] = now[GIVE] * now[PER_GAIN]
     return s
 
 
 @inlined
-def strain_of_mixture(memory: Memory, i: int, moving: bool, n: int) -> float:
+def strain_of_mixture(now: Array, m: Array, moving: bool, n: int) -> float:
     """Order n >= 1 of the strain of a microscale spring, but for what that of its stress adds.
 
-    All series are filled as if that were zero.
+    `now` and `m` are the spring's own of `Memory.now` and `Memory.series`, which is filled as if
+    that were zero.
     """
-    row, now, m = memory.rows[i], memory.now[i], memory.series
-    s, below_a, below_c = m[EQ, i], m[BELOW_A, i], m[BELOW_C, i]
-    p, q = now[FRACTION], now[LEFT]
-    per_a, per_c = 1.0 / (row[K0] + s[0]), 1.0 / (row[KC] + s[0])  # quotients that wait for nothing
     by_a = by_c = 0.0
     if not moving:
         for j in range(1, n):
-            by_a += s[j] * below_a[n - j]
-            by_c += s[j] * below_c[n - j]
-        below_a[n], below_c[n] = -by_a * per_a, -by_c * per_c
-        return -q * below_a[n] - p * below_c[n]
-    snapped, pace, score = m[SNAPPED, i], m[PACE, i], m[SCORE, i]
-    density, bend = m[DENSITY, i], m[BEND, i]
+            s_j, k = m[j, EQ], n - j
+            by_a += s_j * m[k, BELOW_A]
+            by_c += s_j * m[k, BELOW_C]
+        below_a, below_c = -by_a * now[PER_A], -by_c * now[PER_C]
+        m[n, BELOW_A], m[n, BELOW_C] = below_a, below_c
+        return -now[LEFT] * below_a - now[FRACTION] * below_c
     by_s = by_density = by_bend = products = parts = 0.0
     for j in range(1, n):
-        by_a += s[j] * below_a[n - j]
-        by_c += s[j] * below_c[n - j]
-        by_s += s[j] * pace[n - j]
-        by_density += pace[j] * density[n - j]
-        by_bend += pace[j] * bend[n - j]
-        products += score[j] * density[n - j]
-        parts += snapped[j] * (below_a[n - j] - below_c[n - j])
+        s_j, pace_j, k = m[j, EQ], m[j, PACE], n - j
+        by_a += s_j * m[k, BELOW_A]
+        by_c += s_j * m[k, BELOW_C]
+        by_s += s_j * m[k, PACE]
+        by_density += pace_j * m[k, DENSITY]
+        by_bend += pace_j * m[k, BEND]
+        products += m[j, SCORE] * m[k, DENSITY]
+        parts += m[j, SNAPPED] * m[k, BETWEEN]
     per_n = 1.0 / n
-    below_a[n], below_c[n] = -by_a * per_a, -by_c * per_c
-    pace[n] = -by_s * (1.0 / s[0])
-    score[n] = pace[n] * per_n
-    snapped[n] = (pace[n] * density[0] + by_density) * per_n
-    density[n] = -(pace[n] * bend[0] + by_bend) * per_n
-    bend[n] = products
-    gap = row[EPS_STAR] + below_a[0] - below_c[0]
-    return snapped[n] * gap - q * below_a[n] - p * below_c[n] + parts
+    below_a, below_c, pace = -by_a * now[PER_A], -by_c * now[PER_C], -by_s * now[PER_S]
+    snapped = (pace * m[0, DENSITY] + by_density) * per_n
+    m[n, BELOW_A], m[n, BELOW_C], m[n, BETWEEN] = below_a, below_c, below_a - below_c
+    m[n, PACE], m[n, SCORE], m[n, SNAPPED] = pace, pace * per_n, snapped
+    m[n, DENSITY], m[n, BEND] = -(pace * m[0, BEND] + by_bend) * per_n, products
+    return snapped * now[GAP] - now[LEFT] * below_a - now[FRACTION] * below_c + parts
 
 
 @inlined
-def finish_mixture(memory: Memory, i: int, moving: bool, n: int, s_n: float) -> None:
-    """Add to the series what order n >= 1 of the stress adds."""
-    row, now, m = memory.rows[i], memory.now[i], memory.series
-    s = m[EQ, i, 0]
-    m[BELOW_A, i, n] -= s_n * (m[BELOW_A, i, 0] / (row[K0] + s))
-    m[BELOW_C, i, n] -= s_n * (m[BELOW_C, i, 0] / (row[KC] + s))
+def finish_mixture(now: Array, m: Array, moving: bool, n: int, s_n: float) -> None:
+    """Add to the series what order n >= 1 of the stress adds; see `strain_of_mixture`."""
+    on_a, on_c = s_n * now[RATE_A], s_n * now[RATE_C]
+    m[n, BELOW_A] -= on_a
+    m[n, BELOW_C] -= on_c
     if moving:
-        more = s_n * (1.0 / (now[SCALE] * s))
-        m[PACE, i, n] += n * more
-        m[SCORE, i, n] += more
-        m[SNAPPED, i, n] += m[DENSITY, i, 0] * more
-        m[DENSITY, i, n] -= m[BEND, i, 0] * more
-        m[BEND, i, n] += m[SCORE, i, 0] * m[DENSITY, i, n] + m[SCORE, i, n] * m[DENSITY, i, 0]
+        more = s_n * now[RATE_U]
+        score, density = m[n, SCORE] + more, m[n, DENSITY] - m[0, BEND] * more
+        m[n, BETWEEN] -= on_a - on_c
+        m[n, PACE] += n * more
+        m[n, SNAPPED] += m[0, DENSITY] * more
+        m[n, SCORE], m[n, DENSITY] = score, density
+        m[n, BEND] += m[0, SCORE] * density + score * m[0, DENSITY]
 
 
 @inlined
-def relaxed(memory: Memory, i: int, n: int) -> float:
-    """Order n of Σ z_k of a spring."""
-    total = 0.0
-    for k in range(memory.z.shape[0]):
-        total += memory.z[k, i, n]
-    return total
-
-
-@inlined
-def keep(memory: Memory, i: int, n: int, s_n: float) -> None:
+def keep(row: Row, m: Array, n: int, s_n: float) -> None:
     """Write order n of a spring's equilibrium stress, and what relaxes in the next."""
-    memory.series[EQ, i, n] = s_n
-    for k in range(memory.z.shape[0]):
-        g, tau = memory.rows[i, N_COLUMNS + 2 * k], memory.rows[i, N_COLUMNS + 2 * k + 1]
-        memory.z[k, i, n + 1] = -(memory.z[k, i, n] + g * s_n) * (1.0 / (tau * (n + 1)))
+    m[n, EQ], total = s_n, 0.0
+    for k in range(m.shape[1] - N_MEMORY):
+        g, tau = row[N_COLUMNS + 2 * k], row[N_COLUMNS + 2 * k + 1]
+        z = -(m[n, N_MEMORY + k] + g * s_n) * (1.0 / (tau * (n + 1)))
+        m[n + 1, N_MEMORY + k] = z
+        total += z
+    m[n + 1, RELAXED] = total
 
 
 @inner
-def longest(memory: Memory, i: int, order: int, span: float) -> float:
+def longest(m: Array, now: Array, order: int, tol: float, span: float) -> float:
     """Longest step, within `span`, over which the logarithm of a stress has a good series.
 
-    Where nearly none, or all, have snapped, the series do not show how soon the others do: a step
-    from beyond `FAR` ends there.
+    `m` and `now` are the spring's own of `Memory.series` and `Memory.now`. Where nearly none, or
+    all, have snapped, the series do not show how soon the others do: a step from there ends where
+    these begin to count, at the truncation `tol`.
     """
-    s, u, scale = memory.series[EQ, i], abs(memory.series[SCORE, i, 0]), memory.now[i, SCALE]
-    within = min(MOST_SCORE, SHARE_OF_ORDER * order / u) if u > 0.0 else MOST_SCORE
-    most = s[0] * min(0.8, 1.0 - math.exp(-scale * max(within, u - FAR)))  # also where it falls
-    for _ in range(400):
-        moved = 0.0
+    s, u, scale = m[0, EQ], abs(m[0, SCORE]), now[SCALE]
+    change = min(MOST_SCORE, SHARE_OF_ORDER * order / u) if u > 0.0 else MOST_SCORE
+    if u > NEAR:
+        few = -2.0 * math.log(NEGLIGIBLE * tol * now[GIVE] * s / now[GAP])
+        change = max(change, u - math.sqrt(min(max(few, NEAR * NEAR), FAR * FAR)))
+    rise = s * min(MOST_GROWTH, math.exp(scale * change) - 1.0)
+    fall = s * min(MOST_GROWTH, 1.0 - math.exp(-scale * change))
+    for _ in range(40):  # Newton's method from above, for what grows faster than in proportion
+        up = down = up_slope = down_slope = 0.0
         for n in range(order, 0, -1):
-            moved = (moved + abs(s[n])) * span
-        if moved <= most:
+            up_slope, down_slope = up_slope * span + up, down_slope * span + down
+            up, down = up * span + max(m[n, EQ], 0.0), down * span + max(-m[n, EQ], 0.0)
+        over, under = up * span - rise, down * span - fall
+        if over <= LOOSE * rise and under <= LOOSE * fall:
             break
-        span *= 0.75
+        span -= max(over / (up + up_slope * span), under / (down + down_slope * span), 0.0)
     return span
 
 
 @inner
-def strain_at(memory: Memory, i: int, moving: bool, s: float) -> tuple[float, float]:
-    """Strain of a mixture at a stress (NaN where its law ends), and its slope dε/ds."""
-    row, state, now = memory.rows[i], memory.state[i], memory.now[i]
+def strain_at(row: Row, state: Array, now: Array, moving: bool, s: float) -> tuple[float, float]:
+    """Strain of a mixture at a stress (NaN where its law ends), and its slope dε/ds.
+
+    What it takes is the spring's own of a `Memory`.
+    """
     p, q, steep = state[micro.SNAPPED], state[REST], 0.0
     if moving:
         if not s > 0.0:
@@ -353,15 +369,22 @@ def strain_at(memory: Memory, i: int, moving: bool, s: float) -> tuple[float, fl
 
 
 @inner
-def advance_memory(memory: Memory, order: int, span: float) -> None:
-    """Carry what relaxes over a step, and where the search for the stress starts."""
-    for i in range(memory.now.shape[0]):
-        if memory.state[i, BRANCH] >= HELD:
-            reached = value_at(memory.series[EQ, i], order, span)
-            memory.state[i, FLEXIBILITY] = 0.0
-            memory.state[i, SIGMA] = reached if reached > 0.0 else memory.state[i, SIGMA]
-        for k in range(memory.z.shape[0]):
-            memory.z[k, i, 0] = value_at(memory.z[k, i], order, span)
+def advance_memory(state: Array, series: Array, order: int, span: float) -> None:
+    """Carry what relaxes over a step, and where the search for the stress starts.
+
+    They are those of `Memory`.
+    """
+    for i in range(state.shape[0]):
+        if state[i, BRANCH] >= HELD:
+            reached = value_at(series[i, :, EQ], order, span)
+            state[i, FLEXIBILITY] = 0.0
+            state[i, SIGMA] = reached if reached > 0.0 else state[i, SIGMA]
+        total = 0.0
+        for k in range(N_MEMORY, series.shape[2]):
+            z = value_at(series[i, :, k], order, span)
+            series[i, 0, k] = z
+            total += z
+        series[i, 0, RELAXED] = total
 
 
 # ---------------------------------------------------------------- its derivatives
@@ -372,9 +395,9 @@ def fill_partials(
     memory: Memory, i: int, moving: bool, back: bool, eps: Array, order: int
 ) -> float:
     """Fill the derivatives of a spring's strain at fixed stress; returns the slope dΣ/dε now."""
-    row, now, m, out = memory.rows[i], memory.now[i], memory.series, memory.partials
-    s, below_a, below_c = m[EQ, i], m[BELOW_A, i], m[BELOW_C, i]
-    snapped, score, density = m[SNAPPED, i], m[SCORE, i], m[DENSITY, i]
+    row, now, m, out = memory.rows[i], memory.now[i], memory.series[i], memory.partials
+    s, below_a, below_c = m[:, EQ], m[:, BELOW_A], m[:, BELOW_C]
+    snapped, score, density = m[:, SNAPPED], m[:, SCORE], m[:, DENSITY]
     square_a, square_c, width = out[SQUARE_A, i], out[SQUARE_C, i], out[WIDTH, i]
     gap, by_stress, steep = out[BY_RANK, i], out[BY_STRESS, i], out[STEEP, i]
     by_k0, by_kc, by_star = out[0, i], out[1, i], out[2, i]
@@ -447,35 +470,35 @@ def tangent_of_mixture(memory: Memory, k: int, i: int, moving: bool, slope: floa
 def relaxed_tangent(memory: Memory, k: int, i: int, n: int) -> float:
     """Order n of the derivative of Σ z_k, and of g s at fixed s, in direction k."""
     total = 0.0
-    for term in range(memory.z.shape[0]):
+    for term in range(memory.tangents.shape[1] - 1):
         total += memory.tangents[k, 1 + term, i, n]
         own = OWN_RELAXATION + 2 * term
         if memory.directions[k, 0] == i and memory.directions[k, 1] == own:
-            total += memory.series[EQ, i, n]
+            total += memory.series[i, n, EQ]
     return total
 
 
 @inlined
 def keep_tangent(memory: Memory, k: int, i: int, n: int, d_sig: float) -> None:
     """Write order n of the derivative of the equilibrium stress, and the next of what relaxes."""
-    d_s = (d_sig - memory.now[i, BASE]) * (1.0 / memory.now[i, GAIN])  # waits for no quotient
+    d_s = (d_sig - memory.now[i, BASE]) * memory.now[i, PER_GAIN]
     memory.tangents[k, 0, i, n] = d_s
-    for term in range(memory.z.shape[0]):
+    for term in range(memory.tangents.shape[1] - 1):
         g, tau = memory.rows[i, N_COLUMNS + 2 * term], memory.rows[i, N_COLUMNS + 2 * term + 1]
         dz = memory.tangents[k, 1 + term, i]
         flow = dz[n] + g * d_s
         own = OWN_RELAXATION + 2 * term
         if memory.directions[k, 0] == i and memory.directions[k, 1] == own:
-            flow += memory.series[EQ, i, n]
+            flow += memory.series[i, n, EQ]
         dz[n + 1] = -flow * (1.0 / (tau * (n + 1)))
         if memory.directions[k, 0] == i and memory.directions[k, 1] == own + 1:
-            dz[n + 1] -= memory.z[term, i, n + 1] * (1.0 / tau)
+            dz[n + 1] -= memory.series[i, n + 1, N_MEMORY + term] * (1.0 / tau)
 
 
 @inner
 def advance_memory_tangents(memory: Memory, k: int, order: int, span: float) -> None:
     """Carry the derivatives in direction k of what relaxes over a step."""
-    for term in range(memory.z.shape[0]):
+    for term in range(memory.tangents.shape[1] - 1):
         for i in range(memory.now.shape[0]):
             dz = memory.tangents[k, 1 + term, i]
             dz[0] = value_at(dz, order, span)

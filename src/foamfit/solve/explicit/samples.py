@@ -136,7 +136,7 @@ def depart(
     for i in range(count):
         speed += law[i, HEIGHT] * slope_at(s[EPS, i], order, span)
         rate[min(i, nodes - 1)] = speed
-    advance(s, groups, order, span, None)
+    advance(s, groups, order, span)
     advance_tangents(d, groups, more, span, None)
     for i in range(count):
         moved += law[i, HEIGHT] * s[EPS, i, 0]

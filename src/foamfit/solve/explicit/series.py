@@ -21,14 +21,16 @@ from foamfit.solve.explicit.memory import (
     EQ,
     GAIN,
     GIVE,
+    PER_A,
+    PER_GAIN,
+    PER_GIVE,
+    RELAXED,
     SOFT,
     Memory,
-    advance_memory,
     advance_memory_tangents,
     enter_mixture,
     finish_mixture,
     keep,
-    relaxed,
     start_mixture,
     strain_at,
     strain_of_mixture,
@@ -198,20 +200,25 @@ def _law_stress(law: Array, i: int, eps: Array, sig: Array, n: int) -> float:
     return k * x * law[i, INVERSE]
 
 
-@inner
+@inlined
 def _remembered_stress(law: Array, i: int, eps: Array, n: int, memory: Memory) -> float:
     """Order n of the stress of a spring in a chain with memory; see `_stress_term`."""
-    moving = law[i, CURVED] > HELD
+    moving, now, m = law[i, CURVED] > HELD, memory.now[i], memory.series[i]
     if law[i, CURVED] < HELD:
-        s_n = _law_stress(law, i, eps, memory.series[EQ], n)
+        s_n = _law_stress(law, i, eps, memory.series[:, :, EQ], n)
+        if n == 0:
+            now[PER_A] = 1.0 / (law[i, SLOPE] + s_n)
+            soft = (1.0 - (eps[i, 0] - law[i, ORIGIN])) * now[PER_A]
+            if law[i, CURVED] == 0.0:
+                soft = 1.0 / law[i, SLOPE] if law[i, SLOPE] > 0.0 else math.inf
+            now[SOFT] = soft * now[PER_GAIN]
     elif n == 0:
         s_n = start_mixture(memory, i, moving, eps[i, 0])
     else:
-        s_n = eps[i, n] - strain_of_mixture(memory, i, moving, n)
-        s_n *= 1.0 / memory.now[i, GIVE]
-        finish_mixture(memory, i, moving, n, s_n)
-    keep(memory, i, n, s_n)
-    return memory.now[i, GAIN] * s_n + relaxed(memory, i, n)
+        s_n = (eps[i, n] - strain_of_mixture(now, m, moving, n)) * now[PER_GIVE]
+        finish_mixture(now, m, moving, n, s_n)
+    keep(memory.rows[i], m, n, s_n)
+    return now[GAIN] * s_n + m[n, RELAXED]
 
 
 @inlined
@@ -235,19 +242,18 @@ def _law_strain(law: Array, i: int, eps: Array, sig: Array, n: int) -> tuple[flo
     return -known / stiff, (1.0 - (eps[i, 0] - law[i, ORIGIN])) / stiff
 
 
-@inner
+@inlined
 def _remembered_strain(
     law: Array, i: int, eps: Array, n: int, memory: Memory
 ) -> tuple[float, float]:
     """Order n >= 1 of the strain of a spring in a chain with memory; see `_strain_term`."""
-    if law[i, CURVED] < HELD:
-        known, soft = _law_strain(law, i, eps, memory.series[EQ], n)
-    else:
-        known = strain_of_mixture(memory, i, law[i, CURVED] > HELD, n)
-        soft = memory.now[i, GIVE]
-    soft /= memory.now[i, GAIN]
-    memory.now[i, SOFT] = soft
-    return (known - soft * relaxed(memory, i, n) if soft < math.inf else known), soft
+    now, m, known = memory.now[i], memory.series[i], 0.0
+    if law[i, CURVED] >= HELD:
+        known = strain_of_mixture(now, m, law[i, CURVED] > HELD, n)
+    elif law[i, CURVED] != 0.0:
+        known = -product(eps, memory.series[:, :, EQ], i, n) * now[PER_A]
+    soft = now[SOFT]
+    return (known - soft * m[n, RELAXED] if soft < math.inf else known), soft
 
 
 @inlined
@@ -263,13 +269,14 @@ def _strain_term(
     return _remembered_strain(law, i, eps, n, memory)
 
 
-@inner
+@inlined
 def _settle_stress(law: Array, i: int, n: int, s_n: float, memory: Memory) -> None:
     """Take down order n >= 1 of the stress of a spring whose strain came from `_strain_term`."""
-    own = (s_n - relaxed(memory, i, n)) / memory.now[i, GAIN]
+    now, m = memory.now[i], memory.series[i]
+    own = (s_n - m[n, RELAXED]) * now[PER_GAIN]
     if law[i, CURVED] >= HELD:
-        finish_mixture(memory, i, law[i, CURVED] > HELD, n, own)
-    keep(memory, i, n, own)
+        finish_mixture(now, m, law[i, CURVED] > HELD, n, own)
+    keep(memory.rows[i], m, n, own)
 
 
 @once
@@ -281,7 +288,6 @@ def _share_elongation(
     sig: Array,
     u_n: float,
     n: int,
-    memory: Memory | None,
 ) -> float:
     """Order n >= 1 of the common stress of a group that has springs without dashpot.
 
@@ -292,7 +298,7 @@ def _share_elongation(
         if law[i, DASHPOT] > 0.0:
             rest -= law[i, HEIGHT] * eps[i, n]
             continue
-        known, soft = _strain_term(law, i, eps, sig, n, memory)
+        known, soft = _law_strain(law, i, eps, sig, n)
         eps[i, n] = known  # so far
         rest -= law[i, HEIGHT] * known
         if soft < math.inf:
@@ -300,21 +306,46 @@ def _share_elongation(
         elif flat < 0:
             flat = i
     s_n = 0.0 if flat >= 0 else rest / compliance
-    if memory is not None and flat >= 0:
-        s_n = relaxed(memory, flat, n)
-        rest -= s_n * compliance
     for i in range(i0, i1):
         if law[i, DASHPOT] == 0.0:
             sig[i, n] = s_n
-            if memory is not None:
-                if memory.now[i, SOFT] < math.inf:
-                    eps[i, n] += memory.now[i, SOFT] * s_n
-                _settle_stress(law, i, n, s_n, memory)
-            elif law[i, CURVED] != 0.0:
+            if law[i, CURVED] != 0.0:
                 x = eps[i, 0] - law[i, ORIGIN]
                 eps[i, n] += (1.0 - x) / (law[i, SLOPE] + sig[i, 0]) * s_n
             elif law[i, SLOPE] > 0.0:
                 eps[i, n] += s_n / law[i, SLOPE]
+    if flat >= 0:
+        eps[flat, n] = rest / law[flat, HEIGHT]
+    return s_n
+
+
+@inlined
+def _share_remembered(
+    law: Array, i0: int, i1: int, eps: Array, sig: Array, u_n: float, n: int, memory: Memory
+) -> float:
+    """Share an elongation among springs with memory as `_share_elongation` does."""
+    compliance, rest, flat = 0.0, u_n, -1
+    for i in range(i0, i1):
+        if law[i, DASHPOT] > 0.0:
+            rest -= law[i, HEIGHT] * eps[i, n]
+            continue
+        known, soft = _remembered_strain(law, i, eps, n, memory)
+        eps[i, n] = known  # so far
+        rest -= law[i, HEIGHT] * known
+        if soft < math.inf:
+            compliance += law[i, HEIGHT] * soft
+        elif flat < 0:
+            flat = i
+    s_n = rest * (1.0 / compliance)
+    if flat >= 0:
+        s_n = memory.series[flat, n, RELAXED]
+        rest -= s_n * compliance
+    for i in range(i0, i1):
+        if law[i, DASHPOT] == 0.0:
+            sig[i, n] = s_n
+            if memory.now[i, SOFT] < math.inf:
+                eps[i, n] += memory.now[i, SOFT] * s_n
+            _settle_stress(law, i, n, s_n, memory)
     if flat >= 0:
         eps[flat, n] = rest / law[flat, HEIGHT]
     return s_n
@@ -380,7 +411,9 @@ def _group_term(
         return _damped_term(law, i0, i1, sig, rate_n, push_n, drag, n)
     if n == 0:
         return sig[first, 0]
-    return _share_elongation(law, i0, i1, eps, sig, u_n, n, memory)
+    if memory is None:
+        return _share_elongation(law, i0, i1, eps, sig, u_n, n)
+    return _share_remembered(law, i0, i1, eps, sig, u_n, n, memory)
 
 
 @once
@@ -410,37 +443,63 @@ def _stressed_term(
 
 
 @inner
-def is_bare(links: Links) -> bool:
-    """Whether every spring is undamped and alone between two masses."""
-    if links.top != FREE or links.ends.size != links.law.shape[0]:
+def is_bare(links: Links, memory: Memory | None) -> bool:
+    """Whether every spring is undamped and, but for those with memory, alone between two masses."""
+    if links.top != FREE or (memory is None and links.ends.size != links.law.shape[0]):
         return False
     damped = 0
-    for i in range(links.ends.size):
+    for i in range(links.law.shape[0]):
         damped += links.law[i, DASHPOT] > 0.0
     return damped == 0
 
 
 @inlined
-def expand_bare(links: Links, s: Array, push: Array, order: int, memory: Memory | None) -> None:
+def _accelerate(links: Links, s: Array, push: Array, n: int) -> None:
+    """Write the next order of the motion of all masses under a chain without dashpots."""
+    w, v, group, last, share = s[W], s[V], s[GROUP], links.mass.size - 1, 1.0 / (n + 1)
+    for g in range(last + 1):
+        net = -group[g, n]
+        if g < last:
+            net += group[g + 1, n]
+        else:
+            net += push[n] if n < 2 else 0.0
+            if links.drag > 0.0:
+                net -= links.drag * v[g, n]
+        v[g, n + 1] = net * (share / links.mass[g])
+        w[g, n + 1] = v[g, n] * share
+
+
+@inlined
+def expand_bare(links: Links, s: Array, push: Array, order: int) -> None:
     """Fill the series of a chain that `is_bare`, as `expand` does, asking less at each order."""
-    law, _, mass, drag, _ = links
-    w, v, eps, sig, group = s[W], s[V], s[EPS], s[SIG], s[GROUP]
-    last = mass.size - 1
+    law, w, eps, sig, group = links.law, s[W], s[EPS], s[SIG], s[GROUP]
     for n in range(order + 1):
-        share = 1.0 / (n + 1)
-        for i in range(last + 1):
+        for i in range(links.mass.size):
             eps[i, n] = (w[i, n] - (w[i - 1, n] if i > 0 else 0.0)) * (1.0 / law[i, HEIGHT])
-            sig[i, n] = group[i, n] = _stress_term(law, i, eps, sig, n, memory)
-        for i in range(last + 1):
-            net = -sig[i, n]
-            if i < last:
-                net += sig[i + 1, n]
-            else:
-                net += push[n] if n < 2 else 0.0
-                if drag > 0.0:
-                    net -= drag * v[i, n]
-            v[i, n + 1] = net * (share / mass[i])
-            w[i, n + 1] = v[i, n] * share
+            sig[i, n] = group[i, n] = _law_stress(law, i, eps, sig, n)
+        _accelerate(links, s, push, n)
+
+
+@inner
+def expand_remembered(links: Links, s: Array, push: Array, order: int, memory: Memory) -> None:
+    """Fill the series of a chain with memory that `is_bare`, whose springs may share a stress."""
+    law, w, eps, sig, group = links.law, s[W], s[EPS], s[SIG], s[GROUP]
+    for n in range(order + 1):
+        for g in range(links.mass.size):
+            i0, i1 = springs_of(links.ends, g)
+            u_n = w[g, n] - (w[g - 1, n] if g > 0 else 0.0)
+            if n > 0 and i1 - i0 > 1:
+                group[g, n] = _share_remembered(law, i0, i1, eps, sig, u_n, n, memory)
+                continue
+            if i1 - i0 == 1:
+                eps[i0, n] = u_n * (1.0 / law[i0, HEIGHT])
+            common = i0
+            for i in range(i0, i1):
+                sig[i, n] = _remembered_stress(law, i, eps, n, memory)
+                if law[i, CURVED] == 0.0 and law[i, SLOPE] == 0.0:
+                    common = i  # see `_group_term`
+            group[g, n] = sig[common, n]
+        _accelerate(links, s, push, n)
 
 
 @inner
@@ -509,13 +568,14 @@ def share_a_stress(law: Array, ends: Branches, i: int, j: int, memory: Memory) -
     return False
 
 
-@inner
+@inlined
 def _own_strain(law: Array, i: int, stress: float, memory: Memory) -> tuple[float, float]:
     """Strain of a spring under a stress on the branch that it is on, and its slope dε/dΣ."""
     gain, k = memory.now[i, GAIN], law[i, SLOPE]
-    s = (stress - relaxed(memory, i, 0)) / gain
+    s = (stress - memory.series[i, 0, RELAXED]) / gain
     if law[i, CURVED] >= HELD:
-        eps, soft = strain_at(memory, i, law[i, CURVED] > HELD, s)
+        moving, row = law[i, CURVED] > HELD, memory.rows[i]
+        eps, soft = strain_at(row, memory.state[i], memory.now[i], moving, s)
         return eps, soft / gain
     if law[i, CURVED] == 0.0:
         return law[i, ORIGIN] + (s - law[i, OFFSET]) / k, 1.0 / (k * gain)
@@ -589,13 +649,11 @@ def settle_together(
 
 
 @inner
-def advance(s: Array, groups: int, order: int, span: float, memory: Memory | None) -> None:
+def advance(s: Array, groups: int, order: int, span: float) -> None:
     """Carry the state, order 0 of W, V and EPS, over a step of length `span`."""
     for row in range(W, EPS + 1):
         for i in range(s.shape[1] if row == EPS else groups):
             s[row, i, 0] = value_at(s[row, i], order, span)
-    if memory is not None:
-        advance_memory(memory, order, span)
 
 
 @piece
@@ -605,6 +663,6 @@ def advance_tangents(
     """Carry the derivatives of the state over a step of length `span`."""
     for p in range(d.drag.size):
         if d.live[p] > 0.0:
-            advance(d.series[p], groups, order, span, None)
+            advance(d.series[p], groups, order, span)
             if memory is not None:
                 advance_memory_tangents(memory, p, order, span)

@@ -39,6 +39,7 @@ from foamfit.solve.explicit.series import (
     V,
     W,
     _stress_term,
+    is_bare,
     product,
     springs_of,
 )
@@ -80,7 +81,7 @@ def _known_tangent(
     """Order n of δσ of a spring in direction p, but for the term T_0 δε_n."""
     eps, sig, tilt, gain = s[EPS], s[SIG], s[TILT], 1.0
     if memory is not None:
-        sig, gain = memory.series[EQ], memory.now[i, GAIN]
+        sig, gain = memory.series[:, :, EQ], memory.now[i, GAIN]
     known = -tilt[i, n] * m[i, ORIGIN]
     if law[i, CURVED] == 0.0:
         known += gain * (eps[i, n] - (law[i, ORIGIN] if n == 0 else 0.0)) * m[i, SLOPE]
@@ -233,6 +234,48 @@ def _expand_tangent(
                 w[g, n + 1] = v[g, n] * share
 
 
+@inner
+def _share_remembered(
+    law: Array, tilt: Array, d: Array, i0: int, i1: int, rest: float, n: int
+) -> float:
+    """Share the derivative of an elongation among undamped springs; see `_share_tangent`."""
+    eps, sig, common = d[EPS], d[SIG], 0.0
+    if i1 - i0 == 1:
+        eps[i0, n] = rest * (1.0 / law[i0, HEIGHT])
+        common = sig[i0, n] + tilt[i0, 0] * eps[i0, n]
+        sig[i0, n] = common
+        return common
+    return _share_tangent(law, tilt, d, i0, i1, rest, n)
+
+
+@inner
+def _expand_remembered(
+    links: Links, s: Array, m: Array, drag: float, d: Array, order: int, memory: Memory, p: int
+) -> None:
+    """Do what `_expand_tangent` does for a chain with memory that `is_bare`, asking less."""
+    law, tilt, last = links.law, s[TILT], links.ends.size - 1
+    w, v, group = d[W], d[V], d[GROUP]
+    for n in range(order + 1):
+        for g in range(last + 1):
+            i0, i1 = springs_of(links.ends, g)
+            rest = w[g, n] - (w[g - 1, n] if g > 0 else 0.0)
+            for i in range(i0, i1):
+                rest -= s[EPS, i, n] * m[i, HEIGHT]
+                d[SIG, i, n] = _known_tangent(law, s, m, d, i, n, memory, p)
+            group[g, n] = _share_remembered(law, tilt, d, i0, i1, rest, n)
+            for i in range(i0, i1):
+                keep_tangent(memory, p, i, n, d[SIG, i, n])
+        share = 1.0 / (n + 1)
+        for g in range(last + 1):
+            net = -group[g, n]
+            if g < last:
+                net += group[g + 1, n]
+            else:
+                net -= links.drag * v[g, n] + s[V, g, n] * drag
+            v[g, n + 1] = net * (share / links.mass[g])
+            w[g, n + 1] = v[g, n] * share
+
+
 @piece
 def expand_tangents(
     links: Links, s: Array, d: SeriesTangents, order: int, memory: Memory | None
@@ -248,11 +291,16 @@ def expand_tangents(
                     memory, i, kind > HELD, kind == BACK, s[EPS, i], order
                 )
             else:
-                _fill_tilt(links.law, i, memory.series[EQ], s[TILT], order)
+                _fill_tilt(links.law, i, memory.series[:, :, EQ], s[TILT], order)
                 for n in range(order + 1):
                     s[TILT, i, n] *= memory.now[i, GAIN]
+    bare = memory is not None and is_bare(links, memory)
     for p in range(d.drag.size):
-        if d.live[p] > 0.0:
+        if d.live[p] == 0.0:
+            continue
+        if memory is not None and bare:
+            _expand_remembered(links, s, d.law[p], d.drag[p], d.series[p], order, memory, p)
+        else:
             _expand_tangent(links, s, d.law[p], d.drag[p], d.series[p], order, memory, p)
 
 
@@ -261,11 +309,11 @@ def start_relaxing(law: Array, i: int, s: Array, d: SeriesTangents, memory: Memo
     """Let nothing have relaxed yet of the stress at which a spring starts: q_k = 0."""
     sig, tilt = s[SIG], s[TILT]
     _stress_term(law, i, s[EPS], sig, 0, memory)
-    kind, stress = law[i, CURVED], memory.series[EQ, i, 0]
+    kind, stress = law[i, CURVED], memory.series[i, 0, EQ]
     if kind >= HELD:
         tilt[i, 0] = fill_partials(memory, i, kind > HELD, kind == BACK, s[EPS, i], 0)
     else:
-        _fill_tilt(law, i, memory.series[EQ], tilt, 0)
+        _fill_tilt(law, i, memory.series[:, :, EQ], tilt, 0)
         tilt[i, 0] *= memory.now[i, GAIN]
     for p in range(d.drag.size):
         change = _known_tangent(law, s, d.law[p], d.series[p], i, 0, memory, p)

@@ -14,6 +14,7 @@ import numpy as np
 
 from foamfit.solve.explicit.memory import (
     Memory,
+    advance_memory,
     first_turn,
     leave,
     load,
@@ -46,6 +47,7 @@ from foamfit.solve.explicit.series import (
     enter_tangents,
     expand,
     expand_bare,
+    expand_remembered,
     is_bare,
     make_series,
     settle_together,
@@ -442,7 +444,9 @@ def _integrated(
     for p in range(size):
         late[p] = 0.0
     begin(rows, heights, start, directions, branches, law, s, d, memory)
-    bare, apart = is_bare(links), is_apart(links)
+    bare, apart = is_bare(links, memory), is_apart(links)
+    shared = groups < count or top == STRESS  # springs have one stress, or are given it
+    fine = 0.0 if tangent else tol  # a derivative may be of what is negligible
     w_scale, s_scale, b_scale, pressed, knot, stalled, done = 0.0, 0.0, math.inf, False, 0, 0, 0
     switches = count - count  # a whole number, and no constant: one type to compile for
     now = 0.0 if struck else t[0]
@@ -461,7 +465,10 @@ def _integrated(
                 fresh = True
             horizon = _prescribe(top, values, t, knot, now, push, motion)
         if bare:
-            expand_bare(links, s, push, order, memory)
+            if memory is None:
+                expand_bare(links, s, push, order)
+            else:
+                expand_remembered(links, s, push, order, memory)
         elif not expand(links, s, push, motion, order, memory):
             return FLAT_UNDER_STRESS, now, step, switches
         if step > 0:
@@ -473,7 +480,8 @@ def _integrated(
             return NOT_FINITE, now, step, switches
         if memory is not None:
             for i in range(count):
-                span = longest(memory, i, order, span) if branches[i] > HELD else span
+                if branches[i] > HELD:
+                    span = longest(memory.series[i], memory.now[i], order, fine, span)
         span, spring, side = first_switch(law, s, order, span)
         if memory is not None:
             span, turning = first_turn(branches, s[EPS], order, span, c)
@@ -512,21 +520,24 @@ def _integrated(
             depart(links, s, d, order, more, span, end, out, done, scratch)
             return DONE, end, step + 1, switches
         now = end
-        advance(s, groups, order, span, memory)
+        advance(s, groups, order, span)
+        if memory is not None:
+            advance_memory(memory.state, memory.series, order, span)
         if tangent:
             advance_tangents(d, groups, more, span, memory)
         w_scale, total = _reached(links, s, w_scale)
         if not math.isfinite(total):
             return NOT_FINITE, now, step, switches
-        settle(links, s, memory)
-        if memory is not None:
-            settle_together(links, s, order, span, push, memory)
+        if shared:
+            settle(links, s, memory)
+            if memory is not None:
+                settle_together(links, s, order, span, push, memory)
         if spring >= 0:
             switches = switch(
                 rows, branches, law, s, d, directions, order, span, now, spring, side, log,
                 switches, ends, memory,
             )  # fmt: skip
-            if memory is not None:
+            if memory is not None and shared:
                 settle_together(links, s, order, span, push, memory)
     return TOO_MANY_STEPS, now, max_steps, switches
 
