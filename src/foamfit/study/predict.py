@@ -11,6 +11,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.data.csv_file import read_test
 from foamfit.data.measurement import Measurement
+from foamfit.data.noise import with_noise
 from foamfit.data.rate import loading_rate
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.curves import check_drive, choose_drive
@@ -93,7 +94,7 @@ def predict(
             raise InputError(f"{name} = {value!r} must be a whole number, at least {least}")
     source = read_source(result)
     measurement = test if isinstance(test, Measurement) else read_test(test)
-    rate, warnings = loading_rate(measurement), list[str]()
+    rate, warnings = loading_rate(with_noise(measurement)), list[str]()
     outside = _check_rate(source, measurement, rate, extrapolate, warnings)
     problem = _problem(source, measurement, drive, warnings)
     objective = problem.objective
