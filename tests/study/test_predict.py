@@ -462,6 +462,44 @@ def test_file_and_memory_give_the_same_numbers(tmp_path, fitted):
     assert here.fitted_rates == pytest.approx((0.25,), rel=0.01)
 
 
+@pytest.fixture(scope="module")
+def joint(tmp_path_factory):
+    """Four tests fitted together: one parameter scatters, one follows a law of rate, one is own."""
+    here = tmp_path_factory.mktemp("family")
+    for i, rate in enumerate((0.01, 0.03, 0.3, 1.0)):
+        test = loop(rate=rate, seed=i, sigma_plus=1.1e5 * (rate / 0.1) ** 0.05, kc=4e5 + 2e4 * i)
+        columns = zip(test.time, test.stress, test.displacement, strict=True)
+        lines = ["time (s),stress (Pa),displacement (m)"]
+        lines += [f"{t:.9g},{stress:.9g},{w:.9g}" for t, stress, w in columns]
+        (here / f"t{i}.csv").write_text("\n".join(lines) + "\n")
+    (here / "foam.toml").write_text(
+        f'[specimen]\nheight = "{HEIGHT} m"\narea = "{AREA} m^2"\n[noise]\nstress = "{SIGMA} Pa"\n'
+    )
+    kinds = dict.fromkeys(LAW, "shared") | {"s1_kc": "scatter", "s1_sigma_plus": "power rate"}
+    kinds |= {"s1_sigma_minus": "own"}
+    (here / "study.toml").write_text(
+        'tests = ["t*.csv"]\nmodel = "microscale"\ndrive = "displacement"\nstarts = 1\n'
+        'specimen = "foam.toml"\n[parameters]\n'
+        + "\n".join(f'{name} = "{kind}"' for name, kind in kinds.items())
+    )
+    return ff.joint(here / "study.toml", jobs=1)
+
+
+def test_a_joint_fit_predicts_a_rate_between_its_own(tmp_path, joint):
+    test = loop(rate=0.1, seed=9, kc=4.3e5)
+    found = ff.predict(joint, test, draws=DRAWS)
+    assert found.parameters["s1_sigma_plus"].value == pytest.approx(1.1e5, rel=0.02)
+    assert {one.kind for one in found.parameters.values()} >= {
+        "shared", "own", "scatter", "power rate", "fixed"
+    }  # fmt: skip
+    assert 0.9 < found.inside["stress_strain"] <= 1.0
+    assert found.curves["stress_strain"].half_width_of("scatter") > 0.0
+    path = written(tmp_path, json.loads(json.dumps(joint.to_json_dict())))
+    assert ff.predict(path, test, draws=DRAWS).to_json_dict() == found.to_json_dict()
+    with pytest.raises(InputError, match=r"10 1/s, lies outside .* 0\.01 to 1 1/s"):
+        ff.predict(tmp_path, loop(rate=10.0, seed=9))
+
+
 @pytest.fixture
 def record(tmp_path) -> Path:
     """A test in a file, as an instrument would write it, and its TOML."""
@@ -516,11 +554,12 @@ def test_the_command_writes_a_folder_whole(tmp_path, monkeypatch, record, result
 
 def test_the_command_prints_json_and_nothing_else(tmp_path, monkeypatch, record, result):
     pictures_of_a_few_bytes(monkeypatch)
-    out = tmp_path / "out"
-    done = run("predict", result, record, "--draws", DRAWS, "--out", out, "--json")
+    out, specimen = tmp_path / "out", record.with_suffix(".toml").rename(tmp_path / "foam.toml")
+    args = ("--specimen", specimen, "--cycle", 1, "--draws", DRAWS, "--out", out)
+    done = run("predict", result, record, *args, "--json")
     assert (done.exit_code, done.stderr) == (0, "")
     assert json.loads(done.stdout) == json.loads((out / "prediction.json").read_text())
-    quiet = run("predict", result, record, "--draws", DRAWS, "--out", out, "--quiet")
+    quiet = run("predict", result, record, *args, "--quiet")
     assert (quiet.exit_code, quiet.output) == (0, "")
 
 
