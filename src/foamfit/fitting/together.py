@@ -1,7 +1,8 @@
 """One fit of several tests: some parameters have one value for all, the others one for each test.
 
-All residuals are minimised as one sum of squares, each test in units of its own noise. The normal
-matrix has a block for each test, and only the shared parameters couple them: own parameters are
+All residuals are minimised as one sum of squares, each test in units of its own noise. A parameter
+may also scatter about a common value or follow a law of rate (`fitting.links`). The normal matrix
+has a block for each test, and only the shared coordinates couple them: own parameters are
 eliminated test by test (Schur complement), so that a step costs as much as the tests one by one.
 """
 
@@ -17,7 +18,18 @@ from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
-from foamfit.fitting.box import LAST_STRAIN, Scales, Space
+from foamfit.fitting.box import LAST_STRAIN, Scales, Space, is_logarithmic
+from foamfit.fitting.links import (
+    RATES,
+    STEEPEST,
+    Links,
+    Slots,
+    law,
+    law_slopes,
+    log_law,
+    log_law_slopes,
+    start_of,
+)
 from foamfit.fitting.problem import Problem
 from foamfit.springs.parameters import split_name
 
@@ -26,14 +38,17 @@ RELATIVE_TO = {"eps_star": ("k0", "kc"), "eps_c": ("eps_a",), "dsigma": ("k0", "
 # Descents end when two steps in a row gain less than this share, or after so many steps.
 ENOUGH, ITERATIONS = 1e-5, 80
 _LEAST_MOVE, _MOST_DAMPING = 1e-9, 1e8
+# Least value of which a scattering parameter has the logarithm, and the largest logarithm.
+_TINY, _FAR = 1e-30, 100.0
 
 
 @dataclass(frozen=True, eq=False)
 class Together:
     """Several tests with some parameters in common, at the best point found.
 
-    `shared` and `own` are the names of the parameters that vary, `values` (n_values,) those of all
-    parameters of each test (SI), `costs` the sum of squares of each, in units of its noise.
+    `shared` are the names of the parameters that follow from what all tests have in common, `own`
+    those with a value for each test, scattering ones among them. `values` (n_values,) are those of
+    all parameters of each test (SI), `costs` the sum of squares of each, in units of its noise.
     """
 
     problems: tuple[Problem, ...]
@@ -42,6 +57,10 @@ class Together:
     values: tuple[Array, ...]
     costs: tuple[float, ...]
     steps: int  # Steps of the descent
+    links: Links
+    # What all tests have in common, SI: the value of a shared parameter, value and slope by a law
+    # of rate, common value (its logarithm is the mean of theirs) of a scattering one.
+    common: dict[str, tuple[float, ...]]
 
     @property
     def cost(self) -> float:
@@ -50,8 +69,9 @@ class Together:
 
     @property
     def n_vary(self) -> int:
-        """Parameters that vary, those of one test counted for each."""
-        return len(self.shared) + len(self.own) * len(self.problems)
+        """Numbers that the fit chose: those of all tests, and one of each test where it varies."""
+        laws = sum(self.links.kind(name) in RATES for name in self.shared)
+        return len(self.shared) + laws + sum(len(self.own_of(p)) for p in self.problems)
 
     @property
     def n_data(self) -> int:
@@ -65,6 +85,10 @@ class Together:
             problem.objective.misfit(problem.objective.simulate(values, everything=True))
             for problem, values in zip(self.problems, self.values, strict=True)
         )
+
+    def own_of(self, problem: Problem) -> tuple[str, ...]:
+        """Names of the parameters that one test has of its own."""
+        return tuple(name for name in problem.free() if name in self.own)
 
     def value(self, name: str) -> list[float]:
         """Values of one parameter, one for each test."""
@@ -83,15 +107,39 @@ def fit_together(
 ) -> Together:
     """Fit several tests at once, parameters named in `own` for each test, the others for all.
 
+    See `fit_linked`, which this calls.
+    """
+    names = _varying(problems)
+    for name in own:
+        if name not in names:
+            raise InputError(
+                f"parameter '{name}' cannot be one of each test; it must be one of "
+                f"{', '.join(names)}"
+            )
+    kinds = {name: "own" if name in own else "shared" for name in names}
+    return fit_linked(problems, Links(kinds), starts, iterations=iterations)
+
+
+def fit_linked(
+    problems: Sequence[Problem],
+    links: Links,
+    starts: Sequence[Sequence[Array]],
+    *,
+    iterations: int = ITERATIONS,
+) -> Together:
+    """Fit several tests at once, their parameters linked as `links` say.
+
     Parameters
     ----------
     problems : sequence of Problem
-        Of one model, with the same parameters varying.
-    own : collection of str
-        Names of parameters with a value for each test; all others that vary are shared.
+        Of one model. Drives and noise may differ; a parameter that does not vary in one of them
+        keeps its value there.
+    links : Links
+        What each parameter is to all tests.
     starts : sequence of sequences of (n_values,) arrays
         Each holds a vector of parameters for each test, as its own fit has found; the shared
-        parameters start at the median over the tests. The best end of all starts is returned.
+        parameters start at the median over the tests, laws of rate at their least squares. The
+        best end of all starts is returned.
     iterations : int
         Steps of a descent at most.
 
@@ -102,11 +150,11 @@ def fit_together(
     Raises
     ------
     InputError
-        If the problems have not the same parameters, or `own` names one that does not vary.
+        If the problems are not of one model.
     SimulationError
         If no start can be simulated.
     """
-    layout = _Layout.of(tuple(problems), own)
+    layout = _Layout.of(tuple(problems), links)
     best: tuple[float, _Point, int] | None = None
     for start in starts:
         found = _descend(layout, layout.start(start), iterations)
@@ -118,11 +166,25 @@ def fit_together(
             "simulated; give values that each test can be simulated with"
         )
     _, point, steps = best
-    values = tuple(
-        test.decode(local) for test, local in zip(layout.tests, point.local, strict=True)
-    )
+    values = tuple(layout.values(point))
     costs = tuple(float(r @ r) for r in map(_residual, layout.problems, values) if r is not None)
-    return Together(layout.problems, layout.shared, layout.own, values, costs, steps)
+    return Together(
+        layout.problems, layout.slots.linked, layout.own, values, costs, steps, links,
+        layout.common(point, values),
+    )  # fmt: skip
+
+
+def _varying(problems: Sequence[Problem]) -> tuple[str, ...]:
+    """Names of the parameters that vary in some test; all must be of one model."""
+    first = problems[0]
+    for problem in problems[1:]:
+        if problem.names != first.names:
+            raise InputError(
+                f"{problem.measurement.name} has other parameters than {first.measurement.name}; "
+                "tests that are fitted together need one model"
+            )
+    free = {name for problem in problems for name in problem.free()}
+    return tuple(name for name in first.names if name in free)
 
 
 # ------------------------------------------------------------------------------- coordinates
@@ -134,11 +196,6 @@ class _Point:
 
     shared: Any
     own: Any
-
-    @property
-    def local(self) -> list[Array]:
-        """Coordinates of each test: the shared ones, then its own."""
-        return [np.concatenate([self.shared, own]) for own in self.own]
 
     def moved(self, step: _Point, low: _Point, high: _Point) -> _Point:
         """The point a step away, kept in the box."""
@@ -153,9 +210,9 @@ class _Test:
     """The way from the local coordinates of one test, in the order of `names`, to its parameters.
 
     The box of the search has coordinates in which every point is admissible, some of them relative
-    to other parameters. A shared parameter that is relative to an own one in that box (`plain`)
-    would not be one value: its coordinate is the parameter itself, and a point with it may not be
-    admissible.
+    to other parameters. A linked parameter that is relative to one of another value in each test
+    (`plain`) would not be one value: its coordinate is the parameter itself, and a point with it
+    may not be admissible. What does not vary in this test has a coordinate that does nothing.
     """
 
     problem: Problem
@@ -178,9 +235,15 @@ class _Test:
         return np.array([self.problem.index[name] for name in self.plain], dtype=np.intp)
 
     @cached_property
+    def present(self) -> NDArray[np.bool_]:
+        """Which of the local coordinates vary in this test."""
+        free = set(self.problem.free())
+        return np.array([name in free for name in self.names])
+
+    @cached_property
     def box(self) -> tuple[Array, Array]:
-        """Lowest and highest local coordinates."""
-        low, high = np.empty(len(self.names)), np.empty(len(self.names))
+        """Lowest and highest local coordinates; both zero for what does not vary here."""
+        low, high = np.zeros(len(self.names)), np.zeros(len(self.names))
         low[self._order], high[self._order] = self.space.box
         for at, place in zip(self._plain, self._places, strict=True):
             low[at], high[at] = self.space.low[place], self.space.high[place]
@@ -190,7 +253,7 @@ class _Test:
 
     def encode(self, values: Array) -> Array:
         """Local coordinates of parameters, moved into the box."""
-        local = np.empty(len(self.names))
+        local = np.zeros(len(self.names))
         local[self._order] = self.space.encode(values)
         local[self._plain] = values[self._places]
         return np.clip(local, *self.box)
@@ -217,34 +280,31 @@ class _Test:
 
 @dataclass(frozen=True, eq=False)
 class _Layout:
-    """The tests, their shared and own parameters, and the box of all coordinates."""
+    """The tests, what links their parameters, and the box of all coordinates.
+
+    Local coordinates of a test are those of the linked parameters, then those of its own ones; the
+    linked ones follow from the shared coordinates of all tests.
+    """
 
     problems: tuple[Problem, ...]
-    shared: tuple[str, ...]
+    links: Links
+    slots: Slots
     own: tuple[str, ...]
+    logarithmic: tuple[bool, ...]  # Whether the coordinate of each linked one is its logarithm
     tests: tuple[_Test, ...] = field(default=())
 
     @classmethod
-    def of(cls, problems: tuple[Problem, ...], own: Collection[str]) -> _Layout:
+    def of(cls, problems: tuple[Problem, ...], links: Links) -> _Layout:
         """Check that the tests can be fitted together, and put all of them on one set of scales."""
-        first = problems[0]
-        names = first.free()
-        for problem in problems[1:]:
-            if problem.names != first.names or problem.free() != names:
-                raise InputError(
-                    f"{problem.measurement.name} has other parameters than "
-                    f"{first.measurement.name}; tests that are fitted together need one model with "
-                    "the same parameters varying"
-                )
-        for name in own:
-            if name not in names:
-                raise InputError(
-                    f"parameter '{name}' cannot be one of each test; it must be one of "
-                    f"{', '.join(names)}"
-                )
-        shared = tuple(name for name in names if name not in own)
-        mine = tuple(name for name in names if name in own)
-        plain = tuple(name for name in shared if _parents(name) & set(mine))
+        names = _varying(problems)
+        kinds = {name: links.kind(name) for name in names}
+        linked = tuple(name for name in names if kinds[name] not in ("own", "scatter"))
+        mine = tuple(name for name in names if name not in linked)
+        one_value = {name for name in names if kinds[name] == "shared"}
+        plain = tuple(
+            name for name in linked
+            if _parents(name) & set(names) - one_value or (_parents(name) and kinds[name] in RATES)
+        )  # fmt: skip
         every = [problem.scales for problem in problems]
         scales = Scales(
             max(one.stress for one in every),
@@ -255,36 +315,142 @@ class _Layout:
         spaces = [problem.space() for problem in problems]
         low = np.min([space.low for space in spaces], axis=0)
         high = np.max([space.high for space in spaces], axis=0)
-        boxed = tuple(name for name in names if name not in plain)
-        tests = tuple(
-            _Test(
-                problem,
-                replace(space, scales=scales, low=low, high=high, free=boxed),
-                shared + mine,
-                plain,
-            )
-            for problem, space in zip(problems, spaces, strict=True)
-        )
-        return cls(problems, shared, mine, tests)
+        tests = list[_Test]()
+        for problem, space in zip(problems, spaces, strict=True):
+            free = problem.free()
+            boxed = tuple(name for name in free if name not in plain)
+            here = tuple(name for name in plain if name in free)
+            space = replace(space, scales=scales, low=low, high=high, free=boxed)
+            tests.append(_Test(problem, space, linked + mine, here))
+        return cls(
+            problems,
+            links,
+            Slots(linked, tuple(kinds[name] for name in linked),
+                  tuple(name for name in mine if kinds[name] == "scatter")),
+            mine,
+            tuple(is_logarithmic(split_name(name)[1]) for name in linked),
+            tuple(tests),
+        )  # fmt: skip
 
-    def split(self, locals_: Sequence[Array]) -> _Point:
-        """Coordinates of all tests as one point, the shared ones at their median."""
-        table, s = np.array(locals_), len(self.shared)
-        return _Point(np.median(table[:, :s], axis=0), table[:, s:])
+    def _x(self, test: int) -> float:
+        return 0.0 if self.links.log_rates is None else float(self.links.log_rates[test])
+
+    def through(self, test: int, shared: Array) -> Array:
+        """Coordinates of the linked parameters of a test."""
+        out = np.empty(len(self.slots.linked))
+        for j, (at, kind) in enumerate(zip(self.slots.places, self.slots.kinds, strict=True)):
+            out[j] = shared[at]
+            if kind in RATES:
+                follow = log_law if self.logarithmic[j] else law
+                out[j] = follow(kind, shared[at], shared[at + 1], self._x(test))
+        return out
+
+    def through_slopes(self, test: int, shared: Array) -> Array:
+        """Derivative of these by the shared coordinates, (n_linked, n_shared)."""
+        out = np.zeros((len(self.slots.linked), self.slots.count))
+        for j, (at, kind) in enumerate(zip(self.slots.places, self.slots.kinds, strict=True)):
+            out[j, at] = 1.0
+            if kind in RATES and self.logarithmic[j]:
+                out[j, at : at + 2] = log_law_slopes(kind, shared[at + 1], self._x(test))
+            elif kind in RATES:
+                out[j, at : at + 2] = law_slopes(kind, shared[at], shared[at + 1], self._x(test))
+        return out
+
+    def local(self, point: _Point) -> list[Array]:
+        """Coordinates of each test: the linked ones, then its own."""
+        return [
+            np.concatenate([self.through(t, point.shared), own]) for t, own in enumerate(point.own)
+        ]
 
     def start(self, vectors: Sequence[Array]) -> _Point:
-        """The point that has the own parameters of these vectors, and the median of the others."""
-        return self.split([t.encode(v) for t, v in zip(self.tests, vectors, strict=True)])
+        """The point that has the own parameters of these vectors, and what is nearest in common."""
+        table = np.array([t.encode(v) for t, v in zip(self.tests, vectors, strict=True)])
+        first, shared = len(self.slots.linked), np.empty(self.slots.count)
+        for j, (at, kind) in enumerate(zip(self.slots.places, self.slots.kinds, strict=True)):
+            there = [t for t, test in enumerate(self.tests) if test.present[j]]
+            own = table[there, j]
+            if kind not in RATES:
+                shared[at] = np.median(own)
+                continue
+            x = np.array([self._x(t) for t in there])
+            values = np.exp(own) if self.logarithmic[j] else own
+            v, slope = start_of(kind, values, x)
+            shared[at : at + 2] = float(np.log(v)) if self.logarithmic[j] else v, slope
+        for name, at in zip(self.slots.scatter, self.slots.common, strict=True):
+            shared[at] = np.median(
+                [_logarithm(p, v, name) for p, v in zip(self.problems, vectors, strict=True)
+                 if name in p.free()]
+            )  # fmt: skip
+        low, high = self.box
+        return _Point(np.clip(shared, low.shared, high.shared), table[:, first:])
 
     @cached_property
     def box(self) -> tuple[_Point, _Point]:
         """Lowest and highest coordinates."""
-        low, high = zip(*(test.box for test in self.tests), strict=True)
-        return self.split(low), self.split(high)
+        first, sides = len(self.slots.linked), list[_Point]()
+        for side, far in ((0, -1.0), (1, 1.0)):
+            ends = np.array([test.box[side] for test in self.tests])
+            there = np.array([test.present for test in self.tests])
+            shared = np.full(self.slots.count, far * _FAR)
+            for j, (at, kind) in enumerate(zip(self.slots.places, self.slots.kinds, strict=True)):
+                shared[at] = np.median(ends[there[:, j], j])
+                if kind in RATES:
+                    shared[at + 1] = far * STEEPEST
+            sides.append(_Point(shared, ends[:, first:]))
+        return sides[0], sides[1]
 
     def values(self, point: _Point) -> list[Array]:
         """Parameters of each test at a point, SI."""
-        return [test.decode(local) for test, local in zip(self.tests, point.local, strict=True)]
+        return [
+            test.decode(local) for test, local in zip(self.tests, self.local(point), strict=True)
+        ]
+
+    def common(self, point: _Point, values: Sequence[Array]) -> dict[str, tuple[float, ...]]:
+        """What all tests have in common at a point, SI; see `Together.common`."""
+        out = dict[str, tuple[float, ...]]()
+        for j, (name, at) in enumerate(zip(self.slots.linked, self.slots.places, strict=True)):
+            t = next(t for t, test in enumerate(self.tests) if test.present[j])
+            value = float(values[t][self.problems[t].index[name]])
+            if self.slots.kinds[j] not in RATES:
+                out[name] = (value,)
+                continue
+            slope = float(point.shared[at + 1])
+            out[name] = value / law(self.slots.kinds[j], 1.0, slope, self._x(t)), slope
+        for name, at in zip(self.slots.scatter, self.slots.common, strict=True):
+            out[name] = (float(np.exp(point.shared[at])),)
+        return out
+
+    def pull(self, test: int, name: str) -> float:
+        """Root of the weight that draws a scattering parameter of a test to its common value."""
+        pulls = self.links.pulls.get(name)
+        there = pulls is not None and name in self.problems[test].free()
+        return float(pulls[test]) if there and pulls is not None else 0.0
+
+    def pulled(self, test: int, point: _Point, values: Array) -> Array:
+        """Residuals of the scattering parameters of a test, (n_scatter,)."""
+        return np.array([
+            pull * (_logarithm(self.problems[test], values, name) - point.shared[at])
+            if (pull := self.pull(test, name)) else 0.0
+            for name, at in zip(self.slots.scatter, self.slots.common, strict=True)
+        ])  # fmt: skip
+
+    def pulled_slopes(self, test: int, values: Array, moves: Array) -> Array:
+        """Derivative of these by the coordinates along which the parameters move, (·, m).
+
+        The first coordinates are the shared ones.
+        """
+        out = np.zeros((len(self.slots.scatter), moves.shape[1]))
+        for j, (name, at) in enumerate(zip(self.slots.scatter, self.slots.common, strict=True)):
+            pull, place = self.pull(test, name), self.problems[test].index[name]
+            if pull and abs(values[place]) > _TINY:
+                out[j] = pull * moves[place] / values[place]
+                out[j, at] -= pull
+        return out
+
+
+def _logarithm(problem: Problem, values: Array, name: str) -> float:
+    """Logarithm of the size of a parameter."""
+    return float(np.log(max(abs(float(values[problem.index[name]])), _TINY)))
 
 
 def _parents(name: str) -> set[str]:
@@ -332,7 +498,8 @@ class _Normal:
 
     def expected(self, moved: _Point) -> float:
         """Gain of the cost that is expected of a move."""
-        local = np.array(moved.local)
+        count = len(moved.own)
+        local = np.concatenate([np.tile(moved.shared, (count, 1)), moved.own], axis=1)
         curved = np.einsum("ij,ijk,ik->", local, self.matrices, local)
         return -float(2.0 * np.sum(self.gradients * local) + curved)
 
@@ -360,25 +527,32 @@ def _residual(problem: Problem, values: Array) -> Array | None:
 
 
 def _residuals(layout: _Layout, point: _Point) -> list[Array] | None:
-    """Residual of each test; None where one cannot be simulated."""
+    """Residual of each test, and of what its scattering parameters are drawn by.
+
+    None where one cannot be simulated.
+    """
     found = []
-    for problem, values in zip(layout.problems, layout.values(point), strict=True):
+    for t, (problem, values) in enumerate(zip(layout.problems, layout.values(point), strict=True)):
         residual = _residual(problem, values)
         if residual is None:
             return None
-        found.append(residual)
+        found.append(np.concatenate([residual, layout.pulled(t, point, values)]))
     return found
 
 
 def _normal(layout: _Layout, point: _Point, residuals: Sequence[Array]) -> _Normal:
     """Normal matrix and gradient of each test; no Jacobian is kept."""
     matrices, gradients = [], []
-    for test, local, residual in zip(layout.tests, point.local, residuals, strict=True):
+    first, locals_ = len(layout.slots.linked), layout.local(point)
+    for t, (test, local, residual) in enumerate(zip(layout.tests, locals_, residuals, strict=True)):
         values = test.decode(local)
-        jacobian = test.problem.objective.jacobian_along(values, test.moves(local, values))
+        own = test.moves(local, values)
+        moves = np.hstack([own[:, :first] @ layout.through_slopes(t, point.shared), own[:, first:]])
+        jacobian = test.problem.objective.jacobian_along(values, moves)
+        jacobian = np.vstack([jacobian, layout.pulled_slopes(t, values, moves)])
         matrices.append(jacobian.T @ jacobian)
         gradients.append(jacobian.T @ residual)
-    return _Normal(np.array(matrices), np.array(gradients), len(layout.shared))
+    return _Normal(np.array(matrices), np.array(gradients), layout.slots.count)
 
 
 def _cost(residuals: Sequence[Array]) -> float:

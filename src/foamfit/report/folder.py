@@ -6,7 +6,7 @@ import csv
 import json
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,10 +27,13 @@ RESULT_FILES = (
     "fit.pdf", "report.html",
 )  # fmt: skip
 CYCLES_FILES = ("cycles.json", "cycles.csv", "cycles.png")
+JOINT_FILES = ("joint.json", "joint.html", "joint.png")
 # What `studies.batch` writes beside the folders of the tests, and into each of them.
 BATCH_FILES = ("summary.csv", "summary.html", "batch.json")
+PREDICTION_FILES = ("prediction.json", "prediction.csv", "prediction.png", "prediction.pdf")
 # One of these is in every result.
-MARKS = ("fit.json", "cycles.json", "batch.json")
+MARKS = ("fit.json", "cycles.json", "joint.json", "batch.json", "prediction.json")
+_FILES = (*RESULT_FILES, *CYCLES_FILES, *JOINT_FILES, *PREDICTION_FILES, "batch.json")
 
 
 def save_result(result: Fit, folder: str | Path) -> Path:
@@ -97,22 +100,34 @@ def _check_replaceable(folder: Path, place: Path) -> None:
             f"{folder} is not empty and holds no foamfit result (no fit.json of foamfit), so it is "
             "not replaced; choose a new or an empty folder"
         )
+    tests = _tests_of(place)
     for path in there:
-        if not is_written(path):
+        if not is_written(path, tests):
             raise InputError(
                 f"{folder} holds {path.name}, which foamfit did not write, so it is not replaced; "
                 "move that or choose another folder"
             )
 
 
-def is_written(path: Path) -> bool:
-    """Whether something in a result folder is what a fit writes there."""
+def is_written(path: Path, tests: Collection[str] = ()) -> bool:
+    """Whether something in a result folder is what a fit writes there.
+
+    `tests` are the names of the folders that a joint fit says to be its own.
+    """
     if path.is_symlink():
         return False
-    if re.fullmatch(r"cycle-\d+", path.name) and path.is_dir():
+    if path.is_dir() and (re.fullmatch(r"cycle-\d+", path.name) or path.name in tests):
         within = list(path.iterdir())
         return all(inner.name in RESULT_FILES and is_written(inner) for inner in within)
-    return path.name in (*RESULT_FILES, *CYCLES_FILES, "batch.json") and path.is_file()
+    return path.name in _FILES and path.is_file()
+
+
+def _tests_of(place: Path) -> Collection[str]:
+    """Names of the tests whose folders a joint fit has written here."""
+    if not _is_of_fit(place / "joint.json"):
+        return ()
+    tests = json.loads((place / "joint.json").read_text(encoding="utf-8")).get("tests")
+    return tests.keys() if isinstance(tests, dict) else ()
 
 
 def _is_of_fit(path: Path) -> bool:

@@ -212,7 +212,12 @@ def step_of(
     return Step(own, fits, bic)
 
 
+def bic(cost: float, n_data: int, n_vary: int, n_eff: int) -> float:
+    """Bayesian information criterion n_eff ln(χ²/n) + k ln(n_eff)."""
+    n_eff = max(n_eff, 2)
+    return n_eff * math.log(max(cost, 1e-12 * n_data) / n_data) + n_vary * math.log(n_eff)
+
+
 def _bic(group: Group, cost: float, n_vary: int) -> float:
-    n = sum(problem.objective.n_data for problem in group.problems)
-    n_eff = max(group.n_eff, 2)
-    return n_eff * math.log(max(cost, 1e-12 * n) / n) + n_vary * math.log(n_eff)
+    n_data = sum(problem.objective.n_data for problem in group.problems)
+    return bic(cost, n_data, n_vary, group.n_eff)

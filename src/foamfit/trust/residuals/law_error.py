@@ -84,7 +84,7 @@ class _Spectrum:
 
     @classmethod
     def of(cls, residual: Array, basis: Array) -> _Spectrum:
-        """Spectrum of a residual of a fit; `basis` (n, k) is orthonormal over all curves."""
+        """Spectrum of a residual of a fit; `basis` (n, k) is what that took, over all curves."""
         n = residual.size
         k = np.arange(1, n)
         power = dct(residual, norm="ortho")[1:] ** 2
@@ -154,7 +154,9 @@ class _Spectrum:
         return _Sum(float(cost[at]) + price, law, red, white)
 
 
-def curve_errors(residual: Array, jacobian: Array, sizes: tuple[int, ...]) -> list[CurveError]:
+def curve_errors(
+    residual: Array, jacobian: Array, sizes: tuple[int, ...], taken: Array | None = None
+) -> list[CurveError]:
     """Tell noise from an error of the law in the residual of each curve, whichever is likelier.
 
     Arguments as of `noise_processes`, whose noise is taken where the residual holds no error of the
@@ -164,8 +166,8 @@ def curve_errors(residual: Array, jacobian: Array, sizes: tuple[int, ...]) -> li
     information criterion decides; one of 1200 records of white noise and of noise of first order
     (up to 0.95 from sample to sample, 120 to 5000 samples) was taken for an error of the law.
     """
-    basis = basis_of(jacobian)
-    own = noise_processes(residual, jacobian, sizes)
+    basis = basis_of(jacobian) if taken is None else taken
+    own = noise_processes(residual, jacobian, sizes, taken)
     return [
         _curve_error(residual[part], basis[part], process)
         for part, process in zip(parts(sizes), own, strict=True)

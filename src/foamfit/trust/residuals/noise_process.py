@@ -130,7 +130,9 @@ def noise_process(residual: Array, jacobian: Array | None = None) -> NoiseProces
     return noise_processes(residual, none if jacobian is None else jacobian, (residual.size,))[0]
 
 
-def noise_processes(residual: Array, jacobian: Array, sizes: tuple[int, ...]) -> list[NoiseProcess]:
+def noise_processes(
+    residual: Array, jacobian: Array, sizes: tuple[int, ...], taken: Array | None = None
+) -> list[NoiseProcess]:
     """Noise of each curve as an autoregressive process, from the residuals of a fit.
 
     The order is that of the least Bayesian information criterion. A fit takes what its parameters
@@ -139,9 +141,11 @@ def noise_processes(residual: Array, jacobian: Array, sizes: tuple[int, ...]) ->
     expected lag sums tr S_k (I-H)Σ(I-H); the autocovariances are corrected by what Σ itself loses.
 
     `residual` (n,) holds all curves after each other, each in the order of time, so many samples of
-    each as in `sizes`; `jacobian` (n, k) may have any scaling of its columns.
+    each as in `sizes`; `jacobian` (n, k) may have any scaling of its columns. Where other data took
+    part in the fit, `taken` (n, k) says what it took of these: orthogonal columns, each as long as
+    the root of the share of the noise along it.
     """
-    basis = basis_of(jacobian)
+    basis = basis_of(jacobian) if taken is None else _shortened(taken)
     curves = parts(sizes)
     sums, processes = [], []
     for part in curves:
@@ -167,6 +171,15 @@ def noise_processes(residual: Array, jacobian: Array, sizes: tuple[int, ...]) ->
             for process, seen, part, image in zip(processes, sums, curves, images, strict=True)
         ]
     return processes
+
+
+def _shortened(taken: Array) -> Array:
+    """Columns q with which (I-qqᵀ) twice leaves of white noise what `taken` leaves of it once.
+
+    A share λ of the noise along a column is gone from a residual; 1-λ is the square of (1-λ').
+    """
+    share = np.clip(np.sum(taken**2, axis=0), 1e-300, 1.0)
+    return np.asarray(taken * np.sqrt((1.0 - np.sqrt(1.0 - share)) / share))
 
 
 def _corrected(

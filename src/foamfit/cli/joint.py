@@ -1,0 +1,105 @@
+"""`foamfit joint`: several tests in one fit."""
+
+# ruff: noqa: D301  (a \b keeps click from joining the lines of an example)
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from foamfit.cli.group import NOT_ACCEPTABLE, main
+from foamfit.cli.options import FILE, compiling, progress_bar
+from foamfit.errors import InputError
+from foamfit.terminal import say, without_ctrl_c
+
+if TYPE_CHECKING:
+    from foamfit.study.joint import JointResult
+
+
+@main.command()
+@click.argument("study", metavar="STUDY.toml", type=FILE)
+@click.option("--out", type=FILE, help="Result folder. Default: fits/<STUDY>.")
+@click.option(
+    "--jobs", type=click.IntRange(min=1), help="Processes. Default: one for each core."
+)  # fmt: skip
+@click.option(
+    "--seed", type=click.IntRange(min=0), help="Same tests and seed, same numbers. Default: 0."
+)
+@click.option("--no-report", is_flag=True, help="Write no report and no figures of single tests.")
+@click.option("--json", "as_json", is_flag=True, help="Print joint.json on stdout, nothing else.")
+@click.option("--quiet", is_flag=True, help="Print nothing but warnings of failure.")
+def joint(
+    study: Path, out: Path | None, jobs: int | None, seed: int | None,
+    no_report: bool, as_json: bool, quiet: bool,
+) -> int:  # fmt: skip
+    """Fit the tests of STUDY.toml together: shared, own, scattering, rate-dependent parameters.
+
+    Writes joint.json, joint.html, joint.png and a result folder for each test. Exit codes are those
+    of foamfit fit; a test that cannot be read is left out with a warning.
+
+    \b
+    STUDY.toml, for example:
+        name = "shoe foam, new heel"
+        tests = ["new-heel-comp-*_raw.txt"]     # files, folders, globs, relative to this file
+        specimen = "heel.toml"                  # of all tests; default: the TOML beside each
+        model = "microscale"
+        relaxation = 1
+        drive = "displacement"                  # default: what each test allows
+        [parameters]                            # what is not named is "own"
+        s1_k0 = "shared"                        # one value for all tests
+        s1_kc = "own"                           # one value for each
+        s1_sigma_plus = "scatter"               # one for each, log-normal about a common value
+        s1_sigma_minus = "log rate"             # v (1 + b ln(rate/rate0)), rate0 of the median test
+        s1_tau1 = "power rate"                  # v (rate/rate0)^b
+        s1_g1 = "auto"                          # shared, own or a law of rate, by evidence
+        s1_eps_star = 0.3                       # held at a number (SI)
+    Also: seed, cycle, starts, and [specimens] with a TOML for single tests: new-heel-1 = "a.toml".
+    """
+    from foamfit.report.folder import check_target
+
+    folder = Path("fits", study.stem) if out is None else out
+    check_target(folder)
+    with compiling(quiet or as_json) as compile_rest:
+        from foamfit.study.joint import joint as fit_jointly
+        from foamfit.study.study_file import read_study
+
+        _spare(folder, study, [path for _, path in read_study(study).tests])
+        compile_rest()
+        with progress_bar(quiet or as_json) as progress:
+            result = fit_jointly(study, jobs=jobs, seed=seed, progress=progress)
+        try:
+            with without_ctrl_c():
+                result.save(folder, jobs=jobs, reports=not no_report)
+        except InputError:  # the numbers are not lost with the folder
+            _tell(result, as_json, quiet)
+            raise
+    _tell(result, as_json, quiet)
+    if not quiet and not as_json:
+        say(f"\nwritten to {folder}: open {folder / 'joint.html'}")
+    if result.status == "failed":
+        say(f"foamfit: no acceptable fit was found; see {folder}", err=True)
+        return NOT_ACCEPTABLE
+    return 0
+
+
+def _spare(folder: Path, study: Path, tests: list[Path]) -> None:
+    """Refuse a folder that holds what is read."""
+    for path in (study, *tests):
+        if folder.is_dir() and folder.resolve() in path.resolve().parents:
+            raise InputError(
+                f"{folder} holds {path.name} and would be replaced as a whole; choose another --out"
+            )
+
+
+def _tell(result: JointResult, as_json: bool, quiet: bool) -> None:
+    """Print a result."""
+    if as_json:
+        import json
+
+        say(json.dumps(result.to_json_dict(), allow_nan=False))
+    elif not quiet:
+        from foamfit.report.studies.joint_text import joint_text
+
+        say(joint_text(result))

@@ -1,0 +1,200 @@
+"""The picture of a joint fit: the loop of each test, and what each parameter is to the tests."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from foamfit.fitting.links import RATES, law_values
+from foamfit.report.figures import BLUE, GREY, VERMILION, drawing
+from foamfit.report.readable import readable_unit
+from foamfit.report.studies.joint_text import in_unit
+from foamfit.text import percent
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from foamfit.arrays import Array
+    from foamfit.study.joint_result import JointData
+
+# Columns of the picture, and inches of a loop and of a parameter.
+LOOPS, LOOP, COLUMNS, PANEL = 6, (1.25, 1.15), 3, (2.5, 1.6)
+MOST_LOOPS = 48
+MOST_NAMES = 12  # of tests that stand at an axis
+# Points of a drawn curve, and the share of the largest range that intervals may run out of.
+POINTS = 400
+
+
+def plot_joint(found: JointData) -> Figure:
+    """Draw the loop of each test and every parameter by test, or by rate where there are several.
+
+    Bars are 95 % intervals; a hollow mark is a test that does not determine the parameter well. The
+    line is what the tests have in common: a value, a law of rate, a common value with its spread
+    between specimens.
+    """
+    shown = _shown(found)
+    names = [n for n, one in found.parameters.items() if one.kind not in ("fixed", "shared")]
+    shared = [n for n, one in found.parameters.items() if one.kind == "shared"]
+    panels = len(names) + bool(shared)
+    rows, low = -(-len(shown) // LOOPS), -(-panels // COLUMNS)
+    heights = [rows * LOOP[1], low * PANEL[1]]
+    with drawing(max(LOOPS * LOOP[0], COLUMNS * PANEL[0]), sum(heights) + 0.55) as figure:
+        top, bottom = figure.subfigures(2, 1, height_ratios=heights, squeeze=False)[:, 0]
+        _draw_loops(top.subplots(rows, LOOPS, squeeze=False).ravel().tolist(), found, shown)
+        axes = bottom.subplots(low, COLUMNS, squeeze=False).ravel().tolist()
+        for ax, name in zip(axes, names, strict=False):
+            _parameter(ax, found, name)
+        for ax in axes[len(names) :]:
+            ax.set_axis_off()
+        if shared:
+            _list(axes[len(names)], found, shared)
+        more = (
+            f"; {len(shown)} of {len(found.tests)} drawn" if len(shown) < len(found.tests) else ""
+        )
+        figure.suptitle(
+            f"{found.study.name} · {found.study.model} · {len(found.tests)} tests together\n"
+            f"loops: measured grey, fitted blue{more}; below: 95 % intervals by test, hollow if "
+            "not well determined; red: in common",
+            x=0.01, ha="left", fontsize=8,
+        )  # fmt: skip
+    return figure
+
+
+def _shown(found: JointData) -> list[int]:
+    """Tests whose loops are drawn: all, or some at equal steps of their order by rate."""
+    order = sorted(range(len(found.tests)), key=lambda t: (found.rates[t] or 0.0, t))
+    places = np.unique(np.linspace(0, len(order) - 1, min(MOST_LOOPS, len(order))).astype(int))
+    return [order[place] for place in places]
+
+
+def _draw_loops(axes: list[Axes], found: JointData, shown: list[int]) -> None:
+    tests = found.measurements
+    top = max(float(np.max(t.stress)) for t in tests if t.stress is not None)
+    factor, unit = readable_unit(top, "Pa")
+    for ax, t in zip(axes, shown, strict=False):
+        problem, test = found.problems[t], tests[t]
+        curves = problem.objective.simulate(found.fit.found.values[t], everything=True).curves
+        along, fitted, label = _along(found, t, curves)
+        if along is None or test.stress is None:
+            continue
+        step = max(along.size // POINTS, 1)
+        ax.plot(along[::step], test.stress[::step] / factor, color=GREY, linewidth=1.1)
+        if fitted is not None:
+            ax.plot(along[::step], fitted[::step] / factor, color=BLUE, linewidth=0.7)
+        rate = found.rates[t]
+        told = found.tests[t] if rate is None else f"{found.tests[t]}, {rate:.2g}/s"
+        ax.set_title(told if len(told) < 24 else f"…{told[-22:]}", fontsize=6)
+        ax.tick_params(labelsize=5.5, length=2, pad=1.5)
+        ax.locator_params(nbins=3)
+        if t == shown[0]:
+            ax.set_xlabel(label, fontsize=6, labelpad=1)
+            ax.set_ylabel(f"stress ({unit})", fontsize=6, labelpad=1)
+    for ax in axes[len(shown) :]:
+        ax.set_axis_off()
+
+
+def _along(
+    found: JointData, t: int, curves: dict[str, Array]
+) -> tuple[Array | None, Array | None, str]:
+    """What a stress is drawn against, the fitted stress, and the name of the axis."""
+    test = found.measurements[t]
+    if test.displacement is not None and "stress_strain" in curves:
+        return test.displacement / test.specimen.height, curves["stress_strain"], "strain"
+    return test.time, curves.get("stress_time"), "time (s)"
+
+
+def _parameter(ax: Axes, found: JointData, name: str) -> None:
+    """One parameter by test, or by rate."""
+    one = found.parameters[name]
+    by_rate = found.rate0 is not None and len({f"{r:.2g}" for r in found.rates if r}) > 1
+    factor, unit = readable_unit(abs(one.value), one.unit)
+    x = np.array(found.rates, dtype=float) if by_rate else np.arange(1.0, len(found.tests) + 1)
+    ax.set_title(f"{_title(found, name)}{f' ({unit})' if unit else ''}: {one.kind}")
+    there = [
+        (at, one.tests[test]) for at, test in zip(x, found.tests, strict=True)
+        if one.tests and one.tests[test].state != "fixed"
+    ]  # fmt: skip
+    bars = [(at, *v.ci95) for at, v in there if v.ci95 is not None]
+    ends = np.array(bars, dtype=float).reshape(-1, 3)
+    ends[:, 1:] /= factor
+    ax.vlines(ends[:, 0], ends[:, 1], ends[:, 2], color=GREY, linewidth=0.8, zorder=1)
+    middle = [v.value / factor for _, v in there]
+    if one.kind not in RATES:
+        size = 3.5 if len(found.tests) < 60 else 1.5
+        for sure, face in ((True, BLUE), (False, "white")):
+            points = [
+                (at, v.value / factor) for at, v in there if (v.state == "determined") == sure
+            ]
+            ax.plot(*np.array(points).reshape(-1, 2).T, "o", color=BLUE, markerfacecolor=face,
+                    markersize=size)  # fmt: skip
+    if by_rate:
+        ax.set_xscale("log")
+        ax.set_xlabel("strain rate (1/s)", labelpad=1)
+    else:
+        ax.set_xlabel("test", labelpad=1)
+        if len(x) <= MOST_NAMES:
+            ax.set_xticks(x, [str(int(at)) for at in x])
+    _common(ax, found, name, x, factor)
+    if middle and one.kind not in RATES:
+        _limit(ax, middle, ends[:, 1:].ravel().tolist())
+
+
+def _common(ax: Axes, found: JointData, name: str, x: Array, factor: float) -> None:
+    """What the tests have in common: line and 95 % band, spread between specimens dashed."""
+    one = found.parameters[name]
+    if one.kind == "own":
+        return
+    span = np.array([x.min(), x.max()])
+    if one.kind in RATES and one.b is not None and found.rate0 is not None:
+        span = np.geomspace(x.min(), x.max(), 50)
+        values = law_values(one.kind, one.value, one.b, np.log(span / found.rate0))
+        ax.plot(span, values / factor, color=VERMILION, linewidth=1.0)
+        told = f"b = {one.b:.3g}"
+        if one.b_ci95 is not None:
+            told += f" ({one.b_ci95[0]:.3g} to {one.b_ci95[1]:.3g})"
+        _say(ax, told, below=one.b > 0.0)
+        return
+    ax.plot(span, [one.value / factor] * 2, color=VERMILION, linewidth=1.0, zorder=0)
+    if one.ci95 is not None:
+        low, high = (end / factor for end in one.ci95)
+        ax.fill_between(span, low, high, color=VERMILION, alpha=0.18, linewidth=0, zorder=0)
+    if one.scatter:
+        for sign in (-1.0, 1.0):
+            edge = one.value * np.exp(sign * one.scatter) / factor
+            ax.plot(span, [edge] * 2, "--", color=VERMILION, linewidth=0.7, zorder=0)
+        _say(ax, f"spread {percent(one.scatter)}")
+
+
+def _list(ax: Axes, found: JointData, names: list[str]) -> None:
+    """Write the values that all tests share."""
+    lines = [["shared by all tests", "", ""]]
+    for name in names:
+        one = found.parameters[name]
+        half = None if one.ci95 is None else 0.5 * (one.ci95[1] - one.ci95[0])
+        error = f"±{percent(half / abs(one.value))}" if half and one.value else one.state or ""
+        lines.append([_title(found, name), in_unit((one.value,), one.unit), error])
+    size = min(7.0, 90.0 / len(lines))
+    for column, x in ((0, 0.0), (1, 0.42), (2, 0.78)):
+        told = "\n".join(line[column] for line in lines)
+        ax.text(x, 1.0, told, transform=ax.transAxes, va="top", fontsize=size, linespacing=1.5)
+
+
+def _title(found: JointData, name: str) -> str:
+    """Name of a parameter, without the spring where there is one alone."""
+    return name if "+" in found.study.model else name.removeprefix("s1_")
+
+
+def _say(ax: Axes, told: str, *, below: bool = False) -> None:
+    y, side = (0.05, "bottom") if below else (0.97, "top")
+    ax.text(0.98, y, told, transform=ax.transAxes, ha="right", va=side, fontsize=6.5)
+
+
+def _limit(ax: Axes, values: list[float], ends: list[float]) -> None:
+    """Let wide intervals run out of the panel rather than flatten the values."""
+    low, high = min(values), max(values)
+    room = max(1.5 * (high - low), 0.1 * max(abs(low), abs(high)), 1e-12)
+    bottom, top = max(min([low, *ends]), low - room), min(max([high, *ends]), high + room)
+    edge = 0.08 * max(top - bottom, 0.2 * room)
+    ax.set_ylim(bottom - edge, top + 2.0 * edge)

@@ -1,0 +1,407 @@
+"""Several tests in one fit: what the study says of each parameter, from files to joint.json."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NoReturn
+
+import lmfit
+import numpy as np
+
+from foamfit.arrays import Array
+from foamfit.data.csv_file import read_test
+from foamfit.data.measurement import Measurement
+from foamfit.data.rate import loading_rate
+from foamfit.errors import InputError, SimulationError
+from foamfit.fitting.links import KINDS, RATES, Links
+from foamfit.fitting.problem import Problem, make_params
+from foamfit.fitting.search import Tracker, descend
+from foamfit.one_model import Options, Progress, identify
+from foamfit.report.folder import check_target
+from foamfit.report.studies.joint import save_joint
+from foamfit.springs.model import Model
+from foamfit.study.joint_estimates import common_covariance, parameter_of
+from foamfit.study.joint_fit import (
+    Alternative,
+    JointFit,
+    Map,
+    choose_kinds,
+    evidence,
+    fit_jointly,
+    samples_of,
+)
+from foamfit.study.joint_result import Alone, JointData
+from foamfit.study.joint_words import sentences_of, warnings_of
+from foamfit.study.shared import bic
+from foamfit.study.study_file import AUTO, Study, read_study
+from foamfit.study.workers import workers
+from foamfit.text import counted
+
+# Tests that are searched as a fit of their own is; the others start at what these have found.
+SEARCHED = 3
+# Up to so many tests are fitted in this process: each takes some tenths of a second.
+FEW = 20
+# Up to so many result folders are written in this process: each takes a second or two.
+FEW_FOLDERS = 3
+# Reduced χ² of a test over the largest of those, past which it is searched as well.
+FAR = 2.0
+# Steps of a descent from what another test has found.
+STEPS = 60
+# Starts of the joint fit besides the own fits: what one test has found, for all.
+ONE_FOR_ALL = 2
+# Rates that differ by less than this share are one.
+SAME_RATE = 0.02
+
+
+class JointResult(JointData):
+    """Everything that a joint fit found, and how it is written; its fields are `JointData`'s."""
+
+    def save(self, folder: str | Path, *, jobs: int | None = None, reports: bool = True) -> Path:
+        """Write joint.json, joint.html, joint.png and a result folder per test; returns the folder.
+
+        An older result there is replaced as a whole, at the end. The folders of the tests are made
+        by `jobs` processes (by default one for each core), without `reports` with tables alone.
+        """
+        check_target(folder)
+        with workers(jobs, len(self.tests), FEW_FOLDERS) as each:
+            return save_joint(self, folder, each, reports=reports)
+
+
+@dataclass(frozen=True, eq=False)
+class _Test:
+    """One test of a study, ready to be fitted."""
+
+    name: str
+    file: Path
+    problem: Problem
+    params: lmfit.Parameters  # Before any fit
+    rate: float | None
+
+
+def joint(
+    path: str | Path,
+    *,
+    jobs: int | None = None,
+    out: str | Path | None = None,
+    seed: int | None = None,
+    reports: bool = True,
+    progress: Progress | None = None,
+) -> JointResult:
+    """Fit the tests of a study together.
+
+    Parameters
+    ----------
+    path : str or Path
+        STUDY.toml: tests, model, drive, and what each parameter is: "shared", "own", "scatter",
+        "log rate", "power rate" or "auto", or a number that it is held at.
+    jobs : int, optional
+        Processes; by default one for each core. The numbers are the same with any.
+    out : str or Path, optional
+        Folder to write the result to, as `JointResult.save` does, with or without `reports`.
+    seed : int, optional
+        Of the search; by default that of the study, or 0.
+    progress : callable, optional
+        Told the fraction done and what is going on.
+
+    Returns
+    -------
+    JointResult
+
+    Raises
+    ------
+    InputError
+        If the study cannot be used: the message names the file and the key. A single test that
+        cannot be read or fitted is in `refused` with its sentence.
+    SimulationError
+        If no start of the joint fit can be simulated.
+    """
+    began, study, tell = time.perf_counter(), read_study(path), progress or (lambda *_: None)
+    if out is not None:
+        check_target(out)
+    seed = study.seed if seed is None else seed
+    options = Options(
+        drive=study.drive, seed=seed, starts=study.starts, relaxation=study.relaxation
+    )
+    tests, refused = _read(study, options, tell)
+    _links(study, tests)  # refuses what cannot be, before anything is fitted
+    with workers(jobs, len(tests), FEW) as each:
+        tests, vectors = _own_fits(study, options, tests, refused, each, tell)
+        problems, links = [test.problem for test in tests], _links(study, tests)
+        starts, n_eff = _starts(problems, vectors), samples_of(problems, vectors)
+        tell(0.5, "together")
+        choices = _choices(tests)
+        links = _chosen(study, problems, links, starts, n_eff, choices)
+        fit = fit_jointly(problems, links, starts, each=each)
+    tell(0.9, "evidence")
+    alternatives = _evidence(study, fit, n_eff, vectors, choices)
+    result = _conclude(study, seed, tests, fit, vectors, alternatives, n_eff, refused, began)
+    tell(1.0, "done")
+    if out is not None:
+        result.save(out, jobs=jobs, reports=reports)
+    return result
+
+
+# ------------------------------------------------------------------------------- reading
+
+
+def _read(study: Study, options: Options, tell: Progress) -> tuple[list[_Test], dict[str, str]]:
+    """Read all tests; those that cannot be used are refused, each with its sentence."""
+    found, refused = list[tuple[str, Path, Measurement]](), dict[str, str]()
+    pairs = list(zip(study.tests, study.specimens, strict=True))
+    for i, ((name, path), specimen) in enumerate(pairs):
+        tell(0.1 * i / len(pairs), "reading")
+        try:
+            test = read_test(path, specimen, study.cycle)
+            options.problem(test, study.model)
+            found.append((name, path, test))
+        except (InputError, SimulationError) as error:
+            refused[str(path)] = str(error)
+    if len(found) < 2:
+        _too_few(study, len(found), refused)
+    params = _params(study, [test for _, _, test in found])
+    return [
+        _Test(name, path, options.problem(test, study.model, own), own, loading_rate(test))
+        for (name, path, test), own in zip(found, params, strict=True)
+    ], refused
+
+
+def _too_few(study: Study, count: int, refused: Mapping[str, str]) -> NoReturn:
+    told = "; ".join(list(refused.values())[:2])
+    raise InputError(
+        f"{study.path}: {counted(count, 'test')} of {len(study.tests)} can be used, a joint fit "
+        f"needs two: {told}"
+    )
+
+
+def _params(study: Study, tests: Sequence[Measurement]) -> list[lmfit.Parameters]:
+    """Parameters of each test, varied and held as the study says.
+
+    What is named varies where it does so by itself, and if it does nowhere, then in every test.
+    """
+    model = Model.parse(study.model, study.relaxation)
+    every = [make_params(test, model, study.drive) for test in tests]
+    for name in (*study.kinds, *study.held):
+        where = f"{study.path}: [parameters] {name}"
+        tied = [params[name].expr for params in every if params[name].expr is not None]
+        if tied:
+            raise InputError(f"{where} follows from others ({tied[0]}); name those instead")
+        if name in study.held:
+            for params in every:
+                params[name].set(value=study.held[name], vary=False, min=-math.inf, max=math.inf)
+        elif not any(params[name].vary for params in every):
+            if name.endswith("_height"):
+                raise InputError(f"{where} is given by [specimen] heights; leave one of them out")
+            for params in every:
+                params[name].set(vary=True)
+    return every
+
+
+def _links(study: Study, tests: Sequence[_Test]) -> Links:
+    """What each parameter is to the tests, and ln(rate/rate0) where a law of rate needs it."""
+    rates = [test.rate for test in tests]
+    by_rate = [name for name, kind in study.kinds.items() if kind in RATES]
+    for name in by_rate:
+        where = f'{study.path}: [parameters] {name} = "{study.kinds[name]}"'
+        there = [test for test in tests if test.problem.params[name].vary]
+        for test in there:
+            if test.rate is None:
+                raise InputError(
+                    f"{where} needs the strain rate of every test, and {test.file} has no time"
+                )
+        if not _several([test.rate for test in there]):
+            rate = f"{there[0].rate:.3g} 1/s" if there else "none"
+            raise InputError(
+                f"{where} needs tests at two or more rates, and all have one ({rate}); make it "
+                '"shared" or "own", or add tests'
+            )
+    for name, kind in study.kinds.items():
+        there = [test for test in tests if test.problem.params[name].vary]
+        if kind == "scatter" and len(there) < 2:
+            raise InputError(
+                f'{study.path}: [parameters] {name} = "scatter" needs two or more tests in which '
+                f"it varies, and there is {counted(len(there), 'test')}"
+            )
+    middle = _median_rate(rates)
+    if middle is None:
+        return Links(study.kinds)
+    return Links(study.kinds, np.log([(rate or middle) / middle for rate in rates]))
+
+
+def _median_rate(rates: Sequence[float | None]) -> float | None:
+    """Rate of the median test of those that have one; of an even number that of the slower one."""
+    known = sorted(rate for rate in rates if rate is not None)
+    return known[(len(known) - 1) // 2] if known else None
+
+
+def _several(rates: Sequence[float | None]) -> bool:
+    known = [rate for rate in rates if rate is not None]
+    return len(known) > 1 and max(known) > (1.0 + SAME_RATE) * min(known)
+
+
+# ------------------------------------------------------------------------------- own fits
+
+
+def _own_fits(
+    study: Study, options: Options, tests: Sequence[_Test], refused: dict[str, str], each: Map,
+    tell: Progress,
+) -> tuple[list[_Test], list[Array]]:  # fmt: skip
+    """Tests that can be fitted, and the parameters that a fit of each alone finds.
+
+    A few tests, spread over the rates, are searched as `fit` searches them. The others descend from
+    what these have found, and are searched too where that does not follow them as well.
+    """
+    order = sorted(range(len(tests)), key=lambda t: (tests[t].rate or 0.0, t))
+    places = np.unique(np.linspace(0, len(order) - 1, min(SEARCHED, len(order))).astype(int))
+    first = [order[place] for place in places]
+    found = dict[int, tuple[Array, float]]()
+
+    def do(chosen: Sequence[int], near: tuple[Array, ...], done: float) -> None:
+        work = [
+            (tests[t].problem.measurement, study.model, tests[t].params, options, near)
+            for t in chosen
+        ]
+        made = each(_own_fit, *zip(*work, strict=True)) if work else ()
+        for i, (t, own) in enumerate(zip(chosen, made, strict=True)):
+            if isinstance(own, str):
+                refused[str(tests[t].file)] = own
+            else:
+                found[t] = own
+            tell(done + 0.2 * (i + 1) / len(chosen), "each test")
+
+    do(first, (), 0.1)
+    near = tuple(found[t][0] for t in first if t in found)
+    do([t for t in order if t not in first], near, 0.3)
+    worst = max((found[t][1] for t in first if t in found), default=math.inf)
+    do([t for t in order if t not in first and t in found and found[t][1] > FAR * worst], (), 0.3)
+    there = sorted(found)
+    if len(there) < 2:
+        _too_few(study, len(there), refused)
+    return [tests[t] for t in there], [found[t][0] for t in there]
+
+
+def _own_fit(
+    measurement: Measurement, model: str, params: lmfit.Parameters, options: Options,
+    near: tuple[Array, ...],
+) -> tuple[Array, float] | str:  # fmt: skip
+    """Fit one test from points nearby, or search; returns its vector and χ² per sample.
+
+    Where it cannot be fitted, a sentence that says why.
+    """
+    if not near:
+        try:
+            found = identify(measurement, model, params, options, lambda *_: None)
+        except SimulationError as error:
+            return str(error)
+        return found.best().values, found.tracker.best_cost / found.problem.objective.n_data
+    problem = options.problem(measurement, model, params)
+    space, tracker = problem.space(), Tracker(problem.objective)
+    for start in near:
+        descend(tracker, space, space.encode(_as(problem, start)), STEPS)
+    if tracker.best_values is None:
+        return _own_fit(measurement, model, params, options, ())
+    return tracker.best_values, tracker.best_cost / problem.objective.n_data
+
+
+def _starts(problems: Sequence[Problem], vectors: Sequence[Array]) -> list[list[Array]]:
+    """Where the joint fit starts: at the own fits, and at those of single tests for all."""
+    n = len(vectors)
+    chosen = np.unique(np.linspace(0, n - 1, min(n, ONE_FOR_ALL)).astype(int))
+    return [list(vectors), *([_as(p, vectors[i]) for p in problems] for i in chosen)]
+
+
+def _as(problem: Problem, vector: Array) -> Array:
+    """A vector with the values of another test where this one varies."""
+    values = problem.vector()
+    free = [problem.index[name] for name in problem.free()]
+    values[free] = vector[free]
+    return problem.space().complete(values)
+
+
+# ------------------------------------------------------------------------------- kinds
+
+
+def _chosen(
+    study: Study, problems: Sequence[Problem], links: Links, starts: list[list[Array]], n_eff: int,
+    choices: tuple[str, ...],
+) -> Links:  # fmt: skip
+    """Links with the kinds of the parameters that evidence is to choose."""
+    free = {name for problem in problems for name in problem.free()}
+    names = [name for name, kind in study.kinds.items() if kind == AUTO and name in free]
+    if not names:
+        return links
+    return choose_kinds(problems, links, names, starts, n_eff, choices)
+
+
+def _choices(tests: Sequence[_Test]) -> tuple[str, ...]:
+    """Kinds between which there can be evidence: laws of rate only where there are several."""
+    rates = [test.rate for test in tests]
+    rated = None not in rates and _several(rates)
+    return tuple(kind for kind in KINDS if kind != "scatter" and (rated or kind not in RATES))
+
+
+def _evidence(
+    study: Study, fit: JointFit, n_eff: int, vectors: Sequence[Array], choices: tuple[str, ...]
+) -> tuple[Alternative, ...]:
+    """Every parameter with a law of rate, or of which evidence was to choose, as other kinds."""
+    found = fit.found
+    names = [
+        name for name in (*found.shared, *found.own)
+        if found.links.kind(name) in RATES or study.kinds.get(name) == AUTO
+    ]  # fmt: skip
+    return tuple(evidence(found, names, n_eff, choices, [list(vectors)]))
+
+
+# ------------------------------------------------------------------------------- the result
+
+
+def _conclude(
+    study: Study, seed: int, tests: Sequence[_Test], fit: JointFit, vectors: Sequence[Array],
+    alternatives: tuple[Alternative, ...], n_eff: int, refused: Mapping[str, str], began: float,
+) -> JointResult:  # fmt: skip
+    """Assemble the result."""
+    names = tuple(test.name for test in tests)
+    parameters = {name: parameter_of(fit, names, name) for name in tests[0].problem.names}
+    rates = tuple(test.rate for test in tests)
+    result = JointResult(
+        study=study,
+        seed=seed,
+        tests=names,
+        files=tuple(test.file for test in tests),
+        rates=rates,
+        rate0=_median_rate(rates),
+        fit=fit,
+        parameters=parameters,
+        covariance=common_covariance(fit),
+        evidence=alternatives,
+        n_eff=n_eff,
+        alone=_alone(tests, vectors, n_eff),
+        refused=refused,
+        status="ok",
+        warnings=(),
+        sentences=(),
+        runtime_s=time.perf_counter() - began,
+    )
+    lost, warnings = warnings_of(result)
+    status = "failed" if lost else "warnings" if warnings else "ok"
+    sentences = tuple(sentences_of(result))
+    return replace(result, status=status, warnings=tuple(warnings), sentences=sentences)
+
+
+def _alone(tests: Sequence[_Test], vectors: Sequence[Array], n_eff: int) -> Alone:
+    """What the fits of the tests one by one come to."""
+    objectives = [test.problem.objective for test in tests]
+    runs = [
+        one.simulate(values, everything=True)
+        for one, values in zip(objectives, vectors, strict=True)
+    ]
+    cost = sum(
+        float(np.sum(one.compare(run) ** 2)) for one, run in zip(objectives, runs, strict=True)
+    )
+    n_vary = sum(len(test.problem.free()) for test in tests)
+    score = bic(cost, sum(one.n_data for one in objectives), n_vary, n_eff)
+    misfits = tuple(one.misfit(run) for one, run in zip(objectives, runs, strict=True))
+    return Alone(cost, n_vary, score, misfits)

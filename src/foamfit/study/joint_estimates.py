@@ -1,0 +1,127 @@
+"""The parameters of a joint fit: values, intervals and states, in common and in each test."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from foamfit.arrays import Array
+from foamfit.fitting.box import scale_in_words
+from foamfit.fitting.problem import Problem
+from foamfit.springs.parameters import unit_of
+from foamfit.study.joint_fit import JointFit
+from foamfit.study.joint_result import JointParameter, TestValue
+from foamfit.text import counted
+from foamfit.trust import covariance
+
+
+def common_covariance(fit: JointFit) -> tuple[tuple[str, ...], Array]:
+    """Covariance of the common values and slopes, SI; see `JointData.to_json_dict`."""
+    spread, scales = fit.covariance, []
+    for name in spread.names:
+        one = fit.spreads.get(name)
+        value = math.exp(one.mean) if one else fit.found.common.get(name, (1.0,))[0]
+        before = spread.of_common(name)[0]
+        factor = one.stderr / before if one and before > 0.0 else 1.0
+        scales.append(value * factor if fit.found.links.kind(name) == "scatter" else 1.0)
+    return spread.names, spread.matrix * np.outer(scales, scales)
+
+
+def parameter_of(fit: JointFit, tests: tuple[str, ...], name: str) -> JointParameter:
+    """One parameter of the joint fit."""
+    found = fit.found
+    kind, values, unit = found.links.kind(name), found.value(name), unit_of(name)
+    there = [t for t, problem in enumerate(found.problems) if problem.params[name].vary]
+    if not there:
+        value = float(np.median(values))
+        return JointParameter("fixed", value, unit, state="fixed", why="held fixed")
+    if kind == "own":
+        return JointParameter(
+            kind, float(np.median([values[t] for t in there])), unit,
+            why="one value for each test; this is their median",
+            tests=_values(fit, tests, name),
+        )  # fmt: skip
+    if kind == "scatter":
+        return _scattering(fit, tests, name)
+    first = found.problems[there[0]]
+    (value, *slope) = found.common[name]
+    stderr, freedom = fit.covariance.of_common(name)
+    judged = _judged(first, name, value, stderr, freedom, found.values[there[0]])
+    words = f"one value for {counted(len(there), 'test')}"
+    if not slope:
+        return _estimate(kind, value, unit, judged, words)
+    b_error, b_freedom = fit.covariance.of_common(f"{name}:b")
+    half = covariance.half_width(b_error, b_freedom)
+    known = math.isfinite(half)
+    one = _estimate(kind, value, unit, judged, f"at the rate of the median test; {words}")
+    return replace(
+        one, tests=_values(fit, tests, name), b=slope[0], b_stderr=b_error if known else None,
+        b_ci95=(slope[0] - half, slope[0] + half) if known else None,
+    )  # fmt: skip
+
+
+def _scattering(fit: JointFit, tests: tuple[str, ...], name: str) -> JointParameter:
+    """One parameter that scatters between specimens."""
+    unit, spread = unit_of(name), fit.spreads.get(name)
+    values = _values(fit, tests, name)
+    if spread is None:
+        (common,) = fit.found.common[name]
+        why = "too few tests determine it to tell its common value"
+        return JointParameter(
+            "scatter", common, unit, state="not determined", why=why, tests=values
+        )
+    sign = -1.0 if next(iter(values.values())).value < 0.0 else 1.0
+    value, ends = sign * math.exp(spread.mean), [sign * math.exp(end) for end in spread.ci95]
+    half = 0.5 * abs(ends[1] - ends[0])
+    state, why = covariance.state(value, half, abs(value), -math.inf, math.inf)
+    known = state != "not determined"
+    return JointParameter(
+        "scatter", value, unit, abs(value) * spread.stderr if known else None,
+        (min(ends), max(ends)) if known else None, state,
+        f"common value of {counted(spread.count, 'test')}: {why}", values,
+        spread.tau, spread.tau_stderr, spread.tau_ci95,
+    )  # fmt: skip
+
+
+_Judged = tuple[float | None, tuple[float, float] | None, str, str]
+
+
+def _estimate(kind: str, value: float, unit: str, judged: _Judged, words: str) -> JointParameter:
+    stderr, ci95, state, why = judged
+    return JointParameter(kind, value, unit, stderr, ci95, state, f"{words}: {why}")
+
+
+def _judged(
+    problem: Problem, name: str, value: float, stderr: float, freedom: float, values: Array
+) -> _Judged:
+    """Standard error, interval, state and reason of a value; see `trust.covariance.RULE`."""
+    parameter = problem.params[name]
+    low, high = float(parameter.min), float(parameter.max)
+    size = float(problem.sizes((name,), values)[0])
+    half = covariance.half_width(stderr, freedom)
+    of = scale_in_words(name, value, size)
+    state, why = covariance.state(value, half, size, low, high, of)
+    if not half <= covariance.NOTHING * size:
+        return None, None, state, why
+    return stderr, (max(value - half, low), min(value + half, high)), state, why
+
+
+def _values(fit: JointFit, tests: tuple[str, ...], name: str) -> dict[str, TestValue]:
+    """A parameter in each test."""
+    out, found = dict[str, TestValue](), fit.found
+    for t, (test, problem) in enumerate(zip(tests, found.problems, strict=True)):
+        values = found.values[t]
+        value = float(values[problem.index[name]])
+        if not problem.params[name].vary:
+            out[test] = TestValue(value, None, None, "fixed", "held fixed")
+            continue
+        branch = fit.point.bests[t].unreached.get(name)
+        if branch is not None and found.links.kind(name) == "own":
+            why = f"branch {branch} was never reached"
+            out[test] = TestValue(value, None, None, "not determined", why)
+            continue
+        error, freedom = fit.covariance.of_test(t, name)
+        out[test] = TestValue(value, *_judged(problem, name, value, error, freedom, values))
+    return out

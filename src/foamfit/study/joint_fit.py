@@ -1,0 +1,201 @@
+"""The fit of several tests with linked parameters, its uncertainty, and the scatter between them.
+
+With a parameter that scatters, the best values of the tests, the common value and the spread depend
+on each other. Given a spread, the tests are drawn to their common value as much as their errors
+allow; what they would say undrawn follows from the curvature, and from that REML gives the common
+value and the spread (`trust.scatter`): in turn until the spread stands still (Laplace's method).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from foamfit.arrays import Array
+from foamfit.fitting.links import Links
+from foamfit.fitting.problem import Problem
+from foamfit.fitting.together import Together, fit_linked
+from foamfit.study.shared import bic, effective_samples
+from foamfit.trust.joint_covariance import JointCovariance, JointPoint
+from foamfit.trust.residuals.law_error import CurveError, curve_errors
+from foamfit.trust.residuals.noise_process import noise_processes
+from foamfit.trust.scatter import Spread, common_and_spread
+
+# Rounds between the best values and the spreads at most, and the change of the logarithm of a
+# spread at which they end.
+ROUNDS, STILL = 12, 0.01
+# Nothing is drawn harder than by a spread of so much of the errors of a single test: with no spread
+# at all the values of the tests would be one, and nothing would say what they are undrawn.
+LEAST_SPREAD = 0.3
+Map = Callable[..., Iterable[Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class JointFit:
+    """Several tests fitted together: the best point, and the spread of what scatters."""
+
+    point: JointPoint
+    spreads: Mapping[str, Spread] = field(default_factory=dict)
+
+    @property
+    def found(self) -> Together:
+        """The fit itself."""
+        return self.point.found
+
+    @cached_property
+    def covariance(self) -> JointCovariance:
+        """Covariance of all parameters."""
+        return self.point.covariance
+
+
+def fit_jointly(
+    problems: Sequence[Problem],
+    links: Links,
+    starts: Sequence[Sequence[Array]],
+    *,
+    each: Map = map,
+) -> JointFit:
+    """Fit tests whose parameters are linked as `links` say, and judge the fit.
+
+    Arguments are those of `fitting.together.fit_linked`; `each` maps a function over what is to be
+    done for each test, as `map` does.
+    """
+    scatter = [name for name, kind in links.kinds.items() if kind == "scatter"]
+    found = fit_linked(problems, links, starts)
+    errors = errors_of(found, each)
+    point, spreads = JointPoint(found, errors), dict[str, Spread]()
+    scatter = [name for name in scatter if name in found.own]
+    if not scatter:
+        return JointFit(point)
+    for _ in range(ROUNDS):
+        before, inflations, pulls = spreads, dict[str, Array](), dict[str, Array]()
+        spreads = {}
+        for name in scatter:
+            matrix, bread = point.of_logarithms(name)
+            drawn = _drawn(found, name)
+            there = np.isfinite(np.diag(matrix)) & np.isfinite(drawn)
+            pull = found.links.pulls.get(name, np.zeros(drawn.size))
+            (common,) = found.common[name]
+            inner = np.ix_(there, there)
+            undrawn = drawn[there] + bread[inner] @ (
+                pull[there] ** 2 * (drawn[there] - math.log(common))
+            )
+            if undrawn.size < 2:
+                continue
+            spreads[name] = common_and_spread(undrawn, matrix[inner])
+            more = np.ones(drawn.size)
+            more[there] = np.maximum(np.diag(matrix)[there] / np.diag(bread)[there], 1e-6)
+            least = LEAST_SPREAD * math.sqrt(float(np.median(np.diag(matrix)[there])))
+            inflations[name] = more
+            pulls[name] = np.sqrt(more) / max(spreads[name].tau, least)
+        if _still(before, spreads):
+            break
+        found = fit_linked(problems, replace(links, pulls=pulls), [found.values])
+        point = JointPoint(found, errors, inflations)
+    return JointFit(point, spreads)
+
+
+def _drawn(found: Together, name: str) -> Array:
+    """Logarithms of a parameter in all tests; NaN where it does not vary, or vanishes."""
+    values = np.abs(np.array(found.value(name)))
+    free = np.array([name in problem.free() for problem in found.problems])
+    with np.errstate(divide="ignore"):
+        logs = np.log(values)
+    return np.where(free & np.isfinite(logs), logs, np.nan)
+
+
+def _still(before: Mapping[str, Spread], now: Mapping[str, Spread]) -> bool:
+    """Whether no spread changed by more than `STILL` of itself."""
+    if before.keys() != now.keys():
+        return False
+    return all(
+        abs(now[name].tau - before[name].tau) <= STILL * max(now[name].tau, 1e-3 * now[name].stderr)
+        for name in now
+    )
+
+
+def errors_of(found: Together, each: Map = map) -> tuple[tuple[CurveError, ...], ...]:
+    """What the residual of each curve of each test is made of; see `BestPoint.errors`."""
+    point = JointPoint(found)
+    work = [
+        (best.residual, best.jacobian * best.sizes, best.problem.objective.sizes, point.taken(t))
+        for t, best in enumerate(point.bests)
+    ]
+    driven = [best.problem.objective.drive == "stress" for best in point.bests]
+    plain = [items for items, by_stress in zip(work, driven, strict=True) if not by_stress]
+    made = iter(each(curve_errors, *zip(*plain, strict=True)) if plain else ())
+    return tuple(
+        tuple(map(CurveError, noise_processes(*items)) if by_stress else next(made))
+        for items, by_stress in zip(work, driven, strict=True)
+    )
+
+
+# ------------------------------------------------------------------------------- evidence
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """One kind of a parameter, and the evidence for it."""
+
+    parameter: str
+    kind: str
+    chosen: bool
+    bic: float
+    n_vary: int
+    chi2: float
+
+
+def evidence(
+    fit: Together, names: Sequence[str], n_eff: int, kinds: Sequence[str],
+    near: Sequence[Sequence[Array]],
+) -> Iterator[Alternative]:  # fmt: skip
+    """Evidence for each of these kinds of each of these parameters, the others as they are.
+
+    The fits start at that fit, and at the points `near`.
+    """
+    for name in names:
+        own = fit.links.kind(name)
+        for kind in dict.fromkeys((own, *kinds)):
+            links = replace(fit.links, kinds={**fit.links.kinds, name: kind})
+            one = fit if kind == own else fit_linked(fit.problems, links, [fit.values, *near])
+            score = bic(one.cost, one.n_data, one.n_vary, n_eff)
+            yield Alternative(name, kind, kind == own, score, one.n_vary, one.cost)
+
+
+def choose_kinds(
+    problems: Sequence[Problem], links: Links, names: Sequence[str],
+    starts: Sequence[Sequence[Array]], n_eff: int, kinds: Sequence[str],
+) -> Links:  # fmt: skip
+    """Links in which each of these parameters has the kind of the least BIC.
+
+    All are shared at first; in each round the change of one kind that lowers BIC most is taken.
+    """
+    links = replace(links, kinds={**links.kinds, **dict.fromkeys(names, "shared")})
+    now = fit_linked(problems, links, starts)
+    score = bic(now.cost, now.n_data, now.n_vary, n_eff)
+    while True:
+        near = [now.values, *starts[:1]]
+        trials = list[tuple[float, Together]]()
+        for name in names:
+            for kind in kinds:
+                if kind == now.links.kind(name):
+                    continue
+                other = replace(now.links, kinds={**now.links.kinds, name: kind})
+                one = fit_linked(problems, other, near)
+                trials.append((bic(one.cost, one.n_data, one.n_vary, n_eff), one))
+        if not trials:
+            return now.links
+        least, found = min(trials, key=lambda trial: trial[0])
+        if least >= score:
+            return now.links
+        now, score = found, least
+
+
+def samples_of(problems: Sequence[Problem], vectors: Sequence[Array]) -> int:
+    """Effective samples of the own fits; see `study.shared.effective_samples`."""
+    return sum(effective_samples(p, values) for p, values in zip(problems, vectors, strict=True))

@@ -1,0 +1,253 @@
+"""What a joint fit found: data only, and the content of joint.json."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from foamfit.arrays import Array
+from foamfit.data.measurement import Measurement
+from foamfit.fitting.problem import Problem
+from foamfit.fitting.search import SearchRecord
+from foamfit.results import SCHEMA, Fit, ParameterEstimate, plain
+from foamfit.study.joint_fit import Alternative, JointFit
+from foamfit.study.shared import bic
+from foamfit.study.study_file import Study
+from foamfit.text import counted
+from foamfit.trust.best_point import BestPoint
+from foamfit.trust.checklist import status_of, warnings_of
+from foamfit.trust.conclude import conclude
+
+# Keys of a parameter that only some kinds have.
+_SCATTER = ("scatter", "scatter_stderr", "scatter_ci95")
+# Questions to a search of one test.
+_OF_A_SEARCH = ("ended", "agree")
+_RATE = ("b", "b_stderr", "b_ci95")
+
+
+@dataclass(frozen=True)
+class TestValue:
+    """A parameter in one test, SI; None where the test says nothing of it."""
+
+    __test__ = False  # what pytest must not take for a test
+
+    value: float
+    stderr: float | None
+    ci95: tuple[float, float] | None
+    state: str
+    why: str
+
+
+@dataclass(frozen=True)
+class JointParameter:
+    """One parameter of a joint fit, SI.
+
+    `kind` is one of `links.KINDS` or "fixed". `value` is the common one: of a scattering parameter
+    the median specimen's, by a law of rate that at the rate of the median test, of an own one the
+    median over the tests (which has no error). `scatter` is the standard deviation of its logarithm
+    between specimens, `b` the slope of the law of rate. `tests` has its value in each test, unless
+    it is the same in all.
+    """
+
+    kind: str
+    value: float
+    unit: str
+    stderr: float | None = None
+    ci95: tuple[float, float] | None = None
+    state: str | None = None
+    why: str | None = None
+    tests: Mapping[str, TestValue] | None = None
+    scatter: float | None = None
+    scatter_stderr: float | None = None
+    scatter_ci95: tuple[float, float] | None = None
+    b: float | None = None
+    b_stderr: float | None = None
+    b_ci95: tuple[float, float] | None = None
+
+    def to_json_dict(self) -> dict[str, Any]:
+        """Return its part of joint.json."""
+        content = asdict(self)
+        gone = [] if self.kind == "scatter" else [*_SCATTER]
+        gone += [] if self.kind.endswith("rate") else [*_RATE]
+        gone += [] if self.tests is not None else ["tests"]
+        return {key: value for key, value in content.items() if key not in gone}
+
+
+@dataclass(frozen=True, eq=False)
+class Alone:
+    """What the fits of the tests one by one come to, all together."""
+
+    chi2: float
+    n_vary: int
+    bic: float
+    misfits: tuple[dict[str, float | None], ...]  # As `Together.misfits`
+
+
+@dataclass(frozen=True, eq=False)
+class TestFit:
+    """One test of a joint fit, and what its result is made of."""
+
+    __test__ = False
+
+    problem: Problem
+    values: Array
+    parameters: dict[str, ParameterEstimate]
+    note: str
+    seed: int
+
+    def fit(self) -> Fit:
+        """The result of the test: its curves at the joint fit, its parameters as that has them."""
+        self.problem.put(self.values)
+        record = SearchRecord(self.seed, 0, time.perf_counter())
+        made = conclude(BestPoint(self.problem, self.values), record)
+        checklist = tuple(check for check in made.checklist if check.key not in _OF_A_SEARCH)
+        return replace(
+            made, parameters=self.parameters, notes=(self.note, *made.notes), checklist=checklist,
+            status=status_of(checklist), warnings=warnings_of(checklist),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class JointData:
+    """Everything that a joint fit found; arrays are in the order of `tests`."""
+
+    study: Study
+    seed: int
+    tests: tuple[str, ...]
+    files: tuple[Path, ...]
+    rates: tuple[float | None, ...]  # Mean strain rate on loading, 1/s
+    rate0: float | None  # That of the median test
+    fit: JointFit
+    parameters: Mapping[str, JointParameter]
+    covariance: tuple[tuple[str, ...], Array]  # Names and matrix, SI; see `to_json_dict`
+    evidence: tuple[Alternative, ...]
+    n_eff: int  # Effective samples that the evidence counts
+    alone: Alone
+    refused: Mapping[str, str]  # File and sentence
+    status: str
+    warnings: tuple[str, ...]
+    sentences: tuple[str, ...]
+    runtime_s: float
+
+    @property
+    def problems(self) -> tuple[Problem, ...]:
+        """What was fitted, for each test."""
+        return self.fit.found.problems
+
+    @property
+    def measurements(self) -> tuple[Measurement, ...]:
+        """The tests."""
+        return tuple(problem.measurement for problem in self.problems)
+
+    @property
+    def drive(self) -> str | None:
+        """The drive; None where the tests have different ones."""
+        drives = {problem.objective.drive for problem in self.problems}
+        return drives.pop() if len(drives) == 1 else None
+
+    @property
+    def bic(self) -> float:
+        """Bayesian information criterion, counted as that of the tests one by one in `alone`."""
+        found = self.fit.found
+        return bic(found.cost, found.n_data, found.n_vary, self.n_eff)
+
+    @property
+    def shares(self) -> tuple[float, ...]:
+        """Share of each test in χ²."""
+        costs = np.array(self.fit.found.costs)
+        total = float(costs.sum())
+        return tuple((costs / total if total else np.full(costs.size, 1.0 / costs.size)).tolist())
+
+    def estimates(self, test: int) -> dict[str, ParameterEstimate]:
+        """Parameters of one test, as its fit.json has them."""
+        problem, values = self.problems[test], self.fit.found.values[test]
+        out = dict[str, ParameterEstimate]()
+        for name, value in zip(problem.names, values.tolist(), strict=True):
+            one, vary = self.parameters[name], problem.params[name].vary
+            if not vary:
+                expr = problem.params[name].expr
+                why = "held fixed" if expr is None else f"tied by {expr}"
+                out[name] = ParameterEstimate(
+                    value, None, None, one.unit, False, "fixed", why
+                )  # fmt: skip
+                continue
+            at = one if one.tests is None else one.tests[self.tests[test]]
+            out[name] = ParameterEstimate(
+                value, at.stderr, at.ci95, one.unit, True, at.state or "fixed", at.why or "",
+                None if at.ci95 is None else "local covariance",
+            )  # fmt: skip
+        return out
+
+    def to_json_dict(self) -> dict[str, Any]:
+        """Return the content of joint.json: SI, plain types, null for what is not there.
+
+        The covariance is that of shared values, common values of what scatters, and by a law of
+        rate of the value at `rate0` and, with ":b", the slope.
+        """
+        found, names = self.fit.found, self.problems[0].names
+        content = {
+            "schema": SCHEMA,
+            "foamfit": version("foamfit"),
+            "name": self.study.name,
+            "model": self.study.model,
+            "relaxation": self.study.relaxation,
+            "drive": self.drive,
+            "seed": self.seed,
+            "status": self.status,
+            "warnings": self.warnings,
+            "sentences": self.sentences,
+            "rate0": self.rate0,
+            "tests": {
+                name: {
+                    "file": str(self.files[t]),
+                    "drive": self.problems[t].objective.drive,
+                    "rate": self.rates[t],
+                    "misfit": found.misfits[t],
+                    "chi2_share": self.shares[t],
+                    "n_data": self.problems[t].objective.n_data,
+                    "data_sha256": self.measurements[t].data_sha256,
+                    "values": dict(zip(names, found.values[t].tolist(), strict=True)),
+                }
+                for t, name in enumerate(self.tests)
+            },
+            "parameters": {name: one.to_json_dict() for name, one in self.parameters.items()},
+            "covariance": {"names": self.covariance[0], "matrix": self.covariance[1]},
+            "evidence": [asdict(one) for one in self.evidence],
+            "statistics": self.statistics,
+            "refused": self.refused,
+            "runtime_s": self.runtime_s,
+        }
+        return dict(plain(content))
+
+    def test_fits(self) -> Iterator[TestFit]:
+        """What the result folder of each test is made of."""
+        others = counted(len(self.tests) - 1, "other test")
+        note = f"Fitted together with {others} ({self.study.name}): intervals are those of all."
+        for t, (problem, values) in enumerate(
+            zip(self.problems, self.fit.found.values, strict=True)
+        ):
+            yield TestFit(problem, values, self.estimates(t), note, self.seed)
+
+    @property
+    def statistics(self) -> dict[str, float | int]:
+        """Counts and χ² of the whole fit."""
+        found = self.fit.found
+        return {
+            "n_tests": len(self.tests),
+            "n_data": found.n_data,
+            "n_vary": found.n_vary,
+            "chisqr": found.cost,
+            "redchi": found.cost / max(found.n_data - found.n_vary, 1),
+            "n_effective": self.fit.covariance.effective,
+            "n_eff": self.n_eff,
+            "bic": self.bic,
+            "bic_alone": self.alone.bic,
+            "n_vary_alone": self.alone.n_vary,
+            "chisqr_alone": self.alone.chi2,
+        }

@@ -1,0 +1,126 @@
+"""The picture and the page of a joint fit."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import foamfit as ff
+from conftest import AREA, HEIGHT
+from foamfit.data.measurement import Measurement, Noise, Specimen
+from foamfit.fitting.links import Links
+from foamfit.fitting.problem import make_problem
+from foamfit.report.figures import image
+from foamfit.report.studies.joint_page import joint_page
+from foamfit.report.studies.joint_plot import plot_joint
+from foamfit.report.studies.joint_text import joint_text
+from foamfit.study.joint_estimates import common_covariance, parameter_of
+from foamfit.study.joint_fit import Alternative, fit_jointly
+from foamfit.study.joint_result import Alone, JointData
+from foamfit.study.study_file import Study
+
+RATES = (0.01, 0.1, 1.0)
+KINDS = {
+    "s1_k0": "shared", "s1_kc": "scatter", "s1_eps_star": "shared", "s1_sigma_plus": "log rate",
+    "s1_spread_plus": "own", "s1_sigma_minus": "shared", "s1_spread_minus": "shared",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory) -> JointData:
+    """A joint fit of three loops, started at the truth; one name would be HTML."""
+    up = np.linspace(0.0, 0.5, 50)
+    strain, names = np.concatenate([up, up[::-1][1:]]), ("first", "second", "<i>third</i>")
+    problems, vectors, x = [], [], np.log(np.array(RATES) / 0.1)
+    for i, name in enumerate(names):
+        spring = ff.MicroscaleSpring(
+            k0=5.5e5, kc=4e5 * (0.9, 1.0, 1.15)[i], eps_star=0.3, spread_plus=0.4,
+            sigma_plus=1.1e5 * (1.0 + 0.05 * x[i]), sigma_minus=7e4, spread_minus=0.6,
+        )  # fmt: skip
+        stress = spring.stress(strain)
+        stress = stress + 400.0 * np.random.default_rng(i).standard_normal(stress.size)
+        test = Measurement(
+            name=name, path=None, data_sha256="", time=np.arange(99.0), stress=stress,
+            displacement=strain * HEIGHT, specimen=Specimen(HEIGHT, AREA),
+            noise=Noise(stress=400.0), motion="measured",
+        )  # fmt: skip
+        one = make_problem(test, "microscale", None, None, None, interior_mass=False)
+        values = one.vector()
+        for short in KINDS:
+            values[one.index[short]] = getattr(spring, short[3:])
+        problems.append(one)
+        vectors.append(values)
+    fit = fit_jointly(problems, Links(KINDS, x), [vectors])
+    here = tmp_path_factory.mktemp("study") / "study.toml"
+    study = Study(
+        here, "a & b", tuple((name, here) for name in names), (None,) * 3, "microscale", 0,
+        "displacement", KINDS, {}, 0, None, None,
+    )  # fmt: skip
+    return JointData(
+        study=study, seed=0, tests=names, files=(here,) * 3, rates=RATES, rate0=0.1, fit=fit,
+        parameters={name: parameter_of(fit, names, name) for name in problems[0].names},
+        covariance=common_covariance(fit),
+        evidence=(
+            Alternative("s1_sigma_plus", "log rate", True, 10.0, 13, 300.0),
+            Alternative("s1_sigma_plus", "own", False, 14.0, 14, 299.0),
+        ),
+        n_eff=90, alone=Alone(290.0, 21, 40.0, fit.found.misfits), refused={}, status="warnings",
+        warnings=("x.csv is left out: it holds <nothing>.",), sentences=("One sentence.",),
+        runtime_s=1.0,
+    )  # fmt: skip
+
+
+def test_the_page_needs_nothing_else_and_escapes_names(found):
+    page = joint_page(found, b"\x89PNG")
+    assert not re.search(r'(src|href)="(?!data:|[^"]*report\.html)', page)
+    assert "<i>third</i>" not in page
+    assert "a &amp; b" in page
+    assert "it holds &lt;nothing&gt;." in page
+    assert 'href="%3Ci%3Ethird%3C/i%3E/report.html"' in page
+    assert "report.html" not in joint_page(found, b"\x89PNG", linked=False)
+
+
+def test_the_page_has_every_parameter_and_test(found):
+    page = joint_page(found, b"\x89PNG")
+    for name, one in found.parameters.items():
+        assert (f"<code>{name}</code>" in page) == (one.kind != "fixed")
+    body = page.split('<table class="sortable">')[1]
+    assert body.count("<tr>") == 1 + 3
+    # what a test has of its own, in the unit of the heading
+    value = found.parameters["s1_kc"].tests["first"].value
+    assert f'data-v="{value:.8g}">{value / 1e3:.1f}<' in body
+    assert "scatters by" in page
+    assert re.search(r"b = 0\.0\d+ \(0\.0\d+ to 0\.0\d+\)", page)
+    assert page.count("<td>log rate</td>") == 2  # of the parameter, and of the evidence
+
+
+def test_the_picture_has_a_loop_for_each_test_and_a_panel_for_what_differs(found):
+    figure = plot_joint(found)
+    titles = [ax.get_title() for part in figure.subfigs for ax in part.axes]
+    assert [title for title in titles if title.endswith("/s")] == [
+        "first, 0.01/s", "second, 0.1/s", "<i>third</i>, 1/s",
+    ]  # fmt: skip
+    assert titles[6:9] == [
+        "kc (kPa): scatter", "sigma_plus (kPa): log rate", "spread_plus: own",
+    ]  # fmt: skip
+    panel = figure.subfigs[1].axes[1]
+    assert panel.get_xscale() == "log"
+    law = panel.lines[0].get_ydata()
+    assert law[-1] / law[0] == pytest.approx((1 + 0.05 * 2.303) / (1 - 0.05 * 2.303), rel=0.02)
+    texts = "\n".join(text.get_text() for text in figure.subfigs[1].axes[3].texts)
+    assert "shared by all tests\nk0\neps_star\nsigma_minus\nspread_minus" in texts
+    assert image(figure, "png", 50).startswith(b"\x89PNG")
+
+
+def test_tests_at_one_rate_stand_in_their_order(found):
+    figure = plot_joint(replace(found, rates=(0.1, 0.1, 0.1)))
+    assert figure.subfigs[1].axes[0].get_xlabel() == "test"
+
+
+def test_the_words_have_the_same_numbers(found):
+    told = joint_text(found)
+    assert "a & b: microscale: 3 tests together: warnings" in told
+    assert "warning: x.csv is left out" in told
+    assert re.search(r"s1_sigma_plus +log rate +1\d\d\.\d kPa", told)
+    assert "*  log rate" in told

@@ -1,0 +1,309 @@
+"""Several tests in one fit, from files and STUDY.toml as a user has them."""
+
+import json
+import pickle
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import foamfit as ff
+from conftest import without_pictures
+from foamfit.cli import main
+
+HEIGHT, AREA, TOP = 10e-3, 1e-4, 0.5
+SPRING = {
+    "k0": 5.5e5, "kc": 4e5, "eps_star": 0.3, "sigma_plus": 1.1e5, "spread_plus": 0.4,
+    "sigma_minus": 7e4, "spread_minus": 0.6,
+}  # fmt: skip
+NOISE = 400.0
+
+
+def write_test(folder: Path, name: str, *, rate=0.1, seed=0, noise=NOISE, samples=101, **changes):
+    """The CSV of a slow loop on a microscale spring, at a strain rate."""
+    spring = ff.MicroscaleSpring(**{**SPRING, **changes})
+    up = np.linspace(0.0, TOP, samples // 2 + 1)
+    strain = np.concatenate([up, up[::-1][1:]])
+    time = np.arange(strain.size) * (up[1] / rate)
+    stress = spring.stress(strain) + noise * np.random.default_rng(seed).standard_normal(time.size)
+    rows = zip(time, stress, 1e3 * HEIGHT * strain, strict=True)
+    lines = ["time (s),stress (Pa),displacement (mm)"]
+    lines += [f"{t:.9g},{s:.4f},{d:.7f}" for t, s, d in rows]
+    (folder / f"{name}.csv").write_text("\n".join(lines) + "\n")
+
+
+def write_study(folder: Path, parameters: str, more: str = "") -> Path:
+    specimen = f'[specimen]\nheight = "10 mm"\narea = "100 mm^2"\n[noise]\nstress = "{NOISE} Pa"\n'
+    (folder / "foam.toml").write_text(specimen)
+    (folder / "study.toml").write_text(
+        f'name = "a family"\ntests = ["t*.csv"]\nmodel = "microscale"\ndrive = "displacement"\n'
+        f'specimen = "foam.toml"\nstarts = 4\n{more}\n[parameters]\n{parameters}\n'
+    )
+    return folder / "study.toml"
+
+
+RATES = (0.01, 0.1, 1.0)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """Three tests over two decades of rate; a file that is none; kc differs between them."""
+    here = tmp_path_factory.mktemp("family")
+    for i, (rate, kc) in enumerate(zip(RATES, (3.6e5, 4e5, 4.5e5), strict=True)):
+        slow = 1.0 + 0.04 * np.log(rate / 0.1)
+        write_test(here, f"t{i}", rate=rate, seed=i, kc=kc, sigma_plus=1.1e5 * slow)
+    (here / "t9.csv").write_text("no numbers\n")
+    return here
+
+
+SHARED = '\ns1_spread_plus = "shared"\ns1_spread_minus = "shared"\ns1_eps_star = "shared"'
+
+
+@pytest.fixture(scope="module")
+def found(folder):
+    parameters = 's1_k0 = "shared"\ns1_kc = "scatter"\ns1_sigma_plus = "log rate"' + SHARED
+    return ff.joint(write_study(folder, parameters), jobs=1)
+
+
+def test_kinds_are_what_the_study_says(found):
+    kinds = {name: one.kind for name, one in found.parameters.items()}
+    assert kinds == {
+        "s1_k0": "shared", "s1_kc": "scatter", "s1_eps_star": "shared",
+        "s1_sigma_plus": "log rate", "s1_spread_plus": "shared", "s1_sigma_minus": "own",
+        "s1_spread_minus": "shared", "s1_eta": "fixed", "site_eta": "fixed",
+    }  # fmt: skip
+    assert found.status == "warnings"  # of the file that is none
+    assert list(found.refused) == [str(f) for f in found.refused if f.endswith("t9.csv")]
+    assert found.rates == pytest.approx(RATES)
+    assert found.rate0 == pytest.approx(0.1)
+
+
+def test_values_are_found_with_their_intervals(found):
+    k0, rate = found.parameters["s1_k0"], found.parameters["s1_sigma_plus"]
+    assert abs(k0.value - SPRING["k0"]) < 4.0 * k0.stderr
+    assert k0.ci95[0] < k0.value < k0.ci95[1]
+    assert k0.state == "determined"
+    assert abs(rate.b - 0.04) < 4.0 * rate.b_stderr
+    assert rate.b_stderr < 0.01
+    scatter = found.parameters["s1_kc"]
+    assert scatter.scatter_ci95[0] < 0.11 < scatter.scatter_ci95[1]
+    assert scatter.value == pytest.approx(4e5, rel=0.1)
+    assert set(scatter.tests) == {"t0", "t1", "t2"}
+
+
+def test_linked_values_are_one_value_bit_for_bit(found, tmp_path, monkeypatch):
+    without_pictures(monkeypatch)
+    found.save(tmp_path / "out", jobs=1)
+    content = json.loads((tmp_path / "out" / "joint.json").read_text())
+    value = content["parameters"]["s1_k0"]["value"]
+    for test in content["tests"]:
+        assert content["tests"][test]["values"]["s1_k0"] == value
+        single = json.loads((tmp_path / "out" / test / "fit.json").read_text())
+        assert single["parameters"]["s1_k0"]["value"] == value
+        assert single["parameters"]["s1_k0"]["ci95"] == content["parameters"]["s1_k0"]["ci95"]
+        mine = content["parameters"]["s1_kc"]["tests"][test]["value"]
+        assert single["parameters"]["s1_kc"]["value"] == mine
+        assert "Fitted together with 2 other tests (a family)" in single["notes"][0]
+
+
+def test_joint_json_says_everything(found):
+    content = json.loads(json.dumps(found.to_json_dict(), allow_nan=False))
+    assert content["schema"] == 1
+    assert (content["name"], content["model"], content["drive"]) == (
+        "a family", "microscale", "displacement",
+    )  # fmt: skip
+    assert sum(one["chi2_share"] for one in content["tests"].values()) == pytest.approx(1.0)
+    assert content["tests"]["t1"]["misfit"]["stress_strain"] < 0.01
+    parameters = content["parameters"]
+    assert {"kind", "value", "stderr", "ci95", "unit", "state"} <= parameters["s1_k0"].keys()
+    assert "scatter" not in parameters["s1_k0"]
+    assert {"scatter", "scatter_stderr", "scatter_ci95", "tests"} <= parameters["s1_kc"].keys()
+    assert {"b", "b_stderr", "b_ci95"} <= parameters["s1_sigma_plus"].keys()
+    names = content["covariance"]["names"]
+    assert {"s1_k0", "s1_kc", "s1_sigma_plus", "s1_sigma_plus:b"} <= set(names)
+    matrix = np.array(content["covariance"]["matrix"])
+    for name, error in (("s1_k0", "stderr"), ("s1_kc", "stderr"), ("s1_sigma_plus", "stderr")):
+        at = names.index(name)
+        assert matrix[at, at] ** 0.5 == pytest.approx(parameters[name][error])
+    at = names.index("s1_sigma_plus:b")
+    assert matrix[at, at] ** 0.5 == pytest.approx(parameters["s1_sigma_plus"]["b_stderr"])
+    kinds = {one["kind"] for one in content["evidence"] if one["parameter"] == "s1_sigma_plus"}
+    assert kinds == {"log rate", "power rate", "shared", "own"}
+    assert [one["kind"] for one in content["evidence"] if one["chosen"]] == ["log rate"]
+    assert content["statistics"]["n_vary"] == 4 + 2 + 3 + 3
+
+
+def test_evidence_is_for_the_law_that_there_is(found):
+    scores = {one.kind: one.bic for one in found.evidence}
+    assert scores["log rate"] < scores["shared"] - 10.0
+    assert scores["log rate"] < scores["own"] + 2.0
+    assert not any("evidence" in warning for warning in found.warnings)
+
+
+def test_evidence_chooses_a_kind(folder):
+    parameters = '\ns1_sigma_plus = "auto"\ns1_k0 = "auto"\ns1_kc = "own"' + SHARED
+    chosen = ff.joint(write_study(folder, parameters), jobs=1)
+    assert chosen.parameters["s1_sigma_plus"].kind in ("log rate", "power rate")
+    assert chosen.parameters["s1_k0"].kind == "shared"
+
+
+def test_what_goes_to_other_processes_gives_the_same_numbers(folder, found, monkeypatch):
+    """What is sent to a process and back is what `pickle` makes of it."""
+    sent = []
+
+    @contextmanager
+    def elsewhere(*_):
+        def each(function, *work):
+            for items in zip(*work, strict=True):
+                sent.append(function.__name__)
+                there, given = pickle.loads(pickle.dumps((function, items)))
+                yield pickle.loads(pickle.dumps(there(*given)))
+
+        yield each
+
+    monkeypatch.setattr("foamfit.study.joint.workers", elsewhere)
+    parameters = 's1_k0 = "shared"\ns1_kc = "scatter"\ns1_sigma_plus = "log rate"' + SHARED
+    again = ff.joint(write_study(folder, parameters))
+    assert set(sent) == {"_own_fit", "curve_errors"}
+    one, two = found.to_json_dict(), again.to_json_dict()
+    for content in (one, two):
+        del content["runtime_s"]
+    assert one == two
+
+
+def test_a_noisy_test_does_not_dominate(tmp_path):
+    for i in range(4):
+        write_test(tmp_path, f"t{i}", seed=i, noise=NOISE * (10.0 if i == 3 else 1.0))
+    study = write_study(tmp_path, "\n".join(f'{name} = "shared"' for name in NAMES))
+    specimen = (tmp_path / "foam.toml").read_text()
+    (tmp_path / "noisy.toml").write_text(specimen.replace(f"{NOISE} Pa", f"{10 * NOISE} Pa"))
+    study.write_text(study.read_text().replace("[parameters]",
+                     '[specimens]\nt3 = "noisy.toml"\n[parameters]'))  # fmt: skip
+    result = ff.joint(study, jobs=1)
+    assert result.shares == pytest.approx([0.25] * 4, abs=0.06)
+    one = result.parameters["s1_k0"]
+    assert abs(one.value - SPRING["k0"]) < 4.0 * one.stderr
+
+
+NAMES = [f"s1_{name}" for name in SPRING]
+
+
+def test_drives_and_noise_mix(tmp_path):
+    """An impact and a slow loop of one bistable spring, damped in the impact alone."""
+    spring = ff.published["foam-1/model-1"].bistable
+    spring = ff.BistableSpring(*spring.seven, eta=300.0)
+    time = np.linspace(0.0, 0.75e-3, 301)
+    run = ff.simulate(ff.Chain([spring], [1.19e-3], 1.9635e-5), ff.Impact(7e-3, 2.0), time)
+    up = np.linspace(0.0, 0.38, 150)
+    strain = np.concatenate([up, up[::-1][1:]])
+    loops = {
+        "fast": (time, run.base_stress, run.displacement[-1]),
+        "slow": (np.arange(strain.size) * 0.01, spring.stress(strain), 1.19e-3 * strain),
+    }
+    rng = np.random.default_rng(0)
+    common = '[specimen]\nheight = "1.19 mm"\narea = "19.635 mm^2"\n'
+    for name, (t, stress, moved) in loops.items():
+        stress = stress + 5e3 * rng.standard_normal(t.size)
+        rows = zip(t, stress, 1e3 * moved, strict=True)
+        lines = ["time (s),stress (Pa),displacement (mm)", *(f"{a:.9g},{b:.3f},{c:.9f}"
+                                                             for a, b, c in rows)]  # fmt: skip
+        (tmp_path / f"{name}.csv").write_text("\n".join(lines))
+        striker = '[striker]\nmass = "7 g"\nvelocity = "2 m/s"\n' if name == "fast" else ""
+        (tmp_path / f"{name}.toml").write_text(common + striker)
+    names = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
+    study = tmp_path / "study.toml"
+    study.write_text(
+        'tests = ["*.csv"]\nmodel = "bistable"\nstarts = 6\n[parameters]\n'
+        + "\n".join(f's1_{name} = "shared"' for name in (*names, "eta"))
+    )
+    result = ff.joint(study, jobs=1)
+    assert result.drive is None
+    assert [one["drive"] for one in result.to_json_dict()["tests"].values()] == [
+        "impact", "displacement",
+    ]  # fmt: skip
+    assert result.parameters["s1_eta"].value == pytest.approx(300.0, rel=0.2)
+    assert result.fit.found.value("s1_eta")[1] == 0.0  # it does not vary in the slow loop
+    assert result.fit.found.n_vary == 8
+    assert result.parameters["s1_k0"].value == pytest.approx(5.5e6, rel=0.03)
+
+
+# ------------------------------------------------------------------------------- the command
+
+
+def run(*words):
+    return CliRunner().invoke(main, [str(word) for word in words])
+
+
+def test_the_command_writes_and_prints(folder, tmp_path, monkeypatch):
+    without_pictures(monkeypatch)
+    study = write_study(folder, 's1_k0 = "shared"\ns1_kc = 4e5' + SHARED)
+    result = run("joint", study, "--out", tmp_path / "out", "--jobs", 1)
+    assert result.exit_code == 0
+    assert "3 tests together" in result.stdout
+    assert "t9.csv is left out" in result.stdout
+    assert {path.name for path in (tmp_path / "out").iterdir()} >= {"joint.json", "t0", "t1", "t2"}
+    content = json.loads((tmp_path / "out" / "joint.json").read_text())
+    assert content["parameters"]["s1_kc"]["kind"] == "fixed"
+    assert content["parameters"]["s1_kc"]["value"] == 4e5
+    again = run("joint", study, "--out", tmp_path / "out", "--jobs", 1, "--json", "--no-report")
+    assert again.exit_code == 0
+    assert json.loads(again.stdout)["seed"] == 0
+    (tmp_path / "out" / "t1" / "mine.txt").write_text("mine")
+    kept = run("joint", study, "--out", tmp_path / "out", "--jobs", 1)
+    assert kept.exit_code == 1
+    assert "holds t1, which foamfit did not write" in kept.stderr
+
+
+@pytest.mark.parametrize(
+    ("parameters", "more", "wanted"),
+    [
+        ('s1_kx = "shared"', "", "[parameters] s1_kx is not a parameter of the model microscale"),
+        ('s1_k0 = "share"', "", "s1_k0 = 'share' must be one of shared, own, scatter"),
+        ('s1_k0 = "shared"', 'drive = "pull"', "drive = 'pull' must be one of impact"),
+        ('s1_k0 = "shared"', "seed = -1", "seed = -1 must be a whole number from 0 up"),
+        ('s1_k0 = "shared"', "sead = 1", "has no key 'sead'; meant may be seed"),
+        ('s1_k0 = "shared"', 'tests = ["u*.csv"]', "u*.csv: the glob matches no file"),
+        ('s1_k0 = "shared"', 'tests = ["t0.csv"]', "a joint fit needs at least two"),
+        ('s1_k0 = "shared"', 'model = "microscale+x"', "'x' is not a spring"),
+        ('s1_k0 = "shared"', 'drive = "impact"', "of 4 can be used, a joint fit needs two"),
+        ('s1_k0 = "shared"', 'specimen = "no.toml"', "no.toml: no such file"),
+    ],
+)  # fmt: skip
+def test_bad_studies_are_refused_in_one_sentence(folder, tmp_path, parameters, more, wanted):
+    text = write_study(folder, parameters).read_text()
+    key = more.split(" =")[0]
+    lines = [line for line in text.splitlines() if not (key and line.startswith(f"{key} ="))]
+    study = folder / "bad.toml"
+    study.write_text("\n".join([more, *lines]))
+    result = run("joint", study, "--out", tmp_path / "out")
+    assert result.exit_code == 1
+    assert wanted in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_law_of_rate_needs_two_rates(tmp_path):
+    for i in range(2):
+        write_test(tmp_path, f"t{i}", seed=i)
+    study = write_study(tmp_path, 's1_k0 = "log rate"')
+    with pytest.raises(
+        ff.InputError, match=r'"log rate" needs tests at two or more rates, and all'
+    ):
+        ff.joint(study)
+
+
+def test_a_full_disk_leaves_what_was_there(found, tmp_path, monkeypatch):
+    without_pictures(monkeypatch)
+    found.save(tmp_path / "out", jobs=1, reports=False)
+    before = (tmp_path / "out" / "joint.json").read_text()
+
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("foamfit.report.studies.joint.write_result", full)
+    with pytest.raises(ff.InputError, match="No space left on device; choose another folder"):
+        found.save(tmp_path / "out", jobs=1)
+    assert (tmp_path / "out" / "joint.json").read_text() == before
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]

@@ -1,0 +1,139 @@
+"""The covariance of a joint fit by blocks."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from conftest import HEIGHT, synthetic_loop
+from foamfit.fitting.links import Links
+from foamfit.fitting.problem import make_problem
+from foamfit.fitting.together import fit_linked
+from foamfit.study.joint_fit import errors_of, fit_jointly
+from foamfit.trust.best_point import BestPoint
+from foamfit.trust.joint_covariance import JointPoint
+
+SPRING, WHOLE = synthetic_loop(noise=0.0)
+LOOP = replace(WHOLE, displacement=WHOLE.displacement[::2], stress=WHOLE.stress[::2])
+NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
+X = np.log([0.1, 1.0, 10.0])
+
+
+def loops_of(changes, noise, seed=0, colour=0.0):
+    rng = np.random.default_rng(seed)
+    problems, vectors = [], []
+    for i, change in enumerate(changes):
+        spring = replace(SPRING, **change)
+        stress = spring.stress(LOOP.displacement / HEIGHT)
+        error = noise * rng.standard_normal(stress.size)
+        for k in range(1, error.size if colour else 0):
+            error[k] += colour * error[k - 1]
+        one = make_problem(
+            replace(LOOP, name=f"loop {i}", stress=stress + error),
+            "bistable", None, None, None, interior_mass=False,
+        )  # fmt: skip
+        values = one.vector()
+        for name in NAMES:
+            values[one.index[f"s1_{name}"]] = getattr(spring, name)
+        problems.append(one)
+        vectors.append(values)
+    return problems, vectors
+
+
+@pytest.fixture(scope="module")
+def point():
+    problems, vectors = loops_of([{"k0": 5e6}, {}, {"k0": 6e6, "eps_c": 0.3}], 2e4, colour=0.5)
+    kinds = dict.fromkeys(problems[0].free(), "shared") | {
+        "s1_eps_c": "own", "s1_kh_plus": "own", "s1_k0": "log rate",
+    }  # fmt: skip
+    found = fit_linked(problems, Links(kinds, X), [vectors])
+    return JointPoint(found, errors_of(found))
+
+
+def test_blocks_give_the_dense_sandwich(point):
+    blocks, s, q = point.blocks, len(point.names), 2
+    size = s + 3 * q
+    hessian, meat = np.zeros((size, size)), np.zeros((size, size))
+    for t, block in enumerate(blocks):
+        at = [*range(s), *range(s + q * t, s + q * (t + 1))]
+        hessian[np.ix_(at, at)] += block.slopes.T @ block.slopes
+        meat[np.ix_(at, at)] += block.slopes.T @ block.times(block.slopes)
+    inverse = np.linalg.inv(hessian)
+    dense = inverse @ meat @ inverse
+    arrow = point._plain
+    assert arrow.shared == pytest.approx(dense[:s, :s], rel=1e-6)
+    for t in range(3):
+        at = [*range(s), *range(s + q * t, s + q * (t + 1))]
+        assert arrow.of_test(t) == pytest.approx(dense[np.ix_(at, at)], rel=1e-6)
+        assert arrow.inverse(t) == pytest.approx(inverse[np.ix_(at, at)], rel=1e-6)
+    places = [s + q * t + 1 for t in range(3)]
+    matrix, bread = arrow.across([1, 1, 1])
+    assert matrix == pytest.approx(dense[np.ix_(places, places)], rel=1e-6)
+    assert bread == pytest.approx(inverse[np.ix_(places, places)], rel=1e-6)
+
+
+def test_the_slope_of_a_law_has_its_error(point):
+    error, freedom = point.covariance.of_common("s1_k0:b")
+    assert 1e-4 < error < 0.02
+    assert 20 < freedom < 600
+    assert point.covariance.of_common("s1_eps_c")[0] != point.covariance.of_common("s1_eps_c")[0]
+    assert point.covariance.of_test(0, "s1_eps_c")[0] > 0.0
+
+
+def test_one_test_alone_has_the_covariance_of_its_own_fit():
+    problems, vectors = loops_of([{}], 2e4)
+    kinds = dict.fromkeys(problems[0].free(), "shared")
+    joint = fit_jointly(problems, Links(kinds), [vectors])
+    alone = BestPoint(problems[0], joint.found.values[0])
+    errors = [joint.covariance.of_common(name)[0] for name in alone.names]
+    assert errors == pytest.approx(alone.spread.stderr, rel=1e-3)
+    freedom = [joint.covariance.of_common(name)[1] for name in alone.names]
+    assert freedom == pytest.approx(alone.spread.freedom, rel=0.05)
+
+
+def test_four_tests_of_one_foam_have_half_the_error_of_one():
+    ratios = []
+    for seed in range(20):
+        problems, vectors = loops_of([{}] * 4, 2e4, seed)
+        kinds = dict.fromkeys(problems[0].free(), "shared")
+        four = fit_jointly(problems, Links(kinds), [vectors]).covariance
+        one = fit_jointly(problems[:1], Links(kinds), [vectors[:1]]).covariance
+        ratios.append([four.of_common(n)[0] / one.of_common(n)[0] for n in kinds])
+    assert np.mean(ratios) == pytest.approx(0.5, rel=0.05)
+
+
+def test_what_no_test_reaches_has_no_error():
+    strain = np.concatenate([np.linspace(0, 0.12, 60), np.linspace(0.12, 0.0, 60)[1:]])
+    problems, vectors = loops_of([{}, {}], 2e3)
+    small = replace(
+        LOOP, displacement=strain * HEIGHT,
+        stress=SPRING.stress(strain) + 2e3 * np.random.default_rng(0).standard_normal(strain.size),
+    )  # fmt: skip
+    problems = [
+        make_problem(small, "bistable", None, None, None, interior_mass=False) for _ in range(2)
+    ]
+    kinds = dict.fromkeys(problems[0].free(), "shared")
+    joint = fit_jointly(problems, Links(kinds), [vectors])
+    assert np.isfinite(joint.covariance.of_common("s1_k0")[0])
+    assert np.isnan(joint.covariance.of_common("s1_kc")[0])
+
+
+def test_beside_an_error_of_the_law_tests_add_up_as_well():
+    """A wave that no law of one spring follows, the same in all tests, counts as in one test."""
+    problems, vectors = loops_of([{}] * 3, 5e2)
+    wave = 3e4 * np.sin(LOOP.displacement / HEIGHT * 40.0)
+    bent = [
+        make_problem(
+            replace(p.measurement, stress=p.measurement.stress + wave), "bistable", None, None,
+            None, interior_mass=False,
+        )
+        for p in problems
+    ]  # fmt: skip
+    kinds = dict.fromkeys(problems[0].free(), "shared")
+    found = fit_linked(bent, Links(kinds), [vectors])
+    alone = [BestPoint(p, values) for p, values in zip(bent, found.values, strict=True)]
+    point = JointPoint(found, tuple(best.errors for best in alone))
+    assert all(error.found for errors in point.errors for error in errors)
+    wanted = np.sqrt(np.mean([best.spread.stderr**2 for best in alone], axis=0) / 3.0)
+    errors = [point.covariance.of_common(name)[0] for name in problems[0].free()]
+    assert errors == pytest.approx(wanted, rel=0.05)
