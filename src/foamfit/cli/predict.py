@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from foamfit.cli.group import main
-from foamfit.cli.options import DRIVE, FILE, SPECIMEN, TEST, compiling
+from foamfit.cli.options import FILE, SPECIMEN, TEST, compiling
 from foamfit.errors import InputError
 from foamfit.terminal import say, without_ctrl_c
 
@@ -26,7 +26,10 @@ if TYPE_CHECKING:
     "--cycle", type=click.IntRange(min=1), metavar="N",
     help="Cycle of a slow record. Default: the first.",
 )  # fmt: skip
-@DRIVE
+@click.option(
+    "--drive", type=click.Choice(["impact", "stress", "displacement"]),
+    help="Default: that of the result.",
+)  # fmt: skip
 @click.option(
     "--extrapolate", is_flag=True,
     help="Predict a rate outside the fitted ones by more than a factor of 1.25, too.",
@@ -54,8 +57,6 @@ def predict(
     the result. The folder holds prediction.json, prediction.csv (per sample) and pictures: the
     curve with its 95 % band and what makes the band, the parameters, the scatter between specimens,
     the noise and what the law missed before.
-
-    Without --drive the drive is that of the result.
 
     \b
     Examples:

@@ -280,7 +280,17 @@ def _own_fits(
     there = sorted(found)
     if len(there) < 2:
         _too_few(study, len(there), refused)
-    return [tests[t] for t in there], [found[t][0] for t in there]
+    vectors = [found[t][0] for t in there]
+    return [_with_rate(tests[t], own) for t, own in zip(there, vectors, strict=True)], vectors
+
+
+def _with_rate(test: _Test, values: Array) -> _Test:
+    """The test with the rate of its own fit, where the drive leaves the motion free."""
+    objective = test.problem.objective
+    if objective.drive != "impact" or test.rate is None:
+        return test
+    moved = objective.simulate(values, everything=True).curves["displacement_time"]
+    return replace(test, rate=loading_rate(test.problem.measurement, moved))
 
 
 def _own_fit(
