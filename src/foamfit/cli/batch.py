@@ -48,7 +48,7 @@ PATIENCE = 10
 def batch(
     tests: tuple[str, ...], specimen: Path | None, cycle: str | None, model: str, out: Path | None,
     jobs: int | None, scheduler: str | None, fresh: bool, no_report: bool,
-    fix: dict[str, float], vary: tuple[str, ...], as_json: bool, quiet: bool, **search: Any,
+    as_json: bool, quiet: bool, **search: Any,
 ) -> int:  # fmt: skip
     """Fit every test on its own: a result folder for each, summary.csv and summary.html.
 
@@ -77,11 +77,10 @@ def batch(
     from foamfit.study.batch import run
     from foamfit.study.batch_work import Recipe
 
-    recipe = Recipe(
-        model, {}, alone if several is None else several, fix or None, vary, not no_report
-    )
+    fix, vary = search.pop("fix") or None, search.pop("vary")
+    recipe = Recipe(model, {}, alone if several is None else several, fix, vary, not no_report)
     if scheduler is None:
-        with compiling(quiet or as_json) as compile_rest:
+        with compiling(quiet or as_json, model, search["relaxation"]) as compile_rest:
             compile_rest()
     with (
         nullcontext() if scheduler is None else _cluster(scheduler) as executor,
@@ -118,9 +117,8 @@ def _cluster(address: str) -> Iterator[Executor]:
         ) from None
     import logging
 
-    logging.getLogger("distributed").setLevel(
-        logging.CRITICAL
-    )  # what matters is said in a sentence
+    # What matters is said in a sentence.
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
     connect: Any = Client  # which has no types
     try:
         client = connect(address, timeout=PATIENCE, set_as_default=False)
