@@ -70,8 +70,8 @@ def simulate(item: PublishedSet, velocity: float) -> tuple[np.ndarray, np.ndarra
     return time, response.base_stress, response.displacement[-1]
 
 
-def write(item: PublishedSet, velocity: float) -> Path:
-    """Write the CSV and the TOML of one reconstruction."""
+def write(item: PublishedSet, velocity: float, place: Path = HERE) -> Path:
+    """Write the CSV and the TOML of one reconstruction, below a folder."""
     rng = np.random.default_rng([SEED, round(1000 * velocity), *item.name.encode()])
     time, stress, displacement = simulate(item, velocity)
     contact = stress > 0
@@ -79,8 +79,10 @@ def write(item: PublishedSet, velocity: float) -> Path:
     force = (stress + noise[0] * rng.standard_normal(time.size)) * item.chain.area
     motion = displacement + noise[1] * rng.standard_normal(time.size)
     folder, _, model = item.name.partition("/")
-    path = HERE / folder / f"{'-'.join(filter(None, (model, f'{velocity}mps')))}-reconstruction.csv"
-    path.parent.mkdir(exist_ok=True)
+    path = (
+        place / folder / f"{'-'.join(filter(None, (model, f'{velocity}mps')))}-reconstruction.csv"
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
     facts = {"set": item.name, "velocity": velocity, "noise": NOISE, "seed": SEED}
     rows = zip(1e3 * (time - time[0]), force, 1e3 * motion, strict=True)
     body = "".join(f"{t:.6f},{f:.4f},{w:.6f}\n" for t, f, w in rows)

@@ -22,7 +22,9 @@ from foamfit.report.page import STATISTICS
 
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
 FILES = {"fit.json", "parameters.csv", "curves.csv", "report.html", "fit.png", "fit.pdf"}
-COMMANDS = ("check", "fit", "simulate", "compare", "published")
+COMMANDS = (
+    "batch", "check", "fit", "simulate", "compare", "published", "joint", "predict"
+)  # fmt: skip
 
 SPECIMEN = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\n'
 STRIKER = '[striker]\nmass = "1 kg"\nvelocity = "1 m/s"\n'

@@ -23,7 +23,7 @@ from conftest import EXPERIMENTS, without_pictures
 from foamfit.api import FitResult
 from foamfit.cli import main
 from foamfit.errors import InputError
-from foamfit.files import check_file, replacing, write_file
+from foamfit.files import check_file, replacing, sweep, write_file
 from foamfit.report.comparison import compare
 from foamfit.report.comparison_text import write_csv
 from foamfit.report.folder import check_target, load_result
@@ -251,6 +251,30 @@ def test_what_a_killed_process_left_is_swept_and_nothing_else(here: Path) -> Non
     left_behind(here / "a.csv", "new", gone()).write_text("half")
     write_file(here / "a.csv", b"x")
     assert len([name for name in names(here) if "a.csv" in name]) == 1
+
+
+@posix
+def test_what_another_machine_left_is_swept_after_a_day(here: Path) -> None:
+    dead = left_behind(here / "r", "new", gone())
+    left = here / re.sub(r"^\.r\.[\w-]+", ".r.another-machine", dead.name)
+    left.mkdir()
+    for age, stays in ((3600.0, True), (100_000.0, False)):
+        os.utime(left, (time.time() - age, time.time() - age))
+        with replacing(here / "r"):
+            pass
+        assert left.exists() == stays
+
+
+def test_a_folder_of_many_is_swept_once(here: Path) -> None:
+    dead = left_behind(here / "r", "new", gone())
+    dead.mkdir()
+    with replacing(here / "r", swept=True):
+        pass
+    assert dead.exists()
+    put_aside = left_behind(here / "s", "old", gone())
+    put_aside.mkdir()
+    sweep(here, ["r", "s"])
+    assert names(here) == ["r", "s"]
 
 
 @posix

@@ -12,8 +12,9 @@ import os
 import platform
 import re
 import shutil
+import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from uuid import uuid4
@@ -51,7 +52,7 @@ def write_file(path: str | Path, content: bytes) -> None:
             path.write_bytes(content)
             return
         target = path.resolve()  # a link stays a link
-        _sweep(target)
+        sweep(target.parent, [target.name])
         fresh = _beside(target, "new")
         try:
             fresh.write_bytes(content)
@@ -66,12 +67,17 @@ def write_file(path: str | Path, content: bytes) -> None:
 
 
 @contextmanager
-def replacing(folder: Path) -> Iterator[Path]:
-    """Give an empty sibling of `folder` (resolved) to write into, which replaces it at the end."""
+def replacing(folder: Path, *, swept: bool = False) -> Iterator[Path]:
+    """Give an empty sibling of `folder` (resolved) to write into, which replaces it at the end.
+
+    Where many folders are written into one, that is `swept` once by the caller: to look through it
+    for each of them takes a time that grows with the square of their number.
+    """
     made = [parent for parent in folder.parents if not parent.exists()]
     fresh, old = _beside(folder, "new"), _beside(folder, "old")
     try:
-        _sweep(folder)
+        if not swept:
+            sweep(folder.parent, [folder.name])
         fresh.mkdir(parents=True)
         yield fresh
         if folder.exists():
@@ -88,6 +94,19 @@ def replacing(folder: Path) -> Iterator[Path]:
     finally:
         if folder.exists():  # never the last copy
             shutil.rmtree(old, ignore_errors=True)
+
+
+@contextmanager
+def scratch() -> Iterator[Path]:
+    """Give an empty folder for what is not to stay; what killed processes left of it is removed."""
+    place = Path(tempfile.gettempdir()).resolve() / "foamfit"
+    sweep(place.parent, [place.name])
+    folder = _beside(place, "new")
+    folder.mkdir(mode=0o700)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def reason(error: BaseException) -> str:
@@ -111,20 +130,30 @@ def _host() -> str:
     return re.sub(r"[^\w-]", "-", platform.node())[:40] or "host"
 
 
-def _sweep(path: Path) -> None:
-    """Remove what processes that are gone have left beside a path.
+_LEFT = re.compile(
+    r"\.(?P<name>.+)\.(?P<host>[\w-]{1,40})\.(?P<process>\d+)\.(?P<token>[0-9a-f]{8})[0-9a-f]{8}"
+    r"\.(?P<ending>new|old)",
+    re.DOTALL,
+)
+
+
+def is_left(name: str) -> bool:
+    """Whether a name is that of what a process of foamfit makes beside a path."""
+    return _LEFT.fullmatch(name) is not None
+
+
+def sweep(folder: Path, names: Iterable[str]) -> None:
+    """Remove what processes that are gone have left of these files and folders in a folder.
 
     An older result that one of them had put aside goes back if nothing is in its place.
     """
-    if not path.parent.is_dir():
+    if not folder.is_dir():
         return
-    mark = re.compile(
-        rf"\.{re.escape(_short(path.name))}\.{re.escape(_host())}\."
-        r"(?P<process>\d+)\.(?P<token>[0-9a-f]{8})[0-9a-f]{8}\.(?P<ending>new|old)"
-    )
-    for left in list(path.parent.iterdir()):
-        found = mark.fullmatch(left.name)
-        if found is None or _lives(int(found["process"]), found["token"], left):
+    targets = {_short(name): folder / name for name in names}
+    for left in list(folder.iterdir()):
+        found = _LEFT.fullmatch(left.name)
+        path = None if found is None else targets.get(found["name"])
+        if found is None or path is None or _lives(found, left):
             continue
         with suppress(OSError):
             if found["ending"] == "old" and not path.exists():
@@ -135,14 +164,16 @@ def _sweep(path: Path) -> None:
                 left.unlink()
 
 
-def _lives(process: int, token: str, left: Path) -> bool:
-    """Whether the process of this machine that has made something may still be at it."""
-    if process == os.getpid():
-        return token == _TOKEN
-    if os.name != "posix":  # no harmless signal asks whether a process lives
+def _lives(found: re.Match[str], left: Path) -> bool:
+    """Whether the process that has made something may still be at it."""
+    process = int(found["process"])
+    # No harmless signal asks whether a process of another machine, or of another system, lives.
+    if found["host"] != _host() or os.name != "posix":
         with suppress(OSError):
             return time.time() - left.stat().st_mtime < _ABANDONED
         return True
+    if process == os.getpid():
+        return found["token"] == _TOKEN
     try:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError):

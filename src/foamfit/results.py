@@ -13,6 +13,7 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
+from foamfit.data.rate import loading_rate
 from foamfit.springs.chain import Chain
 from foamfit.springs.microscale import follow_fractions
 from foamfit.springs.spring import BistableSpring, MicroscaleSpring
@@ -266,6 +267,7 @@ class Fit:
     intervals: Intervals | None = None
     ladder: Ladder | None = None
     relaxation: int = 0  # terms of each hysteretic spring
+    interior_mass: bool = False  # whether the specimen's mass sat between the springs
 
     @property
     def bistable_springs(self) -> dict[str, BistableSpring]:
@@ -310,11 +312,13 @@ class Fit:
                     "cycle": self.measurement.cycle,
                     "cycles": len(self.measurement.cycles),
                     "start_strain": self.measurement.start_strain,
+                    "rate": loading_rate(self.measurement),
                     "notes": self.measurement.notes,
                 },
                 "model": self.model,
                 "relaxation": self.relaxation,
                 "drive": self.drive,
+                "interior_mass": self.interior_mass,
                 "seed": self.seed,
                 "status": self.status,
                 "stopped": self.stopped,

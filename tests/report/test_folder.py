@@ -20,7 +20,8 @@ from foamfit.report.folder import check_target, load_result
 
 FILES = {"fit.json", "parameters.csv", "curves.csv", "report.html", "fit.png", "fit.pdf"}
 KEYS = {
-    "schema", "foamfit", "test", "data_sha256", "model", "drive", "seed", "status", "warnings",
+    "schema", "foamfit", "test", "data_sha256", "model", "drive", "interior_mass", "seed",
+    "status", "warnings",
     "notes", "checklist", "data",
     "parameters", "relaxation", "derived", "visited", "misfit", "weights", "statistics", "energy",
     "runtime_s", "stopped", "loss", "noise", "outliers",

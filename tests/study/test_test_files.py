@@ -64,3 +64,9 @@ def test_what_matches_nothing_is_named(here, pattern):
 def test_a_name_with_brackets_is_a_file_where_there_is_one(here):
     (here / "monday/run[1].csv").write_text("x")
     assert names("monday/run[1].csv") == ["run[1]"]
+
+
+def test_a_toml_that_a_shell_names_is_no_test(here):
+    assert names("monday/a.csv", "monday/a.toml", "monday/b.txt") == ["a", "b"]
+    with pytest.raises(InputError, match=r"monday/a\.toml: a TOML is no test"):
+        find_tests("monday/a.toml")

@@ -11,7 +11,7 @@ import click
 
 from foamfit.cli.fit_options import fit_options, intervals_of, params_of
 from foamfit.cli.group import NOT_ACCEPTABLE, main
-from foamfit.cli.options import CYCLE, FILE, SPECIMEN, TEST, compiling, progress_bar
+from foamfit.cli.options import CYCLE, FILE, SPECIMEN, TEST, compiling, cycles_of, progress_bar
 from foamfit.errors import InputError
 from foamfit.terminal import say, without_ctrl_c
 
@@ -59,7 +59,7 @@ def fit(
 
     search |= intervals_of(**{way: search.pop(way) for way in ("profile", "bootstrap", "mcmc")})
     model = "auto" if model.strip() == "auto" else Model.parse(model).name
-    alone, several = _cycles(cycle)
+    alone, several = cycles_of(cycle)
     with compiling(quiet or as_json, model, search["relaxation"]) as compile_rest:
         measurement = read_test(test, specimen, alone)
         folder = _result_folder(out, test, specimen, model)
@@ -96,17 +96,6 @@ def fit(
         say(f"foamfit: no acceptable fit was found; see {folder}", err=True)
         return NOT_ACCEPTABLE
     return 0
-
-
-def _cycles(text: str | None) -> tuple[int | None, tuple[int, ...] | None]:
-    """Read --cycle: the one cycle that is named, or the several that are ("all" names none)."""
-    if text is None or text.strip().lower() == "all":
-        return None, None if text is None else ()
-    parts = text.split(",")
-    if not all(part.strip().isdecimal() and int(part) > 0 for part in parts):
-        raise InputError(f"--cycle {text!r} must be a number from 1 up, several as 1,2,10, or all")
-    numbers = tuple(int(part) for part in parts)
-    return (None, numbers) if len(numbers) > 1 else (numbers[0], None)
 
 
 def _tell_cycles(found: CycleFits, folder: Path, as_json: bool, quiet: bool) -> int:

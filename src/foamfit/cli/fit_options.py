@@ -97,7 +97,7 @@ def params_of(
 ) -> lmfit.Parameters | None:  # fmt: skip
     """Return the parameters of a model as --fix and --vary want them; None for auto."""
     from foamfit.fitting.curves import check_time_shift, choose_drive
-    from foamfit.fitting.problem import make_params
+    from foamfit.fitting.problem import fix_and_vary, make_params
 
     drive, time_shift = search["drive"], search["time_shift"]
     if time_shift:
@@ -111,26 +111,7 @@ def params_of(
     params = make_params(
         measurement, model, drive, time_shift=time_shift, relaxation=search["relaxation"]
     )
-    for name in (*fix, *vary):
-        if name not in params:
-            raise InputError(
-                f"parameter '{name}' is not one of the model {model}; "
-                f"its parameters are {', '.join(params)}"
-            )
-        if name in fix and name in vary:
-            raise InputError(f"parameter '{name}' cannot be both fixed and varied; choose one")
-        if params[name].expr is not None:
-            others = ", ".join(other for other in params if other in params[name].expr)
-            raise InputError(f"parameter '{name}' follows from {others}; fix or vary that instead")
-        if name in vary and name.endswith("_height") and not params[name].vary:
-            raise InputError(
-                f"'{name}' is given by the specimen; leave [specimen] heights out to have it fitted"
-            )
-    for name, value in fix.items():
-        params[name].set(value=value, vary=False, min=-math.inf, max=math.inf)
-    for name in vary:
-        params[name].set(vary=True)
-    return params
+    return fix_and_vary(params, model, fix, vary)
 
 
 def intervals_of(profile: bool, bootstrap: int | None, mcmc: int | None) -> dict[str, Any]:

@@ -35,6 +35,17 @@ RELAXATION = click.option(
 )  # fmt: skip
 
 
+def cycles_of(text: str | None) -> tuple[int | None, tuple[int, ...] | None]:
+    """Read --cycle: the one cycle that is named, or the several that are ("all" names none)."""
+    if text is None or text.strip().lower() == "all":
+        return None, None if text is None else ()
+    parts = text.split(",")
+    if not all(part.strip().isdecimal() and int(part) > 0 for part in parts):
+        raise InputError(f"--cycle {text!r} must be a number from 1 up, several as 1,2,10, or all")
+    numbers = tuple(int(part) for part in parts)
+    return (None, numbers) if len(numbers) > 1 else (numbers[0], None)
+
+
 @contextmanager
 def compiling(
     quiet: bool, model: str = "bistable", relaxation: int = 0

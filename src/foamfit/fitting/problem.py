@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -92,6 +93,33 @@ def make_params(
     for own in (name.removesuffix("dsigma") for name in model.names if name.endswith("_dsigma")):
         eps_a = params[own + "eps_a"].value
         params[own + "dsigma"].value = -0.2 * params[own + "k0"].value * eps_a / (1.0 - eps_a)
+    return params
+
+
+def fix_and_vary(
+    params: lmfit.Parameters, model: str, fix: Mapping[str, float], vary: Iterable[str]
+) -> lmfit.Parameters:
+    """Hold some parameters of a model at values in SI, and vary others that are held by default."""
+    vary = tuple(vary)
+    for name in (*fix, *vary):
+        if name not in params:
+            raise InputError(
+                f"parameter '{name}' is not one of the model {model}; "
+                f"its parameters are {', '.join(params)}"
+            )
+        if name in fix and name in vary:
+            raise InputError(f"parameter '{name}' cannot be both fixed and varied; choose one")
+        if params[name].expr is not None:
+            others = ", ".join(other for other in params if other in params[name].expr)
+            raise InputError(f"parameter '{name}' follows from {others}; fix or vary that instead")
+        if name in vary and name.endswith("_height") and not params[name].vary:
+            raise InputError(
+                f"'{name}' is given by the specimen; leave [specimen] heights out to have it fitted"
+            )
+    for name, value in fix.items():
+        params[name].set(value=value, vary=False, min=-math.inf, max=math.inf)
+    for name in vary:
+        params[name].set(vary=True)
     return params
 
 

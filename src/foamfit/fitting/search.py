@@ -232,7 +232,7 @@ def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> l
                 values[index[f"s{i + 1}_k0"]] = k0
                 motion = motion - heights[i] * loop.stress / k0
         soft = sum(h for h, kind in zip(heights, kinds, strict=True) if kind in HYSTERETIC)
-        own, rest = Loop(motion / soft, loop.stress), iter(mark[7 * count :])
+        own, rest = Loop(motion / (soft or 1.0), loop.stress), iter(mark[7 * count :])
         for i, kind in enumerate(kinds):
             if kind not in HYSTERETIC:
                 continue

@@ -30,8 +30,10 @@ CYCLES_FILES = ("cycles.json", "cycles.csv", "cycles.png")
 JOINT_FILES = ("joint.json", "joint.html", "joint.png")
 # What `studies.batch` writes beside the folders of the tests, and into each of them.
 BATCH_FILES = ("summary.csv", "summary.html", "batch.json")
+PREDICTION_FILES = ("prediction.json", "prediction.csv", "prediction.png", "prediction.pdf")
 # One of these is in every result.
-MARKS = ("fit.json", "cycles.json", "joint.json", "batch.json")
+MARKS = ("fit.json", "cycles.json", "joint.json", "batch.json", "prediction.json")
+_FILES = (*RESULT_FILES, *CYCLES_FILES, *JOINT_FILES, *PREDICTION_FILES, "batch.json")
 
 
 def save_result(result: Fit, folder: str | Path) -> Path:
@@ -44,12 +46,15 @@ def save_result(result: Fit, folder: str | Path) -> Path:
     return save_whole(folder, lambda fresh: write_result(result, fresh))
 
 
-def save_whole(folder: str | Path, write: Callable[[Path], None]) -> Path:
-    """Let `write` fill a new folder, which replaces an older result at the end; returns it."""
+def save_whole(folder: str | Path, write: Callable[[Path], None], *, swept: bool = False) -> Path:
+    """Let `write` fill a new folder, which replaces an older result at the end; returns it.
+
+    `swept` is that of `foamfit.files.replacing`.
+    """
     folder = Path(folder)
     check_target(folder)
     try:
-        with replacing(folder.resolve()) as fresh:
+        with replacing(folder.resolve(), swept=swept) as fresh:
             write(fresh)
             check_target(folder)  # what has been put there in the meantime stays
     except OSError as error:
@@ -114,7 +119,7 @@ def is_written(path: Path, tests: Collection[str] = ()) -> bool:
     if path.is_dir() and (re.fullmatch(r"cycle-\d+", path.name) or path.name in tests):
         within = list(path.iterdir())
         return all(inner.name in RESULT_FILES and is_written(inner) for inner in within)
-    return path.name in (*RESULT_FILES, *CYCLES_FILES, *JOINT_FILES) and path.is_file()
+    return path.name in _FILES and path.is_file()
 
 
 def _tests_of(place: Path) -> Collection[str]:

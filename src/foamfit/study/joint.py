@@ -15,6 +15,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.data.csv_file import read_test
 from foamfit.data.measurement import Measurement
+from foamfit.data.rate import loading_rate
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.links import KINDS, RATES, Links
 from foamfit.fitting.problem import Problem, make_params
@@ -36,7 +37,6 @@ from foamfit.study.joint_fit import (
 from foamfit.study.joint_result import Alone, JointData
 from foamfit.study.joint_words import sentences_of, warnings_of
 from foamfit.study.shared import bic
-from foamfit.study.strain_rate import strain_rate
 from foamfit.study.study_file import AUTO, Study, read_study
 from foamfit.study.workers import workers
 from foamfit.text import counted
@@ -164,7 +164,7 @@ def _read(study: Study, options: Options, tell: Progress) -> tuple[list[_Test], 
         _too_few(study, len(found), refused)
     params = _params(study, [test for _, _, test in found])
     return [
-        _Test(name, path, options.problem(test, study.model, own), own, strain_rate(test))
+        _Test(name, path, options.problem(test, study.model, own), own, loading_rate(test))
         for (name, path, test), own in zip(found, params, strict=True)
     ], refused
 
@@ -290,7 +290,7 @@ def _with_rate(test: _Test, values: Array) -> _Test:
     if objective.drive != "impact" or test.rate is None:
         return test
     moved = objective.simulate(values, everything=True).curves["displacement_time"]
-    return replace(test, rate=strain_rate(test.problem.measurement, moved))
+    return replace(test, rate=loading_rate(test.problem.measurement, moved))
 
 
 def _own_fit(

@@ -13,7 +13,8 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+import warnings
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor
 from concurrent.futures import ThreadPoolExecutor as Threads
 from concurrent.futures.process import BrokenProcessPool
@@ -23,6 +24,9 @@ from types import ModuleType
 from typing import Any
 from unittest.mock import patch
 
+# What fits and their pages import.
+FITS = ("foamfit.study.batch_work", "foamfit.data.csv_file", "pandas", "pint")
+PAGES = ("matplotlib.backends.backend_agg", "matplotlib.backends.backend_pdf", "jinja2")
 # Times that a call is tried whose process ends.
 ATTEMPTS = 2
 # One thread in each process: the processes are as many as the cores.
@@ -44,6 +48,19 @@ def cores() -> int:
     return os.cpu_count() or 1
 
 
+def prepare(preload: Iterable[str]) -> None:
+    """Have the modules imported from which processes part, beside what this process does.
+
+    They are imported once, in a process of its own, where the system has such a start method.
+    """
+    if "forkserver" in multiprocessing.get_all_start_methods():
+        from multiprocessing import forkserver
+
+        with _starting():
+            forkserver.set_forkserver_preload(list(preload))
+            forkserver.ensure_running()
+
+
 class Processes(Executor):
     """Processes of this machine with one thread each, which end with the one that started them.
 
@@ -56,7 +73,7 @@ class Processes(Executor):
     count : int
         How many processes.
     preload : tuple of str
-        Modules that are imported once, before the processes part from each other.
+        Modules that are imported once, before the processes part from each other; see `prepare`.
     """
 
     def __init__(self, count: int, preload: tuple[str, ...] = ()) -> None:
@@ -64,7 +81,7 @@ class Processes(Executor):
         self._context: Any = multiprocessing.get_context(
             "forkserver" if "forkserver" in methods else "spawn"
         )
-        self._context.set_forkserver_preload(list(preload))
+        prepare(preload)
         self._threads = Threads(count, thread_name_prefix="foamfit")
         self._here = threading.local()  # the pool of each thread
         self._pools = list[ProcessPoolExecutor]()
@@ -133,6 +150,7 @@ def _begin(stop: connection.Connection) -> None:
     gc.freeze()  # what the imports have made stays
     gc.set_threshold(100_000, 20, 10)
     logging.getLogger("foamfit").setLevel(logging.ERROR)
+    warnings.simplefilter("ignore")  # NumPy's would come once for each test
     threading.Thread(target=_end_with, args=(stop,), daemon=True).start()
 
 

@@ -8,14 +8,12 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from foamfit.errors import InputError
-from foamfit.report.folder import BATCH_FILES, CYCLES_FILES, RESULT_FILES
+from foamfit.report.folder import BATCH_FILES, CYCLES_FILES, MARKS, RESULT_FILES
 from foamfit.text import listed
 
 ENDINGS = (".csv", ".txt", ".tsv", ".dat")
 # Stems of tables that say what the specimens are, beside the tests.
 _SPECIMENS = ("specimen", "specimens")
-# What marks a folder as one that foamfit wrote: its tables are results.
-_MARKS = ("fit.json", "cycles.json", "batch.json", "summary.html")
 _WRITTEN = (*RESULT_FILES, *CYCLES_FILES, *BATCH_FILES)
 
 
@@ -29,7 +27,7 @@ def find_tests(
     patterns : str, Path or several of them
         Files, folders, globs ("**" goes into folders). Of a folder, and of what a glob matches,
         tables are taken (`ENDINGS`) that are no list of specimens and no result of foamfit. A file
-        that is named itself is always taken.
+        that is named itself is taken unless it is a TOML.
     base : str or Path
         The folder that relative ones start from.
 
@@ -49,6 +47,8 @@ def find_tests(
         raise InputError("no test is named; give files, folders or globs")
     found = {path.resolve(): path for one in given for path in _matches(one, Path(base))}
     paths = sorted(found.values())
+    if not paths:
+        raise InputError(f"{listed(map(str, given))}: a TOML is no test; name the tables beside it")
     return list(zip(_names(paths), paths, strict=True))
 
 
@@ -64,7 +64,8 @@ def _matches(pattern: str | Path, base: Path) -> list[Path]:
             )
         return there
     if path.exists() or not glob.has_magic(str(pattern)):
-        return [path]  # one that is not there is refused where it is read
+        # One that is not there is refused where it is read. A shell's glob also names the TOMLs.
+        return [] if path.suffix.lower() == ".toml" else [path]
     hits = [Path(hit) for hit in glob.glob(str(path), recursive=True)]
     there = [hit for hit in hits if hit.is_file() and _is_test(hit)]
     there += [inner for hit in hits if hit.is_dir() for inner in _tests_in(hit)]
@@ -86,7 +87,9 @@ def _is_test(path: Path) -> bool:
         return False
     if path.name.startswith("."):
         return False
-    is_result = path.name in _WRITTEN and any((path.parent / mark).is_file() for mark in _MARKS)
+    is_result = path.name in _WRITTEN and any(
+        (path.parent / mark).is_file() for mark in (*MARKS, "summary.html")
+    )
     return not is_result
 
 

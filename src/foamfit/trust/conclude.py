@@ -82,6 +82,7 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         stopped=record.stopped,
         loss=objective.loss,
         relaxation=problem.model.relaxation,
+        interior_mass=objective.interior_mass,
         noise=_noise(best),
         intervals=intervals,
     )
@@ -100,6 +101,7 @@ def _noise(best: BestPoint) -> dict[str, dict[str, Any]]:
         law = error is not None and error.found
         found[name] = asdict(level) | {
             "scale": objective.scale[name],
+            "range": float(np.ptp(objective.measured[name])),
             "law_error": error.law / objective.factor(name) if error and law else None,
             "law_error_evidence": error.evidence if error else None,
             "residual_over_noise": rms / level.sigma if level.sigma > 0.0 else None,

@@ -26,17 +26,19 @@ FAR = 20  # a last cycle that is so many times the first is drawn on a logarithm
 
 def save_cycles(found: FittedCycles, folder: str | Path) -> Path:
     """Write the folder whole, replacing an older result at the end; returns it."""
+    return save_whole(folder, lambda fresh: write_cycles(found, fresh))
 
-    def write(fresh: Path) -> None:
-        for number, result in found.results.items():
-            (fresh / f"cycle-{number}").mkdir()
-            write_result(result, fresh / f"cycle-{number}")
-        write_table(fresh / "cycles.csv", found.rows())
-        text = json.dumps(found.to_json_dict(), indent=2, ensure_ascii=False, allow_nan=False)
-        (fresh / "cycles.json").write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
-        (fresh / "cycles.png").write_bytes(image(plot_cycles(found), "png", 200))
 
-    return save_whole(folder, write)
+def write_cycles(found: FittedCycles, folder: Path, *, pages: bool = True) -> None:
+    """Write all files of the cycles into a folder that is there; reports and pictures if wanted."""
+    for number, result in found.results.items():
+        (folder / f"cycle-{number}").mkdir()
+        write_result(result, folder / f"cycle-{number}", pages=pages)
+    write_table(folder / "cycles.csv", found.rows())
+    text = json.dumps(found.to_json_dict(), indent=2, ensure_ascii=False, allow_nan=False)
+    (folder / "cycles.json").write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
+    if pages:
+        (folder / "cycles.png").write_bytes(image(plot_cycles(found), "png", 200))
 
 
 # ------------------------------------------------------------------------------- in words

@@ -7,7 +7,7 @@ import pytest
 
 from conftest import HEIGHT, synthetic_loop
 from foamfit.data.noise import with_noise
-from foamfit.study.strain_rate import strain_rate
+from foamfit.data.rate import loading_rate
 
 _, LOOP = synthetic_loop(noise=0.0)
 
@@ -20,14 +20,14 @@ def moved(time, strain):
 def test_a_triangle_has_the_rate_of_its_loading():
     time = np.linspace(0.0, 8.0, 801)  # 2 s up, 6 s down
     strain = np.interp(time, [0.0, 2.0, 8.0], [0.0, 0.5, 0.0])
-    assert strain_rate(moved(time, strain)) == pytest.approx(0.25, rel=1e-3)
+    assert loading_rate(moved(time, strain)) == pytest.approx(0.25, rel=1e-3)
 
 
 def test_noise_about_a_flat_peak_does_not_move_it():
     """The largest sample lies up to a tenth of the time off."""
     time, rng = np.linspace(0.0, 1e-3, 301), np.random.default_rng(0)
     strain = 0.4 * np.sin(np.pi * time / time[-1])
-    rates = [strain_rate(moved(time, strain + 2e-3 * rng.standard_normal(301))) for _ in range(50)]
+    rates = [loading_rate(moved(time, strain + 2e-3 * rng.standard_normal(301))) for _ in range(50)]
     assert np.mean(rates) == pytest.approx(800.0, rel=0.02)
     assert np.std(rates) < 8.0
 
@@ -36,15 +36,20 @@ def test_a_hold_at_the_largest_strain_is_no_loading():
     time = np.linspace(0.0, 30.0, 3001)
     strain = np.interp(time, [0.0, 2.0, 20.0, 30.0], [0.0, 0.5, 0.5, 0.0])
     noisy = strain + 1e-4 * np.random.default_rng(0).standard_normal(time.size)
-    assert strain_rate(moved(time, noisy)) == pytest.approx(0.25, rel=0.02)
+    assert loading_rate(moved(time, noisy)) == pytest.approx(0.25, rel=0.02)
 
 
 def test_without_time_there_is_no_rate():
-    assert strain_rate(LOOP) is None
+    assert loading_rate(LOOP) is None
 
 
 def test_a_fitted_motion_has_its_peak_between_samples():
     time = np.linspace(0.0, 1e-3, 24)
     strain = 0.4 * np.sin(np.pi * time / time[-1])
     noisy = moved(time, strain + 0.01 * np.random.default_rng(0).standard_normal(24))
-    assert strain_rate(noisy, HEIGHT * strain) == pytest.approx(800.0, rel=2e-3)
+    assert loading_rate(noisy, HEIGHT * strain) == pytest.approx(800.0, rel=2e-3)
+
+
+def test_without_motion_there_is_no_rate():
+    time = np.linspace(0.0, 8.0, 801)
+    assert loading_rate(replace(moved(time, time), displacement=None)) is None

@@ -14,7 +14,7 @@ SURE = 3.0
 CLOSE = 0.95
 
 
-def strain_rate(test: Measurement, fitted: Array | None = None) -> float | None:
+def loading_rate(test: Measurement, fitted: Array | None = None) -> float | None:
     """Mean strain rate on loading, from contact to the largest strain, 1/s; None without time.
 
     The peak is in the middle of the samples that noise alone may keep from being the largest: on a

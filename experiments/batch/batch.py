@@ -1,0 +1,309 @@
+"""What `foamfit batch` costs beside its fits: speed-up, overhead, memory, page, scaling on paper.
+
+    python experiments/batch/batch.py               # all, some 15 minutes on two quiet cores
+    python experiments/batch/batch.py speedup       # one of them; see MEASURES
+
+Synthetic impacts on one spring with 1 % noise. Other work on the machine slows everything, so
+processor times stand beside times of the clock. The figures go to batch.json and README.md.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import foamfit as ff
+from foamfit.report.studies.batch import row_of, table_rows, write_page, write_summary
+from foamfit.study.batch_work import Recipe, Task, fingerprint, put, settings_key, stored, work
+
+HERE = Path(__file__).parent
+TESTS, TINY, MANY = 24, 200, 1000
+HEIGHT, AREA = 1.19e-3, 1.9635e-5
+TOML = (
+    '[specimen]\nheight = "1.19 mm"\narea = "19.635 mm^2"\n'
+    '[striker]\nmass = "7 g"\nvelocity = "2 m/s"\n'
+)
+COMMAND = [sys.executable, "-m", "foamfit", "batch"]
+FAST = ["--starts", "1", "--no-report", "--quiet"]
+
+
+def make_tests(folder: Path, count: int, samples: int, linear: bool = False) -> None:
+    """Write synthetic tests and the TOML of all."""
+    folder.mkdir()
+    spring = ff.LinearSpring(8e6) if linear else ff.published["foam-1/model-1"].bistable
+    chain = ff.Chain([spring], [HEIGHT], AREA)
+    t = np.linspace(0.0, 0.75e-3, samples)
+    response = ff.simulate(chain, ff.Impact(7e-3, 2.0), t)
+    curves = response.base_stress, response.displacement[-1]
+    rng = np.random.default_rng(0)
+    for i in range(count):
+        s, u = (c + 0.01 * np.ptp(c) * rng.standard_normal(samples) for c in curves)
+        rows = "\n".join(
+            f"{1e3 * a:.6f},{1e-6 * b:.6f},{1e3 * c:.6f}" for a, b, c in zip(t, s, u, strict=True)
+        )
+        text = f"time (ms),stress (MPa),displacement (mm)\n{rows}\n"
+        (folder / f"t{i:05d}.csv").write_text(text)
+    (folder.parent / "foam.toml").write_text(TOML)
+
+
+def called(place: Path, *words: object) -> dict[str, float]:
+    """Run the command; times of the clock and of processors: of the start, of the busiest process.
+
+    The start is the command itself and the process from which the others part.
+    """
+    import psutil
+
+    began, cpu = time.perf_counter(), dict[int, tuple[bool, float]]()
+    command = [*COMMAND, "tests", "--specimen", "foam.toml", *map(str, words)]
+    with subprocess.Popen(command, cwd=place) as process:
+        whole = psutil.Process(process.pid)
+        while process.poll() is None:
+            time.sleep(0.1)
+            try:
+                first = {whole.pid, *(child.pid for child in whole.children())}
+                for one in (whole, *whole.children(recursive=True)):
+                    times = one.cpu_times()
+                    cpu[one.pid] = one.pid in first, times.user + times.system
+            except psutil.Error:
+                continue
+    wall = time.perf_counter() - began
+    workers = [used for is_first, used in cpu.values() if not is_first]
+    return {
+        "wall_s": wall,
+        "start_cpu_s": sum(used for is_first, used in cpu.values() if is_first),
+        "busiest_cpu_s": max(workers, default=0.0),
+        "all_cpu_s": sum(used for _, used in cpu.values()),
+    }
+
+
+def runtimes(folder: Path) -> float:
+    """Sum of the run times of all fits, s."""
+    import pandas as pd
+
+    return float(pd.read_csv(folder / "summary.csv")["runtime_s"].sum())
+
+
+def measure_speedup(place: Path, *words: str) -> dict[str, Any]:
+    """One process against two; the same numbers from both.
+
+    On a machine with other work the clock tells little. Processor time does: the way of a batch
+    through its start and its busiest process, which nothing else of it waits longer for.
+    """
+    make_tests(place / "tests", TESTS, 601)
+    took = {}
+    for jobs in (1, 2):
+        took[jobs] = called(place, "--jobs", jobs, "--quiet", "--out", f"out-{jobs}", *words)
+    one, two = (
+        [p.read_bytes() for p in sorted((place / f"out-{j}").glob("*/parameters.csv"))]
+        for j in (1, 2)
+    )
+    way = {jobs: took[jobs]["start_cpu_s"] + took[jobs]["busiest_cpu_s"] for jobs in took}
+    return {
+        "tests": TESTS,
+        "one": took[1],
+        "two": took[2],
+        "share of ideal (clock)": took[1]["wall_s"] / (2.0 * took[2]["wall_s"]),
+        "share of ideal (processor time of the longest way)": way[1] / (2.0 * way[2]),
+        "same numbers": one == two and len(one) == TESTS,
+    }
+
+
+def measure_overhead(place: Path) -> dict[str, Any]:
+    """What a test costs beside its fit: read, compared, written; and the whole command."""
+    make_tests(place / "tests", TINY, 601)
+    recipe = Recipe("bistable", {"starts": 1, "intervals": "local"}, pages=False)
+    key, spent = settings_key(recipe), [0.0, 0.0]
+    from foamfit.study import batch_work
+
+    real: Callable[..., Any] = batch_work.fit
+
+    def fit(*words: Any, **options: Any) -> Any:
+        began = time.process_time()
+        try:
+            return real(*words, **options)
+        finally:
+            spent[1] += time.process_time() - began
+
+    batch_work.fit = fit
+    toml = place / "foam.toml"
+    for i, path in enumerate(sorted((place / "tests").iterdir())):
+        if i == 20:  # all is loaded
+            spent[:] = [0.0, 0.0]
+        began = time.process_time()
+        mark = fingerprint(key, path.read_bytes(), toml.read_bytes())
+        work(Task(path.stem, path, toml, recipe, mark, place / "out" / path.stem))
+        spent[0] += time.process_time() - began
+    batch_work.fit = real
+    count = TINY - 20
+    out = called(place, *FAST, "--jobs", "1", "--out", "whole")
+    return {
+        "tests": count,
+        "fit_ms": 1e3 * spent[1] / count,
+        "beside_ms": 1e3 * (spent[0] - spent[1]) / count,
+        "whole command, beside its fits, per test, start included (clock, ms)": 1e3
+        * (out["wall_s"] - runtimes(place / "whole"))
+        / TINY,
+    }
+
+
+def measure_memory(place: Path) -> dict[str, Any]:
+    """Resident memory of the processes of a batch while it goes through many tests."""
+    import psutil
+
+    make_tests(place / "tests", MANY, 61, linear=True)
+    quick = ["--starts", "1", "--model", "linear", "--no-report", "--quiet", "--jobs", "2"]
+    command = [*COMMAND, "tests", "--specimen", "foam.toml", *quick, "--out", "out"]
+    samples: list[tuple[int, float, float]] = []
+    with subprocess.Popen(command, cwd=place) as process:
+        whole = psutil.Process(process.pid)
+        while process.poll() is None:
+            time.sleep(1.0)
+            try:
+                done = len(os.listdir(place / "out"))
+                main = whole.memory_info().rss / 2**20
+                below = (child.memory_info().rss for child in whole.children(recursive=True))
+                samples.append((done, main, max(below, default=0.0) / 2**20))
+            except (psutil.Error, OSError):
+                continue
+    at = {}
+    for wanted in (100, 500, MANY - 20):
+        done, main, worker = min(samples, key=lambda s, w=wanted: abs(s[0] - w))
+        at[str(wanted)] = {"done": done, "command_MiB": main, "largest_process_MiB": worker}
+    again = called(place, *quick, "--out", "out")
+    return {"tests": MANY, "after": at, "called again, nothing to do": again}
+
+
+def measure_page(place: Path) -> dict[str, Any]:
+    """Size of the page of many tests, and how long a browser takes to show it."""
+    rows = fabricated_rows(place, MANY)
+    began = time.perf_counter()
+    write_page(rows, place, "a batch")
+    made = time.perf_counter() - began
+    found: dict[str, Any] = {
+        "tests": MANY,
+        "MB": (place / "summary.html").stat().st_size / 1e6,
+        "made_s": made,
+    }
+    if (browser := shutil.which("chromium")) is None:
+        return found
+    page = (place / "summary.html").read_text(encoding="utf-8")
+    script = (
+        "<script>addEventListener('load', () => setTimeout(() => {"
+        "const shown = performance.now(), heads = document.querySelector('table').tHead.rows[0];"
+        "heads.cells[5].click(); document.body.offsetHeight;"
+        "document.title = `load ${shown} sort ${performance.now() - shown}`;}, 0));</script>"
+    )
+    (place / "timed.html").write_text(page.replace("</body>", script + "</body>"))
+    words = ["--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=20000"]
+    (place / "empty.html").write_text("<!DOCTYPE html><title>x</title>")
+    used = []
+    for name in ("empty.html", "timed.html"):
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        made_page = subprocess.run(
+            [browser, *words, "--dump-dom", f"file://{place / name}"],
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        used.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+    told = made_page.split("<title>")[1].split("</title>")[0].split()
+    return found | {
+        "browser_load_ms": float(told[1]),
+        "browser_sort_ms": float(told[3]),
+        "browser, more processor time than for an empty page, s": used[1] - used[0],
+    }
+
+
+def fabricated_rows(place: Path, count: int) -> list[Any]:
+    """Rows like those of one fit, with other names and values."""
+    if not (place / "tests").exists():
+        make_tests(place / "tests", 2, 601)
+    path = sorted((place / "tests").iterdir())[0]
+    result = ff.fit(ff.read_test(path, place / "foam.toml"), starts=1, intervals="local")
+    base, rng = row_of("t", "t.csv", result), np.random.default_rng(0)
+    rows = []
+    for i in range(count):
+        values = {n: [c[0] * rng.normal(1, 0.02), *c[1:]] for n, c in base.parameters.items()}
+        rows.append(replace(base, test=f"test-{i:05d}", parameters=values))
+    return rows
+
+
+def measure_parts(place: Path) -> dict[str, Any]:
+    """What the one process that leads a batch does for a test, ms, and what lies on the disk."""
+    make_tests(place / "tests", 50, 601)
+    toml, paths = place / "foam.toml", sorted((place / "tests").iterdir())
+    found: dict[str, Any] = {}
+    for name, pages in {"no report": False, "reports": True}.items():
+        recipe = Recipe("bistable", {"starts": 1, "intervals": "local"}, pages=pages)
+        key, path = settings_key(recipe), paths[0]
+        mark = fingerprint(key, path.read_bytes(), toml.read_bytes())
+        content = path.read_bytes(), toml.read_bytes()
+        outcome = work(Task(path.stem, path, toml, recipe, mark, None, content))
+        assert outcome.files is not None
+        out = place / name
+        found[name] = {
+            "files": len(outcome.files),
+            "kB": sum(map(len, outcome.files.values())) / 1e3,
+            "write_ms": timed(lambda i, f=outcome.files, o=out: put(f, o / f"t{i}"), 50),
+            "again_ms": timed(
+                lambda i, k=key, o=out, m=mark: (
+                    fingerprint(k, paths[i].read_bytes(), toml.read_bytes()),
+                    stored(o / f"t{i}", m, False),
+                ),
+                50,
+            ),
+        }
+    rows = fabricated_rows(place, MANY)
+    found["summary.csv_ms_per_test"] = timed(lambda _: write_summary(rows, place), 3) / MANY
+    found["summary.csv_kB_per_test"] = (place / "summary.csv").stat().st_size / 1e3 / MANY
+    assert len(list(table_rows(rows))) == MANY + 1
+    return found
+
+
+def timed(call: Callable[[int], Any], count: int) -> float:
+    """Processor time of a call, ms."""
+    began = time.process_time()
+    for i in range(count):
+        call(i)
+    return 1e3 * (time.process_time() - began) / count
+
+
+MEASURES = {
+    "speedup": lambda place: measure_speedup(place, "--no-report"),
+    "speedup-reports": measure_speedup,
+    "overhead": measure_overhead,
+    "memory": measure_memory,
+    "page": measure_page,
+    "parts": measure_parts,
+}
+
+
+def main() -> None:
+    wanted = sys.argv[1:] or list(MEASURES)
+    kept = HERE / "batch.json"
+    found = json.loads(kept.read_text()) if kept.exists() else {}
+    for name in wanted:
+        place = Path(tempfile.mkdtemp(prefix="batch-"))
+        try:
+            found[name] = MEASURES[name](place) | {"load": os.getloadavg()[1]}
+        finally:
+            shutil.rmtree(place)
+        print(name, json.dumps(found[name], indent=1), flush=True)
+        kept.write_text(json.dumps(found, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

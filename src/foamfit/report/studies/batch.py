@@ -1,0 +1,305 @@
+"""The summary of a batch: a row for each test, as CSV and as one page to read."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
+
+import numpy as np
+
+from foamfit.arrays import Array
+from foamfit.files import write_file
+from foamfit.report.page import environment
+from foamfit.report.readable import readable_unit, symbol
+from foamfit.results import Fit, ParameterEstimate, plain
+from foamfit.text import aligned, counted, listed, number, percent, wrapped
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+CURVES = ("stress_time", "displacement_time", "stress_strain")
+PARTS = ("", "_stderr", "_lo", "_hi", "_state")
+# What a row says of a test without a result.
+REFUSED, OPEN = "refused", "not fitted"
+# Points of a sketched curve, its size in pixels, and how many tests the page shows.
+POINTS, WIDTH, HEIGHT = 40, 116, 76
+MOST_ON_PAGE = 5000
+_MOST_REFUSALS = 20  # that the terminal names
+
+
+@dataclass(frozen=True)
+class Sketch:
+    """Curves of a test in a few points: paths of SVG, and the ends of their axes in words."""
+
+    measured: str
+    fitted: str
+    ends: str
+
+
+@dataclass(frozen=True)
+class Row:
+    """What a batch knows of one test, or of one cycle of it; `test` is its folder.
+
+    `parameters` holds value, standard error, lower and upper end of the 95 % interval (SI), state
+    and unit of each.
+    """
+
+    test: str
+    file: str
+    status: str
+    error: str | None = None
+    misfit: Mapping[str, float | None] = field(default_factory=dict)
+    runtime_s: float | None = None
+    parameters: Mapping[str, Sequence[Any]] = field(default_factory=dict)
+    sketch: Sketch | None = None
+
+    @property
+    def has_fit(self) -> bool:
+        """Whether there is an acceptable fit."""
+        return self.status in ("ok", "warnings")
+
+    @property
+    def is_written(self) -> bool:
+        """Whether there is a result folder."""
+        return self.status not in (REFUSED, OPEN)
+
+
+def row_of(test: str, file: str, result: Fit) -> Row:
+    """Make the row of a fit."""
+    fatal = [c for c in result.checklist if c.fatal and c.answer is False]
+    error = None
+    if result.status == "failed":
+        told = [w for check in fatal for w in (check.warnings or (check.sentence,))]
+        error = " ".join(["no acceptable fit was found:", *(told or result.warnings)[:1]])
+    return Row(
+        test,
+        file,
+        result.status,
+        error,
+        dict(plain(result.misfit)),
+        plain(result.runtime_s),
+        {name: plain(_cells(p)) for name, p in result.parameters.items()},
+        _sketch(result),
+    )
+
+
+def _cells(p: ParameterEstimate) -> list[Any]:
+    return [p.value, p.stderr, *(p.ci95 or (None, None)), p.state, p.unit]
+
+
+# ------------------------------------------------------------------------------- the table
+
+
+def names_of(rows: Sequence[Row]) -> list[str]:
+    """Names of the parameters of any test, in their order."""
+    return list(dict.fromkeys(name for row in rows for name in row.parameters))
+
+
+def table_rows(rows: Sequence[Row]) -> Iterator[list[Any]]:
+    """Rows of summary.csv, the header first: SI, a row for each test, empty = not there."""
+    names = names_of(rows)
+    head = ["test", "file", "status", "error", *(f"misfit_{name}" for name in CURVES), "runtime_s"]
+    yield [*head, *(f"{name}{part}" for name in names for part in PARTS)]
+    blank = [None] * len(PARTS)
+    for row in rows:
+        cells: list[Any] = [row.test, row.file, row.status, row.error]
+        cells += [*(row.misfit.get(name) for name in CURVES), row.runtime_s]
+        for name in names:
+            cells += [*row.parameters.get(name, blank)][: len(PARTS)]
+        yield cells
+
+
+def table(rows: Sequence[Row]) -> pd.DataFrame:
+    """The rows of summary.csv as pandas reads them."""
+    import pandas as pd
+
+    head, *cells = table_rows(rows)
+    frame = pd.DataFrame(cells, columns=head)
+    words = ("test", "file", "status", "error", *(n for n in head if n.endswith("_state")))
+    return frame.astype({name: float for name in head if name not in words})
+
+
+def write_summary(rows: Sequence[Row], folder: Path) -> None:
+    """Write summary.csv whole."""
+    import csv
+
+    text = io.StringIO(newline="")
+    csv.writer(text, lineterminator="\n").writerows(table_rows(rows))
+    write_file(folder / "summary.csv", text.getvalue().encode("utf-8", "backslashreplace"))
+
+
+def counts_in_words(rows: Sequence[Row]) -> str:
+    """Say how many tests there are and what became of them."""
+    found = Counter(row.status for row in rows)
+    said = {
+        "ok": "fitted", "warnings": "fitted with warnings", "failed": "without an acceptable fit",
+        REFUSED: "refused", OPEN: "not fitted yet",
+    }  # fmt: skip
+    parts = [f"{found[status]} {words}" for status, words in said.items() if found[status]]
+    return f"{counted(len(rows), 'test')}: {listed(parts)}" if parts else "no test"
+
+
+def summary_words(rows: Sequence[Row]) -> str:
+    """Return what the command prints of a batch."""
+    lines = [counts_in_words(rows)]
+    wrong = [row for row in rows if not row.has_fit]
+    for row in wrong[:_MOST_REFUSALS]:
+        lines += ["", *wrapped(f"{row.test}: {row.error}")]
+    if len(wrong) > _MOST_REFUSALS:
+        more = counted(len(wrong) - _MOST_REFUSALS, "other test")
+        lines += ["", f"and {more} without a fit, each with its sentence in summary.csv"]
+    fitted = [row for row in rows if row.has_fit]
+    if fitted:
+        lines += ["", *aligned(list(_parameter_rows(fitted)), right=(1, 2, 3, 4))]
+    return "\n".join(lines)
+
+
+def _parameter_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
+    """Median and quartiles over the tests of each parameter that any test varied."""
+    yield ["parameter", "median", "quartile", "quartile", "determined in", ""]
+    for name in names_of(rows):
+        cells = [row.parameters[name] for row in rows if name in row.parameters]
+        if all(cell[4] == "fixed" for cell in cells):
+            continue
+        values = np.array([math.nan if cell[0] is None else cell[0] for cell in cells])
+        factor, unit = readable_unit(float(np.nanmedian(np.abs(values))), cells[0][5])
+        middle = np.nanquantile(values, [0.5, 0.25, 0.75]) / factor
+        sure = sum(cell[4] == "determined" for cell in cells)
+        yield [name, *(f"{v:.4g}" for v in middle), f"{sure} of {len(cells)}", unit]
+
+
+# ------------------------------------------------------------------------------- the page
+
+
+def _sketch(result: Fit) -> Sketch | None:
+    """Draw the measured and the fitted loop, or the stress against time without a motion."""
+    c = result.curves
+    stress, fitted = c.measured_stress, c.stress_along
+    if stress is None:
+        return None
+    along, axis = c.measured_displacement, "strain"
+    if along is None or fitted is None:
+        along, fitted, axis = c.time, c.stress, "time"
+    if along is None or not np.all(np.isfinite(along)):
+        return None
+    both = stress if fitted is None else np.concatenate([stress, fitted[np.isfinite(fitted)]])
+    x0, x1, y0, y1 = float(along.min()), float(along.max()), float(both.min()), float(both.max())
+    if not (x1 > x0 and y1 > y0):
+        return None
+
+    def path(values: Array | None) -> str:
+        if values is None:
+            return ""
+        good = np.isfinite(values)
+        x, y = WIDTH * (along[good] - x0) / (x1 - x0), HEIGHT * (y1 - values[good]) / (y1 - y0)
+        return _path(x, y)
+
+    factor, unit = readable_unit(y1, "Pa")
+    if axis == "strain":
+        reach = f"{percent(x1 / result.measurement.specimen.height)} strain"
+    else:
+        part, name = readable_unit(x1, "s")
+        reach = f"{x1 / part:.3g} {name}"
+    return Sketch(path(stress), path(fitted), f"{reach}, {y1 / factor:.3g} {unit}")
+
+
+def _path(x: Array, y: Array) -> str:
+    """Draw a curve in few points, equally far from each other along it, in whole pixels."""
+    if x.size < 2:
+        return ""
+    length = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
+    at = np.linspace(0.0, length[-1], POINTS)
+    points = np.rint([np.interp(at, length, x), np.interp(at, length, y)]).astype(int).T
+    steps = np.diff(points, axis=0)
+    moved = [f"{dx} {dy}" for dx, dy in steps.tolist() if dx or dy]
+    return f"M{points[0, 0]} {points[0, 1]}l{' '.join(moved)}" if moved else ""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A parameter in the page's table, in the unit in which it reads well."""
+
+    name: str
+    symbol: tuple[str, str]
+    unit: str
+    factor: float
+    strip: str  # path of SVG: the intervals of all tests side by side
+    dots: str  # the values that are determined
+    unsure: str  # and those that are not
+    ends: tuple[str, str]  # of the strip's axis
+
+
+def write_page(rows: Sequence[Row], folder: Path, title: str) -> None:
+    """Write summary.html whole: one file that needs nothing else."""
+    shown = rows
+    if len(rows) > MOST_ON_PAGE:  # what has no fit must be seen
+        first = {id(row) for row in rows[:MOST_ON_PAGE]}
+        shown = [row for row in rows if id(row) in first or not row.has_fit][: 2 * MOST_ON_PAGE]
+    columns = list(_columns(shown))
+    page = environment().get_template("summary.html").render(
+        title=title,
+        version=version("foamfit"),
+        counts=counts_in_words(rows),
+        rows=shown,
+        total=len(rows),
+        links=[f"{quote(row.test)}/report.html" for row in shown],
+        reports=[(folder / row.test / "report.html").is_file() for row in shown],
+        columns=columns,
+        cells=[[_cell(row, column) for column in columns] for row in shown],
+        misfits={"stress_strain": "loop", "stress_time": "σ(t)", "displacement_time": "u(t)"},
+        width=WIDTH, height=HEIGHT, strip=(STRIP_WIDTH, STRIP_HEIGHT),
+    )  # fmt: skip
+    write_file(folder / "summary.html", page.encode("utf-8", "replace"))
+
+
+STRIP_WIDTH, STRIP_HEIGHT = 900, 110
+
+
+def _columns(rows: Sequence[Row]) -> Iterator[Column]:
+    """The parameters that any test varied, with their values and intervals side by side."""
+    for name in names_of(rows):
+        there = [(i, row.parameters[name]) for i, row in enumerate(rows) if name in row.parameters]
+        there = [(i, cell) for i, cell in there if cell[0] is not None]
+        if not there or all(cell[4] == "fixed" for _, cell in there):
+            continue
+        values = np.array([cell[0] for _, cell in there])
+        factor, unit = readable_unit(float(np.median(np.abs(values))), there[0][1][5])
+        # Wide intervals and far values run out of the strip rather than flatten the others.
+        first, last = np.quantile(values, [0.05, 0.95])
+        room = max(0.6 * (last - first), 0.05 * abs(float(np.median(values))), 1e-12)
+        low, high = float(first - room), float(last + room)
+
+        def pixel(value: float, low: float = low, high: float = high) -> float:
+            y = STRIP_HEIGHT * (high - min(max(value, low), high)) / (high - low)
+            return round(y, 1)
+
+        bars, dots, unsure = list[str](), list[str](), list[str]()
+        for i, cell in there:
+            x = round((i + 0.5) * STRIP_WIDTH / len(rows), 1)
+            if cell[2] is not None and cell[3] is not None:
+                bars.append(f"M{x:g} {pixel(cell[2]):g}V{pixel(cell[3]):g}")
+            mark = f"M{x:g} {pixel(cell[0]):g}h0"
+            (unsure if cell[4] in ("weak", "not determined") else dots).append(mark)
+        ends = number(high / factor), number(low / factor)
+        yield Column(
+            name, symbol(name), unit, factor, "".join(bars), "".join(dots), "".join(unsure), ends
+        )
+
+
+def _cell(row: Row, column: Column) -> tuple[str, str, str, str]:
+    """Value, what to sort by, interval and state of a parameter of a test."""
+    found = row.parameters.get(column.name)
+    if found is None or found[0] is None:
+        return "", "", "", ""
+    value, _, low, high, state, _ = found
+    interval = ""
+    if low is not None and high is not None:
+        interval = f"{low / column.factor:.4g} to {high / column.factor:.4g}".replace("-", "−")
+    return f"{value / column.factor:.4g}".replace("-", "−"), f"{value:.6g}", interval, state

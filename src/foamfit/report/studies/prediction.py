@@ -1,0 +1,210 @@
+"""The folder of a prediction, its text and its picture."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from foamfit.errors import InputError
+from foamfit.report.figures import BLUE, GREY, INSIDE, VERMILION, drawing, image, laid_out
+from foamfit.report.folder import PREDICTION_FILES, check_target, save_whole, write_table
+from foamfit.report.readable import readable_unit
+from foamfit.text import aligned, percent, wrapped
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from foamfit.arrays import Array
+    from foamfit.study.prediction.predicted import PredictedCurve, PredictedTest
+
+PANEL = (2.6, 2.2)  # inches
+# Colour of each part of the band.
+COLOURS = {
+    "parameters": BLUE,
+    "scatter": INSIDE[1],
+    "noise": INSIDE[2],
+    "law_error": INSIDE[0],
+}
+
+
+def save_prediction(found: PredictedTest, folder: str | Path) -> Path:
+    """Write the folder whole, replacing an older prediction at the end; returns it."""
+
+    def write(fresh: Path) -> None:
+        text = json.dumps(found.to_json_dict(), indent=2, ensure_ascii=False, allow_nan=False)
+        (fresh / "prediction.json").write_text(
+            text + "\n", encoding="utf-8", errors="backslashreplace"
+        )
+        write_table(fresh / "prediction.csv", found.rows())
+        figure = plot_prediction(found)
+        with laid_out(figure):
+            (fresh / "prediction.png").write_bytes(image(figure, "png"))
+            (fresh / "prediction.pdf").write_bytes(image(figure, "pdf"))
+
+    check_replaceable(folder)
+    return save_whole(folder, write)
+
+
+def check_replaceable(folder: str | Path) -> None:
+    """Raise InputError unless `folder` is free, empty or an older prediction.
+
+    A result of another kind is not replaced: it may be the one that is predicted from.
+    """
+    check_target(folder)
+    place = Path(folder)
+    there = sorted(path.name for path in place.iterdir()) if place.is_dir() else []
+    if others := [name for name in there if name not in PREDICTION_FILES]:
+        raise InputError(
+            f"{folder} holds {others[0]}, which is no part of a prediction, so it is not replaced; "
+            "choose a new or an empty folder"
+        )
+
+
+# ------------------------------------------------------------------------------- in words
+
+
+def prediction_text(found: PredictedTest) -> str:
+    """Return what the command prints of a prediction."""
+    kind = "joint fit" if found.joint else "fit"
+    lines = wrapped(f"{found.measurement.name}: predicted from the {kind} {found.source!r}")
+    lines += wrapped(f"{found.law}, {found.drive} drive; {_rates(found)}")
+    lines += ["", *_table(found)]
+    for sentence in (*found.sentences, *(f"Warning: {one}" for one in found.warnings)):
+        lines += ["", *wrapped(sentence)]
+    return "\n".join(lines)
+
+
+def _rates(found: PredictedTest) -> str:
+    rates = found.fitted_rates
+    if found.rate is None:
+        return "rate not known"
+    if not rates:
+        return f"rate {found.rate:.3g} 1/s"
+    low, high = min(rates), max(rates)
+    fitted = f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
+    return f"rate {found.rate:.3g} 1/s, fitted at {fitted} 1/s"
+
+
+def _table(found: PredictedTest) -> list[str]:
+    """Misfit, share inside and half widths of each curve, over its measured range."""
+    rows = [["curve", "misfit", "inside", "band", *(part.replace("_", " ") for part in COLOURS)]]
+    for name, curve in found.curves.items():
+        off = found.misfit.get(name)
+        widths = [curve.half_width, *(curve.half_width_of(part) for part in COLOURS)]
+        rows.append(
+            [
+                name,
+                "–" if off is None else percent(off),
+                percent(curve.inside, 3),
+                *(f"±{percent(width / curve.range)}" for width in widths),
+            ]
+        )
+    return aligned(rows)
+
+
+# ------------------------------------------------------------------------------- the picture
+
+
+def plot_prediction(found: PredictedTest) -> Figure:
+    """Draw each curve with its band, the loop, and what makes the band.
+
+    Above are the loop and each curve in time, below the half width that each part alone would give.
+    """
+    curves = list(found.curves.values())
+    with drawing(PANEL[0] * (1 + len(curves)), 1.7 * PANEL[1] + 0.4) as figure:
+        axes = figure.subplots(
+            2, 1 + len(curves), squeeze=False, height_ratios=(1.0, 0.6),
+            gridspec_kw={"hspace": 0.06},
+        )  # fmt: skip
+        _loop(axes[0, 0], found)
+        for column, curve in enumerate(curves, start=1):
+            _in_time(axes[0, column], axes[1, column], found, curve)
+        _legend(axes[1, 0], found)
+        width = int(16 * PANEL[0] * (1 + len(curves)))
+        title = "\n".join(line for part in _title(found) for line in wrapped(part, 0, width))
+        figure.suptitle(title, x=0.01, ha="left", fontsize=8, parse_math=False)
+    return figure
+
+
+def _title(found: PredictedTest) -> tuple[str, str]:
+    inside = ", ".join(f"{c.channel} {percent(c.inside, 3)}" for c in found.curves.values())
+    return (
+        f"{found.measurement.name}, predicted from {found.source}; {_rates(found)}",
+        f"inside the 95 % band: {inside}",
+    )
+
+
+def _loop(ax: Axes, found: PredictedTest) -> None:
+    """Stress against displacement; with the band of the stress where the motion is measured."""
+    m = found.measurement
+    stress = next((c for c in found.curves.values() if c.channel == "stress"), None)
+    moved = next((c for c in found.curves.values() if c.channel == "displacement"), None)
+    motion = m.displacement if moved is None else moved.predicted
+    if m.displacement is None or motion is None or m.stress is None:
+        ax.set_axis_off()
+        ax.text(0.5, 0.5, "no motion", ha="center", va="center", transform=ax.transAxes)
+        return
+    pressed = m.stress if stress is None else stress.predicted
+    height = m.specimen.height
+    factor, unit = readable_unit(float(np.max(m.stress)), "Pa")
+    ax.plot(m.displacement / height, m.stress / factor, color=GREY, linewidth=0.8)
+    ax.plot(motion / height, pressed / factor, color=VERMILION, linewidth=0.9)
+    if stress is not None and moved is None:
+        turn = int(np.argmax(motion))
+        for part in (slice(None, turn + 1), slice(turn, None)):
+            _band(ax, motion[part] / height, stress, factor, part)
+    ax.set_xlabel("strain")
+    ax.set_ylabel(f"stress ({unit})")
+
+
+def _band(ax: Axes, x: Array, curve: PredictedCurve, factor: float, part: slice) -> None:
+    ax.fill_between(
+        x, curve.lo[part] / factor, curve.hi[part] / factor, color=VERMILION, alpha=0.18,
+        linewidth=0.0,
+    )  # fmt: skip
+
+
+def _in_time(above: Axes, below: Axes, found: PredictedTest, curve: PredictedCurve) -> None:
+    """One curve with its band, and the half width of each part."""
+    time = found.measurement.time
+    if time is None:
+        x, label = np.arange(curve.measured.size, dtype=float), "sample"
+    else:
+        scale, unit = readable_unit(float(time[-1]), "s")
+        x, label = time / scale, f"time ({unit})"
+    factor, unit = readable_unit(float(np.max(np.abs(curve.measured))), curve.unit)
+    _band(above, x, curve, factor, slice(None))
+    above.plot(x, curve.measured / factor, color=GREY, linewidth=0.8)
+    above.plot(x, curve.predicted / factor, color=VERMILION, linewidth=0.9)
+    above.set_ylabel(f"{curve.channel.replace('_', ' ')} ({unit})")
+    for part, colour in COLOURS.items():
+        if np.any(curve.parts[part]):
+            below.plot(x, curve.parts[part] / factor, color=colour, linewidth=0.9)
+    below.plot(x, 0.5 * (curve.hi - curve.lo) / factor, ":", color="black", linewidth=0.9)
+    below.set_ylim(bottom=0.0)
+    below.set_ylabel(f"half width ({unit})")
+    below.set_xlabel(label)
+
+
+def _legend(ax: Axes, found: PredictedTest) -> None:
+    """What the lines are, in a panel of their own."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    ax.set_axis_off()
+    handles: list[Line2D | Patch] = [
+        Line2D([], [], color=GREY, label="measured"),
+        Line2D([], [], color=VERMILION, label="predicted"),
+        Patch(color=VERMILION, alpha=0.18, label="95 % band"),
+        Line2D([], [], color="black", linestyle=":", label="half width: all"),
+    ]
+    for part, colour in COLOURS.items():
+        if any(np.any(curve.parts[part]) for curve in found.curves.values()):
+            handles.append(
+                Line2D([], [], color=colour, label=f"half width: {part.replace('_', ' ')}")
+            )
+    ax.legend(handles=handles, loc="upper left", fontsize=7, borderaxespad=0.0)

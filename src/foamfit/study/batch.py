@@ -1,0 +1,430 @@
+"""Many tests, each on its own: in parallel, resumable, a folder for each and one summary."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from numbers import Integral
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import TYPE_CHECKING, Literal, Unpack
+
+from foamfit.errors import InputError
+from foamfit.files import is_left, reason, sweep
+from foamfit.one_model import Keywords, Options
+from foamfit.report.folder import BATCH_FILES, MARKS, is_written
+from foamfit.report.studies.batch import OPEN, REFUSED, Row, table, write_page, write_summary
+from foamfit.solve import cache, precompile
+from foamfit.springs.model import Model
+from foamfit.study.batch_work import (
+    Outcome,
+    Recipe,
+    Task,
+    fingerprint,
+    put,
+    settings_key,
+    stored,
+    work,
+)
+from foamfit.study.processes import FITS, PAGES, EndedError, Processes, cores
+from foamfit.study.test_files import find_tests
+from foamfit.terminal import without_ctrl_c
+from foamfit.text import counted
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_LOG = logging.getLogger(__name__)
+# What is given to an executor ahead of what it has done: tests, and bytes of their files.
+MOST_AHEAD, MOST_BYTES = 1000, 2**28
+# Seconds between two summaries, and how much longer than one takes to write.
+PAUSE, SHARE = 30.0, 50.0
+Tests = str | Path | Iterable[str | Path]
+Cycles = int | Sequence[int] | Literal["all"] | None
+
+
+@dataclass(frozen=True)
+class State:
+    """How far a batch is: tests done in all, of these without a fit, left, and fitted now."""
+
+    done: int
+    wrong: int
+    left: int
+    fitted: int
+
+
+Progress = Callable[[State], None]
+
+
+@dataclass
+class Batch:
+    """The tests of a batch and what became of them; see `batch` for the arguments of `run`."""
+
+    out: Path
+    recipe: Recipe
+    tests: list[tuple[str, Path]]
+    toml: Path | None = None  # for all; else the one beside each
+    rows: dict[str, tuple[Row, ...]] = field(default_factory=dict)  # by the name of the test
+
+    @property
+    def summary(self) -> list[Row]:
+        """A row for each test, or for each of its cycles, in the order of the tests."""
+        found = list[Row]()
+        for name, path in self.tests:
+            again = "not fitted yet, because the batch was ended before; call it again"
+            found += self.rows.get(name) or (Row(name, str(path), OPEN, again),)
+        return found
+
+    def save(self) -> None:
+        """Write summary.csv and summary.html."""
+        rows = self.summary
+        write_summary(rows, self.out)
+        write_page(rows, self.out, f"{self.out.resolve().name}: {self.recipe.model}")
+
+
+def batch(
+    tests: Tests,
+    *,
+    out: str | Path | None = None,
+    model: str = "bistable",
+    executor: Executor | None = None,
+    jobs: int | None = None,
+    fresh: bool = False,
+    report: bool = True,
+    specimen: str | Path | None = None,
+    cycle: Cycles = None,
+    fix: Mapping[str, float] | None = None,
+    vary: Sequence[str] = (),
+    progress: Progress | None = None,
+    **options: Unpack[Keywords],
+) -> pd.DataFrame:
+    """Fit every test on its own, in parallel; a result folder for each and one summary.
+
+    Called again, only what is missing or has changed is fitted: data, TOML, settings or version.
+    A test that cannot be read or fitted is a row with its sentence. What is done stays, whatever
+    ends the call.
+
+    Parameters
+    ----------
+    tests : str, Path or several
+        Files, folders and globs; see `foamfit.study.test_files.find_tests`.
+    out : str or Path, optional
+        The folder; by default ``fits/batch/<model>``. It holds ``<test>/`` for each test, the
+        result folder of its fit, ``summary.csv`` and ``summary.html``.
+    model : str
+        As for `foamfit.fit`.
+    executor : concurrent.futures.Executor, optional
+        What runs the fits, as a Dask client's ``get_executor()``; tests go there and results come
+        back with the calls, so that its machines need no common file system. By default processes
+        of this machine, one for each core, with one thread each.
+    jobs : int, optional
+        How many processes of this machine.
+    fresh : bool
+        Whether everything is fitted again.
+    report : bool
+        Whether there are ``report.html``, ``fit.png`` and ``fit.pdf`` of each fit.
+    specimen : str or Path, optional
+        One TOML for all tests; by default the one beside each.
+    cycle : int, sequence of int or "all", optional
+        The cycle of each record; several are fitted as `foamfit.fit_cycles` does, and each is a
+        row of the summary.
+    fix, vary : optional
+        Parameters to hold at a value (SI), and to vary though they are held by default.
+    progress : callable, optional
+        Told the `State` after each test.
+    options
+        As for `foamfit.fit`.
+
+    Returns
+    -------
+    pandas.DataFrame
+        The rows of ``summary.csv``.
+
+    Raises
+    ------
+    InputError
+        If the call is wrong, or a result cannot be written, as to a full disk.
+    """
+    recipe = Recipe(model, {}, _cycles(cycle), fix, tuple(vary), report)
+    found = run(
+        tests, recipe, out=out, executor=executor, jobs=jobs, fresh=fresh, specimen=specimen,
+        progress=progress, **options,
+    )  # fmt: skip
+    return table(found.summary)
+
+
+def run(
+    tests: Tests,
+    recipe: Recipe,
+    *,
+    out: str | Path | None = None,
+    executor: Executor | None = None,
+    jobs: int | None = None,
+    fresh: bool = False,
+    specimen: str | Path | None = None,
+    progress: Progress | None = None,
+    **options: Unpack[Keywords],
+) -> Batch:
+    """Do what `batch` says, and return all that is known of it."""
+    chosen = Options(**options)
+    recipe = replace(recipe, model=_checked(recipe, chosen), options=vars(chosen))
+    if jobs is not None and not (isinstance(jobs, Integral) and jobs >= 1):
+        raise InputError(f"jobs = {jobs!r} is not admissible; it must be a whole number from 1 up")
+    if jobs is not None and executor is not None:
+        raise InputError("jobs and an executor exclude each other; leave one of them out")
+    toml = None if specimen is None else Path(specimen)
+    if toml is not None and not toml.is_file():
+        raise InputError(f"{toml}: no such file; name the TOML of the specimen of all tests")
+    folder = Path("fits", "batch", recipe.model) if out is None else Path(out)
+    made = Batch(folder, recipe, find_tests(tests), toml)
+    check_out(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        sweep(folder.resolve(), [*(name for name, _ in made.tests), *BATCH_FILES])
+    except OSError as error:
+        raise InputError(f"{folder} cannot be written: {reason(error)}") from None
+    with _executor(executor, jobs, made) as runner:
+        _Run(made, runner, executor is not None, fresh, progress or (lambda _: None)).all()
+    return made
+
+
+def _cycles(cycle: Cycles) -> int | tuple[int, ...] | None:
+    """Return one cycle, several, or () for all."""
+    if cycle is None or isinstance(cycle, int):
+        return cycle
+    return () if cycle == "all" else tuple(int(number) for number in cycle)
+
+
+def _checked(recipe: Recipe, options: Options) -> str:
+    """Return the model's name; refuse what no test could be fitted with."""
+    if recipe.model.strip() == "auto":
+        if recipe.fix or recipe.vary:
+            raise InputError("fix and vary belong to one model; name it instead of 'auto'")
+        if options.relaxation:
+            raise InputError(
+                f"relaxation = {options.relaxation} belongs to one model; name it instead of "
+                "'auto', which tries relaxation by itself"
+            )
+        return "auto"
+    model = Model.parse(recipe.model, options.relaxation)
+    names = (*model.names, *(("time_shift",) if options.time_shift else ()))
+    for name in (*(recipe.fix or ()), *recipe.vary):
+        if name not in names:
+            raise InputError(
+                f"parameter '{name}' is not one of the model {model.name}; "
+                f"its parameters are {', '.join(names)}"
+            )
+        if name in (recipe.fix or ()) and name in recipe.vary:
+            raise InputError(f"parameter '{name}' cannot be both fixed and varied; choose one")
+    return model.name
+
+
+def check_out(out: Path) -> None:
+    """Raise InputError unless a folder is free, or holds nothing but what foamfit wrote."""
+    try:
+        if not out.is_dir():
+            if os.path.lexists(out):
+                raise InputError(f"{out} is a file; choose a new or an empty folder")
+            there = next(path for path in out.resolve().parents if path.exists())
+            if not there.is_dir():
+                raise InputError(f"{out} cannot be written: {there} is a file")
+        else:
+            there = out.resolve()
+            for path in sorted(out.iterdir()):
+                _check_foreign(out, path)
+        if not os.access(there, os.W_OK | os.X_OK):
+            raise InputError(f"{out} cannot be written: Permission denied in {there}")
+    except (OSError, RuntimeError) as error:  # also a link to itself
+        raise InputError(f"{out} cannot be written: {reason(error)}") from None
+
+
+def _check_foreign(out: Path, path: Path) -> None:
+    """Refuse what stands in the folder of a batch and was not written by one."""
+    if is_left(path.name):
+        return
+    name = path.name
+    if path.is_dir() and not path.is_symlink():
+        inside = list(path.iterdir())
+        foreign = next((inner.name for inner in inside if not is_written(inner)), None)
+        known = foreign is None and any(inner.name in MARKS for inner in inside)
+        if known or not inside:
+            return
+        name = f"{path.name}/{foreign}" if foreign is not None else path.name
+    elif path.name in BATCH_FILES and path.is_file():
+        return
+    raise InputError(
+        f"{out} holds {name}, which foamfit did not write; choose a new or an empty folder"
+    )
+
+
+@contextmanager
+def _executor(given: Executor | None, jobs: int | None, made: Batch) -> Iterator[Executor]:
+    """Give what runs the fits; processes of this machine end with the body."""
+    if given is not None:
+        yield given
+        return
+    if not cache.compiled():
+        _LOG.warning("foamfit: compiling the solver, once after installation")
+        with precompile.side_by_side() as finish:
+            finish()
+    count = min(jobs or cores(), max(len(made.tests), 1))
+    pool = Processes(count, (*FITS, *(PAGES if made.recipe.pages else ())))
+    try:
+        yield pool
+    except BaseException:
+        pool.stop()
+        sweep(made.out.resolve(), [name for name, _ in made.tests])
+        raise
+    pool.shutdown()
+    sweep(made.out.resolve(), [name for name, _ in made.tests])
+
+
+class _Run:
+    """The fits of a batch: given to an executor, collected, and the summary kept."""
+
+    def __init__(
+        self, made: Batch, executor: Executor, foreign: bool, fresh: bool, progress: Progress
+    ) -> None:
+        self.batch, self.executor = made, executor
+        self.foreign, self.fresh, self.progress = foreign, fresh, progress
+        self.ready = SimpleQueue[Future[Outcome]]()
+        self.waiting = dict[Future[Outcome], tuple[str, Path, int]]()
+        self.ahead = 0  # bytes that wait
+        self.fitted = self.wrong = 0
+        self.key = settings_key(made.recipe)
+        self.saved, self.took = time.monotonic(), 0.0
+
+    def all(self) -> None:
+        """Fit what is to be fitted; what ends this leaves a summary of what is done."""
+        try:
+            for i, (name, path) in enumerate(self.batch.tests):
+                self._begin(name, path)
+                while len(self.waiting) >= MOST_AHEAD or self.ahead >= MOST_BYTES:
+                    self._collect(wait=True)
+                while self._collect(wait=False):
+                    pass
+                if i == 0 and not self.foreign and self._is_cold():
+                    while self.waiting:  # one compiles, for all
+                        self._collect(wait=True)
+            while self.waiting:
+                self._collect(wait=True)
+        except BaseException:
+            for future in self.waiting:
+                future.cancel()
+            with without_ctrl_c(), suppress(InputError):
+                self.batch.save()
+            raise
+        self.batch.save()
+
+    def _is_cold(self) -> bool:
+        """Whether the first fit compiles what the others need too."""
+        recipe = self.batch.recipe
+        memory = "microscale" in recipe.model or recipe.options["relaxation"] > 0
+        memory = memory or recipe.model == "auto"
+        return memory and not cache.compiled("integrate_with_memory")
+
+    def _begin(self, name: str, path: Path) -> None:
+        """Take the stored rows of a test, or have it fitted."""
+        made = self.batch
+        toml = path.with_suffix(".toml") if made.toml is None else made.toml
+        folder = made.out / name
+        try:
+            data, settings = path.read_bytes(), _bytes(toml)
+        except OSError:  # who reads the test says it better
+            data, settings = b"", None
+        mark = fingerprint(self.key, data, settings)
+        known = None if self.fresh else stored(folder, mark, made.recipe.pages)
+        if known is not None:
+            moved = tuple(replace(row, file=str(path)) for row in known)
+            self._keep(name, moved)
+            return
+        content = (data, settings) if self.foreign and data else None
+        task = Task(
+            name,
+            path,
+            toml,
+            made.recipe,
+            mark,
+            None if self.foreign else folder.absolute(),
+            content,
+        )
+        try:
+            future = self.executor.submit(work, task)
+        except (BrokenExecutor, RuntimeError) as error:
+            raise self._ended(error) from error
+        size = len(data) if content else 0
+        self.ahead += size
+        self.waiting[future] = (name, path, size)
+        future.add_done_callback(self.ready.put)
+
+    def _collect(self, *, wait: bool) -> bool:
+        """Take one fit that is done; returns whether there was one."""
+        try:
+            future = self.ready.get(timeout=1.0) if wait else self.ready.get_nowait()
+        except Empty:
+            self._save_sometimes()
+            return False
+        name, path, size = self.waiting.pop(future)
+        self.ahead -= size
+        try:
+            outcome = future.result()
+        except (BrokenExecutor, CancelledError) as error:
+            raise self._ended(error) from error
+        except Exception as error:
+            self._keep(name, (Row(name, str(path), REFUSED, _lost(error)),))
+            return True
+        if outcome.unwritten is None and outcome.files is not None:
+            try:
+                put(outcome.files, self.batch.out / name)
+            except InputError as error:
+                outcome = replace(outcome, unwritten=str(error))
+        if outcome.unwritten is not None:
+            raise InputError(f"{outcome.unwritten}; {self._done_words()}")
+        self.fitted += 1
+        self._keep(name, outcome.rows)
+        self._save_sometimes()
+        return True
+
+    def _keep(self, name: str, rows: tuple[Row, ...]) -> None:
+        made = self.batch
+        made.rows[name] = rows
+        self.wrong += not all(row.has_fit for row in rows)
+        left = len(made.tests) - len(made.rows)
+        self.progress(State(len(made.rows), self.wrong, left, self.fitted))
+
+    def _save_sometimes(self) -> None:
+        """Write summary.csv from time to time."""
+        began = time.monotonic()
+        if began - self.saved < max(PAUSE, SHARE * self.took):
+            return
+        write_summary(self.batch.summary, self.batch.out)
+        self.saved = time.monotonic()
+        self.took = self.saved - began
+
+    def _ended(self, error: BaseException) -> InputError:
+        told = " ".join(str(error).split()) or "it has given up the tests"
+        return InputError(f"the executor has ended: {told}; {self._done_words()}")
+
+    def _done_words(self) -> str:
+        done, count = len(self.batch.rows), counted(len(self.batch.tests), "test")
+        return f"{done} of {count} are done and stay, call again for the others"
+
+
+def _bytes(path: Path) -> bytes | None:
+    return path.read_bytes() if path.is_file() else None
+
+
+def _lost(error: Exception) -> str:
+    """Say why a test has no result that the test itself is not known to be the reason of."""
+    if isinstance(error, EndedError) or type(error).__name__ == "KilledWorker":  # that is Dask's
+        return (
+            "its process ended each time that the fit was tried (killed, or out of memory); call "
+            "again to try once more"
+        )
+    told = " ".join(f"{type(error).__name__}: {error}".split())
+    return f"its fit was lost ({told}); call again to try once more"

@@ -1,0 +1,232 @@
+"""One test of a batch: read, fitted, and written whole; what runs in another process.
+
+Everything here takes and returns what can be pickled, and a test depends on nothing but its task.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import lmfit
+
+from foamfit.api import FitResult, fit
+from foamfit.data.csv_file import read_test
+from foamfit.data.measurement import Measurement
+from foamfit.errors import InputError, SimulationError
+from foamfit.files import scratch
+from foamfit.fitting.curves import check_time_shift, choose_drive
+from foamfit.fitting.problem import fix_and_vary, make_params
+from foamfit.report.folder import save_whole, write_result
+from foamfit.report.studies.batch import REFUSED, Row, Sketch, row_of
+from foamfit.report.studies.cycles import write_cycles
+from foamfit.study.cycles import fit_cycles
+
+SCHEMA = 1
+RECORD = "batch.json"  # in the folder of each test: its rows, and what they were made from
+# One fit at a time in a process, whatever its executor: drawing is not safe in two threads.
+_ALONE = threading.Lock()
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How every test of a batch is fitted.
+
+    `cycles` is one number, several, () for all of a record, or None for the one that the TOML
+    names; `options` are keywords of `foamfit.fit`.
+    """
+
+    model: str
+    options: Mapping[str, Any]
+    cycles: int | tuple[int, ...] | None = None
+    fix: Mapping[str, float] | None = None
+    vary: tuple[str, ...] = ()
+    pages: bool = True
+
+    def params(self, test: Measurement) -> lmfit.Parameters | None:
+        """The parameters of a test, as `fix` and `vary` want them; None for what fit chooses."""
+        shift = bool(self.options.get("time_shift", False))
+        drive = self.options.get("drive")
+        if shift:
+            check_time_shift(test, drive or choose_drive(test))
+        if self.model == "auto" or not (self.fix or self.vary):
+            return None
+        terms = self.options.get("relaxation", 0)
+        params = make_params(test, self.model, drive, time_shift=shift, relaxation=terms)
+        return fix_and_vary(params, self.model, self.fix or {}, self.vary)
+
+
+@dataclass(frozen=True)
+class Task:
+    """One test to be fitted.
+
+    `out` is the folder to write; None brings the files back in the outcome. `content` holds the
+    bytes of the test and of its TOML where the paths may be those of another machine, which must
+    have the same `version` of foamfit.
+    """
+
+    name: str
+    path: Path
+    toml: Path
+    recipe: Recipe
+    fingerprint: str
+    out: Path | None = None
+    content: tuple[bytes, bytes | None] | None = None
+    version: str = field(default_factory=lambda: version("foamfit"))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a test: its rows, and its files if they were to come back.
+
+    `unwritten` says why the result could not be written; then it is lost.
+    """
+
+    rows: tuple[Row, ...]
+    files: Mapping[str, bytes] | None = None
+    unwritten: str | None = None
+
+
+def settings_key(recipe: Recipe) -> str:
+    """What a result is made by: settings and version, not whether there is a page of it."""
+    parts = asdict(replace(recipe, pages=True)) | {"foamfit": version("foamfit")}
+    return json.dumps(parts, sort_keys=True)
+
+
+def fingerprint(key: str, data: bytes, toml: bytes | None) -> str:
+    """Identify what a result is made from: settings and version (`settings_key`), data, TOML."""
+    digests = (None if part is None else hashlib.sha256(part).hexdigest() for part in (data, toml))
+    return hashlib.sha256(json.dumps([key, *digests]).encode()).hexdigest()
+
+
+def stored(folder: Path, wanted: str, pages: bool) -> tuple[Row, ...] | None:
+    """The rows in a test's folder if they were made from what is `wanted`; else None."""
+    try:
+        content = json.loads((folder / RECORD).read_text(encoding="utf-8"))
+        if content["fingerprint"] != wanted or (pages and not content["pages"]):
+            return None
+        rows = [
+            row | {"sketch": row["sketch"] and Sketch(**row["sketch"])} for row in content["rows"]
+        ]
+        return tuple(Row(**row) for row in rows)
+    except (OSError, ValueError, KeyError, TypeError):  # none, or of another version
+        return None
+
+
+def work(task: Task) -> Outcome:
+    """Fit one test and write its folder whole; raises nothing that the test could be blamed for."""
+    if task.version != (own := version("foamfit")):
+        raise RuntimeError(
+            f"{platform.node()} has foamfit {own}, the call came from {task.version}"
+        )
+    with _ALONE:
+        rows, write = _fitted(task)
+        record = {
+            "schema": SCHEMA,
+            "foamfit": version("foamfit"),
+            "fingerprint": task.fingerprint,
+            "pages": task.recipe.pages,
+            "rows": [asdict(row) for row in rows],
+        }
+
+        def fill(folder: Path) -> None:
+            write(folder)
+            text = json.dumps(record, ensure_ascii=False, allow_nan=False)
+            (folder / RECORD).write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
+
+        try:
+            if task.out is not None:
+                save_whole(task.out, fill, swept=True)
+                return Outcome(rows)
+            with scratch() as folder:
+                fill(folder)
+                found = (path for path in sorted(folder.rglob("*")) if path.is_file())
+                files = {path.relative_to(folder).as_posix(): path.read_bytes() for path in found}
+            return Outcome(rows, files)
+        except (InputError, OSError) as error:
+            return Outcome(rows, unwritten=str(error))
+
+
+def put(files: Mapping[str, bytes], out: Path) -> None:
+    """Write the files that came back from another process as a whole folder."""
+
+    def write(folder: Path) -> None:
+        for name, content in files.items():
+            (folder / name).parent.mkdir(exist_ok=True)
+            (folder / name).write_bytes(content)
+
+    save_whole(out, write, swept=True)
+
+
+Write = Callable[[Path], None]
+
+
+def _fitted(task: Task) -> tuple[tuple[Row, ...], Write]:
+    """The rows of a test, and what writes its files into a folder."""
+    try:
+        with _inputs(task) as (path, toml):
+            if task.recipe.cycles is None or isinstance(task.recipe.cycles, int):
+                return _one(task, path, toml)
+            return _several(task, path, toml)
+    except (InputError, SimulationError) as error:
+        why = str(error)
+    except (MemoryError, OSError):  # of this machine
+        raise
+    except Exception as error:
+        why = f"this is a defect of foamfit, please report it ({type(error).__name__}: {error})"
+    return (Row(task.name, str(task.path), REFUSED, " ".join(why.split())),), lambda _: None
+
+
+def _one(task: Task, path: Path, toml: Path) -> tuple[tuple[Row, ...], Write]:
+    recipe = task.recipe
+    assert not isinstance(recipe.cycles, tuple)
+    test = read_test(path, toml, recipe.cycles)
+    result = fit(test, model=recipe.model, params=recipe.params(test), **recipe.options)
+    row = row_of(task.name, str(task.path), result)
+    return (row,), lambda folder: write_result(result, folder, pages=recipe.pages)
+
+
+def _several(task: Task, path: Path, toml: Path) -> tuple[tuple[Row, ...], Write]:
+    """Each cycle is a row, and its folder is one in the folder of the test."""
+    recipe = task.recipe
+    assert isinstance(recipe.cycles, tuple)
+    found = fit_cycles(
+        path, toml, cycles=recipe.cycles or None, model=recipe.model, params=recipe.params,
+        **recipe.options,
+    )  # fmt: skip
+
+    def row(number: int, result: FitResult | None) -> Row:
+        name = f"{task.name}/cycle-{number}"
+        if result is None:
+            return Row(name, str(task.path), REFUSED, " ".join(found.refused[number].split()))
+        return row_of(name, str(task.path), result)
+
+    rows = (row(n, found.results.get(n)) for n in sorted({*found.results, *found.refused}))
+    return tuple(rows), lambda folder: write_cycles(found, folder, pages=recipe.pages)
+
+
+@contextmanager
+def _inputs(task: Task) -> Iterator[tuple[Path, Path]]:
+    """The files of a test, which are made here if they came with the task."""
+    if task.content is None:
+        yield task.path, task.toml
+        return
+    data, toml = task.content
+    with scratch() as folder:
+        path, settings = folder / task.path.name, folder / task.toml.name
+        path.write_bytes(data)
+        if toml is not None:
+            settings.write_bytes(toml)
+        try:
+            yield path, settings
+        except (InputError, SimulationError) as error:
+            told = str(error).replace(str(path), str(task.path))
+            raise type(error)(told.replace(str(settings), str(task.toml))) from None

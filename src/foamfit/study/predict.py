@@ -1,0 +1,402 @@
+"""Predict a test that was not fitted, with its 95 % band."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from numbers import Integral
+from pathlib import Path
+
+import numpy as np
+
+from foamfit.arrays import Array
+from foamfit.data.csv_file import read_test
+from foamfit.data.measurement import Measurement
+from foamfit.data.noise import with_noise
+from foamfit.data.rate import loading_rate
+from foamfit.errors import InputError, SimulationError
+from foamfit.fitting.curves import check_drive, choose_drive
+from foamfit.fitting.problem import Problem, make_problem
+from foamfit.report.studies.prediction import save_prediction
+from foamfit.study.prediction.identified import HasContent, Source, read_source
+from foamfit.study.prediction.population import NORMAL, Population
+from foamfit.study.prediction.predicted import (
+    PARTS,
+    PredictedCurve,
+    PredictedParameter,
+    PredictedTest,
+)
+from foamfit.text import counted, listed, percent
+
+# Draws of the parameters; fewer say nothing of the ends of a 95 % band.
+DRAWS, FEWEST = 400, 40
+# By how much the rate of a test may lie outside the fitted ones, as a factor.
+RATE_FACTOR = 1.25
+# Draws that are tried for each that is wanted, before the others are given up.
+TRIES = 5
+BAND = (0.025, 0.975)
+
+
+class Prediction(PredictedTest):
+    """A test that was not fitted, predicted with its 95 % band, and how it is written."""
+
+    def save(self, folder: str | Path) -> Path:
+        """Write ``prediction.json``, ``.csv``, ``.png`` and ``.pdf`` whole; returns the folder.
+
+        An older prediction there is replaced as a whole, at the end.
+        """
+        return save_prediction(self, folder)
+
+
+def predict(
+    result: HasContent | str | Path,
+    test: Measurement | str | Path,
+    *,
+    drive: str | None = None,
+    extrapolate: bool = False,
+    draws: int = DRAWS,
+    seed: int = 0,
+) -> Prediction:
+    """Predict a test that was not fitted.
+
+    Height, area, mass and velocity are those of the test, and so is the rate at which laws of rate
+    are evaluated. The 95 % band has four parts: what the result leaves uncertain of the parameters,
+    their scatter between specimens (of a joint result), the noise of the test, and what the law has
+    missed of the fitted tests beyond their noise. The first two are drawn and simulated exactly.
+
+    Parameters
+    ----------
+    result : FitResult, JointResult, str or Path
+        A result of `fit` or `joint`, its folder, or its fit.json or joint.json; the file gives the
+        same numbers.
+    test : Measurement, str or Path
+        The test, or its file with its TOML beside it.
+    drive : str, optional
+        "impact", "stress" or "displacement"; by default that of the result.
+    extrapolate : bool
+        Whether the rate of the test may lie outside the fitted rates by more than `RATE_FACTOR`.
+    draws, seed
+        Draws of the parameters for each part; same seed, same numbers.
+
+    Returns
+    -------
+    Prediction
+
+    Raises
+    ------
+    InputError
+        If the result or the test cannot be read, the test cannot feed the drive, or its rate lies
+        outside the fitted ones.
+    SimulationError
+        If the test cannot be simulated with the common values, or with too few of the draws.
+    """
+    for name, value, least in (("draws", draws, FEWEST), ("seed", seed, 0)):
+        if not isinstance(value, Integral) or isinstance(value, bool) or value < least:
+            raise InputError(f"{name} = {value!r} must be a whole number, at least {least}")
+    source = read_source(result)
+    measurement = test if isinstance(test, Measurement) else read_test(test)
+    rate, warnings = loading_rate(with_noise(measurement)), list[str]()
+    outside = _check_rate(source, measurement, rate, extrapolate, warnings)
+    problem = _problem(source, measurement, drive, warnings)
+    objective = problem.objective
+    population = Population(source, problem.names, problem.measurement.specimen, rate)
+    point = _point(population, problem, warnings)
+    try:
+        simulated = objective.simulate(point, everything=True)
+    except SimulationError as error:
+        raise SimulationError(
+            f"{measurement.name} cannot be predicted from {source.where}: {error}"
+        ) from None
+    drawn = _draw(population, problem, _limits(problem, point), draws, seed)
+    curves = {
+        name: _curve(problem, name, simulated.curves[name], drawn, source)
+        for name in objective.counted
+    }
+    _warn(source, population, curves, drawn, draws, warnings)
+    return Prediction(
+        source=source.name,
+        joint=source.joint,
+        measurement=problem.measurement,
+        model=source.model.name,
+        relaxation=source.model.relaxation,
+        drive=objective.drive,
+        seed=int(seed),
+        curves=curves,
+        misfit=objective.misfit(simulated),
+        parameters=_parameters(population, point, drawn),
+        rate=rate,
+        fitted_rates=source.rates,
+        extrapolated=outside,
+        draws=min((len(one.values) for one in drawn.values()), default=0),
+        redrawn=sum(one.redrawn for one in drawn.values()),
+        held=population.held,
+        sentences=(*_of_curves(curves), *_of_trends(population)),
+        warnings=tuple(warnings),
+    )
+
+
+# ------------------------------------------------------------------------------- the test
+
+
+def _check_rate(
+    source: Source, measurement: Measurement, rate: float | None, extrapolate: bool,
+    warnings: list[str],
+) -> bool:  # fmt: skip
+    """Refuse a rate outside the fitted ones, or warn of it; whether it is outside."""
+    if rate is None or not source.rates:
+        whose = f"of {measurement.name}" if rate is None else f"at which {source.name} was fitted"
+        warnings.append(
+            f"The rate {whose} is not known, so that nobody can tell whether this is an "
+            "extrapolation in rate."
+        )
+        return False
+    low, high = min(source.rates), max(source.rates)
+    if low / RATE_FACTOR <= rate <= high * RATE_FACTOR:
+        return False
+    fitted = f"{low:.3g} 1/s" if low == high else f"{low:.3g} to {high:.3g} 1/s"
+    where = (
+        f"its rate, {rate:.3g} 1/s, lies outside the fitted rates, {fitted}, by more than a factor "
+        f"of {RATE_FACTOR}"
+    )
+    if not extrapolate:
+        raise InputError(
+            f"{measurement.name}: {where}; --extrapolate (extrapolate=True) predicts it all the "
+            "same, with a warning"
+        )
+    warnings.append(f"An extrapolation: {where}; nothing shows that the law holds there.")
+    return True
+
+
+def _problem(
+    source: Source, measurement: Measurement, drive: str | None, warnings: list[str]
+) -> Problem:
+    """The scene of the test under the law of the result."""
+    chosen = drive or source.drive or choose_drive(measurement)
+    try:
+        check_drive(measurement, chosen)
+    except InputError as error:
+        if drive is not None:
+            raise
+        raise InputError(
+            f"{error}; {source.name} was fitted in this drive, --drive (drive=) chooses another"
+        ) from None
+    if source.drive is not None and chosen != source.drive:
+        warnings.append(
+            f"{source.name} was fitted in the {source.drive} drive; this prediction is in the "
+            f"{chosen} drive, with the damping that was found or held there."
+        )
+    inside = source.interior_mass and chosen == "impact"
+    return make_problem(
+        measurement, source.model.name, chosen, None, None, inside,
+        time_shift=source.time_shift, relaxation=source.model.relaxation,
+    )  # fmt: skip
+
+
+def _point(population: Population, problem: Problem, warnings: list[str]) -> Array:
+    """The common values; where they are not admissible together, those of the nearest test."""
+    point = population.point
+    if _admissible(problem, point):
+        return point
+    nearest = population.nearest(lambda values: _admissible(problem, values))
+    if nearest is None:
+        raise SimulationError(
+            f"{population.source.where}: its common values are no admissible spring, nor are those "
+            "of a test; give the result of a fit as foamfit wrote it"
+        )
+    warnings.append(
+        "The medians of the own parameters are no admissible spring together; the curve is that of "
+        "the test whose values are nearest to them."
+    )
+    return nearest
+
+
+def _admissible(problem: Problem, values: Array) -> bool:
+    """Whether a vector of parameters is an admissible chain."""
+    own = values[: len(problem.model.names)]
+    heights = problem.model.heights(own, problem.measurement.specimen.height)
+    if not (np.all(np.isfinite(values)) and np.all(heights > 0.0) and own[-1] >= 0.0):
+        return False
+    return problem.model.rows(own) is not None
+
+
+# ------------------------------------------------------------------------------- the band
+
+
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """Draws of the parameters and their curves."""
+
+    values: list[Array]
+    curves: list[dict[str, Array]]
+    redrawn: int
+
+
+Limits = tuple[Array, Array]
+
+
+def _limits(problem: Problem, point: Array) -> Limits:
+    """Limits of a draw: those of a fit of the test, and the common values.
+
+    Far beyond them lie values that no test can show, from what one test left undetermined.
+    """
+    params = [problem.params[name] for name in problem.names]
+    low, high = np.array([one.min for one in params]), np.array([one.max for one in params])
+    return np.minimum(low, point), np.maximum(high, point)
+
+
+def _draw(
+    population: Population, problem: Problem, limits: Limits, draws: int, seed: int
+) -> dict[str, _Drawn]:
+    """Draws of each of the first two parts, and of both together."""
+    wanted = {"parameters": population.uncertain, "scatter": bool(population.scattering)}
+    out = dict[str, _Drawn]()
+    for i, (part, there) in enumerate(wanted.items()):
+        if there:
+            rng = np.random.default_rng([seed, i])
+            out[part] = _simulate(
+                population, problem, limits, draws, rng, part == "parameters", part == "scatter"
+            )
+    if len(out) == 2:
+        rng = np.random.default_rng([seed, 2])
+        out["both"] = _simulate(population, problem, limits, draws, rng, True, True)
+    elif out:
+        out["both"] = next(iter(out.values()))
+    return out
+
+
+def _simulate(
+    population: Population, problem: Problem, limits: Limits, draws: int,
+    rng: np.random.Generator, open_: bool, scatter: bool,
+) -> _Drawn:  # fmt: skip
+    """Draw and simulate until there are so many; what is not admissible is drawn again."""
+    values, curves = list[Array](), list[dict[str, Array]]()
+    (low, high), objective, tried = limits, problem.objective, 0
+    while len(values) < draws and tried < TRIES * draws:
+        tried += 1
+        one = population.draw(rng, open_=open_, scatter=scatter)
+        if not np.all((low <= one) & (one <= high)):
+            continue
+        try:
+            simulated = objective.simulate(one)
+        except SimulationError:
+            continue
+        values.append(one)
+        curves.append({name: simulated.curves[name] for name in objective.counted})
+    if len(values) < FEWEST:
+        raise SimulationError(
+            f"{population.source.where}: only {len(values)} of {tried} sets of parameters drawn "
+            "from its uncertainty can be simulated; hold or share what it leaves undetermined"
+        )
+    return _Drawn(values, curves, tried - len(values))
+
+
+def _curve(
+    problem: Problem, name: str, predicted: Array, drawn: dict[str, _Drawn],
+    source: Source,
+) -> PredictedCurve:  # fmt: skip
+    """One curve with its band: quantiles of the draws, noise and law error added in quadrature."""
+    objective = problem.objective
+    channel, n = objective.channel(name), predicted.size
+    parts = {part: np.zeros(n) for part in PARTS}
+    ends = {
+        part: np.quantile([curves[name] for curves in one.curves], [BAND[0], 0.5, BAND[1]], axis=0)
+        for part, one in drawn.items()
+    }
+    for part in ends.keys() & parts.keys():
+        parts[part] = 0.5 * (ends[part][2] - ends[part][0])
+    sigma, span = objective.noise(name).sigma, float(np.ptp(predicted))
+    parts["noise"] = np.full(n, NORMAL * sigma)
+    missed = source.law_error(channel, sigma / float(np.ptp(objective.measured[name])))
+    parts["law_error"] = np.full(n, NORMAL * missed * span)
+    low, middle, high = ends.get("both", np.tile(predicted, (3, 1)))
+    more = parts["noise"] ** 2 + parts["law_error"] ** 2
+    kept = np.zeros(n, dtype=bool)
+    kept[objective.kept(name)] = True
+    return PredictedCurve(
+        channel=channel,
+        unit="m" if channel.startswith("displacement") else "Pa",
+        measured=objective.measured[name],
+        predicted=predicted,
+        lo=middle - np.sqrt((middle - low) ** 2 + more),
+        hi=middle + np.sqrt((high - middle) ** 2 + more),
+        parts=parts,
+        kept=kept,
+    )
+
+
+def _parameters(
+    population: Population, point: Array, drawn: dict[str, _Drawn]
+) -> dict[str, PredictedParameter]:
+    """Each parameter at the test, and where 95 % of the draws lie."""
+    both = np.array(drawn["both"].values) if drawn else point[None]
+    low, high = np.quantile(both, BAND, axis=0)
+    return {
+        name: PredictedParameter(
+            population.source.parameters[name].kind, float(point[i]), float(low[i]), float(high[i])
+        )
+        for i, name in enumerate(population.names)
+    }
+
+
+# ------------------------------------------------------------------------------- in words
+
+
+def _warn(
+    source: Source, population: Population, curves: dict[str, PredictedCurve],
+    drawn: dict[str, _Drawn], draws: int, warnings: list[str],
+) -> None:  # fmt: skip
+    """Add what a reader of the band must know."""
+    if source.status == "failed":
+        warnings.append(f"{source.name} is no acceptable fit; see its warnings.")
+    if not source.joint:
+        warnings.append(
+            "One test tells nothing of the scatter between specimens, so the band holds none: fit "
+            "several specimens together (foamfit joint)."
+        )
+    if population.held:
+        many = len(population.held) > 1
+        warnings.append(
+            f"{listed(population.held)} {'are' if many else 'is'} held at "
+            f"{'their values' if many else 'its value'}: the result does not determine "
+            f"{'them' if many else 'it'}, and the band does not hold what that leaves open."
+        )
+    if untold := [curve.channel for curve in curves.values() if curve.channel not in source.misses]:
+        warnings.append(
+            f"{source.name} does not say how far its law misses the {listed(untold)} of a test, so "
+            "the band of it holds no error of the law."
+        )
+    fewest = min((len(one.values) for one in drawn.values()), default=draws)
+    if fewest < draws:
+        warnings.append(f"Only {fewest} of {draws} draws could be simulated; the band is rough.")
+
+
+def _of_trends(population: Population) -> list[str]:
+    """What own parameters do with the rate."""
+    names = [name for name, slope in population.trends.items() if slope]
+    if not names:
+        return []
+    return [
+        f"{listed(names)}, own to each test, {'changes' if len(names) == 1 else 'change'} with the "
+        "rate of the fitted tests: the mean and the scatter are those about a line against the "
+        "logarithm of the rate, at the rate of this test."
+    ]
+
+
+def _of_curves(curves: dict[str, PredictedCurve]) -> list[str]:
+    """What the prediction says of each curve."""
+    out = []
+    for curve in curves.values():
+        widths = {part: curve.half_width_of(part) for part in PARTS}
+        largest = max(widths, key=lambda part: widths[part])
+        half = percent(curve.half_width / curve.range)
+        out.append(
+            f"{curve.channel}: {percent(curve.inside, 3)} of "
+            f"{counted(int(curve.kept.sum()), 'sample')} lie inside the 95 % band, which is "
+            f"±{half} of the measured range in the mean, most of it by {_in_words(largest)}."
+        )
+    return out
+
+
+def _in_words(part: str) -> str:
+    """Name of a part of the band."""
+    told = {"scatter": "the scatter between specimens", "law_error": "the error of the law"}
+    return told.get(part, f"the {part}")

@@ -1,0 +1,188 @@
+"""What the prediction of a test says: data only."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foamfit.arrays import Array
+from foamfit.data.measurement import Measurement
+from foamfit.results import law_in_words, plain
+
+SCHEMA = 1
+# What makes the band, in the order in which it is told.
+PARTS = ("parameters", "scatter", "noise", "law_error")
+
+
+@dataclass(frozen=True, eq=False)
+class PredictedCurve:
+    """A curve of a test with its 95 % band, one row per sample, Pa or m.
+
+    `parts` has the half width (n,) that each of `PARTS` alone would give the band.
+    """
+
+    channel: str  # "stress", "displacement", "displacement_1", …
+    unit: str
+    measured: Array
+    predicted: Array
+    lo: Array
+    hi: Array
+    parts: dict[str, Array]
+    kept: NDArray[np.bool_]  # Samples that count: all but the outliers of the channel
+
+    @property
+    def range(self) -> float:
+        """Measured range."""
+        return float(np.ptp(self.measured))
+
+    @property
+    def inside(self) -> float:
+        """Share of the samples that lie inside the band."""
+        within = (self.lo <= self.measured) & (self.measured <= self.hi)
+        return float(np.mean(within[self.kept]))
+
+    @property
+    def half_width(self) -> float:
+        """Half of the band, mean over the samples that count."""
+        return float(np.mean(0.5 * (self.hi - self.lo)[self.kept]))
+
+    def half_width_of(self, part: str) -> float:
+        """Half of the band that a part alone would give, mean over the samples that count."""
+        return float(np.mean(self.parts[part][self.kept]))
+
+
+@dataclass(frozen=True)
+class PredictedParameter:
+    """A parameter as it is for the test: its value, and where 95 % of the draws lie."""
+
+    kind: str  # As in joint.json; "shared" or "fixed" where the result is of one test
+    value: float
+    lo: float
+    hi: float
+
+
+@dataclass(frozen=True, eq=False)
+class PredictedTest:
+    """A test that was not fitted, predicted from a result.
+
+    Attributes
+    ----------
+    source, joint
+        Name of the result and whether it is of several tests.
+    measurement
+        The test; its specimen, striker and motion are what is simulated.
+    model, relaxation, drive, seed
+        Of the simulation and its draws.
+    curves : dict of str to PredictedCurve
+        By their names in fit.json; those that the drive leaves free.
+    misfit : dict
+        RMS of predicted minus measured over the measured range, as in fit.json.
+    rate, fitted_rates
+        Mean strain rate on loading of the test and of those that were fitted, 1/s.
+    extrapolated : bool
+        Whether the rate lies outside the fitted ones.
+    draws, redrawn : int
+        Draws of the parameters, and those more that were not admissible and were drawn again.
+    held : tuple of str
+        Parameters that the result leaves undetermined and that were held at their values.
+    """
+
+    source: str
+    joint: bool
+    measurement: Measurement
+    model: str
+    relaxation: int
+    drive: str
+    seed: int
+    curves: dict[str, PredictedCurve]
+    misfit: dict[str, float | None]
+    parameters: dict[str, PredictedParameter]
+    rate: float | None
+    fitted_rates: tuple[float, ...]
+    extrapolated: bool
+    draws: int
+    redrawn: int
+    held: tuple[str, ...]
+    sentences: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def law(self) -> str:
+        """The model and its relaxation in words."""
+        return law_in_words(self.model, self.relaxation)
+
+    @property
+    def inside(self) -> dict[str, float]:
+        """Share of the samples of each curve that lie inside its 95 % band."""
+        return {name: curve.inside for name, curve in self.curves.items()}
+
+    def to_json_dict(self) -> dict[str, Any]:
+        """Return the content of ``prediction.json``: SI, plain types, null = not there."""
+        m = self.measurement
+        content: dict[str, Any] = plain(
+            {
+                "schema": SCHEMA,
+                "foamfit": version("foamfit"),
+                "test": m.name,
+                "data_sha256": m.data_sha256,
+                "cycle": m.cycle,
+                "result": self.source,
+                "joint": self.joint,
+                "model": self.model,
+                "relaxation": self.relaxation,
+                "drive": self.drive,
+                "seed": self.seed,
+                "draws": self.draws,
+                "redrawn": self.redrawn,
+                "rate": self.rate,
+                "fitted_rates": self.fitted_rates,
+                "extrapolated": self.extrapolated,
+                "misfit": self.misfit,
+                "inside": self.inside,
+                "curves": {
+                    name: {
+                        "range": curve.range,
+                        "half_width": curve.half_width,
+                        "half_widths": {part: curve.half_width_of(part) for part in PARTS},
+                        "n": int(curve.kept.sum()),
+                        "unit": curve.unit,
+                    }
+                    for name, curve in self.curves.items()
+                },
+                "parameters": {name: vars(one) for name, one in self.parameters.items()},
+                "held": self.held,
+                "warnings": self.warnings,
+                "sentences": self.sentences,
+            }
+        )
+        return content
+
+    def rows(self) -> Iterator[list[object]]:
+        """Rows of prediction.csv, the header first: one row per sample, SI."""
+        m, columns = self.measurement, dict[str, Array]()
+        if m.time is not None:
+            columns["time (s)"] = m.time
+        predicted = {curve.channel for curve in self.curves.values()}
+        for channel, values in m.channels().items():
+            if channel not in predicted:
+                columns[f"measured {channel} ({'Pa' if channel == 'stress' else 'm'})"] = values
+        for curve in self.curves.values():
+            channel, unit = curve.channel, curve.unit
+            columns[f"measured {channel} ({unit})"] = curve.measured
+            columns[f"predicted {channel} ({unit})"] = curve.predicted
+            columns[f"{channel} band low ({unit})"] = curve.lo
+            columns[f"{channel} band high ({unit})"] = curve.hi
+            for part in PARTS:
+                columns[f"{channel} half width, {part.replace('_', ' ')} ({unit})"] = curve.parts[
+                    part
+                ]
+            if not curve.kept.all():
+                columns[f"outliers of {channel} left out"] = (~curve.kept).astype(int)
+        yield list(columns)
+        for row in zip(*(column.tolist() for column in columns.values()), strict=True):
+            yield list(row)

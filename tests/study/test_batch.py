@@ -1,0 +1,600 @@
+"""Many tests: each whole or not at all, none twice, whatever ends; and their summary."""
+
+from __future__ import annotations
+
+import csv
+import errno
+import itertools
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from click.testing import CliRunner
+
+import fabricated
+import foamfit as ff
+from conftest import HEIGHT, synthetic_impact, without_pictures
+from foamfit.cli import batch as command
+from foamfit.cli import main
+from foamfit.report.studies.batch import MOST_ON_PAGE, Row, row_of, table_rows, write_page
+from foamfit.study import batch as module
+from foamfit.study import batch_work
+from foamfit.study.batch_work import work
+from foamfit.study.processes import ATTEMPTS, EndedError, Processes
+
+posix = pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+QUICK = {"starts": 1, "intervals": "local"}
+TOML = (
+    f'[specimen]\nheight = "{1e3 * HEIGHT} mm"\narea = "19.635 mm^2"\n'
+    '[striker]\nmass = "7 g"\nvelocity = "2 m/s"\n'
+)
+
+
+def write(folder: Path, name: str, seed: int) -> None:
+    _, test = synthetic_impact(seed=seed, samples=101)
+    columns = (1e3 * test.time, 1e-6 * test.stress, 1e3 * test.displacement)
+    lines = [",".join(f"{x:.6f}" for x in row) for row in zip(*columns, strict=True)]
+    header = "time (ms),stress (MPa),displacement (mm)"
+    (folder / f"{name}.csv").write_text("\n".join([header, *lines]) + "\n")
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """Three tests, one file that is none, and the TOML of all."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "tests").mkdir()
+    for seed, name in enumerate("abc"):
+        write(tmp_path / "tests", name, seed)
+    (tmp_path / "tests" / "bad.csv").write_text("x,y\n1,2\n")
+    (tmp_path / "foam.toml").write_text(TOML)
+    return tmp_path
+
+
+class Inline(Executor):
+    """Calls at once, in this process."""
+
+    def submit(self, fn, /, *args, **kwargs):
+        future = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+@pytest.fixture
+def tried(monkeypatch):
+    """The names of the tests that are fitted; a fit takes no time."""
+    found = []
+
+    def fit(test, **options):
+        found.append(test.name)
+        return fabricated.result(measurement=test)
+
+    monkeypatch.setattr(batch_work, "fit", fit)
+    return found
+
+
+def again(**changed):
+    given = {"out": "out", "specimen": "foam.toml", "executor": Inline(), "report": False}
+    return ff.batch("tests", **(given | changed))
+
+
+def run(*words):
+    return CliRunner().invoke(main, [str(word) for word in words])
+
+
+def names(folder):
+    return sorted(path.name for path in Path(folder).iterdir())
+
+
+def numbers(out):
+    """What was fitted, as it is written."""
+    found = Path(out).glob("*/parameters.csv")
+    return {path.parent.name: path.read_text() for path in sorted(found)}
+
+
+def stamps(out):
+    """When each result was written."""
+    return {p.parent.name: p.stat().st_mtime_ns for p in Path(out).glob("*/batch.json")}
+
+
+# ------------------------------------------------------------------------- what there is at the end
+
+
+def test_the_same_numbers_with_any_number_of_processes_and_anywhere(here):
+    frames = {}
+    for jobs in (1, 2, 4):
+        call = {"out": f"out{jobs}", "specimen": "foam.toml", "report": False, "jobs": jobs}
+        frames[jobs] = ff.batch("tests", **call, **QUICK)
+    again(out="inline", **QUICK)
+    made = numbers("out1")
+    assert list(made) == ["a", "b", "c"]
+    assert made == numbers("out2") == numbers("out4") == numbers("inline")
+    alone = ff.fit(ff.read_test("tests/b.csv", "foam.toml"), **QUICK)
+    frame = frames[2].set_index("test")
+    assert frame.loc["b", "s1_k0"] == alone.params["s1_k0"].value
+    assert names("out2") == ["a", "b", "bad", "c", "summary.csv", "summary.html"]
+    assert names("out2/a") == ["batch.json", "curves.csv", "fit.json", "parameters.csv"]
+    assert frame.loc["bad", "status"] == "refused"
+    assert frame.loc["bad", "error"].startswith("tests/bad.csv: ")
+    with open("out2/summary.csv", newline="") as file:
+        head = next(csv.reader(file))
+    curves = [f"misfit_{c}" for c in ("stress_time", "displacement_time", "stress_strain")]
+    assert head[:8] == ["test", "file", "status", "error", *curves, "runtime_s"]
+    parts = [f"s1_k0{part}" for part in ("", "_stderr", "_lo", "_hi", "_state")]
+    assert head[8:13] == parts
+    pd.testing.assert_frame_equal(frames[2], pd.read_csv("out2/summary.csv"), check_dtype=False)
+
+
+def test_reports_are_there_unless_they_are_not_wanted(here, tried, monkeypatch):
+    without_pictures(monkeypatch)
+    again(report=False)
+    assert len(tried) == 3
+    again(report=True)  # the reports are missing
+    assert len(tried) == 6
+    assert {"report.html", "fit.png", "fit.pdf"} <= set(names("out/a"))
+    assert 'href="a/report.html"' in Path("out/summary.html").read_text()
+    again(report=False)
+    assert len(tried) == 6
+
+
+def test_a_cycle_is_a_row_and_its_folder_is_in_that_of_the_test(here, monkeypatch):
+    from foamfit.study.cycles import CycleFits
+
+    def fit_cycles(path, specimen, *, cycles, **options):
+        assert cycles is None
+        results = {1: fabricated.result(), 2: fabricated.result(status="ok")}
+        return CycleFits("a", "bistable", (1, 2, 3), results, {3: "it is cut"})
+
+    monkeypatch.setattr(batch_work, "fit_cycles", fit_cycles)
+    frame = again(cycle="all").set_index("test")
+    assert list(frame.index[:3]) == ["a/cycle-1", "a/cycle-2", "a/cycle-3"]
+    assert list(frame["status"][:3]) == ["warnings", "ok", "refused"]
+    assert frame.loc["a/cycle-3", "error"] == "it is cut"
+    assert {"batch.json", "cycle-1", "cycle-2", "cycles.csv", "cycles.json"} == set(names("out/a"))
+    before = stamps("out")
+    again(cycle="all")
+    assert stamps("out") == before
+
+
+# ------------------------------------------------------------------------- called again
+
+
+def test_only_what_is_missing_or_has_changed_is_fitted(here, tried):
+    first = again()
+    assert tried == ["a", "b", "c"]
+    before = stamps("out")
+    pd.testing.assert_frame_equal(again(), first)
+    assert tried == ["a", "b", "c"]
+    assert stamps("out") == before  # the one that was refused is not tried again, too
+    changes = (
+        (lambda: write(here / "tests", "b", 7), {}, ["b"]),
+        (lambda: write(here / "tests", "d", 8), {}, ["d"]),
+        (lambda: (here / "out/a/batch.json").unlink(), {}, ["a"]),
+        (lambda: (here / "foam.toml").write_text(TOML + '[noise]\nstress = "1 kPa"\n'), {}, None),
+        (lambda: None, {"seed": 3}, None),
+        (lambda: None, {"seed": 3, "fix": {"s1_eta": 0.0}}, None),
+        (lambda: None, {"seed": 3, "fix": {"s1_eta": 0.0}, "fresh": True}, None),
+        (lambda: None, {"seed": 3, "fix": {"s1_eta": 0.0}}, []),
+    )
+    for change, call, wanted in changes:
+        tried.clear()
+        change()
+        again(**call)
+        assert sorted(tried) == (["a", "b", "c", "d"] if wanted is None else wanted)
+
+
+def test_another_version_fits_again(here, tried, monkeypatch):
+    again()
+    monkeypatch.setattr(batch_work, "version", lambda _: "99.0")
+    monkeypatch.setattr("foamfit.results.version", lambda _: "99.0")
+    tried.clear()
+    again()
+    assert tried == ["a", "b", "c"]
+
+
+def test_a_test_that_became_unreadable_loses_its_old_result(here, tried):
+    again()
+    (here / "tests/a.csv").write_text("nothing")
+    assert again().set_index("test").loc["a", "status"] == "refused"
+    assert names("out/a") == ["batch.json"]
+    write(here / "tests", "a", 0)
+    assert again().set_index("test").loc["a", "status"] != "refused"
+
+
+# ------------------------------------------------------------------------- what goes wrong
+
+
+def test_a_defect_is_a_row_and_ends_nothing(here, tried, monkeypatch):
+    def fit(test, **options):
+        if test.name == "b":
+            raise ZeroDivisionError("of b")
+        return fabricated.result(measurement=test)
+
+    monkeypatch.setattr(batch_work, "fit", fit)
+    row = again().set_index("test").loc["b"]
+    assert row["status"] == "refused"
+    assert "defect of foamfit, please report it (ZeroDivisionError: of b)" in row["error"]
+
+
+def failing(task):
+    """Work, but for the test b, whose process is killed; a module's function, as those must be."""
+    if task.name == "b":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return work(task)
+
+
+@posix
+def test_a_test_that_kills_its_process_is_a_row_and_is_tried_again_when_called(here, monkeypatch):
+    monkeypatch.setattr(module, "work", failing)
+    call = {"executor": None, "jobs": 2, **QUICK}
+    frame = again(**call).set_index("test")
+    assert "its process ended each time" in frame.loc["b", "error"]
+    assert list(numbers("out")) == ["a", "c"]
+    assert not [name for name in names("out") if name.startswith(".")]
+    before = stamps("out")
+    monkeypatch.undo()
+    os.chdir(here)
+    assert again(**call).set_index("test").loc["b", "status"] in ("ok", "warnings")
+    after = stamps("out")
+    assert {name: after[name] for name in before} == before
+
+
+def seen_once(path):
+    """Kill this process at the first call."""
+    if not Path(path).exists():
+        Path(path).touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return os.environ["OMP_NUM_THREADS"], os.getpid()
+
+
+@posix
+def test_one_process_that_ends_takes_nothing_else_with_it(tmp_path):
+    with Processes(2) as pool:
+        calls = [pool.submit(time.sleep, 0.05) for _ in range(6)]
+        twice = pool.submit(os._exit, 1)
+        once = pool.submit(seen_once, tmp_path / "seen")
+        assert [call.result() for call in calls] == [None] * 6
+        assert once.result()[0] == "1"
+        with pytest.raises(EndedError, match=f"ended {ATTEMPTS} times"):
+            twice.result()
+    pool = Processes(1)
+    sleeping = pool.submit(time.sleep, 60)
+    while not sleeping.running():
+        time.sleep(0.01)
+    began = time.monotonic()
+    pool.stop()
+    assert time.monotonic() - began < 10
+    assert sleeping.exception() is not None or sleeping.cancelled()
+
+
+def test_ctrl_c_leaves_what_is_done_and_a_summary(here):
+    def interrupt(state):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        again(executor=None, jobs=1, progress=interrupt, **QUICK)
+    frame = pd.read_csv("out/summary.csv").set_index("test")
+    assert frame.loc["a", "status"] in ("ok", "warnings")
+    assert list(frame["status"][["b", "c"]]) == ["not fitted", "not fitted"]
+    assert "call it again" in frame.loc["c", "error"]
+    assert not [name for name in names("out") if name.startswith(".")]
+
+
+def test_a_full_disk_ends_in_one_sentence_and_loses_nothing(here, tried, monkeypatch):
+    real, written = batch_work.write_result, []
+
+    def write_result(result, folder, **options):
+        if written:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        written.append(1)
+        real(result, folder, **options)
+
+    monkeypatch.setattr(batch_work, "write_result", write_result)
+    with pytest.raises(ff.InputError, match=r"No space left.*1 of 4 tests are done and stay"):
+        again()
+    assert list(numbers("out")) == ["a"]
+    assert not [name for name in names("out") if name.startswith(".")]
+    monkeypatch.setattr(batch_work, "write_result", real)
+    tried.clear()
+    again()
+    assert tried == ["b", "c"]
+
+
+def test_an_executor_that_ends_is_one_sentence_and_what_is_done_stays(here, tried):
+    class Ending(Inline):
+        count = 0
+
+        def submit(self, fn, /, *args, **kwargs):
+            self.count += 1
+            if self.count > 1:
+                raise RuntimeError("cannot schedule new futures after shutdown")
+            return super().submit(fn, *args, **kwargs)
+
+    with pytest.raises(ff.InputError, match=r"executor has ended.*1 of 4 tests are done"):
+        again(executor=Ending())
+    assert list(numbers("out")) == ["a"]
+
+
+def test_memory_errors_and_other_versions_are_not_the_fault_of_a_test(here, monkeypatch):
+    monkeypatch.setattr(batch_work, "fit", lambda *_, **__: (_ for _ in ()).throw(MemoryError()))
+    frame = again().set_index("test")
+    assert "its fit was lost (MemoryError" in frame.loc["a", "error"]
+    assert names("out") == ["bad", "summary.csv", "summary.html"]  # so that it is tried again
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["none/*.csv"], "none/*.csv: the glob matches no file"),
+        (["tests", "--jobs", "2", "--scheduler", "tcp://x"], "--jobs and --scheduler exclude"),
+        (["tests", "--fix", "s1_kx=1"], "'s1_kx' is not one of the model bistable"),
+        (["tests", "--model", "auto", "--vary", "s1_eta"], "belong to one model"),
+        (["tests", "--specimen", "none.toml"], "none.toml: no such file"),
+        (["tests", "--model", "elastic"], "'elastic' is not a spring"),
+        (["tests", "--out", "foam.toml"], "foam.toml is a file"),
+        (["tests", "--out", "tests"], "tests holds a.csv, which foamfit did not write"),
+        (["tests", "--cycle", "0"], "must be a number from 1 up"),
+        (["tests", "--jobs", "0"], "--jobs"),
+    ],
+)
+def test_a_wrong_call_is_one_sentence_and_nothing_is_written(here, words, told):
+    before = sorted(here.rglob("*"))
+    result = run("batch", *words)
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert re.fullmatch(r"foamfit: [^\n]+\n", result.stderr)
+    assert told in result.stderr
+    assert sorted(here.rglob("*")) == before
+
+
+@pytest.mark.parametrize("place", ["notes.txt", "a/notes.txt", "mine/notes.txt"])
+def test_a_folder_with_files_of_others_is_refused(here, tried, place):
+    again()
+    (here / "out" / place).parent.mkdir(exist_ok=True)
+    (here / "out" / place).write_text("mine")
+    with pytest.raises(ff.InputError, match=f"out holds {place}, which foamfit did not write"):
+        again(fresh=True)
+    assert len(tried) == 3
+
+
+# ------------------------------------------------------------------------- the command
+
+
+@posix
+def test_killed_and_called_again_nothing_is_lost_or_done_twice(here):
+    """The process of the command is killed: the others end, and the next call goes on."""
+    import psutil
+
+    for seed in range(3, 6):
+        write(here / "tests", f"t{seed}", seed)
+    words = ["batch", "tests", "--specimen", "foam.toml", "--starts", "2", "--jobs", "2"]
+    words += ["--no-report", "--quiet", "--out", "out"]
+    with subprocess.Popen([sys.executable, "-m", "foamfit", *words]) as process:
+        deadline = time.monotonic() + 60
+        while not stamps("out") and time.monotonic() < deadline:
+            time.sleep(0.02)
+        others = psutil.Process(process.pid).children(recursive=True)
+        process.kill()
+    done = stamps("out")
+    assert len(done) < 7
+    assert len(others) >= 3
+    _, alive = psutil.wait_procs(others, timeout=20)
+    assert not [one for one in alive if one.is_running() and one.status() != psutil.STATUS_ZOMBIE]
+    done = stamps("out")
+    result = run(*words)
+    assert result.exit_code == 2  # bad.csv
+    assert "1 of 7 tests has no acceptable fit" in result.stderr
+    after = stamps("out")
+    assert {name: after[name] for name in done} == done
+    assert len(after) == 7
+    assert not [name for name in names("out") if name.startswith(".")]
+
+
+def test_the_command_prints_counts_parameters_and_refusals(here, tried, monkeypatch):
+    monkeypatch.setattr(module, "Processes", lambda *_: Local())
+    result = run("batch", "tests", "--specimen", "foam.toml", "--no-report", "--out", "out")
+    assert result.exit_code == 2
+    assert result.stdout.startswith("4 tests: 3 fitted with warnings and 1 refused\n")
+    assert "\nbad: tests/bad.csv: " in result.stdout
+    assert re.search(r"\ns1_k0 +5\.5 +5\.5 +5\.5 +3 of 3 +MPa\n", result.stdout)
+    assert result.stdout.endswith("written to out: open out/summary.html\n")
+    assert result.stderr == "foamfit: 1 of 4 tests has no acceptable fit; see out/summary.csv\n"
+    words = ("--specimen", "foam.toml", "--no-report", "--out", "out")
+    result = run("batch", "tests/a.csv", *words, "--json")
+    assert result.exit_code == 0
+    (row,) = json.loads(result.stdout)
+    assert row["s1_k0_state"] == "determined"
+    assert result.stderr == ""
+
+
+class Local(Inline):
+    """In place of the processes."""
+
+    def stop(self):
+        """Nothing to end."""
+
+
+def test_progress_says_done_wrong_left_and_how_long(monkeypatch):
+    shown = []
+
+    class Bar:
+        pos = 0
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+        def update(self, n):
+            shown.append(self.label)
+
+    monkeypatch.setattr(command.sys, "stderr", type("T", (), {"isatty": lambda _: True})())
+    monkeypatch.setattr(command.click, "progressbar", lambda **_: Bar())
+    clock = itertools.count(0, 60)
+    monkeypatch.setattr(command.time, "monotonic", lambda: next(clock))
+    with command._progress_line(False) as progress:
+        progress(module.State(done=4, wrong=1, left=6, fitted=2))
+        progress(module.State(done=10, wrong=1, left=0, fitted=8))
+    assert shown == [
+        "4 done, 1 without a fit, 6 left, about 3 min",
+        "10 done, 1 without a fit, 0 left",
+    ]
+
+
+def test_without_dask_the_command_says_how_it_is_installed(here, monkeypatch):
+    monkeypatch.setitem(sys.modules, "dask.distributed", None)
+    result = run("batch", "tests", "--scheduler", "tcp://127.0.0.1:1")
+    assert result.exit_code == 1
+    assert result.stderr == (
+        'foamfit: --scheduler needs Dask, which is not installed: pip install "foamfit[dask]"\n'
+    )
+
+
+def test_a_scheduler_that_does_not_answer_is_one_sentence(here, monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(command, "PATIENCE", 0.3)
+    for address in ("tcp://127.0.0.1:1", "nonsense://x"):
+        result = run("batch", "tests", "--scheduler", address, "--out", "out")
+        assert (result.exit_code, result.stdout) == (1, "")
+        assert re.fullmatch(r"foamfit: --scheduler [^\n]+no Dask scheduler[^\n]+\n", result.stderr)
+    assert not Path("out").exists()
+
+
+@posix
+def test_a_dask_cluster_loses_a_worker_and_no_test(here):
+    """Two workers, which read nothing of this file system; one is killed in the middle."""
+    pytest.importorskip("distributed")
+    (here / "tests/bad.csv").unlink()
+    for seed in range(3, 7):
+        write(here / "tests", f"t{seed}", seed)
+    begin = [sys.executable, "-m"]
+    file = here / "scheduler.json"
+    worker = [*begin, "distributed.cli.dask_worker", "--scheduler-file", file]
+    worker += ["--nthreads", "1", "--no-nanny", "--no-dashboard"]
+    (here / "elsewhere").mkdir()
+    calls = (
+        ([*begin, "distributed.cli.dask_scheduler", "--port", "0", "--scheduler-file", file,
+          "--no-dashboard"], here),
+        (worker, here / "elsewhere"), (worker, here / "elsewhere"),
+    )  # fmt: skip
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    processes = [subprocess.Popen(call, cwd=place, **quiet) for call, place in calls]
+
+    def kill() -> None:
+        while not stamps("out"):
+            time.sleep(0.02)
+        processes[1].kill()
+
+    killer = threading.Thread(target=kill, daemon=True)
+    try:
+        while not file.exists():
+            time.sleep(0.05)
+        address = json.loads(file.read_text())["address"]
+        killer.start()
+        words = ["batch", "tests", "--specimen", "foam.toml", "--starts", "1", "--no-report"]
+        result = run(*words, "--scheduler", address, "--out", "out", "--quiet")
+        assert result.exit_code == 0, result.output
+        assert processes[1].wait(10) == -signal.SIGKILL
+    finally:
+        for process in reversed(processes):
+            process.kill()
+            process.wait()
+    again(starts=1, out="local")
+    assert len(numbers("out")) == 7
+    assert numbers("out") == numbers("local")
+
+
+def test_one_fit_compiles_what_all_need_before_the_others_start(here, monkeypatch):
+    order = []
+
+    class Slow(ThreadPoolExecutor):
+        def submit(self, fn, /, task):
+            order.append(f"{task.name} given")
+            return super().submit(fn, task)
+
+        def stop(self):
+            """Nothing to end."""
+
+    def fit(test, **options):
+        time.sleep(0.02)
+        order.append(f"{test.name} fitted")
+        return fabricated.result(measurement=test)
+
+    monkeypatch.setattr(batch_work, "fit", fit)
+    monkeypatch.setattr(module, "Processes", lambda *_: Slow(3))
+    for compiled in (False, True):
+        order.clear()
+        have = {"integrate", "integrate_with_memory"} if compiled else {"integrate"}
+        monkeypatch.setattr(module.cache, "compiled", lambda name="integrate", h=have: name in h)
+        again(executor=None, model="microscale", fresh=True)
+        assert order[0] == "a given"
+        assert (order[1] == "a fitted") != compiled
+
+
+# ------------------------------------------------------------------------- the page
+
+
+def rows_of(count):
+    rng = np.random.default_rng(0)
+    base = row_of("t", "t.csv", fabricated.result())
+    for i in range(count):
+        given = {n: [rng.normal(c[0] or 1.0, 1e-2), *c[1:]] for n, c in base.parameters.items()}
+        status = ("ok", "warnings", "failed")[i % 3]
+        yield Row(
+            f"test-{i:04d}", f"data/test-{i:04d}.csv", status, None, base.misfit, 1.0, given,
+            base.sketch,
+        )  # fmt: skip
+    yield Row("<b>", "<b>.csv", "refused", "no <height> & no width")
+
+
+def test_the_page_of_a_thousand_tests_is_small_and_needs_nothing_else(tmp_path):
+    rows = list(rows_of(1000))
+    write_page(rows, tmp_path, "a batch")
+    page = (tmp_path / "summary.html").read_text(encoding="utf-8")
+    assert len(page) < 2_500_000
+    assert not re.search(r"(src|href)=\"(https?:)?//", page)
+    assert page.count("<tr>") == 1002
+    assert page.count('<path class="m" d="M') == 1000
+    assert page.count('<div class="strip">') == 7  # what is held is no column
+    assert "no &lt;height&gt; &amp; no width" in page
+    assert page.count("<i>") >= 6000  # intervals
+
+
+def test_of_very_many_tests_the_page_shows_some_and_all_that_failed(tmp_path):
+    rows = [Row(f"t{i}", "x.csv", "ok") for i in range(MOST_ON_PAGE + 5)]
+    rows.append(Row("last", "x.csv", "refused", "why"))
+    write_page(rows, tmp_path, "a batch")
+    page = (tmp_path / "summary.html").read_text(encoding="utf-8")
+    assert f"This page shows {MOST_ON_PAGE + 1} of them" in page
+    assert "last" in page
+
+
+def test_a_sketch_follows_the_curves():
+    result = fabricated.result()
+    sketch = row_of("t", "t.csv", result).sketch
+    numbers = [int(n) for n in re.findall(r"-?\d+", sketch.measured)]
+    points = np.cumsum(np.reshape(numbers, (-1, 2)), axis=0)
+    top = np.argmin(points[:, 1])
+    assert points[:, 0].min() >= 0
+    assert points[:, 0].max() == points[top, 0] == 116
+    assert sketch.ends.startswith("35 % strain, ")
+
+
+def test_models_with_other_parameters_leave_cells_empty():
+    one = Row("a", "a.csv", "ok", parameters={"s1_k0": [1.0, 0.1, 0.8, 1.2, "determined", "Pa"]})
+    other = Row("b", "b.csv", "ok", parameters={"s1_kc": [2.0, None, None, None, "weak", "Pa"]})
+    head, first, second = table_rows([one, other])
+    assert dict(zip(head, first, strict=True))["s1_kc"] is None
+    assert dict(zip(head, second, strict=True))["s1_kc_state"] == "weak"

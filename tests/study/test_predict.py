@@ -1,0 +1,610 @@
+"""The prediction of a test that was not fitted: its curve, its band, and what is refused."""
+
+import copy
+import csv
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import foamfit as ff
+from conftest import synthetic_impact
+from foamfit.cli import main
+from foamfit.data.measurement import Measurement, Noise, Specimen
+from foamfit.errors import InputError, SimulationError
+from foamfit.fitting.problem import make_problem
+from foamfit.report.studies import prediction as prediction_report
+from foamfit.report.studies.prediction import prediction_text
+from foamfit.study.prediction.identified import read_source
+from foamfit.study.prediction.population import Population
+
+HEIGHT, AREA, SIGMA = 10e-3, 5e-5, 1e3
+LAW = {
+    "s1_k0": 8e5, "s1_kc": 4e5, "s1_eps_star": 0.3, "s1_sigma_plus": 1.1e5, "s1_spread_plus": 0.4,
+    "s1_sigma_minus": 7e4, "s1_spread_minus": 0.6,
+}  # fmt: skip
+DRAWS = 60
+
+
+def loop(rate=0.25, seed=None, height=HEIGHT, noise=SIGMA, **changes) -> Measurement:
+    """A triangle to a strain of 0.5 on a microscale spring, with the noise of a seed."""
+    time = np.linspace(0.0, 1.0 / rate, 301)
+    strain = 0.5 - np.abs(0.5 - rate * time)
+    values = LAW | {f"s1_{name}": value for name, value in changes.items()}
+    spring = ff.MicroscaleSpring(**{name[3:]: value for name, value in values.items()})
+    stress = np.asarray(spring.stress(strain))
+    if seed is not None:
+        stress = stress + noise * np.random.default_rng(seed).standard_normal(stress.size)
+    return Measurement(
+        "held out", None, "0" * 64, time, stress, strain * height, Specimen(height, AREA),
+        noise=Noise(noise, 1e-7), motion="measured",
+    )  # fmt: skip
+
+
+def fit_content(**changes) -> dict:
+    """What fit.json holds of a test at 0.25 1/s that nothing is uncertain of but sigma_plus."""
+    parameters = {
+        name: {"value": value, "stderr": None, "ci95": None, "vary": False, "state": "fixed"}
+        for name, value in LAW.items()
+    }
+    parameters["s1_sigma_plus"] |= {"stderr": 1e3, "vary": True, "state": "determined"}
+    return {
+        "schema": 1, "foamfit": "0", "test": "fitted", "model": "microscale", "relaxation": 0,
+        "drive": "displacement", "status": "ok", "data": {"rate": 0.25}, "parameters": parameters,
+        "misfit": {"stress_strain": 0.01}, "noise": {},
+        "correlation": {"names": ["s1_sigma_plus"], "matrix": [[1.0]]},
+    } | changes  # fmt: skip
+
+
+def joint_content(parameters: dict, rates=(0.2, 0.3), misfit=None) -> dict:
+    """What joint.json holds of tests in which all but `parameters` are held."""
+    held = {name: {"kind": "fixed", "value": value} for name, value in LAW.items()}
+    tests = {f"t{i}": {"rate": rate, "misfit": misfit or {}} for i, rate in enumerate(rates)}
+    return {
+        "schema": 1, "name": "several", "model": "microscale", "relaxation": 0,
+        "drive": "displacement", "status": "ok", "rate0": 0.25, "tests": tests,
+        "parameters": held | parameters, "covariance": {"names": [], "matrix": []},
+    }  # fmt: skip
+
+
+def written(folder: Path, content: dict) -> Path:
+    path = folder / ("joint.json" if "tests" in content else "fit.json")
+    path.write_text(json.dumps(content))
+    return path
+
+
+def population(content: dict, folder: Path, test: Measurement | None = None) -> Population:
+    source = read_source(written(folder, content))
+    return Population(source, source.model.names, (test or loop()).specimen, 0.25)
+
+
+# ------------------------------------------------------------------------------- the band
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    return ff.fit(loop(seed=99), model="microscale", starts=3, intervals="local")
+
+
+def test_the_band_holds_held_out_noise(fitted):
+    shares = [
+        ff.predict(fitted, loop(seed=seed), draws=DRAWS).inside["stress_strain"]
+        for seed in range(20)
+    ]
+    assert 0.93 < np.mean(shares) < 0.97
+
+
+def test_the_band_of_the_parameters_is_that_of_linearised_errors(fitted):
+    found = ff.predict(fitted, loop(seed=1), draws=400)
+    problem = make_problem(loop(), "microscale", None, None, None, interior_mass=False)
+    names = fitted.correlation.names
+    stderr = np.array([fitted.parameters[name].stderr for name in names])
+    covariance = fitted.correlation.matrix * np.outer(stderr, stderr)
+    slopes = problem.slopes(problem.vector(fitted.params), names) / problem.objective.factor(
+        "stress_strain"
+    )
+    linear = 1.96 * np.sqrt(np.einsum("ij,jk,ik->i", slopes, covariance, slopes))
+    drawn = found.curves["stress_strain"].parts["parameters"]
+    assert np.linalg.norm(drawn - linear) < 0.15 * np.linalg.norm(linear)
+
+
+def shares_of_new_specimens(make, spread=0.25, groups=20, tests=8):
+    """Share inside of a new specimen of each of some groups, sigma_plus log-normal."""
+    rng, shares = np.random.default_rng(5), []
+    for group in range(groups):
+        logs = np.log(1.1e5) + spread * rng.standard_normal(tests + 1)
+        found = ff.predict(
+            make(np.exp(logs[:-1])), loop(seed=group, sigma_plus=np.exp(logs[-1])), draws=DRAWS
+        )
+        shares.append(found.inside["stress_strain"])
+    return np.mean(shares)
+
+
+class InMemory:
+    def __init__(self, content):
+        self.content = content
+
+    def to_json_dict(self):
+        return self.content
+
+
+def scatter(values):
+    logs = np.log(values)
+    mean, tau, n = float(np.exp(logs.mean())), float(logs.std(ddof=1)), len(values)
+    item = {
+        "kind": "scatter", "value": mean, "stderr": mean * tau / n**0.5, "scatter": tau,
+        "tests": {f"t{i}": {"value": v} for i, v in enumerate(values)},
+    }  # fmt: skip
+    content = joint_content({"s1_sigma_plus": item}, [0.25] * n)
+    content["covariance"] = {"names": ["s1_sigma_plus"], "matrix": [[item["stderr"] ** 2]]}
+    return InMemory(content)
+
+
+def own(values):
+    item = {
+        "kind": "own", "value": float(np.median(values)), "stderr": None,
+        "tests": {f"t{i}": {"value": v} for i, v in enumerate(values)},
+    }  # fmt: skip
+    return InMemory(joint_content({"s1_sigma_plus": item}, [0.25] * len(values)))
+
+
+@pytest.mark.parametrize("make", [scatter, own])
+def test_the_band_holds_new_specimens(make):
+    assert 0.90 < shares_of_new_specimens(make) < 0.99
+
+
+def test_own_values_that_change_with_the_rate_are_taken_at_that_of_the_test():
+    rng = np.random.default_rng(2)
+    rates = np.array([0.025, 0.025, 0.025, 1.0, 1.0, 1.0, 1.0, 1.0])
+    values = 1.1e5 * (rates / 0.25) ** 0.3 * np.exp(0.1 * rng.standard_normal(8))
+    content = own(values).content
+    found = {}
+    for name, at in (("rising", rates), ("unknown", [None] * 8)):
+        made = copy.deepcopy(content)
+        for test, rate in zip(made["tests"].values(), at, strict=True):
+            test["rate"] = None if rate is None else float(rate)
+        found[name] = ff.predict(InMemory(made), loop(rate=0.25, seed=0), draws=200)
+    rising, unknown = (found[name].parameters["s1_sigma_plus"] for name in ("rising", "unknown"))
+    assert rising.value == pytest.approx(1.1e5, rel=0.1)
+    assert unknown.value == pytest.approx(np.median(values))
+    assert np.log(rising.hi / rising.lo) < 0.5 * np.log(unknown.hi / unknown.lo)
+    assert any("change" in one for one in found["rising"].sentences)
+
+
+def test_own_values_that_do_not_change_with_the_rate_have_one_mean():
+    content = own(1.1e5 * np.exp(0.2 * np.random.default_rng(3).standard_normal(8))).content
+    for i, test in enumerate(content["tests"].values()):
+        test["rate"] = (0.025, 1.0)[i % 2]
+    found = ff.predict(InMemory(content), loop(seed=0), draws=DRAWS)
+    item = content["parameters"]["s1_sigma_plus"]
+    assert found.parameters["s1_sigma_plus"].value == pytest.approx(item["value"])
+
+
+def test_without_the_scatter_it_would_not():
+    def shared(values):
+        content = scatter(values).content
+        content["parameters"]["s1_sigma_plus"] |= {"kind": "shared"}
+        return InMemory(content)
+
+    assert shares_of_new_specimens(shared) < 0.8
+
+
+def test_what_own_parameters_share_from_test_to_test_widens_the_band_together():
+    logs = 0.2 * np.random.default_rng(0).standard_normal(8)
+    together, apart = {}, {}
+    for name, order in (("s1_k0", logs), ("s1_sigma_plus", logs), ("s1_sigma_minus", logs)):
+        for made, at in ((together, order), (apart, np.roll(order, len(apart) + 1))):
+            tests = {f"t{i}": {"value": LAW[name] * np.exp(v)} for i, v in enumerate(at)}
+            made[name] = {"kind": "own", "value": LAW[name], "tests": tests}
+    widths = [
+        ff.predict(InMemory(joint_content(one, [0.25] * 8)), loop(seed=0), draws=200)
+        .curves["stress_strain"].half_width_of("scatter")
+        for one in (together, apart)
+    ]  # fmt: skip
+    assert widths[0] > 1.15 * widths[1]
+
+
+def test_what_the_law_missed_before_is_in_the_band():
+    content = fit_content(misfit={"stress_strain": 0.05})
+    content["noise"] = {"stress_strain": {"sigma": 3e3, "range": 1e5}}
+    curve = ff.predict(InMemory(content), loop(seed=0), draws=DRAWS).curves["stress_strain"]
+    assert curve.parts["law_error"] == pytest.approx(
+        1.96 * (0.05**2 - 0.03**2) ** 0.5 * np.ptp(curve.predicted), rel=1e-4
+    )
+    assert np.all(curve.hi - curve.lo > 2 * curve.parts["law_error"])
+
+
+# ------------------------------------------------------------------------------- the draws
+
+
+def test_what_is_not_determined_is_held_and_narrows_what_is_correlated_with_it(tmp_path):
+    content = fit_content()
+    content["parameters"]["s1_k0"] |= {"vary": True, "state": "not determined"}
+    content["correlation"] = {
+        "names": ["s1_k0", "s1_sigma_plus"], "matrix": [[1.0, 0.8], [0.8, 1.0]]
+    }  # fmt: skip
+    drawn = population(content, tmp_path)
+    assert drawn.held == ("s1_k0",)
+    rng = np.random.default_rng(0)
+    values = np.array([drawn.draw(rng, open_=True, scatter=False) for _ in range(800)])
+    assert np.ptp(values[:, 0]) == 0.0
+    assert np.std(values[:, 3]) == pytest.approx(0.6 * 1e3, rel=0.1)
+    found = ff.predict(InMemory(content), loop(seed=0), draws=DRAWS)
+    assert any("s1_k0 is held at its value" in one for one in found.warnings)
+
+
+def test_what_has_a_range_is_drawn_over_it(tmp_path):
+    content = fit_content()
+    content["parameters"]["s1_k0"] |= {"vary": True, "range": [4e5, 1.6e6]}
+    drawn = population(content, tmp_path)
+    assert drawn.held == ()
+    rng = np.random.default_rng(0)
+    values = np.array([drawn.draw(rng, open_=True, scatter=False)[0] for _ in range(400)])
+    assert 4e5 <= values.min() < 4.3e5
+    assert 1.5e6 < values.max() <= 1.6e6
+    assert np.median(values) == pytest.approx(8e5, rel=0.1)  # as many below as above, by ratio
+
+
+def test_few_degrees_of_freedom_widen_the_draws(tmp_path):
+    content = fit_content()
+    content["parameters"]["s1_sigma_plus"]["ci95"] = [1.1e5 - 3920, 1.1e5 + 3920]
+    drawn = population(content, tmp_path)
+    rng = np.random.default_rng(0)
+    values = [drawn.draw(rng, open_=True, scatter=False)[3] for _ in range(800)]
+    assert np.std(values) == pytest.approx(2e3, rel=0.1)
+
+
+def test_draws_that_are_not_admissible_are_drawn_again_and_counted():
+    content = fit_content()
+    content["parameters"]["s1_eps_star"] |= {"value": 0.01, "stderr": 0.02, "vary": True}
+    found = ff.predict(InMemory(content), loop(seed=0, eps_star=0.01), draws=DRAWS)
+    assert found.draws == DRAWS
+    assert 0.2 * DRAWS < found.redrawn < 2 * DRAWS
+    assert found.parameters["s1_eps_star"].lo >= 0.0
+    assert found.to_json_dict()["redrawn"] == found.redrawn
+
+
+def test_draws_lie_within_the_limits_of_a_fit_of_the_test():
+    values = np.array([1e4, 1e5, 1e6])  # of three tests: Student's t reaches from 1e-30 to 1e30
+    found = ff.predict(own(values), loop(seed=0), draws=DRAWS)
+    params = ff.make_params(loop(), "microscale")
+    drawn = found.parameters["s1_sigma_plus"]
+    assert params["s1_sigma_plus"].min <= drawn.lo < drawn.hi <= params["s1_sigma_plus"].max
+    assert found.redrawn > 0
+
+
+def test_draws_that_are_never_admissible_are_refused():
+    content = fit_content()
+    content["parameters"]["s1_kc"] |= {"value": 4e9}  # eps_star = 0.3 is too small for it
+    with pytest.raises(SimulationError, match="fitted: its common values are no admissible"):
+        ff.predict(InMemory(content), loop(seed=0), draws=DRAWS)
+
+
+def test_medians_that_are_no_spring_give_way_to_the_nearest_test():
+    values = {"s1_k0": (8e5, 8e5, 8e5), "s1_kc": (4e5, 8e7, 9e7), "s1_eps_star": (0.1, 0.9, 0.2)}
+    made = {
+        name: {
+            "kind": "own", "value": float(np.median(each)),
+            "tests": {f"t{i}": {"value": v} for i, v in enumerate(each)},
+        }
+        for name, each in values.items()
+    }  # fmt: skip
+    found = ff.predict(InMemory(joint_content(made, [0.25] * 3)), loop(seed=0), draws=DRAWS)
+    assert found.parameters["s1_kc"].value == pytest.approx(8e7)
+    assert found.parameters["s1_eps_star"].value == pytest.approx(0.9)
+    assert any("nearest" in one for one in found.warnings)
+
+
+# ------------------------------------------------------------------------------- the test
+
+
+def test_specimen_and_motion_are_those_of_the_new_test():
+    thicker = loop(seed=0, height=2 * HEIGHT)
+    found = ff.predict(InMemory(fit_content()), thicker, draws=DRAWS)
+    clean = loop(height=2 * HEIGHT).stress
+    assert found.curves["stress_strain"].predicted == pytest.approx(clean, rel=1e-6, abs=1.0)
+
+
+def test_mass_and_velocity_are_those_of_the_new_test():
+    spring, slow = synthetic_impact(1.75)
+    content = fit_content(model="bistable", drive="impact", data={"rate": 1100.0})
+    content["parameters"] = {
+        f"s1_{name}": {"value": getattr(spring, name), "stderr": None, "vary": False}
+        for name in ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus", "eta")
+    }
+    content |= {"correlation": None, "misfit": {}}
+    found = ff.predict(InMemory(content), slow, draws=DRAWS)
+    assert set(found.curves) == {"stress_time", "displacement_time"}
+    assert found.misfit["stress_time"] == pytest.approx(0.01, rel=0.1)  # its noise
+    assert 0.93 < found.inside["displacement_time"] < 0.97
+
+
+def test_heights_of_a_chain_keep_their_shares():
+    content = fit_content(model="linear+linear")
+    content |= {"correlation": {"names": ["s1_height"], "matrix": [[1.0]]}}
+    item = {"stderr": None, "vary": False}
+    content["parameters"] = {
+        "s1_k0": item | {"value": 1e6}, "s2_k0": item | {"value": 4e5},
+        "s1_height": item | {"value": 4e-3, "vary": True, "stderr": 1e-4},
+        "s2_height": item | {"value": 6e-3},
+    }  # fmt: skip
+    found = ff.predict(InMemory(content), loop(seed=0, height=2 * HEIGHT), draws=DRAWS)
+    first, second = (found.parameters[f"s{i}_height"] for i in (1, 2))
+    assert (first.value, second.value) == pytest.approx((8e-3, 12e-3))
+    assert first.hi + second.lo == pytest.approx(2 * HEIGHT)
+    assert first.hi > 8.2e-3
+
+
+def test_a_law_of_rate_is_taken_at_the_rate_of_the_test():
+    for kind, factor in (("power rate", 2**0.3), ("log rate", 1 + 0.3 * np.log(2))):
+        item = {"kind": kind, "value": 1.1e5, "stderr": 1e3, "b": 0.3, "b_stderr": 0.01}
+        content = joint_content({"s1_sigma_plus": item}, (0.05, 1.0))
+        content["covariance"] = {
+            "names": ["s1_sigma_plus", "s1_sigma_plus:b"], "matrix": [[1e6, 0.0], [0.0, 1e-4]]
+        }  # fmt: skip
+        found = ff.predict(InMemory(content), loop(rate=0.5, seed=0), draws=DRAWS)
+        assert found.parameters["s1_sigma_plus"].value == pytest.approx(1.1e5 * factor, rel=5e-3)
+        clean = loop(sigma_plus=found.parameters["s1_sigma_plus"].value).stress
+        assert found.curves["stress_strain"].predicted == pytest.approx(clean, abs=1.0)
+
+
+def test_a_law_of_rate_needs_a_rate():
+    content = joint_content({"s1_sigma_plus": {"kind": "power rate", "value": 1.1e5, "b": 0.3}})
+    with pytest.raises(InputError, match="s1_sigma_plus follows a law of rate, and the rate of"):
+        ff.predict(InMemory(content), replace(loop(), time=None), draws=DRAWS)
+
+
+# ------------------------------------------------------------------------------- refusals
+
+
+def test_a_rate_outside_the_fitted_ones_is_refused_unless_it_is_wanted():
+    content = InMemory(joint_content({}, (0.05, 0.3)))
+    assert not ff.predict(content, loop(rate=0.35, seed=0), draws=DRAWS).extrapolated
+    with pytest.raises(InputError) as refused:
+        ff.predict(content, loop(rate=0.5, seed=0), draws=DRAWS)
+    for word in ("0.5 1/s", "0.05 to 0.3 1/s", "--extrapolate"):
+        assert word in str(refused.value)
+    found = ff.predict(content, loop(rate=0.5, seed=0), extrapolate=True, draws=DRAWS)
+    assert found.extrapolated
+    assert "An extrapolation: its rate, 0.5 1/s" in prediction_text(found).replace("\n  ", " ")
+    told = found.to_json_dict()
+    assert told["extrapolated"]
+    assert any("extrapolation" in one for one in told["warnings"])
+
+
+def test_a_drive_that_the_test_cannot_feed_is_named_with_the_way_out():
+    content = fit_content(drive="impact")
+    with pytest.raises(InputError, match=r"impact drive needs .* --drive"):
+        ff.predict(InMemory(content), loop(seed=0), draws=DRAWS)
+    found = ff.predict(InMemory(content), loop(seed=0), drive="displacement", draws=DRAWS)
+    assert any("fitted in the impact drive" in one for one in found.warnings)
+
+
+def without(content, *keys):
+    *path, last = keys
+    for key in path:
+        content = content[key]
+    del content[last]
+
+
+BROKEN = {
+    "no_model": (lambda c: without(c, "model"), "not the result of a fit"),
+    "schema": (lambda c: c.update(schema=7), "schema 7"),
+    "model": (lambda c: c.update(model="rubber"), "'rubber' is not a spring"),
+    "drive": (lambda c: c.update(drive="gravity"), "drive is 'gravity'"),
+    "parameter": (lambda c: without(c, "parameters", "s1_kc"), "no parameter s1_kc"),
+    "value": (lambda c: c["parameters"]["s1_kc"].update(value=None), "s1_kc: value is None"),
+    "text": (lambda c: c["parameters"]["s1_kc"].update(value="1"), "s1_kc: value is '1'"),
+    "item": (lambda c: c["parameters"].update(s1_kc=4.0), "s1_kc is 4.0; it must be an object"),
+    "unknown": (lambda c: c["parameters"].update(s9_k0={"value": 1.0}), "s9_k0 is no parameter"),
+    "stderr": (lambda c: c["parameters"]["s1_kc"].update(stderr=-1.0), "stderr is -1.0"),
+    "ci95": (lambda c: c["parameters"]["s1_kc"].update(ci95=[1.0]), "two numbers"),
+    "matrix": (lambda c: c["correlation"].update(matrix=[[1.0, 0.0]]), "square matrix"),
+    "names": (lambda c: c["correlation"].update(names=["s1_zeta"]), "correlation must have"),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_broken_result_is_refused_by_its_key(tmp_path, name):
+    change, words = BROKEN[name]
+    content = copy.deepcopy(fit_content())
+    change(content)
+    with pytest.raises(InputError, match=re.escape(words)) as refused:
+        ff.predict(written(tmp_path, content), loop(seed=0), draws=DRAWS)
+    assert "\n" not in str(refused.value)
+
+
+JOINT_BROKEN = {
+    "kind": ({"kind": "mine", "value": 1e5}, "kind is 'mine'"),
+    "tests": ({"kind": "own", "value": 1e5}, "no object 'tests'"),
+    "scatter": ({"kind": "scatter", "value": 1e5, "tests": {}}, "scatter is None"),
+    "b": ({"kind": "log rate", "value": 1e5}, "b is None"),
+}
+
+
+@pytest.mark.parametrize("name", JOINT_BROKEN)
+def test_a_broken_joint_result_is_refused_by_its_key(tmp_path, name):
+    item, words = JOINT_BROKEN[name]
+    with pytest.raises(InputError, match=re.escape(words)):
+        ff.predict(written(tmp_path, joint_content({"s1_kc": item})), loop(seed=0), draws=DRAWS)
+
+
+def test_what_is_no_result_is_refused(tmp_path):
+    for text in ("", "[1, 2]", '{"name": "package"}', "\udc80".encode("utf-8", "surrogateescape")):
+        path = tmp_path / "fit.json"
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        with pytest.raises(InputError, match=r"fit\.json"):
+            ff.predict(tmp_path, loop(seed=0))
+    with pytest.raises(InputError, match="not from a int"):
+        ff.predict(3, loop(seed=0))
+    (tmp_path / "fit.json").unlink()
+    (tmp_path / "cycles.json").write_text("{}")
+    with pytest.raises(InputError, match="several cycles; name one"):
+        ff.predict(tmp_path, loop(seed=0))
+
+
+# ------------------------------------------------------------------------------- files
+
+
+def test_file_and_memory_give_the_same_numbers(tmp_path, fitted):
+    path = written(tmp_path, json.loads(json.dumps(fitted.to_json_dict())))
+    there, here = (ff.predict(one, loop(seed=3), draws=DRAWS) for one in (path, fitted))
+    assert there.to_json_dict() == here.to_json_dict()
+    for name in ("lo", "hi", "predicted"):
+        one, other = (getattr(p.curves["stress_strain"], name) for p in (there, here))
+        assert np.array_equal(one, other)
+    folder = ff.predict(tmp_path, loop(seed=3), draws=DRAWS)
+    assert folder.to_json_dict() == here.to_json_dict()
+    assert here.fitted_rates == pytest.approx((0.25,), rel=0.01)
+
+
+@pytest.fixture(scope="module")
+def joint(tmp_path_factory):
+    """Four tests fitted together: one parameter scatters, one follows a law of rate, one is own."""
+    here = tmp_path_factory.mktemp("family")
+    for i, rate in enumerate((0.01, 0.03, 0.3, 1.0)):
+        test = loop(rate=rate, seed=i, sigma_plus=1.1e5 * (rate / 0.1) ** 0.05, kc=4e5 + 2e4 * i)
+        columns = zip(test.time, test.stress, test.displacement, strict=True)
+        lines = ["time (s),stress (Pa),displacement (m)"]
+        lines += [f"{t:.9g},{stress:.9g},{w:.9g}" for t, stress, w in columns]
+        (here / f"t{i}.csv").write_text("\n".join(lines) + "\n")
+    (here / "foam.toml").write_text(
+        f'[specimen]\nheight = "{HEIGHT} m"\narea = "{AREA} m^2"\n[noise]\nstress = "{SIGMA} Pa"\n'
+    )
+    kinds = dict.fromkeys(LAW, "shared") | {"s1_kc": "scatter", "s1_sigma_plus": "power rate"}
+    kinds |= {"s1_sigma_minus": "own"}
+    (here / "study.toml").write_text(
+        'tests = ["t*.csv"]\nmodel = "microscale"\ndrive = "displacement"\nstarts = 1\n'
+        'specimen = "foam.toml"\n[parameters]\n'
+        + "\n".join(f'{name} = "{kind}"' for name, kind in kinds.items())
+    )
+    return ff.joint(here / "study.toml", jobs=1)
+
+
+def test_a_joint_fit_predicts_a_rate_between_its_own(tmp_path, joint):
+    test = loop(rate=0.1, seed=9, kc=4.3e5)
+    found = ff.predict(joint, test, draws=DRAWS)
+    assert found.parameters["s1_sigma_plus"].value == pytest.approx(1.1e5, rel=0.02)
+    assert {one.kind for one in found.parameters.values()} >= {
+        "shared", "own", "scatter", "power rate", "fixed"
+    }  # fmt: skip
+    assert 0.9 < found.inside["stress_strain"] <= 1.0
+    assert found.curves["stress_strain"].half_width_of("scatter") > 0.0
+    path = written(tmp_path, json.loads(json.dumps(joint.to_json_dict())))
+    assert ff.predict(path, test, draws=DRAWS).to_json_dict() == found.to_json_dict()
+    with pytest.raises(InputError, match=r"10 1/s, lies outside .* 0\.01 to 1 1/s"):
+        ff.predict(tmp_path, loop(rate=10.0, seed=9))
+
+
+@pytest.fixture
+def record(tmp_path) -> Path:
+    """A test in a file, as an instrument would write it, and its TOML."""
+    test = loop(seed=4)
+    path = tmp_path / "other.csv"
+    lines = ["time (s),stress (Pa),displacement (m)"]
+    lines += [
+        f"{t:.9g},{s:.9g},{w:.9g}"
+        for t, s, w in zip(test.time, test.stress, test.displacement, strict=True)
+    ]
+    path.write_text("\n".join(lines) + "\n")
+    path.with_suffix(".toml").write_text(
+        f'[specimen]\nheight = "{HEIGHT} m"\narea = "{AREA} m^2"\n[noise]\nstress = "{SIGMA} Pa"\n'
+    )
+    return path
+
+
+def run(*args):
+    return CliRunner().invoke(main, [str(arg) for arg in args])
+
+
+@pytest.fixture
+def result(tmp_path) -> Path:
+    (tmp_path / "result").mkdir()
+    return written(tmp_path / "result", fit_content()).parent
+
+
+def test_the_command_writes_a_folder_whole(tmp_path, monkeypatch, record, result):
+    monkeypatch.chdir(tmp_path)
+    done = run("predict", result, record, "--draws", DRAWS)
+    assert (done.exit_code, done.stderr) == (0, "")
+    assert "inside the 95 % band" in done.stdout
+    folder = tmp_path / "predictions" / "other"
+    assert {path.name for path in folder.iterdir()} == {
+        f"prediction.{form}" for form in ("json", "csv", "png", "pdf")
+    }
+    told = json.loads((folder / "prediction.json").read_text())
+    assert told["test"] == "other"
+    assert 0.9 < told["inside"]["stress_strain"] <= 1.0
+    with (folder / "prediction.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    low, measured, high = (
+        np.array([float(row[name]) for row in rows])
+        for name in ("stress band low (Pa)", "measured stress (Pa)", "stress band high (Pa)")
+    )
+    assert np.mean((low <= measured) & (measured <= high)) == pytest.approx(
+        told["inside"]["stress_strain"]
+    )
+    parts = ("parameters", "scatter", "noise", "law error")
+    assert {f"stress half width, {part} (Pa)" for part in parts} <= rows[0].keys()
+
+
+def test_the_command_prints_json_and_nothing_else(tmp_path, monkeypatch, record, result):
+    pictures_of_a_few_bytes(monkeypatch)
+    out, specimen = tmp_path / "out", record.with_suffix(".toml").rename(tmp_path / "foam.toml")
+    args = ("--specimen", specimen, "--cycle", 1, "--draws", DRAWS, "--out", out)
+    done = run("predict", result, record, *args, "--json")
+    assert (done.exit_code, done.stderr) == (0, "")
+    assert json.loads(done.stdout) == json.loads((out / "prediction.json").read_text())
+    quiet = run("predict", result, record, *args, "--quiet")
+    assert (quiet.exit_code, quiet.output) == (0, "")
+
+
+def pictures_of_a_few_bytes(monkeypatch):
+    monkeypatch.setattr(prediction_report, "image", lambda *_: b"\x89PNG" + bytes(20))
+
+
+def test_the_command_replaces_predictions_and_nothing_else(tmp_path, monkeypatch, record, result):
+    pictures_of_a_few_bytes(monkeypatch)
+    before = (result / "fit.json").read_bytes()
+    done = run("predict", result, record, "--out", result, "--draws", DRAWS)
+    assert done.exit_code == 1
+    assert "holds fit.json, which is no part of a prediction" in done.stderr
+    assert (result / "fit.json").read_bytes() == before
+    out = tmp_path / "out"
+    for seed in (0, 1):
+        done = run(
+            "predict", result, record, "--out", out, "--draws", DRAWS, "--seed", seed, "--quiet"
+        )
+        assert done.exit_code == 0
+    assert json.loads((out / "prediction.json").read_text())["seed"] == 1
+
+
+def test_a_prediction_that_cannot_be_drawn_leaves_nothing(tmp_path, monkeypatch):
+    def fails(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(prediction_report, "image", fails)
+    found = ff.predict(InMemory(fit_content()), loop(seed=0), draws=DRAWS)
+    with pytest.raises(InputError, match="No space left on device"):
+        found.save(tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_command_refuses_in_one_sentence(tmp_path, monkeypatch, record, result):
+    monkeypatch.chdir(tmp_path)
+    for args, words in (
+        (("nowhere", record), "nowhere"),
+        ((result, "nothing.csv"), "nothing.csv"),
+        ((record, record), "JSON"),
+        ((result, record, "--cycle", 3), "cycle 3"),
+        ((result, record, "--drive", "impact"), "impact drive needs"),
+    ):
+        done = run("predict", *args)
+        assert (done.exit_code, done.stdout) == (1, "")
+        assert re.fullmatch(r"foamfit: [^\n]+\n", done.stderr)
+        assert words in done.stderr
+    assert not (tmp_path / "predictions").exists()
