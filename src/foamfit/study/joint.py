@@ -43,8 +43,8 @@ from foamfit.text import counted
 
 # Tests that are searched as a fit of their own is; the others start at what these have found.
 SEARCHED = 3
-# Up to so many tests are fitted in this process: each takes some tenths of a second.
-FEW = 20
+# Up to so many tests are fitted in this process: most take less than a tenth of a second each.
+FEW = 100
 # Up to so many result folders are written in this process: each takes a second or two.
 FEW_FOLDERS = 3
 # Reduced χ² of a test over the largest of those, past which it is searched as well.
