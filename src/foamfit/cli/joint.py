@@ -61,11 +61,13 @@ def joint(
 
     folder = Path("fits", study.stem) if out is None else out
     check_target(folder)
-    with compiling(quiet or as_json) as compile_rest:
-        from foamfit.study.joint import joint as fit_jointly
-        from foamfit.study.study_file import read_study
+    from foamfit.study.study_file import read_study
 
-        _spare(folder, study, [path for _, path in read_study(study).tests])
+    read = read_study(study)
+    _spare(folder, study, [path for _, path in read.tests])
+    with compiling(quiet or as_json, read.model, read.relaxation) as compile_rest:
+        from foamfit.study.joint import joint as fit_jointly
+
         compile_rest()
         with progress_bar(quiet or as_json) as progress:
             result = fit_jointly(study, jobs=jobs, seed=seed, progress=progress)
