@@ -261,20 +261,32 @@ def test_few_degrees_of_freedom_widen_the_draws(tmp_path):
 def test_draws_that_are_not_admissible_are_drawn_again_and_counted():
     content = fit_content()
     content["parameters"]["s1_eps_star"] |= {"value": 0.01, "stderr": 0.02, "vary": True}
+    content["parameters"]["s1_kc"] |= {"value": 1.036 * content["parameters"]["s1_k0"]["value"]}
     found = ff.predict(InMemory(content), loop(seed=0, eps_star=0.01), draws=DRAWS)
     assert found.draws == DRAWS
-    assert 0.2 * DRAWS < found.redrawn < 2 * DRAWS
-    assert found.parameters["s1_eps_star"].lo >= 0.0
+    assert 0.6 * DRAWS < found.redrawn < 1.4 * DRAWS  # about every second one
+    assert found.parameters["s1_eps_star"].lo >= 0.009  # else branch c would lie before branch a
     assert found.to_json_dict()["redrawn"] == found.redrawn
 
 
 def test_draws_lie_within_the_limits_of_a_fit_of_the_test():
     values = np.array([1e4, 1e5, 1e6])  # of three tests: Student's t reaches from 1e-30 to 1e30
     found = ff.predict(own(values), loop(seed=0), draws=DRAWS)
-    params = ff.make_params(loop(), "microscale")
+    limits = ff.make_params(loop(seed=0), "microscale")["s1_sigma_plus"]
     drawn = found.parameters["s1_sigma_plus"]
-    assert params["s1_sigma_plus"].min <= drawn.lo < drawn.hi <= params["s1_sigma_plus"].max
-    assert found.redrawn > 0
+    assert limits.min <= drawn.lo < drawn.hi <= limits.max
+    assert found.redrawn == 0  # what lies beyond a limit is moved there
+
+
+def test_a_limit_leaves_both_sides_of_the_other_parameters():
+    content = fit_content()
+    content["parameters"]["s1_eps_star"] |= {"value": 0.0, "stderr": 0.02, "vary": True}
+    content["parameters"]["s1_sigma_plus"] |= {"stderr": 2e3, "vary": True}
+    names = ["s1_eps_star", "s1_sigma_plus"]
+    content["correlation"] = {"names": names, "matrix": [[1.0, 0.95], [0.95, 1.0]]}
+    found = ff.predict(InMemory(content), loop(seed=0, eps_star=0.0), draws=DRAWS)
+    drawn = found.parameters["s1_sigma_plus"]
+    assert (drawn.hi - drawn.value) / (drawn.value - drawn.lo) == pytest.approx(1.0, abs=0.3)
 
 
 def test_draws_that_are_never_admissible_are_refused():

@@ -127,7 +127,7 @@ def predict(
         fitted_rates=source.rates,
         extrapolated=outside,
         draws=min((len(one.values) for one in drawn.values()), default=0),
-        redrawn=sum(one.redrawn for one in drawn.values()),
+        redrawn=sum(one.redrawn for one in set(drawn.values())),
         held=population.held,
         sentences=(*_of_curves(curves), *_of_trends(population)),
         warnings=tuple(warnings),
@@ -267,14 +267,16 @@ def _simulate(
     population: Population, problem: Problem, limits: Limits, draws: int,
     rng: np.random.Generator, open_: bool, scatter: bool,
 ) -> _Drawn:  # fmt: skip
-    """Draw and simulate until there are so many; what is not admissible is drawn again."""
+    """Draw and simulate until there are so many; what is not admissible is drawn again.
+
+    What lies beyond a limit is moved there, as a fit does: to draw it again would leave one side of
+    all other parameters out.
+    """
     values, curves = list[Array](), list[dict[str, Array]]()
     (low, high), objective, tried = limits, problem.objective, 0
     while len(values) < draws and tried < TRIES * draws:
         tried += 1
-        one = population.draw(rng, open_=open_, scatter=scatter)
-        if not np.all((low <= one) & (one <= high)):
-            continue
+        one = np.clip(population.draw(rng, open_=open_, scatter=scatter), low, high)
         try:
             simulated = objective.simulate(one)
         except SimulationError:
