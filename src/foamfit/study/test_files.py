@@ -12,6 +12,7 @@ from foamfit.report.folder import BATCH_FILES, CYCLES_FILES, MARKS, RESULT_FILES
 from foamfit.text import listed
 
 ENDINGS = (".csv", ".txt", ".tsv", ".dat")
+WANTED = f"a test is a table that ends in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}"
 # Stems of tables that say what the specimens are, beside the tests.
 _SPECIMENS = ("specimen", "specimens")
 _WRITTEN = (*RESULT_FILES, *CYCLES_FILES, *BATCH_FILES)
@@ -58,10 +59,7 @@ def _matches(pattern: str | Path, base: Path) -> list[Path]:
     if path.is_dir():
         there = _tests_in(path)
         if not there:
-            raise InputError(
-                f"{pattern}: the folder has no test; a test is a table that ends in "
-                f"{listed(ENDINGS)}"
-            )
+            raise InputError(f"{pattern}: the folder has no test; {WANTED}")
         return there
     if path.exists() or not glob.has_magic(str(pattern)):
         # One that is not there is refused where it is read. A shell's glob also names the TOMLs.
@@ -71,9 +69,7 @@ def _matches(pattern: str | Path, base: Path) -> list[Path]:
     there += [inner for hit in hits if hit.is_dir() for inner in _tests_in(hit)]
     if not there:
         why = "matches no file" if not hits else "matches no test"
-        raise InputError(
-            f"{pattern}: the glob {why}; a test is a table that ends in {listed(ENDINGS)}"
-        )
+        raise InputError(f"{pattern}: the glob {why}; {WANTED}")
     return there
 
 
