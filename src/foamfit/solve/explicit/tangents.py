@@ -388,13 +388,15 @@ def _expand_together(links: Links, s: Array, d: SeriesTangents, order: int, memo
 def _take_down(d: Array, memory: Memory, p: int, groups: int, order: int) -> None:
     """Copy the series of one direction to where those of chains without memory are."""
     x, motion = memory.tangents, column_of(memory, memory.now.shape[0])
-    for n in range(order + 1):
-        for g in range(groups):
-            at = motion + N_MOTION * g
-            d[W, g, n], d[V, g, n] = x[n, at + D_W, p], x[n, at + D_V, p]
-            d[GROUP, g, n] = x[n, at + D_GROUP, p]
-        for i in range(memory.now.shape[0]):
-            d[EPS, i, n] = x[n, column_of(memory, i) + D_EPS, p]
+    for g in range(groups):
+        at = motion + N_MOTION * g
+        w, v, group = x[:, at + D_W, p], x[:, at + D_V, p], x[:, at + D_GROUP, p]
+        for n in range(order + 1):
+            d[W, g, n], d[V, g, n], d[GROUP, g, n] = w[n], v[n], group[n]
+    for i in range(memory.now.shape[0]):
+        eps = x[:, column_of(memory, i) + D_EPS, p]
+        for n in range(order + 1):
+            d[EPS, i, n] = eps[n]
 
 
 @piece
