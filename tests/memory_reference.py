@@ -31,6 +31,10 @@ class Linear:
     def strain(self, s: float) -> tuple[float, float]:
         return s / self.spring.k0, 1.0 / self.spring.k0
 
+    def bears(self, s: float) -> float:
+        """Stress that the spring passes on."""
+        return s
+
     def ends(self) -> tuple[float, float]:
         return -math.inf, math.inf
 
@@ -43,6 +47,19 @@ class Linear:
 
     def turn(self, s: float) -> None:
         raise AssertionError
+
+
+class Unilateral(Linear):
+    """Alone between two masses: what is followed is k ε also where the gap is open."""
+
+    def bears(self, s: float) -> float:
+        return max(s, 0.0)
+
+    def ends(self) -> tuple[float, float]:
+        return (0.0, math.inf) if self.mode == "line" else (-math.inf, 0.0)
+
+    def leave(self, s: float, side: int) -> None:
+        self.mode = "line" if side > 0 else "open"
 
 
 class Bistable(Linear):
@@ -146,6 +163,8 @@ class Microscale(Linear):
 
 
 def law_of(spring: Any) -> Linear:
+    if getattr(spring, "unilateral", False):
+        return Unilateral(spring)
     return {
         ff.BistableSpring: Bistable, ff.MicroscaleSpring: Microscale, ff.LinearSpring: Linear
     }[type(spring)](spring)  # fmt: skip
@@ -166,6 +185,8 @@ def follow(
     struck = isinstance(drive, ff.Impact)
     if isinstance(drive, ff.Impact):
         mass[-1] += drive.mass / chain.area
+        if isinstance(laws[0], Unilateral):  # contact ends where it opens
+            laws[0] = Linear(chain.springs[0])
     moved = isinstance(drive, ff.DisplacementDrive)
     heavy = [i for i in range(count) if mass[i] > 0.0 and not (moved and i == count - 1)]
     tops = heavy if heavy and heavy[-1] == count - 1 else [*heavy, count - 1]
@@ -185,7 +206,7 @@ def follow(
         push = values[knot] + slope * (now - t[knot]) if pressed else 0.0
         dz = -(z + g * s[own]) / tau
         held, held_rate = np.bincount(own, z, count), np.bincount(own, dz, count)
-        sig = gain * s + held
+        sig = gain * [law.bears(x) for law, x in zip(laws, s, strict=True)] + held
         soft = np.array([law.strain(x)[1] for law, x in zip(laws, s, strict=True)])
         ds, common = np.zeros(count), []
         below = 0.0

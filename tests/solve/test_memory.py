@@ -23,6 +23,7 @@ ABOVE = ff.MicroscaleSpring(5.5e6, 2.5e6, 0.3, 9.0e5, 0.8, 7.0e5, 0.4)  # hyster
 REVERSIBLE = ff.MicroscaleSpring(5.5e6, 2.5e6, 0.3, 6.0e5, 0.5, 7.0e5, 0.5)
 BISTABLE = ff.BistableSpring(5.5e6, 82.5e6, -0.17907e6, 0.14, 0.31, 14.3e6, 2.3375e6)
 LINEAR = ff.LinearSpring(60e6)
+GAP = ff.LinearSpring(60e6, unilateral=True)
 ONE, TWO = [(0.5, 2e-4)], [(0.4, 5e-5), (0.6, 1e-3)]
 IMPACT = ff.Impact(7e-3, 1.5)
 
@@ -80,6 +81,10 @@ SCENES: dict[str, tuple[ff.Chain, Drive]] = {
     "impact, interior mass, dashpots": (
         chain([damped(relaxing(FOAM), 30.0), damped(MICRO, 30.0)], [1e-3, 0.0]), IMPACT),
     "impact on three": (chain([FOAM, LINEAR, relaxing(MICRO)], [0.0, 1e-3, 0.0]), IMPACT),
+    "impact, unilateral base": (chain([GAP, relaxing(MICRO)]), IMPACT),
+    "impact, unilateral base, interior mass": (
+        chain([GAP, relaxing(MICRO)], [1e-3, 0.0]), IMPACT),
+    "impact, gap between masses": (chain([relaxing(FOAM), GAP], [2e-3, 0.0]), IMPACT),
     "motion of two": (chain([LINEAR, MICRO]), MOVED),
     "motion of two, relaxing": (chain([relaxing(FOAM), relaxing(MICRO, TWO)]), MOVED),
     "motion of two, bistable": (chain([relaxing(BISTABLE), relaxing(MICRO)]), MOVED),
@@ -147,7 +152,8 @@ QUICK = [
     "impact on two microscale", "impact, one of two damped",
     "impact, interior mass, two microscale", "impact on three", "motion of two, bistable",
     "motion of two, both damped", "stress, relaxing", "stress on two, one damped",
-    "stress, viscous top",
+    "stress, viscous top", "impact, unilateral base", "impact, unilateral base, interior mass",
+    "impact, gap between masses",
 ]  # fmt: skip
 
 
@@ -168,7 +174,8 @@ EXACT = [
     "impact, two terms, dashpot, onsite damper", "impact, wide", "impact, hysteretic below",
     "impact, hysteretic above", "impact, bistable relaxing", "impact on three",
     "motion of two, relaxing", "motion of two, both damped", "motion of two, interior mass",
-    "stress on two, one damped", "stress, viscous top",
+    "stress on two, one damped", "stress, viscous top", "impact, gap between masses",
+    "impact, interior mass, two microscale",
 ]  # fmt: skip
 
 
@@ -226,6 +233,24 @@ def test_contact_ends_where_the_whole_stress_does() -> None:
     strain = run.displacement[0, : last + 1] / given.height
     assert MICRO.stress(strain)[-1] > 0.1 * run.base_stress.max()
     assert run.base_stress[last] < 0.1 * run.base_stress.max()
+
+
+def test_a_gap_opens_and_closes_beside_springs_with_memory() -> None:
+    """Between masses while the base is pressed; at the base it is the end of contact."""
+    between = ff.simulate(*SCENES["impact, gap between masses"], TIME, 1e-8)
+    open_now = np.diff(between.displacement, axis=0)[0] < 0.0
+    pressed = between.base_stress > 0.0
+    assert (open_now & pressed).sum() > 3
+    assert (~open_now & pressed).sum() > 3
+    assert (
+        (between.switches[:, 1] == 1) & (between.switches[:, 3] != between.switches[:, 2])
+    ).any()
+    for masses in (None, [1e-3, 0.0]):
+        two = [
+            ff.simulate(chain([k, relaxing(MICRO)], masses), IMPACT, TIME) for k in (GAP, LINEAR)
+        ]
+        assert two[0].contact_end == pytest.approx(two[1].contact_end, rel=1e-9)
+        assert two[0].base_stress == pytest.approx(two[1].base_stress, rel=1e-9, abs=1.0)
 
 
 def test_a_wholly_snapped_spring_without_spread_is_on_branch_c() -> None:

@@ -67,13 +67,15 @@ MARGIN = 2.0
 # The least step, as a share of the time between two samples.
 LEAST_PACE = 1e-9
 # Where the cubic at four nodes has an error below this share of the wanted one, and the slope of
-# the stress changes by less than the share EVEN over a step (of rtol 1e-6; it goes with the root),
-# the next steps take the cubic through values and slopes at both ends, which needs one stress and
-# not three; after so many of them the four nodes are looked at again.
-PLAIN, EVEN, CHECKED = 1e-2, 0.1, 8
+# the stress changes by less than the share EVEN over a step, the next steps take the cubic through
+# values and slopes at both ends, which needs one stress and not three, if the second derivatives
+# there say that it is as exact; after so many of them the four nodes are looked at again.
+PLAIN, EVEN, CHECKED = 1e-2, 0.1, 16
 # Columns of the table of a term: its step h, exp(-x), the weights of the four nodes, their
-# derivatives by x, and what the cubic leaves out of higher polynomials.
-STEP, DECAY, WEIGHT, BY_X, OF_FOURTH, OF_FIFTH, OF_SIXTH, TABLE = 0, 1, 2, 6, 10, 11, 12, 13
+# derivatives by x, what the cubic leaves out of higher polynomials, and r²(1 - r)² as these;
+# and g, or less where the term lasts longer than the motion.
+STEP, DECAY, WEIGHT, BY_X, OF_FOURTH, OF_FIFTH, OF_SIXTH = 0, 1, 2, 6, 10, 11, 12
+OF_BUMP, LASTING, TABLE = 13, 14, 15
 
 
 @inner
@@ -177,12 +179,11 @@ def _tabulate(h: float, tau: float, moments: Array, table: Array) -> None:
     table[OF_FOURTH] = abs(fourth) / moments[0]
     table[OF_FIFTH] = min(0.72 * linear / moments[0], 25.0 / x)
     table[OF_SIXTH] = min(0.44, 39.0 / x)
+    table[OF_BUMP] = max(moments[2] - 2.0 * moments[3] + moments[4], 0.0) / moments[0]
 
 
 @inner
-def _truncation(
-    row: Row, nodes: Array, table: Array, span: float, begins: float, ends_with: float
-) -> float:
+def _truncation(nodes: Array, table: Array, begins: float, ends_with: float) -> float:
     """Estimate what the cubic through four nodes does to the stress of all terms in the end.
 
     Its Legendre coefficients are taken to fall on as they have begun; where the slopes at the ends
@@ -200,9 +201,8 @@ def _truncation(
         fall = max(three / two, two / one)
     error = 0.0
     for k in range(table.shape[0]):
-        lasting = min(1.0, span / row[N_COLUMNS + 2 * k + 1])
         more = table[k, OF_FOURTH] + fall * (table[k, OF_FIFTH] + fall * table[k, OF_SIXTH])
-        error += row[N_COLUMNS + 2 * k] * lasting * more
+        error += table[k, LASTING] * more
     fourth = three * fall
     if begins != 0.0 and ends_with != 0.0:
         for i in range(4):
@@ -214,25 +214,38 @@ def _truncation(
 
 @inner
 def _fill_by_slopes(
-    nodes: Array, state: Array, origin: float, flexibility: float, even: float
-) -> bool:
+    nodes: Array, state: Array, origin: float, flexibility: float, curvature: float
+) -> float:
     """Fill the last three nodes by the cubic through values and slopes at both ends of a step.
 
-    The spring is settled at its end. False where the slope is not known or changes too much.
+    The spring is settled at its end. Returns how much of r²(1 - r)² the stress has beside the cubic
+    by its second derivatives, infinite where the slope is not known or changes too much.
     """
     if not (flexibility > 0.0 and state[FLEXIBILITY] > 0.0):
-        return False
-    longer = state[EPS] - origin
-    begins, ends_with = longer / flexibility, longer / state[FLEXIBILITY]
-    if not abs(ends_with - begins) <= even * abs(begins):
-        return False
+        return math.inf
+    longer, stiff, stiff_last = state[EPS] - origin, 1.0 / flexibility, 1.0 / state[FLEXIBILITY]
+    begins, ends_with = longer * stiff, longer * stiff_last
+    if not abs(ends_with - begins) <= EVEN * abs(begins):
+        return math.inf
     nodes[3] = state[SIGMA]
     rise = nodes[3] - nodes[0]
     for i in range(1, 3):
         r = NODES[i]
         bent = (1.0 - r) * (begins - rise) - r * (ends_with - rise)
         nodes[i] = nodes[0] + r * (rise + (1.0 - r) * bent)
-    return True
+    low, high = begins - rise, ends_with - rise
+    first = 4.0 * low + 2.0 * high - begins * begins * curvature * stiff
+    last = 2.0 * low + 4.0 * high + ends_with * ends_with * state[CURVATURE] * stiff_last
+    return 0.5 * max(abs(first), abs(last))
+
+
+@inner
+def _of_bump(table: Array) -> float:
+    """Return what r²(1 - r)² in each step does to the stress of all terms in the end."""
+    error = 0.0
+    for k in range(table.shape[0]):
+        error += table[k, LASTING] * table[k, OF_BUMP]
+    return error
 
 
 @compiled
@@ -271,8 +284,10 @@ def relaxed_along(
     y, y_tau, d_y = np.zeros(terms), np.zeros(terms), np.zeros((terms, CARRIED))
     d_rank, d_nodes = np.zeros(CARRIED), np.zeros((4, CARRIED))
     _begin(row, state)
-    largest, span, entered, plain = 0.0, t[n - 1] - t[0], True, 0
-    even = EVEN * min(1.0, math.sqrt(1e6 * rtol))
+    largest, entered, plain = 0.0, True, 0
+    for k in range(terms):
+        share = min(1.0, (t[n - 1] - t[0]) / row[N_COLUMNS + 2 * k + 1])
+        table[k, LASTING] = row[N_COLUMNS + 2 * k] * share
     for j in range(n):
         before, start, done = state[EPS], j == 0, 0.0
         while True:
@@ -298,11 +313,17 @@ def relaxed_along(
                 last = pace == until - done
                 nodes[0], origin = state[SIGMA], state[EPS]
                 flexibility, curvature = state[FLEXIBILITY], state[CURVATURE]
+                h = pace * (t[j] - t[j - 1])
+                for k in range(terms):
+                    if not abs(h - table[k, STEP]) <= 1e-13 * h:
+                        _tabulate(h, row[N_COLUMNS + 2 * k + 1], moments, table[k])
                 short = False
                 if plain > 0 and last and pace == 1.0 and not derive:
                     _settle(row, state, end)
                     plain -= 1
-                    short = _fill_by_slopes(nodes, state, origin, flexibility, even)
+                    bump = _fill_by_slopes(nodes, state, origin, flexibility, curvature)
+                    error = MARGIN * bump * _of_bump(table)
+                    short = error <= rtol * max(largest, abs(state[SIGMA]))
                     if not short:
                         state[EPS], state[SIGMA] = origin, nodes[0]
                         state[FLEXIBILITY], state[CURVATURE] = flexibility, curvature
@@ -313,16 +334,12 @@ def relaxed_along(
                 if not abs(nodes[3]) < math.inf:
                     break
                 largest = max(largest, abs(nodes[3]))
-                h = pace * (t[j] - t[j - 1])
-                for k in range(terms):
-                    if not abs(h - table[k, STEP]) <= 1e-13 * h:
-                        _tabulate(h, row[N_COLUMNS + 2 * k + 1], moments, table[k])
                 error, begins, ends_with = 0.0, 0.0, 0.0
                 if pace > LEAST_PACE and not short:
                     if flexibility > 0.0 and state[FLEXIBILITY] > 0.0:
                         begins = (state[EPS] - origin) / flexibility
                         ends_with = (state[EPS] - origin) / state[FLEXIBILITY]
-                    error = _truncation(row, nodes, table, span, begins, ends_with)
+                    error = _truncation(nodes, table, begins, ends_with)
                 if MARGIN * error > rtol * largest:
                     state[EPS], state[SIGMA] = origin, nodes[0]
                     state[FLEXIBILITY], state[CURVATURE] = flexibility, curvature
