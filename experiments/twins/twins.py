@@ -445,7 +445,7 @@ def joint_rows(found: Found) -> str:
                 f"| {cycle} | {group} | {len(off)} | {score['n_vary']} | {percent(min(off))} to "
                 f"{percent(max(off))} | {held['value']:.3f}"
                 f"{'' if group == 'all' else ', held'} | {bics.get('shared', '–')} / "
-                f"{bics.get('own', '–')} | {', '.join(weak) or 'all'} |"
+                f"{bics.get('own', '–')} | {', '.join(weak) or 'none'} |"
             )
     return "\n".join(out)
 

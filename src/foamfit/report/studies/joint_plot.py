@@ -182,7 +182,7 @@ def _common(ax: Axes, found: JointData, name: str, x: Array, factor: float) -> N
         return
     span = np.array([np.nanmin(x), np.nanmax(x)])
     if one.kind in RATES and one.b is not None and found.rate0 is not None:
-        span = np.geomspace(*span, 50)
+        span = np.geomspace(span[0], span[1], 50)
         values = law_values(one.kind, one.value, one.b, np.log(span / found.rate0))
         ax.plot(span, values / factor, color=VERMILION, linewidth=1.0)
         told = f"b = {one.b:.3g}"
