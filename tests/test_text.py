@@ -19,6 +19,11 @@ from foamfit.text import (
 )
 
 
+def test_no_line_begins_with_the_percent_sign_of_a_number() -> None:
+    lines = wrapped("a spread of 4.1 % to 20 %", width=15)
+    assert lines == ["a spread of", "  4.1 % to 20 %"]
+
+
 @pytest.mark.parametrize(
     ("value", "unit", "text"),
     [

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import re
 import textwrap
 from collections.abc import Iterable, Sequence
 
 WIDTH = 100  # characters of a line
+_NO_BREAK = "\u00a0"  # a space at which no line ends
 _PREFIXES = {9: "G", 6: "M", 3: "k", 0: "", -3: "m", -6: "µ", -9: "n"}
 
 
@@ -62,8 +64,13 @@ def listed(items: Iterable[str]) -> str:
 
 
 def wrapped(text: str, indent: int = 2, width: int = WIDTH) -> list[str]:
-    """Break a paragraph into lines; all but the first are indented by so many spaces."""
-    return textwrap.wrap(text, width, subsequent_indent=" " * indent)
+    """Break a paragraph into lines; all but the first are indented by so many spaces.
+
+    No line begins with the % of a number.
+    """
+    whole = re.sub(r"(?<=\d) %", f"{_NO_BREAK}%", text)
+    lines = textwrap.wrap(whole, width, subsequent_indent=" " * indent)
+    return [line.replace(f"{_NO_BREAK}%", " %") for line in lines]
 
 
 def aligned(rows: Sequence[Sequence[str]], gap: str = "  ", right: Iterable[int] = ()) -> list[str]:

@@ -101,7 +101,7 @@ def test_the_picture_has_a_loop_for_each_test_and_a_panel_for_what_differs(found
     assert [title for title in titles if title.endswith("/s")] == [
         "first, 0.01/s", "second, 0.1/s", "<i>third</i>, 1/s",
     ]  # fmt: skip
-    assert titles[6:9] == [
+    assert titles[3:6] == [
         "kc (kPa): scatter", "sigma_plus (kPa): log rate", "spread_plus: own",
     ]  # fmt: skip
     panel = figure.subfigs[1].axes[1]
@@ -116,6 +116,30 @@ def test_the_picture_has_a_loop_for_each_test_and_a_panel_for_what_differs(found
 def test_tests_at_one_rate_stand_in_their_order(found):
     figure = plot_joint(replace(found, rates=(0.1, 0.1, 0.1)))
     assert figure.subfigs[1].axes[0].get_xlabel() == "test"
+
+
+def test_twins_whose_rates_differ_a_little_stand_in_their_order(found):
+    parameters = {n: p for n, p in found.parameters.items() if p.kind != "log rate"}
+    names = ("heel-10_raw", "heel-11_raw", "heel-9_raw")
+    own = {
+        n: p if p.tests is None else replace(p, tests=dict(zip(names, p.tests.values())))  # noqa: B905
+        for n, p in parameters.items()
+    }
+    twins = replace(found, parameters=own, tests=names, rates=(0.224, 0.231, 0.239))
+    top, bottom = plot_joint(twins).subfigs
+    panel = bottom.axes[0]
+    assert panel.get_xlabel() == "test"
+    assert panel.get_xscale() == "linear"
+    assert [label.get_text() for label in panel.get_xticklabels()] == ["10", "11", "9"]
+    assert [ax.get_title() for ax in top.axes] == list(names)
+
+
+def test_rates_within_a_decade_have_labels_that_do_not_overlap(found):
+    figure = plot_joint(replace(found, rates=(0.1, 0.15, 0.4)))
+    panel = figure.subfigs[1].axes[0]
+    shown = [label.get_text() for label in panel.get_xticklabels()]
+    assert shown == ["0.1", "0.2", "0.4"]
+    assert not len(panel.get_xticks(minor=True))
 
 
 def test_the_words_have_the_same_numbers(found):

@@ -79,14 +79,20 @@ def sentences_of(result: JointData) -> Iterator[str]:
         f"{counted(len(result.tests), 'test')} fitted with {counted(found.n_vary, 'number')} "
         f"({'; '.join(parts)})."
     )
+    spreads = {
+        name: (one.scatter, *one.scatter_ci95) for name, one in result.parameters.items()
+        if one.kind == "scatter" and one.scatter is not None and one.scatter_ci95 is not None
+    }  # fmt: skip
+    if spreads:
+        told = ", ".join(
+            f"{name} {percent(tau)} ({percent(low)} to {percent(high)})"
+            for name, (tau, low, high) in spreads.items()
+        )
+        yield (
+            "Scatter between specimens, errors of measurement taken off (standard deviation of "
+            f"the logarithm; 95 % interval): {told}."
+        )
     for name, one in result.parameters.items():
-        if one.kind == "scatter" and one.scatter is not None and one.scatter_ci95 is not None:
-            low, high = one.scatter_ci95
-            yield (
-                f"Between specimens {name} scatters by {percent(one.scatter)} (standard deviation "
-                f"of its logarithm; 95 %: {percent(low)} to {percent(high)}), errors of "
-                "measurement taken off."
-            )
         if one.b is not None and one.b_ci95 is not None:
             low, high = one.b_ci95
             what = "rises" if one.b > 0.0 else "falls"

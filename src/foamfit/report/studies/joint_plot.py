@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import takewhile
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,6 +25,9 @@ if TYPE_CHECKING:
 LOOPS, LOOP, COLUMNS, PANEL = 6, (1.25, 1.15), 3, (2.5, 1.6)
 MOST_LOOPS = 48
 MOST_NAMES = 12  # of tests that stand at an axis
+# Largest over smallest rate from which on the tests stand by rate though nothing follows a law of
+# it: the rates of twins under one programme of the machine differ by some percent.
+SEVERAL_RATES = 1.5
 # Points of a drawn curve, and the share of the largest range that intervals may run out of.
 POINTS = 400
 
@@ -38,11 +43,12 @@ def plot_joint(found: JointData) -> Figure:
     names = [n for n, one in found.parameters.items() if one.kind not in ("fixed", "shared")]
     shared = [n for n, one in found.parameters.items() if one.kind == "shared"]
     panels = len(names) + bool(shared)
-    rows, low = -(-len(shown) // LOOPS), -(-panels // COLUMNS)
+    across = min(LOOPS, max(len(shown), COLUMNS))
+    rows, low = -(-len(shown) // across), -(-panels // COLUMNS)
     heights = [rows * LOOP[1], low * PANEL[1]]
     with drawing(max(LOOPS * LOOP[0], COLUMNS * PANEL[0]), sum(heights) + 0.55) as figure:
         top, bottom = figure.subfigures(2, 1, height_ratios=heights, squeeze=False)[:, 0]
-        _draw_loops(top.subplots(rows, LOOPS, squeeze=False).ravel().tolist(), found, shown)
+        _draw_loops(top.subplots(rows, across, squeeze=False).ravel().tolist(), found, shown)
         axes = bottom.subplots(low, COLUMNS, squeeze=False).ravel().tolist()
         for ax, name in zip(axes, names, strict=False):
             _parameter(ax, found, name)
@@ -83,7 +89,7 @@ def _draw_loops(axes: list[Axes], found: JointData, shown: list[int]) -> None:
         ax.plot(along[::step], test.stress[::step] / factor, color=GREY, linewidth=1.1)
         if fitted is not None:
             ax.plot(along[::step], fitted[::step] / factor, color=BLUE, linewidth=0.7)
-        rate = found.rates[t]
+        rate = found.rates[t] if by_rate(found) else None
         told = found.tests[t] if rate is None else f"{found.tests[t]}, {rate:.2g}/s"
         ax.set_title(told if len(told) < 24 else f"…{told[-22:]}", fontsize=6)
         ax.tick_params(labelsize=5.5, length=2, pad=1.5)
@@ -93,6 +99,30 @@ def _draw_loops(axes: list[Axes], found: JointData, shown: list[int]) -> None:
             ax.set_ylabel(f"stress ({unit})", fontsize=6, labelpad=1)
     for ax in axes[len(shown) :]:
         ax.set_axis_off()
+
+
+def by_rate(found: JointData) -> bool:
+    """Whether the tests stand by rate: something follows a law of it, or there are several."""
+    rates = [rate for rate in found.rates if rate]
+    if found.rate0 is None or min(rates) == max(rates):
+        return False
+    if any(one.kind in RATES for one in found.parameters.values()):
+        return True
+    return len(rates) == len(found.rates) and max(rates) > SEVERAL_RATES * min(rates)
+
+
+def _marks(tests: Sequence[str]) -> list[str]:
+    """What the names of the tests differ in where that is short, else their numbers."""
+    before, after = _alike(tests), _alike([name[::-1] for name in tests])
+    marks = [name[before : len(name) - after] for name in tests]
+    short = all(0 < len(mark) <= 4 for mark in marks)
+    return marks if short else [str(t) for t in range(1, len(tests) + 1)]
+
+
+def _alike(names: Sequence[str]) -> int:
+    """How many letters names begin with alike, up to the number that they differ in."""
+    letters = takewhile(lambda at: len(set(at)) == 1, zip(*names, strict=False))
+    return len("".join(at[0] for at in letters).rstrip("0123456789"))
 
 
 def _along(
@@ -108,9 +138,9 @@ def _along(
 def _parameter(ax: Axes, found: JointData, name: str) -> None:
     """One parameter by test, or by rate."""
     one = found.parameters[name]
-    by_rate = found.rate0 is not None and len({f"{r:.2g}" for r in found.rates if r}) > 1
+    rated = by_rate(found)
     factor, unit = readable_unit(abs(one.value), one.unit)
-    x = np.array(found.rates, dtype=float) if by_rate else np.arange(1.0, len(found.tests) + 1)
+    x = np.array(found.rates, dtype=float) if rated else np.arange(1.0, len(found.tests) + 1)
     ax.set_title(f"{_title(found, name)}{f' ({unit})' if unit else ''}: {one.kind}")
     there = [
         (at, one.tests[test]) for at, test in zip(x, found.tests, strict=True)
@@ -129,13 +159,17 @@ def _parameter(ax: Axes, found: JointData, name: str) -> None:
             ]
             ax.plot(*np.array(points).reshape(-1, 2).T, "o", color=BLUE, markerfacecolor=face,
                     markersize=size)  # fmt: skip
-    if by_rate:
+    if rated:
         ax.set_xscale("log")
         ax.set_xlabel("strain rate (1/s)", labelpad=1)
+        if np.nanmax(x) < 10.0 * np.nanmin(x):  # no two powers of ten, and minor labels overlap
+            ticks = np.geomspace(np.nanmin(x), np.nanmax(x), 3)
+            ax.set_xticks(ticks, [f"{tick:.2g}" for tick in ticks])
+            ax.minorticks_off()
     else:
         ax.set_xlabel("test", labelpad=1)
         if len(x) <= MOST_NAMES:
-            ax.set_xticks(x, [str(int(at)) for at in x])
+            ax.set_xticks(x, _marks(found.tests))
     _common(ax, found, name, x, factor)
     if middle and one.kind not in RATES:
         _limit(ax, middle, ends[:, 1:].ravel().tolist())
@@ -146,9 +180,9 @@ def _common(ax: Axes, found: JointData, name: str, x: Array, factor: float) -> N
     one = found.parameters[name]
     if one.kind == "own":
         return
-    span = np.array([x.min(), x.max()])
+    span = np.array([np.nanmin(x), np.nanmax(x)])
     if one.kind in RATES and one.b is not None and found.rate0 is not None:
-        span = np.geomspace(x.min(), x.max(), 50)
+        span = np.geomspace(span[0], span[1], 50)
         values = law_values(one.kind, one.value, one.b, np.log(span / found.rate0))
         ax.plot(span, values / factor, color=VERMILION, linewidth=1.0)
         told = f"b = {one.b:.3g}"

@@ -1,0 +1,88 @@
+"""What the study of ten twins computes besides the fits."""
+
+from __future__ import annotations
+
+import math
+import sys
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from conftest import DATA, EXPERIMENTS, needs_data
+
+sys.path.insert(0, str(EXPERIMENTS / "twins"))
+from twins import Change, Group, change_of, counted_together, lost, mean_loop, place_tests
+
+
+def test_a_change_is_welchs_test_of_the_logarithms() -> None:
+    new, worn = (10.0, 11.0, 9.0, 10.5, 9.5), (8.0, 9.0, 7.0, 8.5, 6.5)
+    one = change_of("quantity", Group.of(new), Group.of(worn))
+    found = stats.ttest_ind(np.log(worn), np.log(new), equal_var=False)
+    assert one.p == pytest.approx(found.pvalue)
+    ends = found.confidence_interval(0.95)
+    assert one.ci95 == pytest.approx((math.expm1(ends.low), math.expm1(ends.high)))
+    gone = np.mean(np.log(worn)) - np.mean(np.log(new))
+    assert one.change == pytest.approx(math.expm1(gone))
+    spread = math.sqrt(0.5 * (np.var(np.log(new), ddof=1) + np.var(np.log(worn), ddof=1)))
+    assert one.size == pytest.approx(-gone / spread)
+
+
+def test_a_scattering_parameter_brings_the_interval_of_the_joint_fit() -> None:
+    logs = np.array([-0.2, 0.1, 0.0, 0.15, -0.05])
+    values = 5e5 * np.exp(logs)
+    stderr = float(np.std(logs, ddof=1)) / math.sqrt(5)
+    item = {
+        "value": 5e5 * math.exp(logs.mean()), "stderr": 5e5 * math.exp(logs.mean()) * stderr,
+        "scatter": 0.12,
+        "tests": {
+            str(i): {"value": v, "ci95": None if i else [0.9 * v, 1.1 * v], "state": "determined"}
+            for i, v in enumerate(values)
+        },
+    }  # fmt: skip
+    group = Group.of_joint(item)
+    half = stats.t.ppf(0.975, 4) * stderr
+    assert group.ci95 == pytest.approx(
+        (group.common * math.exp(-half), group.common * math.exp(half))
+    )
+    assert group.edges == pytest.approx(
+        (group.common * math.exp(-0.12), group.common * math.exp(0.12))
+    )
+    assert group.ends[0] == pytest.approx((0.9 * values[0], 1.1 * values[0]))
+    assert group.ends[1:] == (None,) * 4
+
+
+def test_comparisons_are_counted_together_and_the_largest_comes_first() -> None:
+    group = Group.of((1.0, 1.1, 0.9))
+
+    def change(name: str, p: float, size: float) -> Change:
+        return Change(name, group, group, 0.1, (0.0, 0.2), p, size)
+
+    given = [change("a", 0.02, 1.0), change("b", 0.01, 3.0), change("c", 0.9, 2.0)]
+    found = counted_together(given)
+    assert [one.name for one in found] == ["b", "c", "a"]
+    assert [one.adjusted for one in found] == pytest.approx([0.03, 0.9, 0.04])
+    assert [one.stands_out for one in found] == [True, False, True]
+
+
+def test_the_mean_loop_of_one_loop_is_that_loop() -> None:
+    up = np.linspace(0.0, 0.5, 301)
+    strain = np.concatenate([up, up[::-1][1:]])
+    stress = np.where(np.arange(strain.size) <= 300, 2e5 * strain, 4e5 * strain**2)
+    along, mean, spread = mean_loop([(strain, stress), (strain, 1.2 * stress)])
+    half = along.size // 2
+    assert mean[:half] == pytest.approx(1.1 * 2e5 * along[:half])
+    assert mean[half:] == pytest.approx(1.1 * 4e5 * along[half:] ** 2, abs=2.0)
+    assert spread[half - 1] == pytest.approx(0.2 * 1e5 / math.sqrt(2.0))
+    assert lost((strain, stress)) == pytest.approx(0.5 * 1e5 * 0.5 - 4e5 * 0.5**3 / 3.0, rel=1e-4)
+
+
+@needs_data
+def test_each_test_is_linked_beside_its_toml(tmp_path) -> None:
+    import foamfit as ff
+
+    place_tests(DATA / "shoe-foam-twins", tmp_path)
+    assert len(list(tmp_path.glob("*.toml"))) == len(list(tmp_path.glob("*_raw.txt"))) == 10
+    test = ff.read_test(tmp_path / "worn-heel-comp-4_raw.txt")
+    assert test.specimen.height == pytest.approx(8.827e-3)
+    assert len(test.cycles) == 6
