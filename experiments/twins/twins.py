@@ -313,8 +313,8 @@ def draw_wear(changes: Sequence[Change], measured: Loops, cycle: int, path: Path
         for place, one in zip(places, changes, strict=True):
             draw_change(figure.add_subplot(place), one)
         figure.suptitle(
-            f"Running-shoe foam, cycle {cycle}, new heel against worn: {headline(changes)}; largest "
-            "change over spread first\n"
+            f"Running-shoe foam, cycle {cycle}, new heel against worn: {headline(changes)}; "
+            "largest change over spread first\n"
             "points: specimens with 95 % intervals, hollow if not well determined; line and band: "
             "common value and its 95 % interval;\n"
             f"dashed: spread between specimens. {SOURCE[0].upper()}{SOURCE[1:]}",
