@@ -31,7 +31,7 @@ import foamfit as ff
 from foamfit.report.figures import BLUE, GREY, VERMILION, drawing, save
 from foamfit.report.readable import readable_unit
 from foamfit.springs.parameters import unit_of
-from foamfit.text import percent, significant
+from foamfit.text import listed, percent, significant
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -67,6 +67,7 @@ HELD = "s1_eps_star"
 SCATTERING = tuple(f"s1_{name}" for name in LAW if f"s1_{name}" != HELD)
 ENERGY, PEAK = "dissipated energy", "peak stress"
 UNITS = {ENERGY: (1e3, "kJ/m³"), PEAK: (1e3, "kPa")}
+POWER = 0.8
 LEVEL = 0.05  # of what is said to stand out, all comparisons of a cycle together
 POINTS = 200  # of a mean loop
 # Measured strain and stress of each specimen by group; joint.json by cycle and group.
@@ -278,8 +279,16 @@ def shown_change(one: Change) -> str:
 def verdict(one: Change) -> str:
     """Whether a change stands out of the scatter between specimens."""
     if one.stands_out:
-        return "stands out of the scatter"
-    return f"a hint, p = {significant(one.p, 1)}" if one.p < LEVEL else "within the scatter"
+        return "stands out"
+    return f"a hint, p = {significant(one.p, 1)}" if one.p < LEVEL else "within scatter"
+
+
+def headline(changes: Sequence[Change]) -> str:
+    """Name what stands out."""
+    there = [one.name.removeprefix("s1_") for one in changes if one.stands_out]
+    if not there:
+        return "no change stands out of the scatter between specimens"
+    return f"{listed(there)} {'stands' if len(there) == 1 else 'stand'} out of the scatter"
 
 
 def unit_for(one: Change) -> tuple[float, str]:
@@ -304,7 +313,7 @@ def draw_wear(changes: Sequence[Change], measured: Loops, cycle: int, path: Path
         for place, one in zip(places, changes, strict=True):
             draw_change(figure.add_subplot(place), one)
         figure.suptitle(
-            f"Running-shoe foam, cycle {cycle}: five specimens of a new heel, five of a worn one; "
+            f"Running-shoe foam, cycle {cycle}, new heel against worn: {headline(changes)}; "
             "largest change over spread first\n"
             "points: specimens with 95 % intervals, hollow if not well determined; line and band: "
             "common value and its 95 % interval;\n"
@@ -348,7 +357,7 @@ def draw_change(ax: Axes, one: Change) -> None:
     ax.set_xlim(-0.55, 1.55)
     ax.set_xticks([0, 1], GROUPS)
     ax.set_title(
-        f"{title(one)}\n{shown_change(one)}\n{verdict(one)}",
+        f"{title(one)}\n{shown_change(one)}\n{one.size:.1f} spreads: {verdict(one)}",
         fontsize=7, fontweight="bold" if one.stands_out else "normal",
     )  # fmt: skip
     ax.locator_params(axis="y", nbins=5)
@@ -450,11 +459,34 @@ def joint_rows(found: Found) -> str:
     return "\n".join(out)
 
 
+def power(size: float, count: int) -> float:
+    """Chance that a change of so many spreads is seen (p < 0.05) with so many specimens each."""
+    freedom, shift = 2 * count - 2, size * math.sqrt(count / 2.0)
+    edge = float(stats.t.ppf(0.975, freedom))
+    return float(stats.nct.sf(edge, freedom, shift) + stats.nct.cdf(-edge, freedom, shift))
+
+
+def needed(size: float) -> int:
+    """Specimens in each group that show a change of so many spreads, four times in five."""
+    return next(count for count in range(2, 10_000) if power(size, count) >= POWER)
+
+
+def one_way(changes: Mapping[int, Sequence[Change]]) -> str:
+    """Name what is lower, and what is higher, in the worn group in every cycle."""
+    signs = dict[str, set[bool]]()
+    for ones in changes.values():
+        for one in ones:
+            signs.setdefault(one.name, set()).add(one.change > 0.0)
+    lower = listed(code(name) for name in signs if signs[name] == {False})
+    higher = listed(code(name) for name in signs if signs[name] == {True})
+    return f"lower in the worn heel in every cycle are {lower}; higher are {higher}"
+
+
 def told(changes: Sequence[Change]) -> str:
     """Name what stands out, what may, and what does not."""
     parts = {
         "Stands out of the scatter between specimens": [o for o in changes if o.stands_out],
-        "A hint, which does not last where all ten comparisons are counted": [
+        "A hint (p below 0.05 on its own)": [
             o for o in changes if o.p < LEVEL and not o.stands_out
         ],
         "Within the scatter": [o for o in changes if o.p >= LEVEL],
@@ -489,13 +521,10 @@ def write_tables(table: pd.DataFrame, changes: Mapping[int, Sequence[Change]]) -
     pd.DataFrame(rows).to_csv(HERE / "wear.csv", index=False, float_format="%.4g")
 
 
-def write_page(
-    table: pd.DataFrame,
-    found: Found,
-    changes: Mapping[int, Sequence[Change]],
-    seconds: Mapping[str, float],
-) -> None:
+def write_page(made: Made, changes: Mapping[int, Sequence[Change]], free: Sequence[Change]) -> None:
     """Write README.md."""
+    table, found, seconds, largest = made.table, made.found, made.seconds, changes[FIRST][0]
+    by_size = [one for one in free if one.name in SCATTERING]
     off = table["misfit_stress_strain"]
     everywhere = [
         code(name)
@@ -521,6 +550,21 @@ def write_page(
             told_first=told(changes[FIRST]),
             told_later=told(changes[LATER]),
             everywhere=", ".join(everywhere) or "nothing",
+            one_way=one_way(changes),
+            largest=code(largest.name),
+            largest_size=significant(largest.size),
+            needed=needed(largest.size),
+            shown=percent(power(largest.size, 5)),
+            free="; ".join(
+                f"{code(one.name)} {shown_change(one)}, p = {significant(one.p)}"
+                for one in by_size[:2]
+            ),
+            free_spread=", ".join(
+                percent(made.free[group]["parameters"]["s1_kc"]["scatter"]) for group in GROUPS
+            ),
+            held_spread=", ".join(
+                percent(found[FIRST][group]["parameters"]["s1_kc"]["scatter"]) for group in GROUPS
+            ),
             wear_first=change_rows(changes[FIRST]),
             wear_later=change_rows(changes[LATER]),
             batch_seconds=f"{seconds['batch']:.0f}",
@@ -530,10 +574,22 @@ def write_page(
     )
 
 
-def measure(
-    data: Path, folder: Path
-) -> tuple[pd.DataFrame, Found, dict[int, Loops], dict[str, float]]:
-    """All fits: the batch, the joint fits and measured loops by cycle, and their seconds."""
+@dataclass(frozen=True)
+class Made:
+    """All that is fitted: the batch, the joint fits by cycle, and of the first with HELD free.
+
+    Also the measured loops by cycle, and seconds.
+    """
+
+    table: pd.DataFrame
+    found: Found
+    free: Mapping[str, Mapping[str, Any]]
+    measured: Mapping[int, Loops]
+    seconds: Mapping[str, float]
+
+
+def measure(data: Path, folder: Path) -> Made:
+    """Make all fits."""
     began = time.perf_counter()
     place_tests(data, folder)
     table = fit_each(folder)
@@ -543,22 +599,21 @@ def measure(
     # A cycle that few records have is no group.
     full = sorted(n for n, count in counts.items() if count == table["specimen"].nunique())
     found = dict[int, dict[str, dict[str, Any]]]()
+    free = {group: fit_study(folder, group, FIRST, '"own"') for group in GROUPS}
     for n in full:
         found[n] = fit_together(folder, n)
         print(f"cycle {n} together", flush=True)
     seconds = {"batch": took, "joint": time.perf_counter() - began - took}
-    return table, found, {n: loops(folder, n) for n in full}, seconds
+    return Made(table, found, free, {n: loops(folder, n) for n in full}, seconds)
 
 
-def write(
-    table: pd.DataFrame, found: Found, measured: Mapping[int, Loops], seconds: Mapping[str, float]
-) -> None:
+def write(made: Made) -> None:
     """Write tables, pictures and page of what was found."""
-    changes = {n: wear(found[n], measured[n]) for n in found}
-    draw_wear(changes[FIRST], measured[FIRST], FIRST, HERE / "new_against_worn.png")
+    changes = {n: wear(made.found[n], made.measured[n]) for n in made.found}
+    draw_wear(changes[FIRST], made.measured[FIRST], FIRST, HERE / "new_against_worn.png")
     draw_cycles(changes, HERE / "by_cycle.png")
-    write_tables(table, changes)
-    write_page(table, found, changes, seconds)
+    write_tables(made.table, changes)
+    write_page(made, changes, wear(made.free, made.measured[FIRST]))
 
 
 def main() -> None:
@@ -567,7 +622,7 @@ def main() -> None:
         sys.exit(f"there is no {data}; set FOAMFIT_DATA to the folder with shoe-foam-twins/")
     with tempfile.TemporaryDirectory() as temporary:
         made = measure(data, Path(temporary))
-    write(*made)
+    write(made)
 
 
 if __name__ == "__main__":

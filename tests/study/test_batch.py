@@ -163,6 +163,8 @@ def test_a_cycle_is_a_row_and_its_folder_is_in_that_of_the_test(here, monkeypatc
     assert list(frame["status"][:3]) == ["warnings", "ok", "refused"]
     assert frame.loc["a/cycle-3", "error"] == "it is cut"
     assert {"batch.json", "cycle-1", "cycle-2", "cycles.csv", "cycles.json"} == set(names("out/a"))
+    page = Path("out/summary.html").read_text(encoding="utf-8")
+    assert f"{len(frame) // 3} tests, {len(frame)} cycles: " in page
     before = stamps("out")
     again(cycle="all")
     assert stamps("out") == before
@@ -570,6 +572,23 @@ def test_the_page_of_a_thousand_tests_is_small_and_needs_nothing_else(tmp_path):
     assert page.count('<div class="strip">') == 7  # what is held is no column
     assert "no &lt;height&gt; &amp; no width" in page
     assert page.count("<i>") >= 6000  # intervals
+
+
+def test_the_page_has_no_misfit_that_no_test_has_and_no_axis_below_zero_without_need(tmp_path):
+    cells = [[float(k), None, 0.5 * k, 1.5 * k, "determined", "Pa"] for k in (1, 2, 40)]
+    rows = [
+        Row(f"t{i}", f"t{i}.csv", "ok", None, {"stress_strain": 0.01, "stress_time": None}, 1.0,
+            {"s1_kc": cell})
+        for i, cell in enumerate(cells)
+    ]  # fmt: skip
+    write_page(rows, tmp_path, "a batch")
+    page = (tmp_path / "summary.html").read_text(encoding="utf-8")
+    assert "misfit loop" in page
+    assert "misfit u(t)" not in page
+    assert "misfit σ(t)" not in page
+    ends = re.search(r'<div class="ends"><span>(.*?)</span>.*<span>(.*?)</span></div>', page)
+    assert ends is not None
+    assert float(ends[2]) == 0.0
 
 
 def test_of_very_many_tests_the_page_shows_some_and_all_that_failed(tmp_path):

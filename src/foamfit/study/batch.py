@@ -19,6 +19,7 @@ from foamfit.files import is_left, reason, sweep
 from foamfit.one_model import Keywords, Options
 from foamfit.report.folder import BATCH_FILES, MARKS, is_written
 from foamfit.report.studies.batch import OPEN, REFUSED, Row, table, write_page, write_summary
+from foamfit.results import law_in_words
 from foamfit.solve import cache, precompile
 from foamfit.springs.model import Model
 from foamfit.study.batch_work import (
@@ -84,7 +85,8 @@ class Batch:
         """Write summary.csv and summary.html."""
         rows = self.summary
         write_summary(rows, self.out)
-        write_page(rows, self.out, f"{self.out.resolve().name}: {self.recipe.model}")
+        law = law_in_words(self.recipe.model, self.recipe.options.get("relaxation", 0))
+        write_page(rows, self.out, f"{self.out.resolve().name}: {law}")
 
 
 def batch(

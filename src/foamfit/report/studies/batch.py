@@ -30,6 +30,7 @@ PARTS = ("", "_stderr", "_lo", "_hi", "_state")
 REFUSED, OPEN = "refused", "not fitted"
 # Points of a sketched curve, its size in pixels, and how many tests the page shows.
 POINTS, WIDTH, HEIGHT = 40, 116, 76
+_MISFITS = {"stress_strain": "loop", "stress_time": "σ(t)", "displacement_time": "u(t)"}
 MOST_ON_PAGE = 5000
 _MOST_REFUSALS = 20  # that the terminal names
 
@@ -143,7 +144,10 @@ def counts_in_words(rows: Sequence[Row]) -> str:
         REFUSED: "refused", OPEN: "not fitted yet",
     }  # fmt: skip
     parts = [f"{found[status]} {words}" for status, words in said.items() if found[status]]
-    return f"{counted(len(rows), 'test')}: {listed(parts)}" if parts else "no test"
+    told = counted(len({row.test.partition("/")[0] for row in rows}), "test")
+    if cycles := sum("/" in row.test for row in rows):
+        told += f", {counted(cycles, 'cycle')}"
+    return f"{told}: {listed(parts)}" if parts else "no test"
 
 
 def summary_words(rows: Sequence[Row]) -> str:
@@ -253,7 +257,10 @@ def write_page(rows: Sequence[Row], folder: Path, title: str) -> None:
         reports=[(folder / row.test / "report.html").is_file() for row in shown],
         columns=columns,
         cells=[[_cell(row, column) for column in columns] for row in shown],
-        misfits={"stress_strain": "loop", "stress_time": "σ(t)", "displacement_time": "u(t)"},
+        misfits={
+            curve: told for curve, told in _MISFITS.items()
+            if any(row.misfit.get(curve) is not None for row in shown)
+        },
         width=WIDTH, height=HEIGHT, strip=(STRIP_WIDTH, STRIP_HEIGHT),
     )  # fmt: skip
     write_file(folder / "summary.html", page.encode("utf-8", "replace"))
@@ -275,6 +282,8 @@ def _columns(rows: Sequence[Row]) -> Iterator[Column]:
         first, last = np.quantile(values, [0.05, 0.95])
         room = max(0.6 * (last - first), 0.05 * abs(float(np.median(values))), 1e-12)
         low, high = float(first - room), float(last + room)
+        if values.min() >= 0.0:
+            low = max(low, 0.0)
 
         def pixel(value: float, low: float = low, high: float = high) -> float:
             y = STRIP_HEIGHT * (high - min(max(value, low), high)) / (high - low)

@@ -69,8 +69,9 @@ def plot_joint(found: JointData) -> Figure:
 
 
 def _shown(found: JointData) -> list[int]:
-    """Tests whose loops are drawn: all, or some at equal steps of their order by rate."""
-    order = sorted(range(len(found.tests)), key=lambda t: (found.rates[t] or 0.0, t))
+    """Tests whose loops are drawn, by rate where they have several: all, or some at equal steps."""
+    rates = found.rates if by_rate(found) else [0.0] * len(found.tests)
+    order = sorted(range(len(found.tests)), key=lambda t: (rates[t] or 0.0, t))
     places = np.unique(np.linspace(0, len(order) - 1, min(MOST_LOOPS, len(order))).astype(int))
     return [order[place] for place in places]
 
