@@ -188,18 +188,7 @@ def twins_told(table: pd.DataFrame) -> str:
             f"- From cycle {first} to {last} these change alike in at least nine of the ten "
             f"specimens (mean ratio ± standard deviation): {told}."
         )
-    worn, new = (kind(table, name) for name in ("worn", "new"))
-    parts = []
-    for column in ("dissipated_energy", *NAMES):
-        a, b = (part[part["cycle"] == 1][column] for part in (new, worn))
-        error = (a.var() / len(a) + b.var() / len(b)) ** 0.5
-        if abs(b.mean() - a.mean()) > 2.0 * error:
-            parts.append(f"{named(column)} × {b.mean() / a.mean():.2f}")
-    told = "; ".join(parts) or "nothing"
-    lines.append(
-        "- Worn against new, first cycles, what differs by more than two standard errors of the "
-        f"means: {told}."
-    )
+    lines.append("- Worn against new: see the study of [twins](../twins/README.md).")
     return "\n".join(lines)
 
 

@@ -199,9 +199,14 @@ def _several(task: Task, path: Path, toml: Path) -> tuple[tuple[Row, ...], Write
     recipe = task.recipe
     assert isinstance(recipe.cycles, tuple)
     found = fit_cycles(
-        path, toml, cycles=recipe.cycles or None, model=recipe.model, params=recipe.params,
+        path,
+        toml,
+        cycles=recipe.cycles or None,
+        model=recipe.model,
+        params=recipe.params,
+        together=False,
         **recipe.options,
-    )  # fmt: skip
+    )  # fmt: skip  (the summary has a row for each cycle)
 
     def row(number: int, result: FitResult | None) -> Row:
         name = f"{task.name}/cycle-{number}"
