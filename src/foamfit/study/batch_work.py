@@ -198,15 +198,11 @@ def _several(task: Task, path: Path, toml: Path) -> tuple[tuple[Row, ...], Write
     """Each cycle is a row, and its folder is one in the folder of the test."""
     recipe = task.recipe
     assert isinstance(recipe.cycles, tuple)
+    # Not together, which takes longer than all of them: the summary has a row for each.
     found = fit_cycles(
-        path,
-        toml,
-        cycles=recipe.cycles or None,
-        model=recipe.model,
-        params=recipe.params,
-        together=False,
-        **recipe.options,
-    )  # fmt: skip  (the summary has a row for each cycle)
+        path, toml, cycles=recipe.cycles or None, model=recipe.model, params=recipe.params,
+        together=False, **recipe.options,
+    )  # fmt: skip
 
     def row(number: int, result: FitResult | None) -> Row:
         name = f"{task.name}/cycle-{number}"
