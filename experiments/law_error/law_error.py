@@ -31,7 +31,6 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from foamfit.trust.residuals.noise_process import NoiseProcess, parts
 from scipy.integrate import solve_ivp
 from scipy.signal import lfilter
 from scipy.special import ndtr
@@ -39,6 +38,7 @@ from scipy.special import ndtr
 import foamfit as ff
 from foamfit.fitting.problem import make_problem
 from foamfit.trust.best_point import BestPoint
+from foamfit.trust.residuals.noise_process import NoiseProcess, parts
 
 HERE = Path(__file__).parent
 NOISE = 0.005  # of the range

@@ -4,7 +4,7 @@ Heavy modules are imported inside the commands that need them. A newcomer reads 
 exit codes and errors, `options` what several commands share.
 """
 
-from foamfit.cli import check, compare, fit, simulate
+from foamfit.cli import check, compare, fit, page, simulate
 from foamfit.cli.group import main
 
-__all__ = ["check", "compare", "fit", "main", "simulate"]
+__all__ = ["check", "compare", "fit", "main", "page", "simulate"]
