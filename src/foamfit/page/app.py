@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import panel as pn
-from bokeh.models import ColumnDataSource
+from bokeh.models import ColumnDataSource, Range1d
 from bokeh.plotting import figure
 
 from foamfit.errors import InputError, SimulationError
@@ -38,6 +38,7 @@ MODELS = ("auto", "bistable", "linear+bistable", "bistable+bistable", "microscal
           "linear+microscale", "unilateral+bistable")  # fmt: skip
 OWN = "as the test allows"  # drive
 POLL = 200  # ms
+MOST_DRAWN, MOST_MARKERS = 400, 150  # points of a curve, of a measured one
 GRID = """
   :host { display: grid; gap: .4rem;
     grid-template-columns: repeat(auto-fit, minmax(min(100%, 17rem), 1fr)); }
@@ -156,17 +157,18 @@ class Window:
         self.back = button(name="Back to the fit", visible=False, **style)
         self.beside = select(name="Compare with a published set", options=["", *published],
                              visible=False, **style)  # fmt: skip
-        self.saves = pn.FlexBox(
+        self.saves = pn.Column(
             self._save("Save the result folder", "result.zip", lambda: self.desk.zipped()),
             self._save("Save the report", "report.html", partial(self._file, "report.html")),
             self._save("Save the TOML", "test.toml", lambda: self.desk.toml),
-            visible=False, margin=0, gap="0 .6rem",
+            visible=False, margin=0, sizing_mode="stretch_width",
+            stylesheets=[GRID.replace("17rem", "11rem")],
         )  # fmt: skip
 
     def _save(self, label: str, filename: str, content: Callable[[], bytes]) -> Any:
         return pn.widgets.FileDownload(
             callback=lambda: BytesIO(content()), filename=filename, label=label, embed=False,
-            auto=True, stylesheets=[FIELD], margin=(3, 0), width=210,
+            auto=True, stylesheets=[FIELD], margin=(3, 0), sizing_mode="stretch_width",
         )  # fmt: skip
 
     def _file(self, name: str) -> bytes:
@@ -180,7 +182,8 @@ class Window:
         self.understood.object = paragraph("There is no test yet.", "soft")
         self.ending.object = paragraph("There is no fit yet.", "soft")
         self.measured = {name: ColumnDataSource({"x": [], "y": []}) for name in PANELS}
-        self.turned = {name: ColumnDataSource({"x": [], "y": []}) for name in PANELS}
+        # One source for all panels: one message for a move.
+        self.turned = ColumnDataSource({f"{name}_{axis}": [] for name in PANELS for axis in "xy"})
         self.scales: dict[str, tuple[float, float]] = {}
         self.figures = {name: self._figure(name) for name in PANELS}
         self.panels = pn.Column(
@@ -192,13 +195,20 @@ class Window:
         made = figure(
             height=270, sizing_mode="stretch_width", title=CURVES[name], output_backend="canvas",
             tools="pan,box_zoom,reset", toolbar_location="right",
+            x_range=Range1d(0.0, 1.0), y_range=Range1d(0.0, 1.0),
         )  # fmt: skip
         made.scatter("x", "y", source=self.measured[name], size=5, fill_color="white",
                      line_color=GREY, legend_label="measured")  # fmt: skip
-        made.line("x", "y", source=self.turned[name], color=VERMILION, width=2,
-                  legend_label="springs")  # fmt: skip
+        made.line(
+            f"{name}_x", f"{name}_y", source=self.turned, color=VERMILION, width=2,
+            legend_label="springs",
+        )  # fmt: skip
         made.legend.background_fill_alpha = 0.7
-        made.legend.location = "top_left"
+        made.legend.location = "center" if name == "displacement_time" else "top_right"
+        if name == "stress_strain":
+            made.legend.location = "top_left"
+        made.legend.padding = made.legend.margin = 3
+        made.legend.label_text_font_size = "8.5pt"
         made.toolbar.logo = None
         made.toolbar.autohide = True
         return made
@@ -318,6 +328,7 @@ class Window:
         return None if self.drive.value == OWN else str(self.drive.value)
 
     def _hide_curves(self, why: str = "") -> None:
+        self.sliders.tell("")
         self.turning, self.rows, self.sliders.rows = None, {}, []
         self.panels.visible = False
         self.misfit.object = paragraph(why, "error") if why else ""
@@ -352,6 +363,7 @@ class Window:
         self.turning = made
         self.rows = {row.name: row for row in made.rows}
         self._show_measured()
+        self.misfit.object = ""
         self.sliders.rows = [vars(row) for row in made.rows]
         self._draw({})
 
@@ -368,8 +380,16 @@ class Window:
             self.scales[name] = fx, fy
             made.xaxis.axis_label = f"{x_name} ({x_unit})" if x_unit else x_name
             made.yaxis.axis_label = f"{y_name} ({y_unit})"
-            some = slice(None, None, max(len(there[0]) // 300, 1))
-            self.measured[name].data = {"x": there[0][some] / fx, "y": there[1][some] / fy}
+            some = slice(None, None, max(len(there[0]) // MOST_MARKERS, 1))
+            x, y = there[0] / fx, there[1] / fy
+            self.measured[name].data = {"x": x[some], "y": y[some]}
+            # They stay while parameters are turned: what moves is the curve alone.
+            for limits, values, beyond in ((made.x_range, x, 0.04), (made.y_range, y, 0.15)):
+                more = beyond * float(np.ptp(values))
+                limits.update(
+                    start=float(values.min()) - more, end=float(values.max()) + more,
+                    reset_start=float(values.min()) - more, reset_end=float(values.max()) + more,
+                )  # fmt: skip
         self.panels.visible = True
 
     def _moved(self, event: Any) -> None:
@@ -389,18 +409,22 @@ class Window:
         """Send the arrays of the curves alone; the figures stay as they are."""
         assert self.turning is not None
         drawn = self.turning.turn(moves)
-        for name, source in self.turned.items():
+        data = dict[str, Any]()
+        for name in PANELS:
             x, y = drawn.curves.get(name, NOTHING)
             fx, fy = self.scales.get(name, (1.0, 1.0))
-            source.data = {"x": x / fx, "y": y / fy}
-        law = self.turning.law
-        if drawn.error:
-            self.misfit.object = paragraph(drawn.error, "error")
-            return
-        told = f"{law}, {self.turning.drive} drive: misfit {misfits_text(drawn.misfit)}"
+            some = slice(None, None, max(len(x) // MOST_DRAWN, 1))
+            data |= {f"{name}_x": x[some] / fx, f"{name}_y": y[some] / fy}
+        longest = max(map(len, data.values()), default=0)
+        self.turned.data = {
+            name: np.pad(one, (0, longest - len(one)), constant_values=np.nan)
+            for name, one in data.items()
+        }
+        told = f"{self.turning.law}, {self.turning.drive} drive: "
+        told += f"misfit {misfits_text(drawn.misfit)}"
         used, shown = self.turning.samples
         told += f"; {shown} of {used} samples are drawn" if shown < used else ""
-        self.misfit.object = paragraph(told)
+        self.sliders.tell(drawn.error or told, wrong=bool(drawn.error))
 
     # ------------------------------------------------------------------------------- the fit
 

@@ -14,6 +14,7 @@ from panel.custom import JSComponent
 
 TEMPLATES = Path(__file__).with_name("templates")
 INPUTS = """
+  .error { color: #85280a; }
   :host { display: block; width: 100%; font: inherit; color: #1d2327; }
   input:focus-visible { outline: 3px solid #0072B2; outline-offset: 2px; }
   input[type=number] { font: inherit; padding: .15rem .3rem; border: 1px solid #6f7a81;
@@ -25,9 +26,9 @@ ZONE = """
   .zone.over { background: #e4f1f9; border-color: #0072B2; }
   .zone input { font: inherit; max-width: 100%; }
   .zone p { margin: 0; overflow-wrap: anywhere; } .zone p:empty { display: none; }
-  .error { color: #85280a; }
 """
 ROWS = """
+  .told { margin: 0 0 .5rem; min-height: 1.5em; }
   .list { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 21rem), 1fr));
     gap: .25rem 1.6rem; }
   .row { display: grid; grid-template-columns: 7.2rem minmax(4rem, 1fr) 6rem 2.6rem; gap: .5rem;
@@ -54,6 +55,8 @@ class Sliders(JSComponent):
     """A slider and a number for each parameter; a message names those that were moved."""
 
     rows = param.List()
+    told = param.String()
+    wrong = param.Boolean()
 
     _esm = TEMPLATES / "sliders.js"
     _stylesheets: ClassVar[list[str]] = [INPUTS, ROWS]
@@ -61,6 +64,10 @@ class Sliders(JSComponent):
     def show(self, values: Mapping[str, float]) -> None:
         """Put the sliders elsewhere, in the units of their rows; nothing is drawn by that."""
         self._send_msg({"values": dict(values)})
+
+    def tell(self, sentence: str, wrong: bool = False) -> None:
+        """Write a sentence above the sliders."""
+        self.param.update(told=sentence, wrong=wrong)
 
     def drawn(self) -> None:
         """Say that the last move is drawn, and the next may come."""

@@ -2,7 +2,9 @@
 export function render({ model, el }) {
   const list = document.createElement("div");
   list.className = "list";
-  el.append(list);
+  const told = document.createElement("p");
+  told.setAttribute("role", "status");
+  el.append(told, list);
   let inputs = {}, waiting = {}, busy = false;
   const STEPS = 1000;
   const digits = (value) => Number(value.toPrecision(5));
@@ -63,10 +65,16 @@ export function render({ model, el }) {
     }
     show(Object.fromEntries(model.rows.map((row) => [row.name, row.value])));
   }
+  function tell() {
+    told.textContent = model.told;
+    told.className = model.wrong ? "told error" : "told";
+  }
   model.on("rows", build);
+  model.on(["told", "wrong"], tell);
   model.on("msg:custom", (told) => {
     if (told.values) show(told.values);
     if (told.drawn) { busy = false; flush(); }
   });
   build();
+  tell();
 }
