@@ -127,26 +127,20 @@ class Page:
     """The page while it is served; `address` has the token. Close it."""
 
     def __init__(self, test: Path | None = None, port: int = 0) -> None:
+        self.port = _free_port(port)
         self.token = secrets.token_urlsafe(24)
         self.folder = Path(tempfile.mkdtemp(prefix="foamfit-page-"))  # for this user alone
         self.desks: dict[str, Desk] = {}
         self.test = test
-        self.port = port or _free_port()
-        try:
-            self.server = get_server(
-                {"/": self._window}, port=self.port, address=HOST, show=False, start=False,
-                title={"/": "foamfit"}, prefix=f"/{self.token}",
-                websocket_origin=f"{HOST}:{self.port}",
-                extra_patterns=[("/receive/([A-Za-z0-9_-]+)", Receive, {"desks": self.desks})],
-                unused_session_lifetime_milliseconds=UNUSED,
-                check_unused_sessions_milliseconds=UNUSED // 4,
-                http_server_kwargs={"max_body_size": 2 * LARGEST},
-            )  # fmt: skip
-        except OSError as error:
-            shutil.rmtree(self.folder, ignore_errors=True)
-            raise InputError(
-                f"--port {port} cannot be used: {error.strerror or error}; choose another one"
-            ) from None
+        self.server = get_server(
+            {"/": self._window}, port=self.port, address=HOST, show=False, start=False,
+            title={"/": "foamfit"}, prefix=f"/{self.token}",
+            websocket_origin=f"{HOST}:{self.port}",
+            extra_patterns=[("/receive/([A-Za-z0-9_-]+)", Receive, {"desks": self.desks})],
+            unused_session_lifetime_milliseconds=UNUSED,
+            check_unused_sessions_milliseconds=UNUSED // 4,
+            http_server_kwargs={"max_body_size": 2 * LARGEST},
+        )  # fmt: skip
         # Before Bokeh's own application sees anything; it has no public way to stand in front.
         self.server._http.request_callback = Guard(self.server._tornado, self.port, self.token)
         self.server.start()
@@ -198,7 +192,14 @@ def serve(test: Path | None, port: int, browser: bool) -> None:
         asyncio.run(run())
 
 
-def _free_port() -> int:
+def _free_port(wanted: int) -> int:
+    """Return the port that is wanted, or else a free one; InputError if it is taken."""
     with socket.socket() as free:
-        free.bind((HOST, 0))
+        free.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            free.bind((HOST, wanted))
+        except OSError as error:
+            raise InputError(
+                f"--port {wanted} cannot be used: {error.strerror}; choose another one"
+            ) from None
         return int(free.getsockname()[1])

@@ -114,13 +114,14 @@ class Worker:
                 self.news = News(**told)
         code = self._process.wait()
         self._process.stdout.close()
-        self._done = self._why(code) if done is None else done
+        done = self._why(code) if done is None else done
+        self._errors.close()
+        self._done = done
 
     def _why(self, code: int) -> str:
         """Say how a process ended that has not said it itself."""
         self._errors.seek(0)
         lines = self._errors.read().decode(errors="replace").strip().splitlines()
-        self._errors.close()
         if self.stopping:
             return STOPPED_EARLY
         last = f" ({lines[-1].strip()})" if lines else ""
