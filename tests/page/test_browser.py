@@ -129,6 +129,7 @@ def test_load_drop_fit_stop_turn_and_save(window, tmp_path):
         if marked is not None:
             api.expect(page.locator("td.wrong").first).to_have_text(marked)
         api.expect(page.get_by_role("button", name="Fit", exact=True)).to_be_disabled()
+        api.expect(page.get_by_text("Save the result folder")).to_be_hidden()
     # A name with markup is text.
     name = "<img src=x onerror=document.title='hit'>"
     toml = TEST.with_suffix(".toml").read_text()
@@ -160,6 +161,7 @@ def test_load_drop_fit_stop_turn_and_save(window, tmp_path):
     page.get_by_label("Starts of the search").fill("100000")
     page.get_by_role("button", name="Fit", exact=True).click()
     api.expect(page.get_by_text("best misfit").first).to_be_visible(timeout=LATER)
+    api.expect(height).to_be_disabled()
     page.get_by_role("button", name="Stop").click()
     report = page.frame_locator("iframe")
     api.expect(report.get_by_text("stopped by Ctrl-C").first).to_be_visible(timeout=LATER)

@@ -170,6 +170,8 @@ def test_a_fit_is_that_of_the_command(ready):
     there = ff.fit(measurement, model="bistable", starts=2, seed=3)
     saved = desk_module.compare([ready.result], "foam-1/model-2").pairs[0].rows[0].value
     assert saved == there.params["s1_k0"].value / 1e6
+    # What was told last is what was found.
+    assert worker.news.misfit["stress_time"] == pytest.approx(there.misfit["stress_time"], rel=0.02)
     assert "report.html" in {path.name for path in ready.result.iterdir()}
     assert ready.zipped().startswith(b"PK")
     assert "foam-1/model-2" in ready.compared("foam-1/model-2")
@@ -193,6 +195,10 @@ def test_a_fit_that_is_stopped_keeps_the_best(ready):
     assert set(worker.news.values) >= {"s1_k0", "s1_eta"}
     with pytest.raises(InputError, match="A fit is running"):
         ready.fit("bistable", {})
+    # What it is fitted to cannot change beneath it.
+    with pytest.raises(InputError, match="A fit is running"):
+        ready.receive("other.csv", b"1,2\n")
+    assert "A fit is running" in ready.check(GOOD, "").error
     worker.stop()
     wait(worker)
     assert worker.ended == ""

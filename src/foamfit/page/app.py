@@ -21,7 +21,7 @@ from bokeh.plotting import figure
 
 from foamfit.errors import InputError, SimulationError
 from foamfit.one_model import Options
-from foamfit.page.desk import LARGEST, QUANTITIES, Checked, Desk, Excerpt
+from foamfit.page.desk import BUSY, LARGEST, QUANTITIES, Checked, Desk, Excerpt
 from foamfit.page.turning import PANELS, Row, Turning
 from foamfit.page.widgets import TEMPLATES, Sliders, Upload, message
 from foamfit.report.figures import GREY, VERMILION
@@ -39,10 +39,6 @@ MODELS = ("auto", "bistable", "linear+bistable", "bistable+bistable", "microscal
 OWN = "as the test allows"  # drive
 POLL = 200  # ms
 MOST_DRAWN, MOST_MARKERS = 400, 150  # points of a curve, of a measured one
-GRID = """
-  :host { display: grid; gap: .4rem;
-    grid-template-columns: repeat(auto-fit, minmax(min(100%, 17rem), 1fr)); }
-"""
 # One thing at a time, for all windows.
 BESIDE = ThreadPoolExecutor(1, thread_name_prefix="foamfit-page")
 NOTHING = np.empty(0), np.empty(0)
@@ -79,6 +75,19 @@ WRONG = FIELD + ".bk-input { border: 2px solid #b3261e; background: #fdeeed; }"
 def text_pane() -> pn.pane.HTML:
     """Make a place for text that is put there already escaped."""
     return pn.pane.HTML("", stylesheets=[TEXT], sizing_mode="stretch_width", margin=(4, 0))
+
+
+def grid(parts: list[Any], width: float) -> pn.Column:
+    """Put parts side by side, none narrower than so many rem; hidden at first.
+
+    What is hidden is the column around it: a part that says itself how it is laid out stays.
+    """
+    style = (
+        ":host { display: grid; gap: .4rem; "
+        f"grid-template-columns: repeat(auto-fit, minmax(min(100%, {width}rem), 1fr)); }}"
+    )
+    wide: dict[str, Any] = {"sizing_mode": "stretch_width", "margin": 0}
+    return pn.Column(pn.Column(*parts, stylesheets=[style], **wide), visible=False, **wide)
 
 
 def paragraph(text: str, kind: str = "") -> str:
@@ -157,13 +166,14 @@ class Window:
         self.back = button(name="Back to the fit", visible=False, **style)
         self.beside = select(name="Compare with a published set", options=["", *published],
                              visible=False, **style)  # fmt: skip
-        self.saves = pn.Column(
-            self._save("Save the result folder", "result.zip", lambda: self.desk.zipped()),
-            self._save("Save the report", "report.html", partial(self._file, "report.html")),
-            self._save("Save the TOML", "test.toml", lambda: self.desk.toml),
-            visible=False, margin=0, sizing_mode="stretch_width",
-            stylesheets=[GRID.replace("17rem", "11rem")],
-        )  # fmt: skip
+        self.saves = grid(
+            [
+                self._save("Save the result folder", "result.zip", lambda: self.desk.zipped()),
+                self._save("Save the report", "report.html", partial(self._file, "report.html")),
+                self._save("Save the TOML", "test.toml", lambda: self.desk.toml),
+            ],
+            11.0,
+        )
 
     def _save(self, label: str, filename: str, content: Callable[[], bytes]) -> Any:
         return pn.widgets.FileDownload(
@@ -186,10 +196,9 @@ class Window:
         self.turned = ColumnDataSource({f"{name}_{axis}": [] for name in PANELS for axis in "xy"})
         self.scales: dict[str, tuple[float, float]] = {}
         self.figures = {name: self._figure(name) for name in PANELS}
-        self.panels = pn.Column(
-            *(pn.pane.Bokeh(one, sizing_mode="stretch_width") for one in self.figures.values()),
-            visible=False, sizing_mode="stretch_width", margin=0, stylesheets=[GRID],
-        )  # fmt: skip
+        self.panels = grid(
+            [pn.pane.Bokeh(one, sizing_mode="stretch_width") for one in self.figures.values()], 14.5
+        )
 
     def _figure(self, name: str) -> Any:
         made = figure(
@@ -280,6 +289,8 @@ class Window:
         except InputError as error:
             self.problem.object = paragraph(str(error), "error")
             return
+        if self.desk.worker is None:  # what is shown of a fit is of another test
+            self._hide_result("There is no fit yet.")
         if found is not None:
             quantities, rest = found
             self._filling = True  # one check after all of them
@@ -306,6 +317,8 @@ class Window:
         self.problem.object = paragraph(checked.error, "error") if checked.error else ""
         for name, field in self.quantities.items():
             field.stylesheets = [WRONG if name == checked.quantity else FIELD]
+        if checked.error == BUSY:
+            return
         if checked.error:
             shown = paragraph("The test cannot be read yet: see what is wrong with it.", "soft")
             self.understood.object = shown + excerpt_html(checked.excerpt)
@@ -453,10 +466,19 @@ class Window:
             self.progress.object = paragraph(str(error), "error")
             return
         self.run.disabled, self.stop.visible, self.stop.disabled = True, True, False
-        self.saves.visible = self.beside.visible = self.back.visible = False
-        self.ending.object = paragraph("A fit is running.", "soft")
-        self.report.object = self.comparison.object = ""
+        self._hide_result("A fit is running.")
+        self._hold(True)
         self._poll.start()
+
+    def _hold(self, held: bool) -> None:
+        """Let nothing of the test be changed while it is fitted."""
+        for field in (*self.quantities.values(), self.rest, self.chosen, self.check):
+            field.disabled = held
+
+    def _hide_result(self, why: str) -> None:
+        self.saves.visible = self.beside.visible = self.back.visible = False
+        self.report.object = self.comparison.object = ""
+        self.ending.object = paragraph(why, "soft")
 
     def _stop(self, event: Any = None) -> None:
         if self.desk.worker is not None:
@@ -504,6 +526,7 @@ class Window:
         """Show the result of the fit, or why there is none."""
         self.run.disabled, self.stop.visible = self.desk.measurement is None, False
         self.progress.object = ""
+        self._hold(False)
         if self.desk.result is None:
             self.ending.object = paragraph(self.desk.ending(), "error")
             return

@@ -30,6 +30,7 @@ from foamfit.text import listed
 
 LARGEST = 64 * 1024 * 1024  # bytes of a file that is dropped
 LONGEST = 80  # characters of the name of a file
+BUSY = "A fit is running; stop it before anything of the test is changed."
 TABLES = (".csv", ".txt", ".tsv", ".dat")
 # Rows and columns of a file that are shown around a cell that is wrong.
 AROUND, ACROSS, CELL = 2, 8, 24
@@ -104,6 +105,8 @@ class Desk:
 
         InputError if it is too large or of no kind that is read.
         """
+        if self.running:
+            raise InputError(BUSY)
         if len(content) > LARGEST:
             raise InputError(too_large(name))
         name = safe_name(name)
@@ -118,7 +121,7 @@ class Desk:
         place = self.folder / "test"
         shutil.rmtree(place, ignore_errors=True)
         place.mkdir()
-        self.csv, self.measurement = place / name, None
+        self.csv, self.measurement, self.worker = place / name, None, None
         self.csv.write_bytes(content)
         return name
 
@@ -154,6 +157,8 @@ class Desk:
 
     def check(self, quantities: Mapping[str, str], rest: str) -> Checked:
         """Read the test as `foamfit check` does, and say what was understood or what is wrong."""
+        if self.running:
+            return Checked(error=BUSY)
         self.measurement = None
         if self.csv is None:
             return Checked(error="There is no test yet; drop a CSV or choose a reconstruction.")
@@ -191,10 +196,12 @@ class Desk:
         if self.csv is None or self.measurement is None:
             raise InputError("There is no test that can be read yet; see what is wrong with it.")
         if self.running:
-            raise InputError("A fit is running; stop it first.")
+            raise InputError(BUSY)
         self._fits += 1
         folder = self.folder / f"fit-{self._fits}"
-        job = Job(str(self.csv), str(self.csv.with_suffix(".toml")), str(folder), model, options)
+        toml = folder.with_suffix(".toml")  # as it is now, whatever is filled in later
+        toml.write_bytes(self.toml)
+        job = Job(str(self.csv), str(toml), str(folder), model, options)
         self.worker = Worker(job)
         return self.worker
 
@@ -222,7 +229,7 @@ class Desk:
         with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
             for path in sorted(self.result.iterdir()):
                 archive.write(path, path.name)
-            archive.writestr("test.toml", self.toml)
+            archive.write(self.result.with_suffix(".toml"), "test.toml")
         return content.getvalue()
 
     def compared(self, published: str) -> str:

@@ -150,6 +150,12 @@ class _Teller:
         self._best = problem, values
         self._tell()
 
+    def finish(self, what: str) -> None:
+        """Tell the last of what was found, and what comes after it."""
+        self.told |= {"fraction": 1.0, "what": what}
+        self._last = 0.0
+        self._tell()
+
     def _tell(self) -> None:
         now = time.monotonic()
         if now - self._last < OFTEN:
@@ -204,7 +210,7 @@ def _run(job: Job) -> str:
                 **job.options,
             )  # fmt: skip
         with without_ctrl_c():
-            _say(teller.told | {"fraction": 1.0, "what": "writing the report"})
+            teller.finish("writing the report")
             result.save(job.folder)
     except (InputError, SimulationError) as error:
         return str(error)
