@@ -75,6 +75,9 @@ def fit(
         along which the cost is no parabola), "local", "profile", "bootstrap" or "mcmc".
     draws : int, optional
         Refits of the bootstrap (by default 500) or steps of the Markov chain (2000).
+    watch : callable, optional
+        Called with the problem and the best parameters so far whenever these get better; it must
+        be quick.
 
     Returns
     -------

@@ -7,6 +7,7 @@ import time
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from numbers import Integral, Real
 from typing import TypedDict
 
@@ -35,6 +36,8 @@ from foamfit.trust.intervals import Announce, Choice, Intervals, assess
 from foamfit.trust.ranges import Open, left_open
 
 Progress = Callable[[float, str], None]
+# Called with the problem and the best point so far, many times a second; it must be quick.
+Watch = Callable[[Problem, Array], None]
 
 # Descents of the search for each spring.
 STARTS = 16
@@ -63,6 +66,7 @@ class Keywords(TypedDict, total=False):
     loss: str
     intervals: str
     draws: int | None
+    watch: Watch | None
 
 
 @dataclass(frozen=True)
@@ -83,6 +87,7 @@ class Options:
     loss: str = "linear"
     intervals: str = "auto"
     draws: int | None = None
+    watch: Watch | None = None
 
     def __post_init__(self) -> None:
         """Refuse what is of no use."""
@@ -143,7 +148,8 @@ def identify(
     problem = options.problem(measurement, model, params)
     starts = STARTS * len(problem.model.kinds) if options.starts is None else options.starts
     deadline = None if options.max_time is None else time.monotonic() + options.max_time
-    tracker = Tracker(problem.objective, deadline)
+    better = None if options.watch is None else partial(options.watch, problem)
+    tracker = Tracker(problem.objective, deadline, better)
     record = SearchRecord(options.seed, starts, began)
     record = _search(problem, tracker, record, progress)
     if tracker.best_values is None:

@@ -53,19 +53,16 @@ def compiling(
     """Compile at first use, beside the body; it calls what is given before it simulates."""
     import logging
 
-    from foamfit.solve import cache, precompile
+    from foamfit.solve import precompile
 
     if quiet:  # what is compiled later is announced by the log
         logging.getLogger("foamfit").setLevel(logging.ERROR)
-    memory = model == "auto" or "microscale" in model or relaxation > 0
-    integrator = (model == "auto" or not memory) and not cache.compiled()
-    memory = memory and not cache.compiled("relaxed_along")
-    if not (integrator or memory):
-        yield lambda: None
-        return
-    if not quiet:
-        say("foamfit: compiling the solver, once after installation", err=True)
-    with precompile.side_by_side(integrator, memory) as finish:
+
+    def tell() -> None:
+        if not quiet:
+            say("foamfit: compiling the solver, once after installation", err=True)
+
+    with precompile.at_first_use(model, relaxation, tell) as finish:
         yield finish
 
 

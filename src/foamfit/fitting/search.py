@@ -68,11 +68,13 @@ class SearchRecord:
 class Tracker:
     """Counts and times the evaluations of an objective and keeps the best point ever seen.
 
-    `ends` holds the parameters at which the descents on the drive's curves ended.
+    `ends` holds the parameters at which the descents on the drive's curves ended; `better` is
+    called with every point that is the best so far.
     """
 
     objective: Objective
     deadline: float | None = None
+    better: Callable[[Array], None] | None = None
     best_values: Array | None = None
     best_cost: float = np.inf
     ends: list[Array] = field(default_factory=list)
@@ -93,6 +95,8 @@ class Tracker:
             return residual
         if cost < self.best_cost and self.objective.failures == failures:
             self.best_cost, self.best_values = cost, values.copy()
+            if self.better is not None:
+                self.better(self.best_values)
         return residual
 
 
@@ -374,7 +378,7 @@ def _search_loop(
         loop, objective.model, "displacement", {"stress_strain": 1.0},
         time_shift=objective.time_shift, loss=objective.loss,
     )  # fmt: skip
-    inner = Tracker(along, tracker.deadline)
+    inner = Tracker(along, tracker.deadline, tracker.better)
     try:
         ranked = rank(inner, space, points + curve_starts(space, loop, rng))
         points = [point for _, point in ranked]

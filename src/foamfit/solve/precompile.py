@@ -17,6 +17,7 @@ from unittest.mock import patch
 
 import numpy as np
 
+from foamfit.solve import cache
 from foamfit.solve.cache import PACKAGE
 
 
@@ -115,6 +116,25 @@ def _rest() -> None:
     _run("displacement")
     _run("displacement", 2)
     _run("stress")
+
+
+@contextmanager
+def at_first_use(
+    model: str, relaxation: int, tell: Callable[[], None]
+) -> Iterator[Callable[[], None]]:
+    """Compile beside the body what the fit of a model needs and is not in the cache.
+
+    The body calls what is given before it simulates; `tell` is called if there is anything to do.
+    """
+    memory = model == "auto" or "microscale" in model or relaxation > 0
+    integrator = (model == "auto" or not memory) and not cache.compiled()
+    memory = memory and not cache.compiled("relaxed_along")
+    if not (integrator or memory):
+        yield lambda: None
+        return
+    tell()
+    with side_by_side(integrator, memory) as finish:
+        yield finish
 
 
 @contextmanager

@@ -1,0 +1,205 @@
+"""The address of the page: on this machine alone, known to who was given it, and for no other page.
+
+Every request is looked at before anything else sees it: its Host and its Origin must be the page's
+own (another site that a name leads here, or that sends its visitors' browsers here, is refused),
+and its path begins with a random token.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+import shutil
+import signal
+import socket
+import tempfile
+import webbrowser
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import tornado.httputil as httputil
+import tornado.routing as routing
+import tornado.web as web
+from panel.io.server import get_server
+
+from foamfit.errors import InputError
+from foamfit.page.app import Window
+from foamfit.page.desk import LARGEST, Desk, too_large
+from foamfit.terminal import TerminatedError, say
+
+HOST = "127.0.0.1"
+UNUSED = 20_000  # ms after which the desk of a closed window is removed
+HEADERS = {
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Cache-Control": "no-store",
+}
+REFUSED = "This page is for the address that foamfit page has printed; open that.\n"
+
+
+class Refusal(httputil.HTTPMessageDelegate):
+    """Answer a request with 403, whatever it is."""
+
+    def __init__(self, connection: httputil.HTTPConnection) -> None:
+        self.connection = connection
+
+    def finish(self) -> None:
+        """Answer, once all of the request has come."""
+        body = REFUSED.encode()
+        head = httputil.HTTPHeaders(
+            {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body)),
+             "Connection": "close"} | HEADERS
+        )  # fmt: skip
+        line = httputil.ResponseStartLine("HTTP/1.1", 403, "Forbidden")
+        self.connection.write_headers(line, head, body)
+        self.connection.finish()
+
+
+class Guard(routing.Router):
+    """Let through what has the page's own Host, Origin and token only."""
+
+    def __init__(self, behind: web.Application, port: int, token: str) -> None:
+        self.behind, self.token = behind, token
+        self.host = f"{HOST}:{port}"
+
+    def find_handler(
+        self, request: httputil.HTTPServerRequest, **kwargs: Any
+    ) -> httputil.HTTPMessageDelegate | None:
+        """Return what answers a request."""
+        origins = request.headers.get_list("Origin")
+        own = request.headers.get_list("Host") == [self.host]
+        own = own and all(origin == f"http://{self.host}" for origin in origins)
+        given = request.path.split("/")[1] if "/" in request.path else ""
+        if own and secrets.compare_digest(given.encode(), self.token.encode()):
+            return self.behind.find_handler(request, **kwargs)
+        assert request.connection is not None
+        return Refusal(request.connection)
+
+
+@web.stream_request_body
+class Receive(web.RequestHandler):
+    """Take a file that was dropped in a window, no larger than is said, onto its desk."""
+
+    def initialize(self, desks: dict[str, Desk]) -> None:
+        """Know the desks of all windows by their random names."""
+        self.desks = desks
+        self.content = bytearray()
+
+    def set_default_headers(self) -> None:
+        """Let nothing be guessed, kept or framed."""
+        for name, value in HEADERS.items():
+            self.set_header(name, value)
+
+    def prepare(self) -> None:
+        """Refuse what is too large before it is sent."""
+        length = self.request.headers.get("Content-Length", "")
+        if self.request.method == "POST" and (not length.isdecimal() or int(length) > LARGEST):
+            self._refuse(413, too_large(self.get_query_argument("name", "The file")))
+
+    def data_received(self, chunk: bytes) -> None:
+        """Take a part of the file."""
+        if len(self.content) + len(chunk) <= LARGEST and not self._finished:
+            self.content += chunk
+
+    def post(self, window: str) -> None:
+        """Keep the file."""
+        desk = self.desks.get(window)
+        if desk is None:
+            return self._refuse(404, "This window is closed; load the page again.")
+        try:
+            name = desk.receive(self.get_query_argument("name", "test.csv"), bytes(self.content))
+        except InputError as error:
+            return self._refuse(400, str(error))
+        self.set_header("Content-Type", "text/plain; charset=utf-8")
+        self.finish(name)
+        return None
+
+    def _refuse(self, code: int, sentence: str) -> None:
+        self.set_status(code)
+        self.set_header("Content-Type", "text/plain; charset=utf-8")
+        self.set_header("Connection", "close")
+        self.finish(sentence + "\n")
+
+
+class Page:
+    """The page while it is served; `address` has the token. Close it."""
+
+    def __init__(self, test: Path | None = None, port: int = 0) -> None:
+        self.port = _free_port(port)
+        self.token = secrets.token_urlsafe(24)
+        self.folder = Path(tempfile.mkdtemp(prefix="foamfit-page-"))  # for this user alone
+        self.desks: dict[str, Desk] = {}
+        self.test = test
+        self.server = get_server(
+            {"/": self._window}, port=self.port, address=HOST, show=False, start=False,
+            title={"/": "foamfit"}, prefix=f"/{self.token}",
+            websocket_origin=f"{HOST}:{self.port}",
+            extra_patterns=[("/receive/([A-Za-z0-9_-]+)", Receive, {"desks": self.desks})],
+            unused_session_lifetime_milliseconds=UNUSED,
+            check_unused_sessions_milliseconds=UNUSED // 4,
+            http_server_kwargs={"max_body_size": 2 * LARGEST},
+        )  # fmt: skip
+        # Before Bokeh's own application sees anything; it has no public way to stand in front.
+        self.server._http.request_callback = Guard(self.server._tornado, self.port, self.token)
+        self.server.start()
+
+    @property
+    def address(self) -> str:
+        """Where the page is, with the token that opens it."""
+        return f"http://{HOST}:{self.port}/{self.token}/"
+
+    def close(self) -> None:
+        """End the server and all fits, and remove all files."""
+        with suppress(RuntimeError, AssertionError):
+            self.server.stop()
+        for desk in list(self.desks.values()):
+            desk.close()
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _window(self) -> Any:
+        """Make one window, with a desk of its own, for one load of the page."""
+        name = secrets.token_urlsafe(12)
+        desk = self.desks[name] = Desk(self.folder / f"window-{len(self.desks)}-{name}")
+
+        def gone() -> None:
+            self.desks.pop(name, None)
+            desk.close()
+
+        return Window(desk, f"/{self.token}/receive/{name}", self.test, gone).template
+
+
+def serve(test: Path | None, port: int, browser: bool) -> None:
+    """Serve the page until Ctrl-C or SIGTERM; its address is the first line of stdout."""
+
+    async def run() -> None:
+        page = Page(test, port)
+        try:
+            ending = asyncio.Event()
+            loop = asyncio.get_running_loop()
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+                loop.add_signal_handler(number, ending.set)
+            say(page.address)
+            say("foamfit: the page is open at this address until Ctrl-C", err=True)
+            if browser:
+                await asyncio.to_thread(webbrowser.open, page.address)
+            await ending.wait()
+        finally:
+            page.close()
+
+    with suppress(KeyboardInterrupt, TerminatedError):
+        asyncio.run(run())
+
+
+def _free_port(wanted: int) -> int:
+    """Return the port that is wanted, or else a free one; InputError if it is taken."""
+    with socket.socket() as free:
+        free.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            free.bind((HOST, wanted))
+        except OSError as error:
+            raise InputError(
+                f"--port {wanted} cannot be used: {error.strerror}; choose another one"
+            ) from None
+        return int(free.getsockname()[1])

@@ -1,0 +1,80 @@
+// A slider and a number for each parameter. One move is under way at a time; the last one waits.
+export function render({ model, el }) {
+  const list = document.createElement("div");
+  list.className = "list";
+  const told = document.createElement("p");
+  told.setAttribute("role", "status");
+  el.append(told, list);
+  let inputs = {}, waiting = {}, busy = false;
+  const STEPS = 1000;
+  const digits = (value) => Number(value.toPrecision(5));
+
+  function flush() {
+    if (busy || !Object.keys(waiting).length) return;
+    busy = true;
+    model.send_msg({ moves: waiting });
+    waiting = {};
+  }
+  function move(name, value) {
+    waiting[name] = value;
+    flush();
+  }
+  function place(row, value) {
+    return Math.round(STEPS * Math.min(Math.max((value - row.low) / (row.high - row.low), 0), 1));
+  }
+  function show(values) {
+    for (const [name, value] of Object.entries(values)) {
+      const own = inputs[name];
+      if (!own) continue;
+      own.slider.value = place(own.row, value);
+      own.slider.setAttribute("aria-valuetext", `${digits(value)} ${own.row.unit}`);
+      own.number.value = digits(value);
+    }
+  }
+  function build() {
+    list.replaceChildren();
+    [inputs, waiting, busy] = [{}, {}, false];
+    for (const row of model.rows) {
+      const line = document.createElement("div");
+      line.className = "row";
+      const label = document.createElement("label");
+      const slider = document.createElement("input");
+      const number = document.createElement("input");
+      const unit = document.createElement("span");
+      label.textContent = row.name;
+      label.htmlFor = slider.id = `slider-${row.name}`;
+      Object.assign(slider, { type: "range", min: 0, max: STEPS, step: 1 });
+      Object.assign(number, { type: "number", step: "any" });
+      number.setAttribute("aria-label", `${row.name} as a number${row.unit ? ", " + row.unit : ""}`);
+      unit.textContent = row.unit;
+      slider.addEventListener("input", () => {
+        const value = row.low + (row.high - row.low) * slider.value / STEPS;
+        number.value = digits(value);
+        slider.setAttribute("aria-valuetext", `${digits(value)} ${row.unit}`);
+        move(row.name, value);
+      });
+      number.addEventListener("change", () => {
+        const value = Math.min(Math.max(number.valueAsNumber, row.least), row.most);
+        if (!Number.isFinite(value)) return;
+        show({ [row.name]: value });
+        move(row.name, value);
+      });
+      inputs[row.name] = { row, slider, number };
+      line.append(label, slider, number, unit);
+      list.append(line);
+    }
+    show(Object.fromEntries(model.rows.map((row) => [row.name, row.value])));
+  }
+  function tell() {
+    told.textContent = model.told;
+    told.className = model.wrong ? "told error" : "told";
+  }
+  model.on("rows", build);
+  model.on(["told", "wrong"], tell);
+  model.on("msg:custom", (told) => {
+    if (told.values) show(told.values);
+    if (told.drawn) { busy = false; flush(); }
+  });
+  build();
+  tell();
+}

@@ -1,0 +1,229 @@
+"""A fit in a process of its own: begun, watched and stopped by the page.
+
+The process reads a job as one line of JSON and answers in lines of JSON; Ctrl-C (SIGINT) stops its
+search, which keeps the best point, as in the terminal.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from foamfit.errors import InputError, SimulationError
+
+if TYPE_CHECKING:
+    from foamfit.arrays import Array
+    from foamfit.fitting.problem import Problem
+
+PACKAGE = Path(__file__).parent.parent
+OFTEN = 0.2  # s between two lines of a fit
+STOPPED_EARLY = "The fit was stopped before anything was found; start it again."
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is to be fitted and how: the keywords of `foamfit.fit`, and where the result goes."""
+
+    csv: str
+    toml: str
+    folder: str
+    model: str
+    options: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class News:
+    """What a fit has told last; `values` are by the names of the parameters of `model`, SI."""
+
+    fraction: float = 0.0
+    what: str = "starting"
+    model: str = ""
+    relaxation: int = 0
+    drive: str = ""
+    values: dict[str, float] = field(default_factory=dict)
+    misfit: dict[str, float | None] = field(default_factory=dict)
+
+
+class Worker:
+    """A running fit, as the page sees it: the last news, and how it ended."""
+
+    def __init__(self, job: Job) -> None:
+        self.job, self.news = job, News()
+        self.began = time.monotonic()
+        self.stopping = False
+        self._done: str | None = None  # the sentence with which it ended, "" where all is well
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  (closed when the process ends)
+        paths = f"{PACKAGE.parent}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "foamfit.page.worker"],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors, text=True,
+            encoding="utf-8", env=os.environ | {"PYTHONPATH": paths.rstrip(os.pathsep)},
+            start_new_session=True,  # Ctrl-C in the terminal of the page is not for this one
+        )  # fmt: skip
+        assert self._process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.write(json.dumps(vars(job)) + "\n")
+            self._process.stdin.close()
+        threading.Thread(target=self._listen, daemon=True).start()
+
+    @property
+    def pid(self) -> int:
+        """The number of the process."""
+        return self._process.pid
+
+    @property
+    def ended(self) -> str | None:
+        """None while it runs; then "" where a result is written, or else why there is none."""
+        return self._done
+
+    def stop(self) -> None:
+        """End the search; the best point is kept, concluded and written."""
+        if not self.stopping and self._process.poll() is None:
+            self.stopping = True
+            self._process.send_signal(signal.SIGINT)
+
+    def kill(self) -> None:
+        """End the process at once."""
+        if self._process.poll() is None:
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.killpg(self._process.pid, signal.SIGKILL)  # what it compiles in, too
+        self._process.wait()
+
+    def _listen(self) -> None:
+        """Read what the process tells until it ends."""
+        assert self._process.stdout is not None
+        done: str | None = None
+        for line in self._process.stdout:
+            try:
+                told = json.loads(line)
+            except ValueError:  # what some library has printed, or half a line of one that died
+                continue
+            if "ended" in told:
+                done = told["ended"]
+            else:
+                self.news = News(**told)
+        code = self._process.wait()
+        self._process.stdout.close()
+        done = self._why(code) if done is None else done
+        self._errors.close()
+        self._done = done
+
+    def _why(self, code: int) -> str:
+        """Say how a process ended that has not said it itself."""
+        self._errors.seek(0)
+        lines = self._errors.read().decode(errors="replace").strip().splitlines()
+        if self.stopping:
+            return STOPPED_EARLY
+        last = f" ({lines[-1].strip()})" if lines else ""
+        how = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
+        return f"The process of the fit has died {how}{last}; start the fit again."
+
+
+# --------------------------------------------------------------------- in the process of the fit
+
+
+class _Teller:
+    """What the page is told of a fit, a few times a second."""
+
+    def __init__(self) -> None:
+        self.told: dict[str, Any] = {}
+        self._best: tuple[Problem, Array] | None = None
+        self._last = 0.0
+
+    def progress(self, fraction: float, what: str) -> None:
+        """Take how far the fit is."""
+        self.told |= {"fraction": fraction, "what": what}
+        self._tell()
+
+    def watch(self, problem: Problem, values: Array) -> None:
+        """Take the best point so far."""
+        self._best = problem, values
+        self._tell()
+
+    def finish(self, what: str) -> None:
+        """Tell the last of what was found, and what comes after it."""
+        self.told |= {"fraction": 1.0, "what": what}
+        self._last = 0.0
+        self._tell()
+
+    def _tell(self) -> None:
+        now = time.monotonic()
+        if now - self._last < OFTEN:
+            return
+        self._last = now
+        if self._best is not None:
+            self.told |= _standing(*self._best)
+            self._best = None
+        _say(self.told)
+
+
+def _standing(problem: Problem, values: Array) -> dict[str, Any]:
+    """Return parameters and misfits of a point; nothing of it is counted as a step of the fit."""
+    own = problem.objective
+    counts = own.evaluations, own.failures
+    try:
+        misfit = own.misfit(own.simulate(values, everything=True))
+    except SimulationError:
+        return {}
+    finally:
+        own.evaluations, own.failures = counts
+    return {
+        "model": problem.model.name,
+        "relaxation": problem.model.relaxation,
+        "drive": own.drive,
+        "values": dict(zip(problem.names, values.tolist(), strict=True)),
+        "misfit": misfit,
+    }
+
+
+def _say(told: dict[str, Any]) -> None:
+    print(json.dumps(told), flush=True)
+
+
+def _run(job: Job) -> str:
+    """Fit and write the result; returns "" or why there is none."""
+    try:
+        from foamfit import api
+        from foamfit.data.csv_file import read_test
+        from foamfit.solve.precompile import at_first_use
+        from foamfit.terminal import without_ctrl_c
+
+        teller = _Teller()
+        relaxation = int(job.options.get("relaxation", 0))
+        with at_first_use(
+            job.model, relaxation, lambda: teller.progress(0.0, "compiling, once")
+        ) as compile_rest:
+            measurement = read_test(job.csv, job.toml)
+            compile_rest()
+            result = api.fit(
+                measurement, model=job.model, progress=teller.progress, watch=teller.watch,
+                **job.options,
+            )  # fmt: skip
+        with without_ctrl_c():
+            teller.finish("writing the report")
+            result.save(job.folder)
+    except (InputError, SimulationError) as error:
+        return str(error)
+    except KeyboardInterrupt:
+        return STOPPED_EARLY
+    return ""
+
+
+def main() -> None:
+    """Do the job that stands on stdin."""
+    job = Job(**json.loads(sys.stdin.readline()))
+    _say({"ended": _run(job)})
+
+
+if __name__ == "__main__":
+    main()

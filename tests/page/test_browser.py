@@ -1,0 +1,221 @@
+"""The page in a real browser: everything that is pressed, dropped and turned there."""
+
+import json
+import os
+import re
+import shutil
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from conftest import EXPERIMENTS
+from serving import served
+
+api = pytest.importorskip(
+    "playwright.sync_api", reason='no browser is driven without: pip install "foamfit[test]"'
+)
+pytest.importorskip("panel", reason='the page needs Panel: pip install "foamfit[page]"')
+__all__ = ["served"]
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+TEST = EXPERIMENTS / "foam-1" / "model-2-2.0mps-reconstruction.csv"
+HEAD = "time (ms),force (N),displacement (mm)"
+SOON, LATER = 20_000, 90_000  # ms
+
+# Milliseconds from a move of a slider to the next frame after the curve has come, many moves.
+REDRAWS = """async () => {
+  const source = [...Bokeh.documents[0]._all_models.values()].find((m) => m.data?.stress_time_y);
+  const inputs = (at) => [...at.querySelectorAll('*')].flatMap((e) => [
+    ...(e.matches('input[type=range]') ? [e] : []), ...(e.shadowRoot ? inputs(e.shadowRoot) : []),
+  ]);
+  const slider = inputs(document)[0], took = [];
+  for (let i = 0; i < 25; i++) {
+    const began = performance.now();
+    await new Promise((drawn) => {
+      const arrived = () => {
+        source.properties.data.change.disconnect(arrived);
+        requestAnimationFrame(() => setTimeout(drawn, 0));
+      };
+      source.properties.data.change.connect(arrived);
+      slider.value = 150 + 8 * i;
+      slider.dispatchEvent(new Event('input'));
+    });
+    took.push(performance.now() - began);
+    await new Promise((later) => setTimeout(later, 30));
+  }
+  return took;
+}"""
+FOCUSED = """() => {
+  let at = document.activeElement;
+  while (at.shadowRoot?.activeElement) at = at.shadowRoot.activeElement;
+  return at.labels?.[0]?.textContent || at.ariaLabel || at.textContent;
+}"""
+CURVE = """() => Array.from([...Bokeh.documents[0]._all_models.values()]
+  .find((m) => m.data?.stress_time_y).data.stress_time_y)"""
+
+
+def rows(change=lambda i, row: row):
+    """A table that can be read but for what is changed in it."""
+    return "\n".join([HEAD, *(change(i, f"{i},{0.1 * i},{0.01 * i}") for i in range(40))])
+
+
+# Of each: its text, what the sentence says, the cell or header that is marked.
+BAD = {
+    "word.csv": (rows(lambda i, r: "9,oops,1" if i == 9 else r), "row 11", "oops"),
+    "no-unit.csv": (rows().replace("force (N)", "force"), "'force'", "force"),
+    "constant.csv": (rows(lambda i, r: f"{i},5,{0.01 * i}"), "is constant", "force (N)"),
+    "back.csv": (rows(lambda i, r: "3,2.0,0.2" if i == 20 else r), "time goes back", "3"),
+    "picture.png": ("\x89PNG", "picture.png is no table", None),
+}
+
+
+@pytest.fixture(scope="module")
+def browser():
+    found = next((path for path in map(shutil.which, NAMES) if path), None)
+    with api.sync_playwright() as playwright:
+        own = playwright.chromium.executable_path
+        if found is None and not Path(own).exists():
+            pytest.skip(
+                f"no browser is installed here: neither {', '.join(NAMES)} nor playwright's"
+            )
+        options = [] if not hasattr(os, "geteuid") or os.geteuid() else ["--no-sandbox"]
+        browser = playwright.chromium.launch(executable_path=found, args=options)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def window(browser, served):
+    """An open window; that no error is on its console is tested at its end."""
+    context = browser.new_context(viewport={"width": 1280, "height": 900}, accept_downloads=True)
+    page, wrong, hosts = context.new_page(), [], set()
+    page.set_default_timeout(SOON)
+    page.on("console", lambda m: wrong.append(m.text) if m.type == "error" else None)
+    page.on("pageerror", lambda error: wrong.append(str(error)))
+    page.on(
+        "request",
+        lambda request: hosts.update(re.findall(r"^(?:http|ws)s?://([^/]*)", request.url)),
+    )
+    page.goto(served.address)
+    page.get_by_label("Drop a CSV").wait_for()
+    yield page
+    assert [text for text in wrong if "status of 400" not in text] == []  # of a bad file
+    assert hosts == {f"127.0.0.1:{served.port}"}
+    context.close()
+
+
+def drop(page, *files):
+    """Put files into the page as a hand does that drops them."""
+    given = [
+        {"name": name, "mimeType": "text/csv", "buffer": text.encode("latin-1")}
+        for name, text in files
+    ]
+    page.get_by_label("Drop a CSV").set_input_files(given)
+
+
+def load(page):
+    drop(page, (TEST.name, TEST.read_text()), ("any.toml", TEST.with_suffix(".toml").read_text()))
+    page.get_by_label("s1_k0", exact=True).wait_for()
+    api.expect(page.get_by_role("button", name="Fit", exact=True)).to_be_enabled()
+
+
+def test_load_drop_fit_stop_turn_and_save(window, tmp_path):
+    page = window
+    # What is wrong is said at once, and shown.
+    for name, (text, told, marked) in BAD.items():
+        drop(page, (name, text), ("t.toml", TEST.with_suffix(".toml").read_text()))
+        api.expect(page.get_by_text(told, exact=False).first).to_be_visible()
+        if marked is not None:
+            api.expect(page.locator("td.wrong").first).to_have_text(marked)
+        api.expect(page.get_by_role("button", name="Fit", exact=True)).to_be_disabled()
+        api.expect(page.get_by_text("Save the result folder")).to_be_hidden()
+    # A name with markup is text.
+    name = "<img src=x onerror=document.title='hit'>"
+    toml = TEST.with_suffix(".toml").read_text()
+    toml = re.sub(r'name = ".*"', f"name = {json.dumps(name)}", toml)
+    drop(page, (TEST.name, TEST.read_text()), ("t.toml", toml))
+    api.expect(page.get_by_text(name).first).to_be_visible()
+    assert page.title() == "foamfit"
+    # The good test; a wrong quantity is marked.
+    load(page)
+    height = page.get_by_label("Specimen height")
+    api.expect(height).to_have_value("1.19 mm")
+    height.fill("5 kg")
+    height.press("Tab")
+    api.expect(page.get_by_text("is of another kind").first).to_be_visible()
+    api.expect(page.get_by_label("s1_k0", exact=True)).to_have_count(0)
+    height.fill("1.19 mm")
+    height.press("Tab")
+    page.get_by_label("s1_k0", exact=True).wait_for()
+    # A slider is turned by keys alone, and the curve follows.
+    slider, before = page.get_by_label("s1_k0", exact=True), page.evaluate(CURVE)
+    slider.focus()
+    for _ in range(5):
+        page.keyboard.press("ArrowRight")
+    page.wait_for_function(f"({CURVE})().join() !== {json.dumps(','.join(map(str, before)))}")
+    page.get_by_label("s1_eps_c as a number").fill("0.01")
+    page.get_by_label("s1_eps_c as a number").press("Enter")
+    api.expect(page.get_by_text("is not admissible").first).to_be_visible()
+    # A fit that is stopped keeps the best.
+    page.get_by_label("Starts of the search").fill("100000")
+    page.get_by_role("button", name="Fit", exact=True).click()
+    api.expect(page.get_by_text("best misfit").first).to_be_visible(timeout=LATER)
+    api.expect(height).to_be_disabled()
+    page.get_by_role("button", name="Stop").click()
+    report = page.frame_locator("iframe")
+    api.expect(report.get_by_text("stopped by Ctrl-C").first).to_be_visible(timeout=LATER)
+    # One to its end, beside a published set.
+    page.get_by_label("Starts of the search").fill("2")
+    page.get_by_role("button", name="Fit", exact=True).click()
+    api.expect(page.get_by_text("A fit is running.")).to_be_visible()
+    api.expect(report.get_by_text("s1_kc").first).to_be_visible(timeout=LATER)
+    page.get_by_label("Compare with").select_option("foam-1/model-2")
+    api.expect(page.get_by_text("beside published foam-1/model-2").first).to_be_visible()
+    # Saved is what the command writes.
+    with page.expect_download() as saved:
+        page.get_by_text("Save the result folder").click()
+    archive = zipfile.ZipFile(saved.value.path())
+    assert {"fit.json", "report.html", "fit.png", "curves.csv", "test.toml"} <= {
+        *archive.namelist()
+    }
+    fit = json.loads(archive.read("fit.json"))
+    k0 = float(page.get_by_label("s1_k0 as a number").input_value())
+    assert k0 == pytest.approx(fit["parameters"]["s1_k0"]["value"] / 1e6, rel=1e-4)
+    archive.close()
+
+
+def test_two_windows_do_not_mix(window, served):
+    other = window.context.new_page()
+    other.goto(served.address)
+    load(window)
+    other.get_by_label("Drop a CSV").wait_for()
+    api.expect(other.get_by_text("There is no test yet.")).to_be_visible()
+    api.expect(other.get_by_label("Specimen height")).to_have_value("")
+    other.get_by_label("reconstruction").select_option("foam-1: model-1-2.0mps-reconstruction")
+    api.expect(other.get_by_text("VACNT foam-1/model-1").first).to_be_visible()
+    api.expect(window.get_by_text("VACNT foam-1/model-2").first).to_be_visible()
+    api.expect(window.get_by_text("VACNT foam-1/model-1")).to_have_count(0)
+    other.close()  # a window behind another one is drawn once a second only
+
+
+def test_everyone_can_use_it_at_once(window):
+    """A checker finds nothing serious, nothing is cut off, keys reach all, a move is drawn soon."""
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe is missing")
+    load(window)
+    for width in (390, 1280):  # of a phone and a laptop
+        window.set_viewport_size({"width": width, "height": 900})
+        window.wait_for_function(f"document.documentElement.scrollWidth <= {width}")
+        found = axe.Axe().run(window).response
+        serious = [v["id"] for v in found["violations"] if v["impact"] in ("serious", "critical")]
+        assert serious == []
+        assert {"label", "color-contrast", "button-name"} <= {one["id"] for one in found["passes"]}
+    reached = set()
+    window.get_by_label("Drop a CSV").focus()
+    for _ in range(45):
+        window.keyboard.press("Tab")
+        reached.add(window.evaluate(FOCUSED))
+    assert {"Specimen height", "Check the test", "Fit", "s1_k0", "s1_eta"} <= reached
+    window.bring_to_front()
+    took = sorted(window.evaluate(REDRAWS))
+    assert took[len(took) // 4] < 100.0, took  # a machine that does other things delays most

@@ -1,0 +1,284 @@
+"""What a window of the page works on, without a browser: files, sentences, fits, curves."""
+
+import os
+import signal
+import time
+import tomllib
+
+import numpy as np
+import pytest
+
+import foamfit as ff
+from conftest import EXPERIMENTS
+from foamfit.errors import InputError
+from foamfit.page import desk as desk_module
+from foamfit.page import turning as turning_module
+from foamfit.page.desk import Desk, excerpt_of, join_toml, safe_name, split_toml
+from foamfit.page.turning import Turning
+
+TEST = EXPERIMENTS / "foam-1" / "model-2-2.0mps-reconstruction.csv"
+GOOD = {
+    "[specimen] height": "1.19 mm", "[specimen] diameter": "5 mm",
+    "[striker] mass": "7 g", "[striker] velocity": "2 m/s",
+}  # fmt: skip
+
+
+@pytest.fixture
+def desk(tmp_path):
+    desk = Desk(tmp_path / "window")
+    yield desk
+    desk.close()
+
+
+@pytest.fixture
+def ready(desk):
+    """A desk with a test that can be fitted."""
+    desk.take(TEST)
+    assert not desk.check(*desk.dropped_toml()).error
+    return desk
+
+
+def wait(worker, until=lambda worker: worker.ended is not None, seconds=60.0):
+    end = time.monotonic() + seconds
+    while not until(worker):
+        assert time.monotonic() < end, worker.news
+        time.sleep(0.02)
+
+
+# ------------------------------------------------------------------------------------- files
+
+
+@pytest.mark.parametrize(
+    ("given", "safe"),
+    [
+        ("test 1.csv", "test_1.csv"),
+        ("../../etc/passwd.csv", "passwd.csv"),
+        ("..\\..\\boot.csv", "boot.csv"),
+        ("<img src=x onerror=alert(1)>.csv", "img_src_x_onerror_alert(1)_.csv"),
+        (".hidden.csv", "hidden.csv"),
+        ("a\x00b\n.csv", "a_b_.csv"),
+        ("…", "..."),
+        ("", "test"),
+        (f"{'x' * 500}.csv", f"{'x' * 70}.csv"),
+        ("Schaum Nº 3 – größer.csv", "Schaum_No_3_größer.csv"),
+    ],
+)
+def test_a_name_is_that_of_one_file(given, safe):
+    assert safe_name(given) == (safe if given != "…" else "test")
+
+
+def test_files_stay_in_the_folder_of_the_window(desk, tmp_path):
+    desk.receive("../../outside.csv", b"1,2\n")
+    desk.receive("/etc/outside.toml", b"")
+    found = [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert sorted(path.name for path in found) == ["dropped.toml", "outside.csv"]
+    assert all(desk.folder in path.parents for path in found)
+    desk.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_too_large_or_no_table_is_refused(desk, monkeypatch):
+    monkeypatch.setattr(desk_module, "LARGEST", 2**20)
+    with pytest.raises(InputError, match=r"a\.csv is larger than 1 MB"):
+        desk.receive("a.csv", bytes(2**20 + 1))
+    with pytest.raises(InputError, match=r"picture\.png is no table"):
+        desk.receive("picture.png", b"\x89PNG")
+    assert desk.csv is None
+
+
+def test_two_desks_share_nothing(tmp_path):
+    one, two = Desk(tmp_path / "one"), Desk(tmp_path / "two")
+    one.take(TEST)
+    quantities, rest = one.dropped_toml()
+    assert two.dropped_toml() is None
+    assert "no test yet" in two.check(quantities, rest).error
+    assert not one.check(quantities, rest).error
+    two.close()
+    assert not one.check(quantities, rest).error
+
+
+# -------------------------------------------------------------------------------------- TOML
+
+
+def test_a_toml_is_split_and_joined_without_loss():
+    text = """
+name = "a \\"foam\\" \\\\ 1"
+[specimen]
+height = "1.19 mm"
+area = "19.6 mm^2"
+heights = ["0.7 mm", "0.49 mm"]
+[columns]
+force = { column = "Load \\t[x]", unit = "V", scale = "4444.4 N/V" }
+displacement = { column = "Gap", counts_down = true }
+[window]
+cycle = 2
+"""
+    quantities, rest = split_toml(text)
+    assert quantities == {"[specimen] height": "1.19 mm", "[specimen] area": "19.6 mm^2"}
+    assert tomllib.loads(join_toml(quantities, rest)) == tomllib.loads(text)
+
+
+def test_a_quantity_that_is_given_twice_is_refused():
+    with pytest.raises(InputError, match=r"\[specimen\] height is filled in above, too"):
+        join_toml(GOOD, '[specimen]\nheight = "2 mm"')
+
+
+@pytest.mark.parametrize(
+    ("quantity", "value", "told"),
+    [
+        ("[specimen] height", "5 kg", "of another kind"),
+        ("[specimen] height", "", "height is missing"),
+        ("[specimen] diameter", "", "needs a diameter"),
+        ("[striker] velocity", "fast", "velocity"),
+    ],
+)
+def test_a_wrong_quantity_is_named(desk, quantity, value, told):
+    desk.take(TEST)
+    checked = desk.check(GOOD | {quantity: value}, "")
+    assert told in checked.error
+    assert checked.quantity == quantity
+    assert str(desk.folder) not in checked.error
+
+
+def test_a_wrong_cell_is_shown_with_its_row_and_column(desk):
+    rows = [f"{i},{i * 0.1},{i * 0.01}" for i in range(30)]
+    rows[17] = "17,oops,0.17"
+    desk.receive("bad.csv", "\n".join(["time (ms),force (N),displacement (mm)", *rows]).encode())
+    checked = desk.check(GOOD, "")
+    shown = checked.excerpt
+    assert "row 19" in checked.error
+    assert shown.numbers[shown.row] == 19
+    assert shown.cells[shown.row] == ["17", "oops", "0.17"]
+    assert shown.cells[0][shown.column] == "force (N)"
+
+
+def test_a_sentence_without_a_row_shows_the_headers(desk):
+    desk.receive("bad.csv", b"time (ms);force;displacement (mm)\n" + b"1;2;3\n2;3;4\n" * 20)
+    shown = excerpt_of(desk.csv, "bad.csv: the column 'force' has no unit.")
+    assert (shown.row, shown.column) == (None, 1)
+    assert shown.cells[0] == ["time (ms)", "force", "displacement (mm)"]
+
+
+# --------------------------------------------------------------------------------------- fits
+
+
+def test_a_fit_is_that_of_the_command(ready):
+    worker = ready.fit("bistable", {"starts": 2, "seed": 3})
+    wait(worker)
+    assert worker.ended == ""
+    measurement = ff.read_test(TEST)
+    there = ff.fit(measurement, model="bistable", starts=2, seed=3)
+    saved = desk_module.compare([ready.result], "foam-1/model-2").pairs[0].rows[0].value
+    assert saved == there.params["s1_k0"].value / 1e6
+    # What was told last is what was found.
+    assert worker.news.misfit["stress_time"] == pytest.approx(there.misfit["stress_time"], rel=0.02)
+    assert "report.html" in {path.name for path in ready.result.iterdir()}
+    assert ready.zipped().startswith(b"PK")
+    assert "foam-1/model-2" in ready.compared("foam-1/model-2")
+
+
+def test_watching_a_fit_changes_nothing():
+    measurement, seen = ff.read_test(TEST), []
+    plain = ff.fit(measurement, starts=2, intervals="local")
+    watched = ff.fit(
+        measurement, starts=2, intervals="local", watch=lambda problem, at: seen.append(at)
+    )
+    assert plain.params.valuesdict() == watched.params.valuesdict()
+    assert plain.statistics["nfev"] == watched.statistics["nfev"]
+    assert len(seen) > 10
+
+
+def test_a_fit_that_is_stopped_keeps_the_best(ready):
+    worker = ready.fit("bistable", {"starts": 100_000})
+    wait(worker, lambda worker: worker.news.misfit)
+    assert worker.news.model == "bistable"
+    assert set(worker.news.values) >= {"s1_k0", "s1_eta"}
+    with pytest.raises(InputError, match="A fit is running"):
+        ready.fit("bistable", {})
+    # What it is fitted to cannot change beneath it.
+    with pytest.raises(InputError, match="A fit is running"):
+        ready.receive("other.csv", b"1,2\n")
+    assert "A fit is running" in ready.check(GOOD, "").error
+    worker.stop()
+    wait(worker)
+    assert worker.ended == ""
+    assert "stopped by Ctrl-C" in ready.compared("foam-1/model-2")
+
+
+def test_a_worker_that_dies_says_so(ready):
+    worker = ready.fit("bistable", {"starts": 100_000})
+    os.kill(worker.pid, signal.SIGKILL)
+    wait(worker)
+    assert ready.ending() == "The process of the fit has died by SIGKILL; start the fit again."
+    assert ready.result is None
+
+
+def test_a_fit_that_cannot_be_says_why(ready):
+    worker = ready.fit("bistable", {"drive": "impact", "relaxation": -1})
+    wait(worker)
+    assert "relaxation = -1" in worker.ended
+    assert "\n" not in worker.ended
+
+
+def test_a_closed_window_ends_its_fit(ready):
+    worker = ready.fit("bistable", {"starts": 100_000})
+    wait(worker, lambda worker: worker.news.what != "starting")
+    ready.close()
+    wait(worker, seconds=5.0)
+    with pytest.raises(ProcessLookupError):
+        os.kill(worker.pid, 0)
+
+
+# ------------------------------------------------------------------------------------- curves
+
+
+@pytest.mark.parametrize("drive", ["impact", "displacement"])
+def test_turned_curves_are_those_of_a_simulation(drive):
+    measurement = ff.read_test(TEST)
+    turning = Turning(measurement, "bistable", drive=drive)
+    before = turning.turn({})
+    drawn = turning.turn({"s1_k0": 1.3 * before.values["s1_k0"]})
+    spring = ff.BistableSpring(**{n[3:]: v for n, v in drawn.values.items() if n[:3] == "s1_"})
+    chain = ff.Chain([spring], [1.19e-3], measurement.specimen.area)
+    drives = {
+        "impact": ff.Impact(7e-3, 2.0),
+        "displacement": ff.DisplacementDrive(measurement.displacement),
+    }
+    response = ff.simulate(chain, drives[drive], measurement.time)
+    strain, stress = drawn.curves["stress_strain"]
+    size = np.ptp(measurement.stress)
+    np.testing.assert_allclose(stress, response.base_stress, rtol=0.0, atol=1e-5 * size)
+    np.testing.assert_allclose(strain, response.strain, rtol=0.0, atol=1e-5)
+    assert not np.allclose(stress, before.curves["stress_strain"][1], atol=1e-2 * size)
+
+
+def test_what_is_not_admissible_is_named():
+    turning = Turning(ff.read_test(TEST), "bistable")
+    before = turning.turn({}).values["s1_eps_c"]
+    drawn = turning.turn({"s1_eps_c": 0.01})
+    assert "eps_c = 0.01 is not admissible" in drawn.error
+    assert drawn.curves == {}
+    assert not turning.turn({"s1_eps_c": before}).error
+
+
+def test_sliders_reach_around_the_values_and_stay_admissible():
+    values = {"s1_k0": 5.5e6, "s1_eps_a": 0.14, "s1_eps_c": 0.31, "s1_dsigma": -2e5}
+    for row in Turning(ff.read_test(TEST), "bistable", values=values).rows:
+        assert row.least <= row.low <= row.value <= row.high <= row.most
+        assert row.high > row.low
+        if row.name in values:
+            assert row.value * row.factor == pytest.approx(values[row.name])
+
+
+def test_the_heights_of_a_chain_keep_their_sum():
+    drawn = Turning(ff.read_test(TEST), "linear+bistable").turn({"s1_height": 0.4e-3})
+    assert drawn.values["s1_height"] == 0.4e-3
+    assert drawn.values["s2_height"] == pytest.approx(0.79e-3)
+
+
+def test_a_long_record_is_thinned_to_be_drawn(monkeypatch):
+    monkeypatch.setattr(turning_module, "MOST_SAMPLES", 200)
+    measurement = ff.read_test(TEST)
+    turning = Turning(measurement, "bistable")
+    assert turning.samples == (measurement.rows.used, 200)
+    assert len(turning.turn({}).curves["stress_strain"][0]) == 200

@@ -1,0 +1,150 @@
+"""Who may see the page: this machine, by its address, with its token."""
+
+import http.client
+import socket
+import sys
+
+import pytest
+from click.testing import CliRunner
+
+from foamfit.cli import main
+from serving import served
+
+pytest.importorskip("panel", reason='the page needs Panel: pip install "foamfit[page]"')
+__all__ = ["served"]
+
+
+def ask(served, path, method="GET", body=None, **headers):
+    """Send a request as it is written, and return status and answer."""
+    connection = http.client.HTTPConnection("127.0.0.1", served.port, timeout=10)
+    names = {"Host": f"127.0.0.1:{served.port}"}
+    names |= {name.replace("_", "-"): value for name, value in headers.items()}
+    connection.putrequest(method, path, skip_host=True)
+    if body is not None:
+        names.setdefault("Content-Length", str(len(body)))
+    for name, value in names.items():
+        if value is not None:
+            connection.putheader(name, value)
+    connection.endheaders(body or None)
+    answer = connection.getresponse()
+    text = answer.read().decode(errors="replace")
+    connection.close()
+    return answer.status, text
+
+
+@pytest.fixture(scope="module")
+def receive(served):
+    """The path at which a window takes files."""
+    assert ask(served, f"/{served.token}/")[0] == 200
+    windows = sorted(served.files.glob("foamfit-page-*/window-*"))
+    assert windows
+    assert all(path.stat().st_mode & 0o077 == 0 for path in (windows[0], windows[0].parent))
+    return f"/{served.token}/receive/{windows[-1].name.split('-', 2)[2]}"
+
+
+def test_the_page_answers_at_its_address(served):
+    assert len(served.token) >= 32
+    status, text = ask(served, f"/{served.token}/")
+    assert status == 200
+    assert "<title>foamfit</title>" in text
+    assert ask(served, f"/{served.token}/", Origin=f"http://127.0.0.1:{served.port}")[0] == 200
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/",
+        "/favicon.ico",
+        "/x{token}/",
+        "/{short}/",
+        "//{token}/",
+        "/static/js/bokeh.min.js",
+        "/ws",
+    ],
+)
+def test_a_request_without_the_token_is_refused(served, path):
+    path = path.format(token=served.token, short=served.token[:-1])
+    assert ask(served, path)[0] == 403
+
+
+@pytest.mark.parametrize("host", ["localhost:{port}", "evil.example:{port}", "127.0.0.1", "", None])
+def test_another_host_is_refused(served, host):
+    """A name that leads here (DNS rebinding) is not the page's own."""
+    host = host and host.format(port=served.port)
+    assert ask(served, f"/{served.token}/", Host=host)[0] in (400, 403)
+
+
+@pytest.mark.parametrize(
+    "origin", ["http://evil.example", "http://localhost:{port}", "https://127.0.0.1:{port}", "null"]
+)
+@pytest.mark.parametrize("path", ["/{token}/", "/{token}/ws"])
+def test_another_origin_is_refused(served, origin, path):
+    origin, path = origin.format(port=served.port), path.format(token=served.token)
+    more = {"Upgrade": "websocket", "Connection": "Upgrade"} if path.endswith("ws") else {}
+    assert ask(served, path, Origin=origin, **more)[0] == 403
+
+
+def test_it_listens_on_this_machine_alone(served):
+    with socket.socket() as other:
+        other.settimeout(2)
+        try:
+            address = socket.gethostbyname(socket.gethostname())
+        except OSError:
+            pytest.skip("this machine has no other address")
+        if address.startswith("127."):
+            pytest.skip("this machine has no other address")
+        with pytest.raises(OSError, match="refused"):
+            other.connect((address, served.port))
+
+
+def test_a_file_is_taken_under_a_safe_name(served, receive):
+    status, text = ask(served, f"{receive}?name=../../<b>x.csv", "POST", b"a,b\n1,2\n")
+    assert (status, text) == (200, "b_x.csv")
+    there = [path for path in served.files.rglob("*") if path.is_file()]
+    assert [path.name for path in there if path.suffix == ".csv"] == ["b_x.csv"]
+
+
+def test_a_file_that_is_too_large_is_refused_unseen(served, receive):
+    status, text = ask(served, f"{receive}?name=a.csv", "POST", b"x", Content_Length=str(65 << 20))
+    assert status == 413
+    assert "a.csv is larger than 64 MB" in text
+
+
+def test_a_file_for_no_window_is_refused(served, receive):
+    path = receive.rsplit("/", 1)[0]
+    for window in ("nobody", "..%2f..", "../../x"):
+        assert ask(served, f"{path}/{window}?name=a.csv", "POST", b"1")[0] == 404
+    status, text = ask(served, f"{receive}?name=picture.png", "POST", b"1")
+    assert status == 400
+    assert "is no table" in text
+
+
+def test_a_path_leads_to_no_file(served):
+    for path in ("/../../etc/passwd", "/static/../../../../etc/passwd", "/..%2f..%2fetc/passwd"):
+        status, text = ask(served, f"/{served.token}{path}")
+        assert status in (403, 404)
+        assert "root:" not in text
+
+
+# -------------------------------------------------------------------------------- the command
+
+
+def test_a_missing_extra_says_which_line_installs_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "panel", None)
+    found = CliRunner().invoke(main, ["page"])
+    assert found.exit_code == 1
+    assert 'pip install "foamfit[page]"' in found.stderr
+    assert len(found.stderr.splitlines()) == 1
+
+
+def test_a_test_that_is_not_there_is_refused(tmp_path):
+    found = CliRunner().invoke(main, ["page", str(tmp_path / "none.csv")])
+    assert found.exit_code == 1
+    assert "no such file" in found.stderr
+
+
+def test_a_port_that_is_taken_is_refused(served):
+    found = CliRunner().invoke(main, ["page", "--no-browser", "--port", str(served.port)])
+    assert found.exit_code == 1
+    assert f"--port {served.port} cannot be used" in found.stderr
+    assert len(found.stderr.splitlines()) == 1

@@ -1,0 +1,31 @@
+"""The page as it is served: the command in a process of its own."""
+
+import os
+import signal
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory):
+    """Serve the page; its address, process and folder of files."""
+    files = tmp_path_factory.mktemp("files")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "foamfit", "page", "--no-browser"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env=os.environ | {"TMPDIR": str(files), "MPLBACKEND": "Agg"},
+    )  # fmt: skip
+    address = process.stdout.readline().strip()
+    assert address.startswith("http://127.0.0.1:"), process.stderr.read()
+    port, token = address.split(":")[2].split("/")[:2]
+    yield SimpleNamespace(
+        address=address, port=int(port), token=token, files=files, process=process
+    )
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate(timeout=20)
+    assert process.returncode == 0, errors
+    assert "Traceback" not in errors
+    assert list(files.iterdir()) == []  # nothing stays behind
