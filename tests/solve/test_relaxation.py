@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad, solve_ivp
 from scipy.optimize import brentq
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 
 import foamfit as ff
 from foamfit.solve.relaxation import relaxed_along
@@ -333,3 +333,37 @@ def test_what_a_spring_cannot_bear_is_refused() -> None:
         spring = ff.MicroscaleSpring(*SHOE, relaxation=terms)
         with pytest.raises(ff.SimulationError, match="no longer finite"):
             stress_of(spring, np.array([0.0, 0.5, 1.08, 0.3]), np.arange(4.0))
+
+
+@pytest.mark.parametrize("sigma_plus", [1e-100, 1e-300])
+def test_springs_may_snap_at_next_to_no_stress(sigma_plus: float) -> None:
+    """The stress is found however small it is, which halving it does not reach."""
+    law, star = (5.5e5, 2.5e5, 0.08, sigma_plus, 0.4, 7e4, 0.77), 0.08
+    once = stress_of(ff.MicroscaleSpring(*law), np.array([0.0, 0.03]), np.array([0.0, 1.0]))
+    want = sigma_plus * math.exp(0.4 * ndtri(0.03 / star))
+    assert once.base_stress[1] == pytest.approx(want, rel=1e-11, abs=0.0)
+    t = np.linspace(0.0, 0.5, 251)
+    eps = 0.5 * np.sin(np.pi * t)
+    bare = stress_of(ff.MicroscaleSpring(*law), eps, t).base_stress
+    snaps = (eps > 0.0) & (eps < star)
+    want = sigma_plus * np.exp(0.4 * ndtri(eps[snaps] / star))
+    assert bare[snaps] == pytest.approx(want, rel=1e-11, abs=0.0)
+
+    def snapped(at: float) -> float:
+        x = max(float(np.interp(at, t, eps)) - star, 0.0)
+        return 2.5e5 * x / (1.0 - x)
+
+    assert bare[-1] == pytest.approx(snapped(0.5), rel=1e-12)
+    g, tau = 0.5, 0.2
+    got = stress_of(ff.MicroscaleSpring(*law, relaxation=[(g, tau)]), eps, t, 1e-8).base_stress
+    begins = t[np.flatnonzero(~snaps & (eps > 0.0))[0] - 1]
+    kinks = np.append(t[t >= begins], 0.5)
+    began = brentq(lambda at: np.interp(at, t, eps) - star, kinks[0], kinks[1])
+    kinks[0] = began
+    faded = sum(
+        quad(lambda u: snapped(u) * math.exp(-(0.5 - u) / tau) / tau, a, b, epsabs=0.0)[0]
+        for a, b in itertools.pairwise(kinks)
+        if b > a
+    )
+    assert got[-1] == pytest.approx(snapped(0.5) + g * (snapped(0.5) - faded), rel=1e-8)
+    assert (np.abs(got[snaps]) < 1e3 * sigma_plus).all()

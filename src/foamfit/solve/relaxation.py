@@ -96,14 +96,24 @@ def _leaves(row: Row, state: Array, eps: float) -> bool:
 
 
 @inner
+def _settle(row: Row, state: Array, eps: float) -> None:
+    """Bring a spring to a strain that lies on its branch."""
+    if row[KIND] == MICROSCALE:
+        micro.settle(row, state, eps)
+        if state[BRANCH] <= HELD:  # on the others the slope comes with the stress
+            micro.fill_slopes(row, state)
+    else:
+        state[EPS], state[SIGMA] = eps, stress_on(row, int(state[BRANCH]), eps)
+
+
+@inner
 def _switch(row: Row, state: Array, up: bool) -> None:
     """Go over to the next branch, at the end of this one or where the strain turns."""
     if row[KIND] == MICROSCALE:
         micro.switch(row, state, up)
-        if state[BRANCH] > HELD:  # the slope that it starts with
-            sigma = state[SIGMA]
-            micro.settle(row, state, state[EPS])
-            state[SIGMA] = sigma
+        sigma = state[SIGMA]
+        _settle(row, state, state[EPS])  # the slope that it starts with
+        state[SIGMA] = sigma
         return
     branch = int(state[BRANCH])
     state[EPS] = state[HIGH] if up else state[LOW]
@@ -111,15 +121,6 @@ def _switch(row: Row, state: Array, up: bool) -> None:
     state[BRANCH] = branch
     state[LOW], state[HIGH] = interval(row, branch)
     state[SIGMA] = stress_on(row, branch, state[EPS])
-
-
-@inner
-def _settle(row: Row, state: Array, eps: float) -> None:
-    """Bring a spring to a strain that lies on its branch."""
-    if row[KIND] == MICROSCALE:
-        micro.settle(row, state, eps)
-    else:
-        state[EPS], state[SIGMA] = eps, stress_on(row, int(state[BRANCH]), eps)
 
 
 @inner

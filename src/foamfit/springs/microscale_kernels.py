@@ -60,6 +60,8 @@ OF_STRAIN, CARRIED = 7, 8
 # A step of Halley's method so small, in widths over which the law bends, is the last: what it
 # leaves is about its cube.
 NEAR = 3e-6
+# The least stress that is sought: the least normal number.
+LEAST = 2.0**-1022
 _ROOT_HALF, _ROOT_TURN = math.sqrt(0.5), 1.0 / math.sqrt(2.0 * math.pi)
 
 _least_eps_star = inner(least_eps_star)
@@ -294,6 +296,18 @@ def stress_in(row: Row, state: Array, eps: float) -> float:
 
 
 @inner
+def _stress_below(row: Row, eps: float, log: float, spread: float) -> float:
+    """Return a stress above 0 below that at a strain above 0, where p = Φ((ln σ - log)/spread).
+
+    Branches a and c take less than half of the strain there, and p eps_star the other half at most:
+    at a rank below 0, p is at most exp(-rank²/2)/2.
+    """
+    bent = 0.5 * min(eps, 1.0) * min(row[K0], row[KC])
+    rank = -math.sqrt(2.0 * math.log(max(row[EPS_STAR] / eps, 1.0)))
+    return max(min(bent, math.exp(log + spread * rank)), LEAST)
+
+
+@inner
 def _along_law(row: Row, state: Array, eps: float, log: float, spread: float) -> float:
     """Stress at a strain where p = Φ((ln σ - log)/spread), to rounding.
 
@@ -339,9 +353,9 @@ def _along_law(row: Row, state: Array, eps: float, log: float, spread: float) ->
             state[FLEXIBILITY] += bend * (new - sigma)
             return new
         if not low < new < high:
-            new = math.sqrt(low * high) if 0.0 < low < high < math.inf else 0.5 * (low + high)
-            if high == math.inf:
-                new = 2.0 * sigma
+            if low == 0.0:  # halving a stress of any size in its logarithm needs an end above 0
+                low = min(_stress_below(row, eps, log, spread), sigma)
+            new = math.sqrt(low) * math.sqrt(high) if high < math.inf else 2.0 * sigma
             if not low < new < high:  # neighbouring numbers: nothing lies between them
                 return sigma
         sigma = new
@@ -353,6 +367,14 @@ def settle(row: Row, state: Array, eps: float) -> None:
     """Bring a spring to a strain that lies on its branch."""
     sigma = stress_in(row, state, eps)
     state[EPS], state[SIGMA] = eps, sigma
+
+
+@inner
+def fill_slopes(row: Row, state: Array) -> None:
+    """Fill dε/dσ and d²ε/dσ² on a branch on which no micro-spring snaps: held, or `a`."""
+    one, two = 1.0 / (row[K0] + state[SIGMA]), 1.0 / (row[KC] + state[SIGMA])
+    on_a, on_c = state[REST] * row[K0] * one * one, state[SNAPPED] * row[KC] * two * two
+    state[FLEXIBILITY], state[CURVATURE] = on_a + on_c, -2.0 * (on_a * one + on_c * two)
 
 
 @inner
