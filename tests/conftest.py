@@ -40,6 +40,7 @@ def first_use(part: str) -> subprocess.Popen[bytes]:
     return subprocess.Popen([sys.executable, str(FIRST_USE), part])
 
 
+@pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     """Folders, and so the whole suite, are tested by all cores; single files in this process."""
     cores = min(os.cpu_count() or 1, 8)
