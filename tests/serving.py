@@ -8,6 +8,8 @@ from types import SimpleNamespace
 
 import pytest
 
+from conftest import EXPERIMENTS
+
 
 @pytest.fixture(scope="module")
 def served(tmp_path_factory):
@@ -16,7 +18,7 @@ def served(tmp_path_factory):
     process = subprocess.Popen(
         [sys.executable, "-m", "foamfit", "page", "--no-browser"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env=os.environ | {"TMPDIR": str(files), "MPLBACKEND": "Agg"},
+        env=os.environ | {"TMPDIR": str(files), "MPLBACKEND": "Agg"}, cwd=EXPERIMENTS.parent,
     )  # fmt: skip
     address = process.stdout.readline().strip()
     assert address.startswith("http://127.0.0.1:"), process.stderr.read()

@@ -121,3 +121,9 @@ def test_states(half, value, expected):
 )
 def test_hopeless_intervals_are_told_in_numbers_that_can_be_read(half, told):
     assert told in state(1.0, half, 1.0, 0.0, 10.0)[1]
+
+
+def test_parameters_that_no_curve_follows_have_no_covariance():
+    found = covariance(np.zeros((50, 2)), np.ones(50), (50,), np.ones(2))
+    assert np.isnan(found.matrix).all()
+    assert np.isnan(found.inflation).all()

@@ -33,7 +33,8 @@ from foamfit.solve.precompile import at_first_use
 from foamfit.springs.published import published
 from foamfit.text import percent
 
-EXPERIMENTS = Path(__file__).parents[3] / "experiments"
+# Where a checkout of the repository may be: the working directory, or around an editable package.
+CHECKOUTS = (Path(), Path(__file__).parents[3])
 MODELS = ("auto", "bistable", "linear+bistable", "bistable+bistable", "microscale",
           "linear+microscale", "unilateral+bistable")  # fmt: skip
 OWN = "as the test allows"  # drive
@@ -137,7 +138,8 @@ class Window:
         }  # fmt: skip
         text, select, button = pn.widgets.TextInput, pn.widgets.Select, pn.widgets.Button
         self.upload = Upload(address=address, limit=LARGEST, sizing_mode="stretch_width")
-        found = sorted(EXPERIMENTS.glob("foam-*/*-reconstruction.csv"))
+        listed = [sorted(one.glob("experiments/foam-*/*-reconstruction.csv")) for one in CHECKOUTS]
+        found = next(filter(None, listed), [])
         self.reconstructions = {f"{one.parent.name}: {one.stem}": one for one in found}
         self.chosen = select(
             name="or a reconstruction of the repository", options=["", *self.reconstructions],

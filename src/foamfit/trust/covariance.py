@@ -106,7 +106,8 @@ def covariance(
     curves = list(zip(noise, parts(sizes), strict=True))
     inner = np.sum([left[part].T @ process.times(left[part]) for process, part in curves], axis=0)
     power, axes = np.linalg.eigh(0.5 * (inner + inner.T))
-    axes = axes * np.sqrt(np.maximum(power, 1e-12 * power[-1]))  # no variance is negative
+    least = 1e-12 * power.max(initial=0.0)  # no variance is negative
+    axes = axes * np.sqrt(np.maximum(power, least))
     bread = np.eye(len(axes)) if gradient is None else _bread(gradient, root, axes)
     spread = root @ bread @ axes
     matrix, inverse = spread @ spread.T, root @ bread @ root.T
@@ -120,7 +121,7 @@ def covariance(
     known = 2.0 * variance**2 / np.maximum(doubt, 1e-300)
     return Covariance(
         matrix * np.outer(sizes_of, sizes_of),
-        np.diag(matrix) / np.diag(inverse),
+        np.diag(matrix) / np.where(lost, np.nan, np.diag(inverse)),
         np.minimum(known, max(effective - len(matrix), 1.0)),
         float(effective),
         tuple(noise),
