@@ -108,7 +108,9 @@ def covariance(
     power, axes = np.linalg.eigh(0.5 * (inner + inner.T))
     least = 1e-12 * power.max(initial=0.0)  # no variance is negative
     axes = axes * np.sqrt(np.maximum(power, least))
-    bread = np.eye(len(axes)) if gradient is None else _bread(gradient, root, axes)
+    bread = np.eye(len(axes))
+    if gradient is not None and len(axes):
+        bread = _bread(gradient, root, axes)
     spread = root @ bread @ axes
     matrix, inverse = spread @ spread.T, root @ bread @ root.T
     lost = np.any(np.abs(vt[~seen]) > 1e-3, axis=0)
