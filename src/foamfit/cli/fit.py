@@ -11,7 +11,16 @@ import click
 
 from foamfit.cli.fit_options import fit_options, intervals_of, params_of
 from foamfit.cli.group import NOT_ACCEPTABLE, main
-from foamfit.cli.options import CYCLE, FILE, SPECIMEN, TEST, compiling, cycles_of, progress_bar
+from foamfit.cli.options import (
+    CYCLE,
+    FILE,
+    SPECIMEN,
+    TEST,
+    compiling,
+    cycles_of,
+    progress_bar,
+    spare,
+)
 from foamfit.errors import InputError
 from foamfit.terminal import say, without_ctrl_c
 
@@ -139,9 +148,5 @@ def _result_folder(out: Path | None, test: Path, specimen: Path | None, model: s
 
     folder = Path("fits", test.stem, model) if out is None else out
     check_target(folder)
-    for path in (test, specimen or test.with_suffix(".toml")):
-        if folder.resolve() in path.resolve().parents and folder.is_dir():
-            raise InputError(
-                f"{folder} holds {path.name} and would be replaced as a whole; choose another --out"
-            )
+    spare(folder, (test, specimen or test.with_suffix(".toml")))
     return folder

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from foamfit.cli.group import NOT_ACCEPTABLE, main
-from foamfit.cli.options import FILE, compiling, progress_bar
+from foamfit.cli.options import FILE, compiling, progress_bar, spare
 from foamfit.errors import InputError
 from foamfit.terminal import say, without_ctrl_c
 
@@ -64,7 +64,7 @@ def joint(
     from foamfit.study.study_file import read_study
 
     read = read_study(study)
-    _spare(folder, study, [path for _, path in read.tests])
+    spare(folder, [study, *(path for _, path in read.tests)])
     with compiling(quiet or as_json, read.model, read.relaxation) as compile_rest:
         from foamfit.study.joint import joint as fit_jointly
 
@@ -84,15 +84,6 @@ def joint(
         say(f"foamfit: no acceptable fit was found; see {folder}", err=True)
         return NOT_ACCEPTABLE
     return 0
-
-
-def _spare(folder: Path, study: Path, tests: list[Path]) -> None:
-    """Refuse a folder that holds what is read."""
-    for path in (study, *tests):
-        if folder.is_dir() and folder.resolve() in path.resolve().parents:
-            raise InputError(
-                f"{folder} holds {path.name} and would be replaced as a whole; choose another --out"
-            )
 
 
 def _tell(result: JointResult, as_json: bool, quiet: bool) -> None:

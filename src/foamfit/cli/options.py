@@ -81,6 +81,15 @@ def progress_bar(quiet: bool) -> Iterator[Callable[[float, str], None]]:
         yield progress
 
 
+def spare(folder: Path, inputs: Iterable[Path]) -> None:
+    """Refuse a result folder that holds a file which the command reads."""
+    for path in inputs:
+        if folder.is_dir() and folder.resolve() in path.resolve().parents:
+            raise InputError(
+                f"{folder} holds {path.name} and would be replaced as a whole; choose another --out"
+            )
+
+
 def check_files(table: Path | None, plot: Path | None, inputs: Iterable[Path]) -> None:
     """Refuse files that could not be written, or that are read too, before anything is computed."""
     given = [path for path in (table, plot) if path is not None]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from foamfit.cli.group import main
-from foamfit.cli.options import FILE, SPECIMEN, TEST, compiling
+from foamfit.cli.options import FILE, SPECIMEN, TEST, compiling, spare
 from foamfit.errors import InputError
 from foamfit.terminal import say, without_ctrl_c
 
@@ -69,11 +69,7 @@ def predict(
 
     folder = Path("predictions", test.stem) if out is None else out
     check_replaceable(folder)
-    for path in (test, specimen or test.with_suffix(".toml"), result):
-        if folder.resolve() in path.resolve().parents and folder.is_dir():
-            raise InputError(
-                f"{folder} holds {path.name} and would be replaced as a whole; choose another --out"
-            )
+    spare(folder, (test, specimen or test.with_suffix(".toml"), result))
     read_source(result)  # a wrong path is told before anything is compiled
     with compiling(quiet or as_json) as compile_rest:
         measurement = read_test(test, specimen, cycle)
