@@ -8,12 +8,12 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import fabricated
 import foamfit as ff
 from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
 from foamfit.report import folder as result_folder
@@ -79,11 +79,14 @@ def compiled() -> Iterator[None]:
         yield
 
 
+def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a result folder be written with pictures of a few bytes."""
+    monkeypatch.setattr(result_folder, "draw_all", lambda *_: fabricated.no_figures().items())
+
+
 def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let a result folder be written with pictures of a few bytes and an empty page."""
-    monkeypatch.setattr(result_folder, "plot_fit", lambda _: None)
-    monkeypatch.setattr(result_folder, "laid_out", lambda _: nullcontext())
-    monkeypatch.setattr(result_folder, "image", lambda *_: b"\x89PNG" + bytes(20))
+    small_pictures(monkeypatch)
     monkeypatch.setattr(result_folder, "render_report", lambda *_, **__: "")
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from foamfit.api import FitResult
 from foamfit.data.measurement import Measurement, Specimen, Striker
+from foamfit.report.result_figures import FIGURES, Images
 from foamfit.results import Curves, ParameterEstimate, Switch
 from foamfit.springs.chain import Chain
 from foamfit.springs.parameters import MICROSCALE_NAMES
@@ -213,3 +214,11 @@ def microscale_result(**changed: Any) -> FitResult:
         "switches": switches,
     }  # fmt: skip
     return result(**(given | changed))
+
+
+def no_figures() -> dict[str, Images | None]:
+    """What stands for the figures of a report, of which drawing takes longest."""
+    return dict.fromkeys(FIGURES) | {
+        name: Images(b"\x89PNG" + bytes(20), 250, pdf)
+        for name, pdf in (("fit", b"%PDF"), ("residuals", None))
+    }

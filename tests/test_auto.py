@@ -13,6 +13,7 @@ import pytest
 from click.testing import CliRunner
 from scipy.signal import lfilter
 
+import fabricated
 import foamfit as ff
 from conftest import DATA, needs_data, synthetic_impact, synthetic_loop
 from foamfit import auto, one_model
@@ -654,7 +655,7 @@ def test_the_folder_holds_the_ladder(climbed, tmp_path):
 
 
 def test_the_report_and_the_summary_show_the_ladder(climbed):
-    page = render_report(climbed, fit_png=b"\x89PNG" + bytes(20))
+    page = render_report(climbed, fabricated.no_figures())
     text = summary_text(climbed, verbose=True)
     assert "Ladder of models" in page
     for rung in climbed.ladder.rungs:
@@ -668,7 +669,7 @@ def test_the_report_and_the_summary_show_the_ladder(climbed):
         assert " ".join(text.split()).count(sentence) == 1
     assert max(map(len, text.splitlines())) <= 100
     named = ff.fit(synthetic_loop()[1], starts=2)
-    assert "The simplest model" not in render_report(named, fit_png=b"\x89PNG" + bytes(20))
+    assert "The simplest model" not in render_report(named, fabricated.no_figures())
     assert "ladder" not in named.to_json_dict()
 
 

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
@@ -20,7 +21,6 @@ import foamfit.report.figures
 import foamfit.report.folder
 import foamfit.results
 from conftest import EXPERIMENTS, without_pictures
-from foamfit.api import FitResult
 from foamfit.cli import main
 from foamfit.errors import InputError
 from foamfit.files import check_file, replacing, sweep, write_file
@@ -28,6 +28,7 @@ from foamfit.report.comparison import compare
 from foamfit.report.comparison_text import write_csv
 from foamfit.report.folder import check_target, load_result
 from foamfit.report.plots import plot_fit
+from foamfit.report.result_figures import Images
 
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
 posix = pytest.mark.skipif(os.name != "posix", reason="signals and permissions of POSIX")
@@ -102,10 +103,11 @@ def test_what_is_put_into_the_folder_while_it_is_written_stays(
 ) -> None:
     folder = fabricated.result(seed=1).save("r")
 
-    def late(_: object) -> None:
+    def late(*_: object) -> Iterable[tuple[str, Images | None]]:
         (here / "r" / "notes.txt").write_text("x")
+        return fabricated.no_figures().items()
 
-    monkeypatch.setattr(foamfit.report.folder, "plot_fit", late)
+    monkeypatch.setattr(foamfit.report.folder, "draw_all", late)
     with pytest.raises(InputError, match=r"notes\.txt"):
         fabricated.result(seed=2).save("r")
     assert load_result(folder)["seed"] == 1
@@ -198,7 +200,7 @@ def test_a_full_disk_loses_no_numbers(here: Path, monkeypatch: pytest.MonkeyPatc
     def full(*_: object) -> None:
         raise InputError("the result cannot be written to r: No space left on device")
 
-    monkeypatch.setattr(FitResult, "save", full)
+    monkeypatch.setattr(foamfit.report.folder, "save_result", full)
     call = ["fit", str(RECONSTRUCTION), "--starts", "1", "--max-time", "0.1", "--out", "r"]
     result = CliRunner().invoke(main, call)
     assert result.exit_code == 1
@@ -287,7 +289,7 @@ def test_an_older_result_that_a_killed_process_put_aside_comes_back(
     def fail(*_: object, **__: object) -> None:
         raise RuntimeError
 
-    monkeypatch.setattr(foamfit.report.folder, "plot_fit", fail)
+    monkeypatch.setattr(foamfit.report.folder, "draw_all", fail)
     with pytest.raises(RuntimeError):
         fabricated.result(seed=2).save("r")
     assert load_result("r")["seed"] == 1

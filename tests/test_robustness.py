@@ -15,8 +15,7 @@ import fabricated
 import foamfit as ff
 import foamfit.report.figures
 import foamfit.report.page
-from conftest import AREA, HEIGHT, synthetic_impact, synthetic_loop
-from foamfit.api import FitResult
+from conftest import AREA, HEIGHT, small_pictures, synthetic_impact, synthetic_loop
 from foamfit.cli import main
 from foamfit.data.measurement import Measurement, Outliers
 from foamfit.fitting.curves import default_weights
@@ -140,11 +139,7 @@ def test_what_stands_at_an_outlier_does_not_matter():
 
 
 def test_outliers_are_in_the_result_and_crossed_in_the_figure(tmp_path, monkeypatch):
-    for module in (
-        foamfit.report.figures,
-        foamfit.report.page,
-    ):  # no pictures are needed
-        monkeypatch.setattr(module, "image", lambda *_: b"\x89PNG" + bytes(20))
+    small_pictures(monkeypatch)
     _, test, at = spoilt_impact()
     result = ff.fit(test, starts=4)
     content = result.to_json_dict()
@@ -283,7 +278,7 @@ def test_a_shift_without_two_channels_in_time_is_refused(changed, missing):
 def test_the_command_fits_a_shift_and_refuses_it_without_time(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     test = fabricated_csv(tmp_path)
-    monkeypatch.setattr(FitResult, "save", lambda self, folder: folder)
+    monkeypatch.setattr("foamfit.report.folder.save_result", lambda *_: None)
     call = ["fit", str(test), "--starts", "4", "--json", "--time-shift", "--loss", "huber"]
     out = CliRunner().invoke(main, call)
     assert out.exit_code == 0
@@ -323,7 +318,7 @@ def test_the_figure_of_a_stopped_fit_says_so():
     stopped = fabricated.result(stopped="Ctrl-C")
     assert "stopped by Ctrl-C" in plot_fit(stopped).get_suptitle().replace("\n", " ")
     assert "stopped" not in plot_fit(fabricated.result()).get_suptitle()
-    assert "stopped by Ctrl-C" in render_report(stopped, fit_png=b"\x89PNG" + bytes(20))
+    assert "stopped by Ctrl-C" in render_report(stopped, fabricated.no_figures())
     assert json.loads(json.dumps(fabricated.result().to_json_dict()))["stopped"] is None
 
 

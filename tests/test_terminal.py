@@ -18,11 +18,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 import fabricated
-import foamfit.report.figures
-import foamfit.report.folder
-import foamfit.report.page
-import foamfit.results
-from conftest import EXPERIMENTS, without_pictures
+from conftest import EXPERIMENTS, small_pictures, without_pictures
 from foamfit import api, terminal
 from foamfit.cli import main
 from foamfit.errors import InputError
@@ -36,8 +32,7 @@ ODD = "foam \x1b[31mred\x1b[0m\x07\x9b2J\u202eback χ"
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty working directory, and figures that need no time."""
     monkeypatch.chdir(tmp_path)
-    for module in (foamfit.report.figures, foamfit.report.page):
-        monkeypatch.setattr(module, "image", lambda *_: b"\x89PNG" + bytes(20))
+    small_pictures(monkeypatch)
     return tmp_path
 
 

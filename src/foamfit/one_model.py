@@ -27,12 +27,12 @@ from foamfit.fitting.search import (
     search,
     what_stopped,
 )
-from foamfit.results import Fit
+from foamfit.results import Fit, Intervals
 from foamfit.springs.parameters import HYSTERETIC, split_name
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
 from foamfit.trust.covariance import AT_LIMIT
-from foamfit.trust.intervals import Announce, Choice, Intervals, assess
+from foamfit.trust.intervals import Announce, Choice, assess
 from foamfit.trust.ranges import Open, left_open
 
 Progress = Callable[[float, str], None]

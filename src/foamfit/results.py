@@ -6,9 +6,8 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import lmfit
 import numpy as np
 
 from foamfit.arrays import Array
@@ -18,8 +17,11 @@ from foamfit.springs.chain import Chain
 from foamfit.springs.microscale import follow_fractions
 from foamfit.springs.spring import BistableSpring, MicroscaleSpring
 from foamfit.text import counted
-from foamfit.trust.identifiability import Insight
-from foamfit.trust.intervals import Intervals
+
+if TYPE_CHECKING:
+    import lmfit
+
+    from foamfit.trust.identifiability import Insight
 
 SCHEMA = 1
 DERIVED_POINTS = ("sigma_a", "sigma_c", "eps_star", "eps_hat_a", "eps_hat_c")
@@ -74,6 +76,46 @@ class Correlation:
 
     names: tuple[str, ...]
     matrix: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """Least cost along one parameter."""
+
+    name: str  # The parameter
+    values: Array  # (m,): Where it was held, ascending, SI; the best point is among them
+    rises: Array  # (m,): Rise of the cost there as a χ² of one degree of freedom
+    points: Array  # (m, n): All parameters of the model at each
+    cut: float  # χ² of the 95 % interval
+    # Outermost crossings of the cut; a limit of the parameter where there is none.
+    ci95: tuple[float, float]
+    # Whether the cost does not reach the cut on that side.
+    open_low: bool
+    open_high: bool
+    # What ended it before its end on both sides: "the time limit", "Ctrl-C".
+    stopped: str | None = None
+
+    @property
+    def complete(self) -> bool:
+        """Whether it was followed to its end on both sides."""
+        return self.stopped is None
+
+
+@dataclass(frozen=True, eq=False)
+class Intervals:
+    """The 95 % intervals of a fit, and how they were made."""
+
+    # Ends of the intervals that are not those of the local covariance, and how each was made.
+    ends: dict[str, tuple[float, float]] = field(default_factory=dict)
+    methods: dict[str, str] = field(default_factory=dict)
+    profiles: tuple[Profile, ...] = ()  # All profiles that were followed, whole or not
+    # Parameters along which the cost is no parabola and whose interval is local all the same.
+    doubtful: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  # Why they are not, or hardly, what was asked for
+    better: Array | None = None  # A point of lower cost: the fit should go on from there
+    # Ends of the ranges that the error of the law leaves open; none where there is no such error.
+    ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,7 @@ import foamfit as ff
 import foamfit.report.figures
 import foamfit.report.folder
 import foamfit.report.page
+from conftest import small_pictures
 from foamfit.errors import InputError
 from foamfit.report.folder import check_target, load_result
 
@@ -36,8 +37,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Save without the time that figures take, where the test is about the folder."""
-    for module in (foamfit.report.figures, foamfit.report.page):
-        monkeypatch.setattr(module, "image", lambda *_: b"\x89PNG" + bytes(20))
+    small_pictures(monkeypatch)
 
 
 def rows(path: Path) -> list[dict[str, str]]:

@@ -26,13 +26,13 @@ from foamfit.report.identifiability_plots import (
 )
 from foamfit.report.page import render_report
 from foamfit.report.summary import summary_text
+from foamfit.results import Intervals
 from foamfit.springs.chain import Chain, Impact
 from foamfit.trust import checklist
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.checklist import Check, status_of
 from foamfit.trust.conclude import conclude
 from foamfit.trust.identifiability import Insight
-from foamfit.trust.intervals import Intervals
 from reference import reference_impact
 
 IMPACT = Impact(mass=7e-3, velocity=1.75)
@@ -546,7 +546,7 @@ def test_the_pictures_show_every_parameter_and_curve() -> None:
 
 def test_report_and_plan_show_them_too() -> None:
     result = concluded()
-    page = render_report(result, fit_png=b"\x89PNG" + bytes(20))
+    page = render_report(result)
     assert page.count("data:image/png;base64,") == 3
     for words in ("Checklist", "What the test determines", "Is the noise floor reached?"):
         assert words in page

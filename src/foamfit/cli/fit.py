@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,7 @@ from foamfit.cli.options import (
     TEST,
     compiling,
     cycles_of,
+    drawing_beside,
     progress_bar,
     spare,
 )
@@ -26,6 +28,7 @@ from foamfit.terminal import say, without_ctrl_c
 
 if TYPE_CHECKING:
     from foamfit.api import FitResult
+    from foamfit.report.result_figures import Mapped
     from foamfit.study.cycles import CycleFits
 
 
@@ -69,13 +72,18 @@ def fit(
     search |= intervals_of(**{way: search.pop(way) for way in ("profile", "bootstrap", "mcmc")})
     model = "auto" if model.strip() == "auto" else Model.parse(model).name
     alone, several = cycles_of(cycle)
-    with compiling(quiet or as_json, model, search["relaxation"]) as compile_rest:
+    with ExitStack() as beside:
+        compile_rest = beside.enter_context(
+            compiling(quiet or as_json, model, search["relaxation"])
+        )
         measurement = read_test(test, specimen, alone)
         folder = _result_folder(out, test, specimen, model)
         from foamfit import api
+        from foamfit.report.folder import save_result
 
         params = params_of(measurement, model, search, fix, vary)
         compile_rest()
+        mapped = beside.enter_context(drawing_beside())
         tell = None if quiet else lambda told: say(f"foamfit: {told}", err=True)
         with progress_bar(quiet or as_json) as progress:
             if several is not None:
@@ -91,10 +99,10 @@ def fit(
                     measurement, model=model, params=params, progress=progress, tell=tell, **search
                 )
         if several is not None:
-            return _tell_cycles(found, folder, as_json, quiet)
+            return _tell_cycles(found, folder, mapped, as_json, quiet)
         try:
             with without_ctrl_c():
-                result.save(folder)
+                save_result(result, folder, mapped)
         except InputError:  # the numbers are not lost with the folder
             _tell_result(result, as_json, quiet, verbose)
             raise
@@ -107,18 +115,18 @@ def fit(
     return 0
 
 
-def _tell_cycles(found: CycleFits, folder: Path, as_json: bool, quiet: bool) -> int:
+def _tell_cycles(found: CycleFits, folder: Path, mapped: Mapped, as_json: bool, quiet: bool) -> int:
     """Write and print the fits of several cycles; returns the exit code."""
     import json
 
-    from foamfit.report.studies.cycles import cycles_text
+    from foamfit.report.studies.cycles import cycles_text, save_cycles
 
     content = found.to_json_dict()
     content["cycles"] = {n: one.to_json_dict() for n, one in sorted(found.results.items())}
     shown = json.dumps(content, allow_nan=False) if as_json else cycles_text(found)
     try:
         with without_ctrl_c():
-            found.save(folder)
+            save_cycles(found, folder, mapped)
     finally:  # the numbers are not lost with the folder
         if as_json or not quiet:
             say(shown)

@@ -6,12 +6,16 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from foamfit.errors import InputError
 from foamfit.files import check_file
 from foamfit.terminal import say
+
+if TYPE_CHECKING:
+    from foamfit.report.result_figures import Mapped
 
 FILE = click.Path(path_type=Path)
 TEST = click.argument("test", metavar="TEST.csv", type=FILE)
@@ -64,6 +68,38 @@ def compiling(
 
     with precompile.at_first_use(model, relaxation, tell) as finish:
         yield finish
+
+
+@contextmanager
+def drawing_beside() -> Iterator[Mapped]:
+    """Give a `map` over figures that has them drawn in two processes, where there are two cores.
+
+    These import what they need beside the body, which then need not. Where they cannot be had, or
+    end before they are done, this process draws.
+    """
+    from foamfit.study import processes
+
+    if processes.cores() < 2:
+        yield map
+        return
+    pool = processes.Processes(2, processes.DRAWING)
+
+    def mapped(draw: Callable[[str], Any], names: Iterable[str]) -> Iterator[Any]:
+        begun = [(name, pool.submit(draw, name)) for name in names]
+
+        def drawn() -> Iterator[Any]:
+            for name, one in begun:
+                try:
+                    yield one.result()
+                except (processes.EndedError, OSError):
+                    yield draw(name)
+
+        return drawn()
+
+    try:
+        yield mapped
+    finally:
+        pool.stop()
 
 
 @contextmanager

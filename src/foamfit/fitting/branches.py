@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from foamfit.fitting.objective import Simulated
-from foamfit.fitting.problem import Problem
 from foamfit.springs import kernels
 from foamfit.springs.parameters import BRANCHES, HYSTERETIC, split_name
+
+if TYPE_CHECKING:
+    from foamfit.fitting.objective import Simulated
+    from foamfit.fitting.problem import Problem
 
 FLIGHT = "free flight"
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 GREY, BLUE, VERMILION = "#6b6b6b", "#0072B2", "#D55E00"  # of Okabe and Ito, told apart by all
 INSIDE = ("#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # of masses inside, from the base up
 STYLE: Any = {  # matplotlib types its keys one by one
-    "font.family": "DejaVu Sans",
+    "font.family": "DejaVu Sans",  # upright and regular: a PDF takes 0.1 s for every font
     "font.size": 7.5,
     "axes.labelsize": 8,
     "axes.titlesize": 8,

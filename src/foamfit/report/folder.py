@@ -14,11 +14,9 @@ from foamfit.arrays import Array
 from foamfit.data.measurement import Outliers, interior_channel
 from foamfit.errors import InputError
 from foamfit.files import reason, replacing
-from foamfit.report.figures import image, laid_out
 from foamfit.report.page import render_report
-from foamfit.report.plots import plot_fit
-from foamfit.results import SCHEMA, Curves, Fit, ParameterEstimate, plain
-from foamfit.trust.intervals import Intervals
+from foamfit.report.result_figures import Mapped, draw_all
+from foamfit.results import SCHEMA, Curves, Fit, Intervals, ParameterEstimate, plain
 
 # All that `save_result` may write, and what `studies.cycles.save_cycles` writes beside the folders
 # of the cycles.
@@ -36,14 +34,15 @@ MARKS = ("fit.json", "cycles.json", "joint.json", "batch.json", "prediction.json
 _FILES = (*RESULT_FILES, *CYCLES_FILES, *JOINT_FILES, *PREDICTION_FILES, "batch.json")
 
 
-def save_result(result: Fit, folder: str | Path) -> Path:
+def save_result(result: Fit, folder: str | Path, mapped: Mapped = map) -> Path:
     """Write the result folder whole, replacing an older one at the end.
 
     It is made with its parents; InputError if something else stands there (see `check_target`) or
     it cannot be written, and nothing is changed then. ``profiles.csv`` is written where there are
-    profiles, ``ladder.csv`` where there is a ladder. Returns the folder.
+    profiles, ``ladder.csv`` where there is a ladder. `mapped` draws the figures; see
+    `result_figures.draw_all`. Returns the folder.
     """
-    return save_whole(folder, lambda fresh: write_result(result, fresh))
+    return save_whole(folder, lambda fresh: write_result(result, fresh, mapped=mapped))
 
 
 def save_whole(folder: str | Path, write: Callable[[Path], None], *, swept: bool = False) -> Path:
@@ -165,8 +164,9 @@ def load_result(folder: str | Path) -> dict[str, Any]:
     return content
 
 
-def write_result(result: Fit, folder: Path, *, pages: bool = True) -> None:
+def write_result(result: Fit, folder: Path, *, pages: bool = True, mapped: Mapped = map) -> None:
     """Write all files of a result into a folder that is there; the report and figures if wanted."""
+    figures = draw_all(result, mapped) if pages else ()
     text = json.dumps(result.to_json_dict(), indent=2, ensure_ascii=False, allow_nan=False)
     # A name that is no UTF-8 keeps its bytes as an escape of JSON.
     (folder / "fit.json").write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
@@ -176,15 +176,14 @@ def write_result(result: Fit, folder: Path, *, pages: bool = True) -> None:
         write_table(folder / "profiles.csv", _profile_rows(result.intervals))
     if result.ladder is not None:
         write_table(folder / "ladder.csv", result.ladder.rows())
-    if not pages:
-        return
-    figure = plot_fit(result)
-    with laid_out(figure):
-        png, pdf = image(figure, "png"), image(figure, "pdf")
-    (folder / "fit.png").write_bytes(png)
-    (folder / "fit.pdf").write_bytes(pdf)
-    page = render_report(result, fit_png=png)
-    (folder / "report.html").write_text(page, encoding="utf-8", errors="replace")
+    drawn = dict(figures)
+    for name, images in drawn.items():
+        if images is not None and images.pdf is not None:
+            (folder / f"{name}.png").write_bytes(images.png)
+            (folder / f"{name}.pdf").write_bytes(images.pdf)
+    if pages:
+        page = render_report(result, drawn)
+        (folder / "report.html").write_text(page, encoding="utf-8", errors="replace")
 
 
 def write_table(path: Path, rows: Iterable[Iterable[object]]) -> None:

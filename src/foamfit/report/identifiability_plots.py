@@ -17,9 +17,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, FigureBase
 
     from foamfit.fitting.branches import Section
-    from foamfit.results import Fit, ParameterEstimate
+    from foamfit.results import Fit, ParameterEstimate, Profile
     from foamfit.trust.identifiability import Insight
-    from foamfit.trust.profile import Profile
 
 # Of one spring's branches.
 SHADES = {

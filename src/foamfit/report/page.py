@@ -5,15 +5,14 @@ from __future__ import annotations
 import base64
 import functools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 from foamfit.fitting.branches import covered
-from foamfit.report.figures import DPI, image
-from foamfit.report.identifiability_plots import plot_insight, plot_profiles
-from foamfit.report.plots import origin_word, plot_fit, plot_residuals
+from foamfit.report.plots import origin_word
 from foamfit.report.readable import number, readable, readable_unit
+from foamfit.report.result_figures import Images, draw_all
 from foamfit.report.summary import ANSWERS, LADDER, conclusions, ladder_cells, misfits
 from foamfit.results import Fit
 from foamfit.springs.parameters import KINDS
@@ -74,7 +73,6 @@ ENERGY = {  # of the audit: label and unit
     "impulse_ratio": ("impulse over change of momentum", ""),
 }
 Point = tuple[tuple[str, str], str, str, str]  # symbol and its index, meaning, value, unit
-COARSE = 160  # dots per inch of what is only on the page, and should not take long
 BADGES = {True: "ok", False: "weak", None: "fixed"}  # of the answers to the checklist
 CITATION = (
     "Thevamaran, R., Fraternali, F., Daraio, C. (2014). Multiscale Mass-Spring Model for "
@@ -99,16 +97,14 @@ def environment() -> Environment:
     return made
 
 
-def render_report(result: Fit, *, fit_png: bytes | None = None) -> str:
+def render_report(result: Fit, figures: Mapping[str, Images | None] | None = None) -> str:
     """Return the report as one HTML page that needs nothing else.
 
-    `fit_png` is the figure of `plots.plot_fit` as PNG, if it is there already.
+    `figures` are those of `draw_all`, if they are drawn already.
     """
+    drawn = dict(draw_all(result)) if figures is None else figures
     plain = result.to_json_dict()
     energy = plain["energy"]
-    profiled = result.intervals is not None and result.intervals.profiles
-    matrix = None if result.correlation is None else result.correlation.matrix
-    insight = None if result.insight is None else plot_insight(result.insight, matrix)
     return (
         environment()
         .get_template("report.html")
@@ -142,12 +138,9 @@ def render_report(result: Fit, *, fit_png: bytes | None = None) -> str:
             ladder=result.ladder,
             ladder_header=LADDER,
             ladder_rows=[] if result.ladder is None else ladder_cells(result.ladder),
-            fit_figure=_figure(fit_png or image(plot_fit(result), "png")),
             answers=ANSWERS,
             badges=BADGES,
-            insight_figure=insight and _figure(image(insight, "png", COARSE), COARSE),
-            residual_figure=_figure(image(plot_residuals(result), "png")),
-            profile_figure=_figure(image(plot_profiles(result), "png")) if profiled else None,
+            figures={name: images and _figure(images) for name, images in drawn.items()},
             citation=CITATION,
         )
     )
@@ -209,6 +202,7 @@ def _visited(result: Fit) -> dict[str, list[tuple[str, str, bool]]]:
     }
 
 
-def _figure(png: bytes, dpi: int = DPI) -> tuple[str, float]:
+def _figure(images: Images) -> tuple[str, float]:
     """Return a PNG in base64, and its width in inches (the width in pixels is in its header)."""
-    return base64.b64encode(png).decode("ascii"), int.from_bytes(png[16:20]) / dpi
+    width = int.from_bytes(images.png[16:20])
+    return base64.b64encode(images.png).decode("ascii"), width / images.dpi

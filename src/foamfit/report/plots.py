@@ -350,7 +350,7 @@ def _draw_law(labels: _Labels, result: Fit) -> None:
         if len(line):  # branch c may lie beyond all that the test reached
             ax.plot(*line.T, color="0.72", lw=0.7, zorder=1.5)
             at = line[int(along * (len(line) - 1))]
-            labels.write(name, at, LIGHT[name], color=GREY, style="italic", fontsize=7)
+            labels.write(name, at, LIGHT[name], color=GREY, fontsize=7)
     if spring.relaxation and "s1" in result.snapping and result.strain is not None:
         equilibrium = result.snapping["s1"].stress
         ax.plot(
@@ -395,21 +395,20 @@ def _name_branches(labels: _Labels, panel: _Panel, result: Fit) -> None:
     springs = result.chain.springs
     if len(springs) > 1 or isinstance(springs[0], LinearSpring) or fitted is None:
         return
-    style: Any = {"color": BLUE, "style": "italic", "weight": "bold"}
     for branch, start, end in _first_visits(result, fitted):
         x, y = fitted.x[start : end + 1] / labels.fx, fitted.y[start : end + 1] / labels.fy
         middle = _evenly(x, y, 3)[1]
         if branch in BESIDE and result.bistable_springs:
             labels.ax.annotate(
                 branch, (x[middle], y[middle]), BESIDE[branch], textcoords="offset points",
-                ha="center", va="center", zorder=6, **style,
+                ha="center", va="center", zorder=6, color=BLUE,
             )  # fmt: skip
         elif branch in IN_WORDS:
             inner = np.column_stack((x, y))[_evenly(x, y, 9)]
             around = sorted(inner, key=lambda at: float(abs(at[0] - x[middle])))
             wanted = IN_WORDS[branch]
             at = next((at for at in around if labels.has_room(branch, at, wanted)), around[0])
-            labels.write(branch, at, wanted, stay=True, fontsize=7, **style)
+            labels.write(branch, at, wanted, stay=True, fontsize=7, color=BLUE)
 
 
 def _first_visits(result: Fit, fitted: _Line) -> Iterator[tuple[str, int, int]]:
@@ -458,7 +457,7 @@ def _head(figure: Figure, result: Fit) -> None:
         title += f" · stopped by {result.stopped}"
     title = textwrap.fill(title, int(12 * figure.get_figwidth()))
     # A name may hold a dollar sign: it is no formula.
-    figure.suptitle(title, x=0.012, ha="left", fontsize=8.5, weight="bold", parse_math=False)
+    figure.suptitle(title, x=0.012, ha="left", fontsize=8.5, parse_math=False)
     entries: dict[str, Any] = {}
     for ax in figure.axes:
         entries |= dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))

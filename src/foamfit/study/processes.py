@@ -14,7 +14,7 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping
 from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor
 from concurrent.futures import ThreadPoolExecutor as Threads
 from concurrent.futures.process import BrokenProcessPool
@@ -22,11 +22,13 @@ from contextlib import contextmanager
 from multiprocessing import connection
 from types import ModuleType
 from typing import Any
-from unittest.mock import patch
+
+from foamfit.terminal import without_ctrl_c
 
 # What fits and their pages import.
 FITS = ("foamfit.study.batch_work", "foamfit.data.csv_file", "pandas", "pint")
 PAGES = ("matplotlib.backends.backend_agg", "matplotlib.backends.backend_pdf", "jinja2")
+DRAWING = ("foamfit.report.result_figures", "foamfit.springs.kernels", *PAGES)
 # Times that a call is tried whose process ends.
 ATTEMPTS = 2
 # One thread in each process: the processes are as many as the cores.
@@ -34,7 +36,7 @@ ONE_THREAD = {
     f"{name}_NUM_THREADS": "1"
     for name in ("OMP", "OPENBLAS", "MKL", "NUMBA", "NUMEXPR", "VECLIB", "BLIS")
 }
-_STARTING = threading.Lock()
+_STARTING, _SCRIPT = threading.Lock(), ModuleType("__main__")
 
 
 class EndedError(RuntimeError):
@@ -56,7 +58,7 @@ def prepare(preload: Iterable[str]) -> None:
     if "forkserver" in multiprocessing.get_all_start_methods():
         from multiprocessing import forkserver
 
-        with _starting():
+        with _starting(), without_ctrl_c():  # which is for this process, while they import too
             forkserver.set_forkserver_preload(list(preload))
             forkserver.ensure_running()
 
@@ -135,13 +137,21 @@ class Processes(Executor):
 @contextmanager
 def _starting() -> Iterator[None]:
     """Start a process with one thread that does not import the running script again."""
-    script = ModuleType("__main__")
-    with (
-        _STARTING,
-        patch.dict(os.environ, ONE_THREAD),
-        patch.dict(sys.modules, {"__main__": script}),
-    ):
+    with _STARTING, _set(os.environ, ONE_THREAD), _set(sys.modules, {"__main__": _SCRIPT}):
         yield
+
+
+@contextmanager
+def _set(values: MutableMapping[str, Any], for_now: Mapping[str, Any]) -> Iterator[None]:
+    """Change some values of a mapping within; as `unittest.mock`, which takes long to import."""
+    before = {name: values[name] for name in for_now if name in values}
+    values.update(for_now)
+    try:
+        yield
+    finally:
+        for name in for_now:
+            del values[name]
+        values.update(before)
 
 
 def _begin(stop: connection.Connection) -> None:

@@ -17,12 +17,11 @@ from foamfit.fitting.branches import covered, visited
 from foamfit.fitting.curves import check_time_shift
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.search import SearchRecord
-from foamfit.results import Check, ParameterEstimate
+from foamfit.results import Check, Intervals, ParameterEstimate
 from foamfit.springs.parameters import BRANCHES, split_name
 from foamfit.text import engineering, listed, percent
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import AT_LIMIT, WEAK
-from foamfit.trust.intervals import Intervals
 from foamfit.trust.time_shift import shift_hint
 
 # A curve was not fitted if it is off by more than this share of its own standard deviation; it is

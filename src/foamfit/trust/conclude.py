@@ -22,7 +22,7 @@ from foamfit.fitting.losses import LOSSES
 from foamfit.fitting.objective import MODEL_ERROR, Objective, Simulated
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import SearchRecord
-from foamfit.results import Correlation, Curves, Fit, ParameterEstimate, Switch
+from foamfit.results import Correlation, Curves, Fit, Intervals, ParameterEstimate, Switch
 from foamfit.springs import kernels
 from foamfit.springs.parameters import split_name, unit_of
 from foamfit.text import engineering, listed, percent
@@ -30,7 +30,6 @@ from foamfit.trust import covariance
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.checklist import MAY_VANISH, Findings, make_checklist, status_of, warnings_of
 from foamfit.trust.identifiability import Insight, look
-from foamfit.trust.intervals import Intervals
 
 # Factor between an interval and the local one from which on the local standard error is given up.
 ASTRAY = 2.0

@@ -10,15 +10,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 
 from foamfit.arrays import Array
 from foamfit.fitting.box import scale_in_words
 from foamfit.fitting.branches import Section, sections
 from foamfit.text import listed, percent
-from foamfit.trust.best_point import BestPoint
+
+if TYPE_CHECKING:
+    from foamfit.trust.best_point import BestPoint
 
 # Shares of a direction below which a parameter has no part in it, and of the largest below which
 # it is not named.
@@ -153,6 +155,8 @@ class Insight:
         that is fixed is given as a product of powers, good to first order; else those parameters
         that compensate a change of it.
         """
+        from scipy.sparse.csgraph import connected_components
+
         errors, vt = self._directions
         free, me = vt[errors > loose], self.names.index(name)
         movable = np.linalg.norm(free, axis=0) > 2.0 * PART

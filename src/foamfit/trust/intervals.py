@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from foamfit.arrays import Array
 from foamfit.errors import InputError
 from foamfit.fitting.search import Tracker
+from foamfit.results import Intervals
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.profile import PLACED, Profile, Tracing, departures
+from foamfit.trust.profile import PLACED, Tracing, departures
 from foamfit.trust.resample import bootstrap, check_emcee, mcmc, walkers
 from foamfit.trust.residuals.noise_process import parts
 
@@ -54,23 +55,6 @@ class Choice:
             )
         if self.method == "mcmc":
             check_emcee()
-
-
-@dataclass(frozen=True, eq=False)
-class Intervals:
-    """The 95 % intervals of a fit, and how they were made."""
-
-    # Ends of the intervals that are not those of the local covariance, and how each was made.
-    ends: dict[str, tuple[float, float]] = field(default_factory=dict)
-    methods: dict[str, str] = field(default_factory=dict)
-    profiles: tuple[Profile, ...] = ()  # All profiles that were followed, whole or not
-    # Parameters along which the cost is no parabola and whose interval is local all the same.
-    doubtful: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()  # Why they are not, or hardly, what was asked for
-    better: Array | None = None  # A point of lower cost: the fit should go on from there
-    # Ends of the ranges that the error of the law leaves open; none where there is no such error.
-    ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
 def assess(

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from foamfit.arrays import Array
 from foamfit.fitting.levenberg import Iterate, damped_step
 from foamfit.fitting.search import STOPPING, Tracker, what_stopped
+from foamfit.results import Profile
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.refit import Refit
 
@@ -29,29 +30,6 @@ OUTWARD, INWARD = 14, 6
 PLACED = 0.02
 # A profile that falls below the best point by this share of the cut has found a better minimum.
 BETTER = 0.01
-
-
-@dataclass(frozen=True, eq=False)
-class Profile:
-    """Least cost along one parameter."""
-
-    name: str  # The parameter
-    values: Array  # (m,): Where it was held, ascending, SI; the best point is among them
-    rises: Array  # (m,): Rise of the cost there as a χ² of one degree of freedom
-    points: Array  # (m, n): All parameters of the model at each
-    cut: float  # χ² of the 95 % interval
-    # Outermost crossings of the cut; a limit of the parameter where there is none.
-    ci95: tuple[float, float]
-    # Whether the cost does not reach the cut on that side.
-    open_low: bool
-    open_high: bool
-    # What ended it before its end on both sides: "the time limit", "Ctrl-C".
-    stopped: str | None = None
-
-    @property
-    def complete(self) -> bool:
-        """Whether it was followed to its end on both sides."""
-        return self.stopped is None
 
 
 def profile(

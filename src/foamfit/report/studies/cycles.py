@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from foamfit.report.result_figures import Mapped
     from foamfit.study.cycle_fits import FittedCycles
 
 COLUMNS, PANEL = 4, (1.85, 1.5)  # of the picture; inches
@@ -24,16 +25,21 @@ MOST_LOOPS = 12
 FAR = 20  # a last cycle that is so many times the first is drawn on a logarithmic axis
 
 
-def save_cycles(found: FittedCycles, folder: str | Path) -> Path:
-    """Write the folder whole, replacing an older result at the end; returns it."""
-    return save_whole(folder, lambda fresh: write_cycles(found, fresh))
+def save_cycles(found: FittedCycles, folder: str | Path, mapped: Mapped = map) -> Path:
+    """Write the folder whole, replacing an older result at the end; returns it.
+
+    `mapped` draws the figures of the reports; see `result_figures.draw_all`.
+    """
+    return save_whole(folder, lambda fresh: write_cycles(found, fresh, mapped=mapped))
 
 
-def write_cycles(found: FittedCycles, folder: Path, *, pages: bool = True) -> None:
+def write_cycles(
+    found: FittedCycles, folder: Path, *, pages: bool = True, mapped: Mapped = map
+) -> None:
     """Write all files of the cycles into a folder that is there; reports and pictures if wanted."""
     for number, result in found.results.items():
         (folder / f"cycle-{number}").mkdir()
-        write_result(result, folder / f"cycle-{number}", pages=pages)
+        write_result(result, folder / f"cycle-{number}", pages=pages, mapped=mapped)
     write_table(folder / "cycles.csv", found.rows())
     text = json.dumps(found.to_json_dict(), indent=2, ensure_ascii=False, allow_nan=False)
     (folder / "cycles.json").write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
