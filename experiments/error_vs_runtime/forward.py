@@ -129,6 +129,7 @@ def compile_all() -> None:
         "one_spring_stress",
         "one_spring_impact",
         "two_springs_impact",
+        "10_springs_impact",
         "10_springs_mass_impact",
         "microscale_impact",
         "microscale_relaxation_displacement",
