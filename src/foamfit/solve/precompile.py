@@ -13,7 +13,6 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 
@@ -44,6 +43,8 @@ def _calls() -> dict[Any, tuple[Any, ...]]:
 
     Some small scenes run uncompiled, which shows them.
     """
+    from unittest.mock import patch
+
     from numba import typeof
 
     from foamfit.solve import plan, polynomial, scene

@@ -1,0 +1,79 @@
+"""Figures of a result are the same whoever draws them, and need little."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from concurrent.futures import Future
+from typing import Any
+
+import pytest
+
+import fabricated
+import foamfit.study.processes
+from conftest import EXPERIMENTS
+from foamfit.cli.options import drawing_beside
+from foamfit.report.result_figures import Images, draw_all
+from foamfit.study.processes import EndedError
+
+RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
+
+
+@pytest.fixture(scope="module")
+def drawn_here() -> dict[str, Images | None]:
+    return dict(draw_all(fabricated.result()))
+
+
+def test_other_processes_draw_the_same(drawn_here: dict[str, Images | None]) -> None:
+    with drawing_beside() as mapped:
+        assert dict(draw_all(fabricated.result(), mapped)) == drawn_here
+    fit = drawn_here["fit"]
+    assert fit is not None
+    assert fit.png.startswith(b"\x89PNG")
+    assert fit.pdf is not None
+
+
+def test_where_processes_end_this_one_draws(
+    drawn_here: dict[str, Images | None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def ended(*_: Any) -> Future[Any]:
+        told: Future[Any] = Future()
+        told.set_exception(EndedError("its process ended 2 times before it was done"))
+        return told
+
+    monkeypatch.setattr(foamfit.study.processes.Processes, "submit", ended)
+    monkeypatch.setattr(foamfit.study.processes, "cores", lambda: 2)
+    with drawing_beside() as mapped:
+        assert dict(draw_all(fabricated.result(), mapped)) == drawn_here
+
+
+def test_one_core_draws_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(foamfit.study.processes, "cores", lambda: 1)
+    with drawing_beside() as mapped:
+        assert mapped is map
+
+
+def modules_after(code: str, *arguments: str) -> Iterator[str]:
+    """Modules that a new process has imported after some code."""
+    told = "\nimport sys; print('modules', *sys.modules)"
+    run = subprocess.run(
+        [sys.executable, "-c", code + told, *arguments], capture_output=True, text=True, check=True
+    )
+    yield from run.stdout.rpartition("modules")[2].split()
+
+
+def test_drawing_imports_no_fit() -> None:
+    there = set(modules_after("import foamfit.report.result_figures"))
+    assert not there & {"lmfit", "pandas", "scipy.stats", "scipy.optimize", "numba"}
+
+
+def test_the_command_imports_what_a_fit_uses(tmp_path: Any) -> None:
+    code = (
+        "import sys, contextlib\nfrom foamfit.cli import main\n"
+        "with contextlib.suppress(SystemExit): main(['fit', *sys.argv[1:]])"
+    )
+    call = [str(RECONSTRUCTION), "--out", str(tmp_path / "r"), "--starts", "1"]
+    there = set(modules_after(code, *call, "--max-time", "0.1", "--quiet"))
+    assert "lmfit" in there
+    assert not there & {"matplotlib.figure", "fontTools", "unittest.mock"}
