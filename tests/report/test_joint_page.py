@@ -95,6 +95,24 @@ def test_the_page_has_every_parameter_and_test(found):
     assert page.count("<td>log rate</td>") == 2  # of the parameter, and of the evidence
 
 
+def test_the_page_tells_the_noise_of_each_test_beside_its_share_of_chi2(found):
+    page = joint_page(found, b"\x89PNG")
+    body = page.split('<table class="sortable">')[1]
+    heads = re.findall(r"<th><button>(.*?)</button>", body)
+    at = heads.index("noise loop (Pa)")
+    assert heads[at - 1] == "share of χ² (%)"
+    row = re.findall(r"<td[^>]*>(.*?)</td>", body.split("<tr>")[2])
+    assert row[at] == '400.0<i class="ends">stated</i>'
+    # what is estimated counts for more than it is
+    level = {"sigma": 250.0, "given": False, "time": 2.5, "scale": 1e3, "range": 1e5}
+    one, *others = found.noise
+    vars(found)["noise"] = ({"stress_strain": level}, *others)
+    told = joint_page(found, b"\x89PNG")
+    vars(found)["noise"] = (one, *others)
+    assert "250.0<i" in told
+    assert "estimated, correlated over 2.5 samples, counted as 1000" in told
+
+
 def test_the_picture_has_a_loop_for_each_test_and_a_panel_for_what_differs(found):
     figure = plot_joint(found)
     titles = [ax.get_title() for part in figure.subfigs for ax in part.axes]

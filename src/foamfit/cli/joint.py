@@ -70,7 +70,7 @@ def joint(
 
         compile_rest()
         with progress_bar(quiet or as_json) as progress:
-            result = fit_jointly(study, jobs=jobs, seed=seed, progress=progress)
+            result = fit_jointly(read, jobs=jobs, seed=seed, progress=progress)
         try:
             with without_ctrl_c():
                 result.save(folder, jobs=jobs, reports=not no_report)

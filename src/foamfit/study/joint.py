@@ -83,7 +83,7 @@ class _Test:
 
 
 def joint(
-    path: str | Path,
+    path: str | Path | Study,
     *,
     jobs: int | None = None,
     out: str | Path | None = None,
@@ -95,9 +95,10 @@ def joint(
 
     Parameters
     ----------
-    path : str or Path
-        STUDY.toml: tests, model, drive, and what each parameter is: "shared", "own", "scatter",
-        "log rate", "power rate" or "auto", or a number that it is held at.
+    path : str, Path or Study
+        STUDY.toml, or what `read_study` has read of it: tests, model, drive, and what each
+        parameter is: "shared", "own", "scatter", "log rate", "power rate" or "auto", or a number
+        that it is held at.
     jobs : int, optional
         Processes; by default one for each core. The numbers are the same with any.
     out : str or Path, optional
@@ -119,7 +120,8 @@ def joint(
     SimulationError
         If no start of the joint fit can be simulated.
     """
-    began, study, tell = time.perf_counter(), read_study(path), progress or (lambda *_: None)
+    began, tell = time.perf_counter(), progress or (lambda *_: None)
+    study = path if isinstance(path, Study) else read_study(path)
     if out is not None:
         check_target(out)
     seed = study.seed if seed is None else seed
@@ -137,8 +139,8 @@ def joint(
         links = _chosen(study, problems, links, starts, n_eff, choices)
         fit = fit_jointly(problems, links, starts, each=each)
     tell(0.9, "evidence")
-    alternatives = _evidence(study, fit, n_eff, vectors, choices)
-    result = _conclude(study, seed, tests, fit, vectors, alternatives, n_eff, refused, began)
+    tried = _evidence(study, fit, n_eff, vectors, choices)
+    result = _conclude(study, seed, tests, fit, vectors, tried, n_eff, refused, began)
     tell(1.0, "done")
     if out is not None:
         result.save(out, jobs=jobs, reports=reports)
@@ -355,14 +357,14 @@ def _choices(tests: Sequence[_Test]) -> tuple[str, ...]:
 
 def _evidence(
     study: Study, fit: JointFit, n_eff: int, vectors: Sequence[Array], choices: tuple[str, ...]
-) -> tuple[Alternative, ...]:
+) -> tuple[tuple[Alternative, ...], dict[str, float]]:
     """Every parameter with a law of rate, or of which evidence was to choose, as other kinds."""
     found = fit.found
     names = [
         name for name in (*found.shared, *found.own)
         if found.links.kind(name) in RATES or study.kinds.get(name) == AUTO
     ]  # fmt: skip
-    return tuple(evidence(found, names, n_eff, choices, [list(vectors)]))
+    return evidence(found, names, n_eff, choices, [list(vectors)])
 
 
 # ------------------------------------------------------------------------------- the result
@@ -370,7 +372,8 @@ def _evidence(
 
 def _conclude(
     study: Study, seed: int, tests: Sequence[_Test], fit: JointFit, vectors: Sequence[Array],
-    alternatives: tuple[Alternative, ...], n_eff: int, refused: Mapping[str, str], began: float,
+    tried: tuple[tuple[Alternative, ...], dict[str, float]], n_eff: int,
+    refused: Mapping[str, str], began: float,
 ) -> JointResult:  # fmt: skip
     """Assemble the result."""
     names = tuple(test.name for test in tests)
@@ -386,7 +389,8 @@ def _conclude(
         fit=fit,
         parameters=parameters,
         covariance=common_covariance(fit),
-        evidence=alternatives,
+        evidence=tried[0],
+        open_slopes=tried[1],
         n_eff=n_eff,
         alone=_alone(tests, vectors, n_eff),
         refused=refused,

@@ -17,10 +17,12 @@ from typing import Any
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.fitting.links import Links
+from foamfit.errors import SimulationError
+from foamfit.fitting.links import RATES, Links
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.together import Together, fit_linked
 from foamfit.study.shared import bic, effective_samples
+from foamfit.trust import covariance
 from foamfit.trust.joint_covariance import JointCovariance, JointPoint
 from foamfit.trust.residuals.law_error import CurveError, curve_errors
 from foamfit.trust.residuals.noise_process import noise_processes
@@ -153,18 +155,19 @@ class Alternative:
 def evidence(
     fit: Together, names: Sequence[str], n_eff: int, kinds: Sequence[str],
     near: Sequence[Sequence[Array]],
-) -> Iterator[Alternative]:  # fmt: skip
+) -> tuple[tuple[Alternative, ...], dict[str, float]]:  # fmt: skip
     """Evidence for each of these kinds of each of these parameters, the others as they are.
 
-    The fits start at that fit, and at the points `near`.
+    The fits start at that fit, and at the points `near`. Then the parameters whose slope by rate
+    the tests leave open (`open_slope`), and by how much.
     """
+    found, wide = list[Alternative](), dict[str, float]()
     for name in names:
-        own = fit.links.kind(name)
-        for kind in dict.fromkeys((own, *kinds)):
-            links = replace(fit.links, kinds={**fit.links.kinds, name: kind})
-            one = fit if kind == own else fit_linked(fit.problems, links, [fit.values, *near])
+        mine = fit.links.kind(name)
+        for kind, one in _kinds_of(fit, name, (mine, *kinds), [fit.values, *near], wide):
             score = bic(one.cost, one.n_data, one.n_vary, n_eff)
-            yield Alternative(name, kind, kind == own, score, one.n_vary, one.cost)
+            found.append(Alternative(name, kind, kind == mine, score, one.n_vary, one.cost))
+    return tuple(found), wide
 
 
 def choose_kinds(
@@ -173,7 +176,8 @@ def choose_kinds(
 ) -> Links:  # fmt: skip
     """Links in which each of these parameters has the kind of the least BIC.
 
-    All are shared at first; in each round the change of one kind that lowers BIC most is taken.
+    All are shared at first; in each round the change of one kind that lowers BIC most is taken. A
+    law of rate is none of the kinds where the tests leave its slope open (`open_slope`).
     """
     links = replace(links, kinds={**links.kinds, **dict.fromkeys(names, "shared")})
     now = fit_linked(problems, links, starts)
@@ -182,18 +186,65 @@ def choose_kinds(
         near = [now.values, *starts[:1]]
         trials = list[tuple[float, Together]]()
         for name in names:
-            for kind in kinds:
-                if kind == now.links.kind(name):
-                    continue
-                other = replace(now.links, kinds={**now.links.kinds, name: kind})
-                one = fit_linked(problems, other, near)
-                trials.append((bic(one.cost, one.n_data, one.n_vary, n_eff), one))
+            for kind, one in _kinds_of(now, name, kinds, near, {}):
+                if kind != now.links.kind(name):
+                    trials.append((bic(one.cost, one.n_data, one.n_vary, n_eff), one))
         if not trials:
             return now.links
         least, found = min(trials, key=lambda trial: trial[0])
         if least >= score:
             return now.links
         now, score = found, least
+
+
+def _kinds_of(
+    fit: Together, name: str, kinds: Sequence[str], near: Sequence[Sequence[Array]],
+    wide: dict[str, float],
+) -> Iterator[tuple[str, Together]]:  # fmt: skip
+    """Fits with a parameter of these kinds, and of its present one, the others as they are.
+
+    A kind with which no start can be simulated is left out, and so is another law of rate than the
+    present one where the slope of one is left open, which is added to `wide`.
+    """
+    mine = fit.links.kind(name)
+    for kind in sorted(dict.fromkeys(kinds), key=lambda kind: (kind in RATES, kind != mine)):
+        if kind in RATES and kind != mine and name in wide:
+            continue
+        try:
+            links = replace(fit.links, kinds={**fit.links.kinds, name: kind})
+            one = fit if kind == mine else fit_linked(fit.problems, links, near)
+        except SimulationError:
+            continue
+        yield kind, one
+        if kind == "own" and any(other in RATES for other in kinds):
+            half = open_slope(one, name)
+            if half > covariance.WEAK:
+                wide[name] = half
+
+
+def open_slope(fit: Together, name: str) -> float:
+    """Half of the 95 % interval of a parameter's slope by rate from its own value in each test.
+
+    The slope of the logarithm is of the order of one: so much doubles a value with the rate. The
+    values scatter about a law of rate as the specimens and the errors of the law make them, which
+    is in no error of a fit in which that law holds.
+    """
+    there = [name in problem.free() for problem in fit.problems]
+    values = np.array(fit.value(name))[there]
+    if fit.links.log_rates is None or values.size < 3:
+        return math.inf
+    x = fit.links.log_rates[there]
+    x = x - x.mean()
+    square = float(x @ x)
+    level = float(np.median(values))
+    if not square > 0.0 or level == 0.0:
+        return math.inf
+    logs = np.log(values / level) if np.all(values / level > 0.0) else values / level
+    logs = logs - logs.mean()
+    left = logs - x * float(x @ logs) / square
+    return covariance.half_width(
+        math.sqrt(float(left @ left) / (values.size - 2) / square), values.size - 2
+    )
 
 
 def samples_of(problems: Sequence[Problem], vectors: Sequence[Array]) -> int:
