@@ -113,6 +113,17 @@ def test_the_page_tells_the_noise_of_each_test_beside_its_share_of_chi2(found):
     assert "estimated, correlated over 2.5 samples, counted as 1000" in told
 
 
+def test_ranges_are_told_where_there_are_some(found):
+    assert "<th>range</th>" not in joint_page(found, b"\x89PNG")
+    k0 = replace(found.parameters["s1_k0"], range=(5.2e5, 5.8e5))
+    ranged = replace(found, parameters={**found.parameters, "s1_k0": k0})
+    page = joint_page(ranged, b"\x89PNG")
+    assert "<th>range</th>" in page
+    assert ">520 to 580 kPa<" in page
+    assert "the range is where it would lie (95 %)" in page
+    assert "520.0 to 580.0 kPa" in joint_text(ranged)
+
+
 def test_the_picture_has_a_loop_for_each_test_and_a_panel_for_what_differs(found):
     figure = plot_joint(found)
     titles = [ax.get_title() for part in figure.subfigs for ax in part.axes]

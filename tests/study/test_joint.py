@@ -5,17 +5,20 @@ import json
 import pickle
 import re
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from scipy import stats
 
 import foamfit as ff
 from conftest import without_pictures
 from foamfit.cli import main
 from foamfit.study import joint_fit, study_file
+from foamfit.study.joint_estimates import parameter_of
 from foamfit.study.joint_fit import open_slope
 from foamfit.study.prediction.identified import read_source
 
@@ -166,6 +169,46 @@ def test_evidence_is_for_the_law_that_there_is(found):
     assert scores["log rate"] < scores["shared"] - 10.0
     assert scores["log rate"] < scores["own"] + 2.0
     assert not any("evidence" in warning for warning in found.warnings)
+
+
+def test_what_noise_alone_is_left_of_has_no_range(found):
+    assert found.fit.ranges == {}
+    content = found.to_json_dict()["parameters"]
+    assert content["s1_k0"]["range"] is None
+    assert content["s1_sigma_plus"]["b_range"] is None
+
+
+@pytest.fixture(scope="module")
+def unlike(tmp_path_factory):
+    """Five specimens that differ in k0 by 5 %, and a study that says they do not."""
+    here, deviates = tmp_path_factory.mktemp("unlike"), np.array([-1.2, -0.6, 0.1, 0.4, 1.3])
+    for i, z in enumerate(deviates):
+        write_test(here, f"t{i}", seed=i, noise=0.1 * NOISE, k0=5.5e5 * (1.0 + 0.05 * z))
+    study = write_study(here, "\n".join(f'{name} = "shared"' for name in NAMES))
+    return ff.joint(study, jobs=1), 5.5e5 * 0.05 * np.std(deviates, ddof=1) / 5**0.5
+
+
+def test_the_range_of_a_shared_value_is_that_of_a_mean_over_other_specimens(unlike):
+    joint, error = unlike
+    k0 = joint.parameters["s1_k0"]
+    half = 0.5 * (k0.range[1] - k0.range[0])
+    assert half == pytest.approx(stats.t.ppf(0.975, 4) * error, rel=0.3)
+    assert k0.range[0] < 5.5e5 < k0.range[1]
+    assert half > 5.0 * 0.5 * (k0.ci95[1] - k0.ci95[0])  # noise says nothing of specimens
+    assert "its range over specimens is ±" in k0.why
+    content = json.loads(json.dumps(joint.to_json_dict()))
+    assert content["parameters"]["s1_k0"]["range"] == list(k0.range)
+
+
+def test_the_state_of_a_shared_value_is_that_of_the_wider_of_interval_and_range(unlike):
+    joint, _ = unlike
+    fit = joint.fit
+    value = joint.parameters["s1_k0"].value
+    for half, state in ((0.4, "determined"), (0.6, "weak"), (4.0, "not determined")):
+        ranges = {"s1_k0": (value * (1.0 - half), value * (1.0 + half))}
+        one = parameter_of(replace(fit, ranges=ranges), joint.tests, "s1_k0")
+        assert one.state == state
+        assert one.ci95 == joint.parameters["s1_k0"].ci95
 
 
 def test_evidence_chooses_a_kind(folder):

@@ -34,15 +34,21 @@ ROUNDS, STILL = 12, 0.01
 # Nothing is drawn harder than by a spread of so much of the errors of a single test: with no spread
 # at all the values of the tests would be one, and nothing would say what they are undrawn.
 LEAST_SPREAD = 0.3
+# Groups of tests that are left out in turn, and steps of a fit without one of them.
+GROUPS, REFIT = 10, 15
 Map = Callable[..., Iterable[Any]]
 
 
 @dataclass(frozen=True, eq=False)
 class JointFit:
-    """Several tests fitted together: the best point, and the spread of what scatters."""
+    """Several tests fitted together: the best point, and the spread of what scatters.
+
+    `ranges` are those of shared values, and with ":b" of slopes by rate; see `ranges_of`.
+    """
 
     point: JointPoint
     spreads: Mapping[str, Spread] = field(default_factory=dict)
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def found(self) -> Together:
@@ -73,7 +79,7 @@ def fit_jointly(
     point, spreads = JointPoint(found, errors), dict[str, Spread]()
     scatter = [name for name in scatter if name in found.own]
     if not scatter:
-        return JointFit(point)
+        return JointFit(point, ranges=ranges_of(point, each))
     for _ in range(ROUNDS):
         before, inflations, pulls = spreads, dict[str, Array](), dict[str, Array]()
         spreads = {}
@@ -99,7 +105,7 @@ def fit_jointly(
             break
         found = fit_linked(problems, replace(links, pulls=pulls), [found.values])
         point = JointPoint(found, errors, inflations)
-    return JointFit(point, spreads)
+    return JointFit(point, spreads, ranges_of(point, each))
 
 
 def _drawn(found: Together, name: str) -> Array:
@@ -135,6 +141,58 @@ def errors_of(found: Together, each: Map = map) -> tuple[tuple[CurveError, ...],
         tuple(map(CurveError, noise_processes(*items)) if by_stress else next(made))
         for items, by_stress in zip(work, driven, strict=True)
     )
+
+
+# ------------------------------------------------------------------------------- ranges
+
+
+def ranges_of(point: JointPoint, each: Map = map) -> dict[str, tuple[float, float]]:
+    """Where what tests share would lie, were it found from as many other specimens (95 %).
+
+    Where the law misses more than noise, each specimen draws shared values its own way, and noise
+    says nothing of that. The fit without each test in turn does: a jackknife (of at most `GROUPS`
+    groups of tests), with Student's t of one less than their number. Empty where all is noise.
+    """
+    found = point.found
+    names = [name for name in found.shared if found.links.kind(name) != "scatter"]
+    if not point.errs or not names:
+        return {}
+    count = len(found.problems)
+    groups = [range(first, count, GROUPS) for first in range(min(count, GROUPS))]
+    kept = [[t for t in range(count) if t not in group] for group in groups]
+    others = [common for common in each(_without, [found] * len(kept), kept) if common]
+    if len(others) < 2:
+        return {}
+    out, quantile = dict[str, tuple[float, float]](), covariance.half_width(1.0, len(others) - 1)
+    for name in names:
+        values = np.array([common[name] for common in others if name in common])
+        if len(values) < len(others):  # a test that alone has it says nothing of others
+            continue
+        off = values - values.mean(axis=0)
+        halves = quantile * np.sqrt((1.0 - 1.0 / len(values)) * np.sum(off**2, axis=0))
+        for at, (value, half) in enumerate(zip(found.common[name], halves, strict=True)):
+            out[f"{name}:b" if at else name] = (float(value - half), float(value + half))
+    return out
+
+
+def _without(found: Together, kept: Sequence[int]) -> dict[str, tuple[float, ...]] | None:
+    """What the kept tests have in common; None where they cannot be fitted alone."""
+    links, rates = found.links, found.links.log_rates
+    some = replace(
+        links,
+        log_rates=None if rates is None else rates[kept],
+        pulls={name: pull[kept] for name, pull in links.pulls.items()},
+    )
+    laws = any(links.kind(name) in RATES for name in found.shared)
+    if laws and some.log_rates is not None and not np.ptp(some.log_rates) > 0.0:
+        return None
+    try:
+        near = [[found.values[t] for t in kept]]
+        return fit_linked(
+            [found.problems[t] for t in kept], some, near, iterations=REFIT
+        ).common  # fmt: skip
+    except SimulationError:
+        return None
 
 
 # ------------------------------------------------------------------------------- evidence

@@ -29,7 +29,7 @@ from foamfit.trust.conclude import conclude, noise_of
 _SCATTER = ("scatter", "scatter_stderr", "scatter_ci95")
 # Questions to a search of one test.
 _OF_A_SEARCH = ("ended", "agree")
-_RATE = ("b", "b_stderr", "b_ci95")
+_RATE = ("b", "b_stderr", "b_ci95", "b_range")
 
 
 @dataclass(frozen=True)
@@ -70,6 +70,9 @@ class JointParameter:
     b: float | None = None
     b_stderr: float | None = None
     b_ci95: tuple[float, float] | None = None
+    # Where it would lie, found from as many other specimens; None where only noise is left.
+    range: tuple[float, float] | None = None
+    b_range: tuple[float, float] | None = None
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return its part of joint.json."""

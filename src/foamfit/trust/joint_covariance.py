@@ -510,10 +510,10 @@ class JointPoint:
         for t, block in enumerate(self.blocks):
             columns = np.array([*free, *range(s, block.through.shape[1])], dtype=np.intp)
             none = np.zeros((0, columns.size))
-            curved = replace(block, curvature=self._curvatures[t]) if self._errs else block
+            curved = replace(block, curvature=self._curvatures[t]) if self.errs else block
             kept = replace(curved.kept(columns), pulls=none, drawn=none)
             blocks.append(kept)
-        arrow = Arrow(tuple(blocks), plain=not self._errs)
+        arrow = Arrow(tuple(blocks), plain=not self.errs)
         places, factors = list[int | None](), list[float]()
         for block in self.blocks:
             mine = [one for one in block.names if one in self.found.own]
@@ -526,7 +526,8 @@ class JointPoint:
         return matrix * scale, bread * scale
 
     @property
-    def _errs(self) -> bool:
+    def errs(self) -> bool:
+        """Whether the law misses more of some test than noise."""
         return any(error.found for errors in self.errors for error in errors)
 
 

@@ -31,6 +31,7 @@ class _Row:
     kind: str
     value: str
     interval: str
+    range: str
     between: str
     state: str | None
     why: str
@@ -64,6 +65,7 @@ def joint_page(found: JointData, picture: bytes, *, linked: bool = True) -> str:
             if one.kind != "fixed" or one.value
         ],
         rule=RULE,
+        ranged=any(one.range for one in found.parameters.values()),
         evidence=evidence,
         heads=_heads(found, names),
         rows=[list(_cells(found, t, names, linked)) for t in range(len(found.tests))],
@@ -73,14 +75,16 @@ def joint_page(found: JointData, picture: bytes, *, linked: bool = True) -> str:
 
 def _row(name: str, one: JointParameter) -> _Row:
     estimate = ParameterEstimate(
-        one.value, one.stderr, one.ci95, one.unit, True, one.state or "", one.why or ""
-    )
+        one.value, one.stderr, one.ci95, one.unit, True, one.state or "", one.why or "",
+        range=one.range,
+    )  # fmt: skip
     shown = readable(name, estimate)
     unit = "" if shown.unit == "–" else f" {shown.unit}"
     interval = f"{shown.interval}{unit}" if shown.interval else ""
     value = f"{shown.with_error}{unit}"
+    span = f"{shown.range}{unit}" if shown.range else ""
     return _Row(
-        name, shown.symbol, one.kind, value, interval, between(one), one.state, one.why or ""
+        name, shown.symbol, one.kind, value, interval, span, between(one), one.state, one.why or ""
     )
 
 
