@@ -15,6 +15,7 @@ import threading
 import time
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pandas as pd
@@ -28,7 +29,7 @@ from foamfit.cli import batch as command
 from foamfit.cli import main
 from foamfit.report.studies.batch import MOST_ON_PAGE, Row, row_of, table_rows, write_page
 from foamfit.study import batch as module
-from foamfit.study import batch_work
+from foamfit.study import batch_work, processes
 from foamfit.study.batch_work import work
 from foamfit.study.processes import ATTEMPTS, EndedError, Processes
 from foamfit.terminal import TerminatedError
@@ -263,6 +264,18 @@ def seen_once(path):
 
 
 @posix
+def test_what_another_thread_imports_while_a_process_starts_stays_imported(monkeypatch):
+    """`unittest.mock.patch.dict` would put all of `sys.modules` back, without it."""
+    name = "foamfit_imported_in_the_meantime"
+    monkeypatch.delitem(sys.modules, name, raising=False)
+    script = sys.modules["__main__"]
+    with processes._starting():
+        assert sys.modules["__main__"] is not script
+        sys.modules[name] = ModuleType(name)
+    assert name in sys.modules
+    assert sys.modules["__main__"] is script
+
+
 def test_one_process_that_ends_takes_nothing_else_with_it(tmp_path):
     with Processes(2) as pool:
         calls = [pool.submit(time.sleep, 0.05) for _ in range(6)]

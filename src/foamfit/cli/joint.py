@@ -66,9 +66,13 @@ def joint(
     read = read_study(study)
     spare(folder, [study, *(path for _, path in read.tests)])
     with compiling(quiet or as_json, read.model, read.relaxation) as compile_rest:
+        from foamfit.study.joint import FEW_FOLDERS
         from foamfit.study.joint import joint as fit_jointly
+        from foamfit.study.workers import begin
 
         compile_rest()
+        if not no_report:
+            begin(jobs, len(read.tests), FEW_FOLDERS)
         with progress_bar(quiet or as_json) as progress:
             result = fit_jointly(read, jobs=jobs, seed=seed, progress=progress)
         try:

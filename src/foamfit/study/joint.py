@@ -38,7 +38,7 @@ from foamfit.study.joint_result import Alone, JointData
 from foamfit.study.joint_words import sentences_of, warnings_of
 from foamfit.study.shared import bic
 from foamfit.study.study_file import AUTO, Study, read_study
-from foamfit.study.workers import workers
+from foamfit.study.workers import begin, workers
 from foamfit.text import counted
 
 # Tests that are searched as a fit of their own is; the others start at what these have found.
@@ -124,6 +124,8 @@ def joint(
     study = path if isinstance(path, Study) else read_study(path)
     if out is not None:
         check_target(out)
+        if reports:
+            begin(jobs, len(study.tests), FEW_FOLDERS)
     seed = study.seed if seed is None else seed
     options = Options(
         drive=study.drive, seed=seed, starts=study.starts, relaxation=study.relaxation

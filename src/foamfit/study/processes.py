@@ -135,13 +135,21 @@ class Processes(Executor):
 @contextmanager
 def _starting() -> Iterator[None]:
     """Start a process with one thread that does not import the running script again."""
-    script = ModuleType("__main__")
-    with (
-        _STARTING,
-        patch.dict(os.environ, ONE_THREAD),
-        patch.dict(sys.modules, {"__main__": script}),
-    ):
+    # Not the whole of `sys.modules` is put back: another thread may import in the meantime.
+    script = {"__main__": ModuleType("__main__")}
+    with _STARTING, patch.dict(os.environ, ONE_THREAD), _instead(script):
         yield
+
+
+@contextmanager
+def _instead(modules: dict[str, ModuleType]) -> Iterator[None]:
+    """Have other modules under these names."""
+    before = {name: sys.modules[name] for name in modules}
+    sys.modules.update(modules)
+    try:
+        yield
+    finally:
+        sys.modules.update(before)
 
 
 def _begin(stop: connection.Connection) -> None:
