@@ -12,6 +12,8 @@ of 0.25 % of the largest stress, which the TOML states.
   over the standard error, coverage of their intervals, and what the evidence chooses.
 - impacts: foam-1 (model-1 of the paper, with a dashpot) struck at five velocities, its k_h+ free of
   rate or following a power law: what does the evidence choose, and does it find the law?
+- predict: a new specimen predicted from 4 to 6 whose own values go together (correlation 0.96 to
+  0.99): how many of its samples lie inside the 95 % band, above and below it?
 - time: seconds of a fit of 10, 20 and 50 tests with nine parameters, three of them shared, 1000
   samples each, with relaxation.
 
@@ -195,6 +197,49 @@ def impacts(draws: int, folder: Path, slope: float) -> Iterator[Row]:
                "spread": float(np.std(off))} | coverage(hits)  # fmt: skip
 
 
+def specimen(rng: np.random.Generator, along: dict[str, float], apart: float) -> dict[str, float]:
+    """One specimen: its parameters go with one density, and a little each their own way."""
+    z = rng.standard_normal()
+    return SPRING | {
+        name: SPRING[name] * float(np.exp(share * z + apart * rng.standard_normal()))
+        for name, share in along.items()
+    }
+
+
+# By how much parameters change with one standard deviation of the density: their logarithms.
+TOGETHER = {
+    "stiffness": {"k0": 0.25, "kc": 0.25, "sigma_plus": 0.25, "sigma_minus": 0.25},
+    "density": {"k0": 0.15, "kc": 0.3, "eps_star": -0.15, "sigma_plus": 0.15, "sigma_minus": 0.15},
+}
+
+
+def predictions(draws: int, folder: Path, kind: str) -> Iterator[Row]:
+    """A new specimen predicted from four to six whose own values are strongly correlated."""
+    found, kinds = [], dict.fromkeys(SPRING, "shared") | dict.fromkeys(TOGETHER[kind], "own")
+    for draw in range(draws):
+        rng = np.random.default_rng([6, len(kind), draw])
+        for old in folder.glob("t*.csv"):
+            old.unlink()
+        count = 4 + draw % 3
+        for i in range(count + 1):
+            spring = ff.MicroscaleSpring(**specimen(rng, TOGETHER[kind], 0.03))
+            name = f"t{i}" if i < count else "new"
+            write_test(folder / f"{name}.csv", spring, 0.1, rng, 101)
+        result = ff.joint(write_study(folder, kinds), jobs=1)
+        test = ff.read_test(folder / "new.csv", folder / "foam.toml")
+        one = ff.predict(result, test, draws=200).curves["stress_strain"]
+        above, below = np.mean(one.measured > one.hi), np.mean(one.measured < one.lo)
+        found.append([one.inside, above, below, one.half_width / one.range])
+    shares, study = np.array(found), f"predict, {kind}"
+    for j, what in enumerate(("inside the band", "above it", "below it")):
+        half = 1.96 * float(shares[:, j].std(ddof=1)) / draws**0.5
+        mean = float(shares[:, j].mean())
+        yield {"study": study, "what": what, "draws": draws, "share": mean,
+               "low": max(mean - half, 0.0), "high": min(mean + half, 1.0)}  # fmt: skip
+    yield {"study": study, "what": "half of the band over the range", "draws": draws,
+           "mean": float(shares[:, 3].mean())}  # fmt: skip
+
+
 def timing(folder: Path, jobs: int) -> Iterator[Row]:
     """Seconds of fits with nine parameters, three of them shared."""
     rng = np.random.default_rng(4)
@@ -265,7 +310,9 @@ def save(rows: list[Row], folder: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--only", choices=("four", "scatter", "log", "power", "impacts", "time"))
+    parser.add_argument(
+        "--only", choices=("four", "scatter", "log", "power", "impacts", "predict", "time")
+    )
     parser.add_argument("--draws", type=int, help="default: 100 of groups, 200 of laws, 20 else")
     parser.add_argument("--jobs", type=int, default=2, help="processes of the timing")
     parser.add_argument("--out", type=Path, default=HERE)
@@ -277,6 +324,7 @@ def main() -> None:
         "log": [lambda at: rates(given.draws or 200, at, "log rate", 0.05)],
         "power": [lambda at: rates(given.draws or 200, at, "power rate", 0.05)],
         "impacts": [lambda at, b=b: impacts(given.draws or 20, at, b) for b in (0.0, 0.2)],
+        "predict": [lambda at, k=k: predictions(given.draws or 60, at, k) for k in TOGETHER],
         "time": [lambda at: timing(at, given.jobs)],
     }
     for name, makers in studies.items():
