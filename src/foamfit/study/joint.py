@@ -15,7 +15,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.data.csv_file import read_test
 from foamfit.data.measurement import Measurement
-from foamfit.data.rate import loading_rate
+from foamfit.data.rate import loading_rate, rate_error
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.links import KINDS, RATES, Links
 from foamfit.fitting.problem import Problem, make_params
@@ -80,6 +80,7 @@ class _Test:
     problem: Problem
     params: lmfit.Parameters  # Before any fit
     rate: float | None
+    rate_error: float = 0.0  # Of its logarithm
 
 
 def joint(
@@ -167,10 +168,12 @@ def _read(study: Study, options: Options, tell: Progress) -> tuple[list[_Test], 
     if len(found) < 2:
         _too_few(study, len(found), refused)
     params = _params(study, [test for _, _, test in found])
-    return [
-        _Test(name, path, options.problem(test, study.model, own), own, loading_rate(test))
-        for (name, path, test), own in zip(found, params, strict=True)
-    ], refused
+    out = list[_Test]()
+    for (name, path, test), own in zip(found, params, strict=True):
+        problem = options.problem(test, study.model, own)
+        rate, doubt = loading_rate(test), rate_error(problem.measurement)
+        out.append(_Test(name, path, problem, own, rate, doubt))
+    return out, refused
 
 
 def _too_few(study: Study, count: int, refused: Mapping[str, str]) -> NoReturn:
@@ -232,7 +235,11 @@ def _links(study: Study, tests: Sequence[_Test]) -> Links:
     middle = _median_rate(rates)
     if middle is None:
         return Links(study.kinds)
-    return Links(study.kinds, np.log([(rate or middle) / middle for rate in rates]))
+    return Links(
+        study.kinds,
+        np.log([(rate or middle) / middle for rate in rates]),
+        rate_errors=np.array([test.rate_error for test in tests]),
+    )
 
 
 def _median_rate(rates: Sequence[float | None]) -> float | None:
@@ -294,7 +301,8 @@ def _with_rate(test: _Test, values: Array) -> _Test:
     if objective.drive != "impact" or test.rate is None:
         return test
     moved = objective.simulate(values, everything=True).curves["displacement_time"]
-    return replace(test, rate=loading_rate(test.problem.measurement, moved))
+    rate = loading_rate(test.problem.measurement, moved)
+    return replace(test, rate=rate, rate_error=0.0)  # what is off in it, the fit has in its errors
 
 
 def _own_fit(

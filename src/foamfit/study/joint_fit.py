@@ -181,6 +181,7 @@ def _without(found: Together, kept: Sequence[int]) -> dict[str, tuple[float, ...
     some = replace(
         links,
         log_rates=None if rates is None else rates[kept],
+        rate_errors=None if links.rate_errors is None else links.rate_errors[kept],
         pulls={name: pull[kept] for name, pull in links.pulls.items()},
     )
     laws = any(links.kind(name) in RATES for name in found.shared)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.arrays import Array
-from foamfit.fitting.links import RATES, law_bend, law_slopes
+from foamfit.fitting.links import LOG_RATE, RATES, law, law_bend, law_slopes
 from foamfit.fitting.together import Together
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import AT_LIMIT, FLATTEST
@@ -68,7 +68,8 @@ class _Block:
     Everything is scaled. `through` (k, s + q) leads from shared and own coordinates to the k
     parameters of the test, `bend` (s, s) is what the bend of the links adds to the curvature.
     `pulls` are rows (r, s + q) by which scattering parameters are drawn to their common value, and
-    `drawn` the same for the covariance of what draws them.
+    `drawn` the same for the covariance of what draws them. `rated` (k,) is what one standard error
+    of the rate of the test does to parameters that follow a law of it.
     """
 
     best: BestPoint
@@ -78,6 +79,7 @@ class _Block:
     bend: Array
     pulls: Array
     drawn: Array
+    rated: Array
     noise: tuple[NoiseProcess, ...]  # Of each curve
     curvature: Array | None = None  # (k, k), where it is not JᵀJ
 
@@ -87,11 +89,15 @@ class _Block:
         return self.jacobian @ self.through
 
     @cached_property
+    def _inner(self) -> Array:
+        """Curvature of half the cost by the parameters of the test, (k, k)."""
+        return self.jacobian.T @ self.jacobian if self.curvature is None else self.curvature
+
+    @cached_property
     def hessian(self) -> Array:
         """Curvature of half the cost, (s + q, s + q)."""
         s = len(self.bend)
-        inner = self.jacobian.T @ self.jacobian if self.curvature is None else self.curvature
-        out = self.through.T @ inner @ self.through + self.pulls.T @ self.pulls
+        out = self.through.T @ self._inner @ self.through + self.pulls.T @ self.pulls
         if self.curvature is not None:
             out[:s, :s] += self.bend
         return np.asarray(out)
@@ -100,6 +106,9 @@ class _Block:
     def meat(self) -> Array:
         """Covariance of the gradient, (s + q, s + q)."""
         out = self.drawn.T @ self.drawn
+        if self.rated.any():
+            pull = self.through.T @ self._inner @ self.rated
+            out = out + np.outer(pull, pull)
         return np.asarray(out + self.slopes.T @ self.times(self.slopes))
 
     def times(self, columns: Array) -> Array:
@@ -352,9 +361,22 @@ class JointPoint:
         none = np.zeros((0, through.shape[1]))
         return _Block(
             best, best.names, jacobian, through, bend, np.array(rows) if rows else none,
-            np.array(wide) if wide else none,
+            np.array(wide) if wide else none, self._rated(t),
             tuple(error.noise for error in self.errors[t]) if self.errors else (),
         )  # fmt: skip
+
+    def _rated(self, t: int) -> Array:
+        """What one standard error of the rate does to the scaled parameters of a test, (k,)."""
+        best, links = self.bests[t], self.found.links
+        out = np.zeros(len(best.names))
+        if links.rate_errors is None:
+            return out
+        for i, name in enumerate(best.names):
+            if (kind := links.kind(name)) in RATES and name in self.found.shared:
+                v, b = self.found.common[name]
+                x = 0.0 if links.log_rates is None else float(links.log_rates[t])
+                out[i] = b * (v if kind == LOG_RATE else law(kind, v, b, x)) / best.sizes[i]
+        return np.asarray(out * links.rate_errors[t])
 
     @cached_property
     def _plain(self) -> Arrow:
