@@ -10,6 +10,8 @@ of 0.25 % of the largest stress, which the TOML states.
   the common value and of the spread hold the truth?
 - log, power: 5 tests over two decades of rate, sigma_plus following a law: bias of value and slope
   over the standard error, coverage of their intervals, and what the evidence chooses.
+- shaken: the same with noise of the displacement, which makes errors of the rates: are they in the
+  interval of the slope?
 - impacts: foam-1 (model-1 of the paper, with a dashpot) struck at five velocities, its k_h+ free of
   rate or following a power law: what does the evidence choose, and does it find the law?
 - predict: a new specimen predicted from 4 to 6 whose own values go together (correlation 0.96 to
@@ -48,14 +50,18 @@ Row = dict[str, str | float | int]
 
 
 def write_test(
-    path: Path, spring: ff.MicroscaleSpring, rate: float, rng: np.random.Generator, samples: int
-) -> None:
+    path: Path, spring: ff.MicroscaleSpring, rate: float, rng: np.random.Generator, samples: int,
+    shake: float = 0.0,
+) -> None:  # fmt: skip
+    """Write a test; `shake` is the noise of the displacement over its range."""
     up = np.linspace(0.0, TOP, samples // 2 + 1)
     strain = np.concatenate([up, up[::-1][1:]])
     clock = np.arange(strain.size) * (up[1] / rate)
     drive = ff.DisplacementDrive(HEIGHT * strain)
     stress = ff.simulate(ff.Chain([spring], [HEIGHT], 1e-4), drive, clock).base_stress
     stress = stress + NOISE * rng.standard_normal(stress.size)
+    if shake:
+        strain = strain + shake * TOP * rng.standard_normal(strain.size)
     columns = np.column_stack([clock, stress, 1e3 * HEIGHT * strain])
     header = "time (s),stress (Pa),displacement (mm)"
     np.savetxt(path, columns, fmt="%.10g", delimiter=",", header=header, comments="")
@@ -139,6 +145,30 @@ def rates(draws: int, folder: Path, kind: str, slope: float) -> Iterator[Row]:
     for name in ("log rate", "power rate", "shared", "own"):
         yield {"study": kind, "what": f"evidence for {name}", "draws": draws,
                "share": chosen.count(name) / draws}  # fmt: skip
+
+
+def shaken(draws: int, folder: Path, level: float) -> Iterator[Row]:
+    """Slope of a power law where noise of the displacement makes errors of the rates."""
+    slope, off, hits, errors = 0.2, [], [], []
+    kinds = dict.fromkeys(SPRING, "shared") | {"sigma_plus": "power rate"}
+    for draw in range(draws):
+        rng = np.random.default_rng([7, round(1e5 * level), draw])
+        for i, rate in enumerate(RATES):
+            own = SPRING["sigma_plus"] * (rate / RATES[2]) ** slope
+            spring = ff.MicroscaleSpring(**SPRING | {"sigma_plus": own})
+            write_test(folder / f"t{i}.csv", spring, rate, rng, 101, level)
+        result = ff.joint(write_study(folder, kinds), jobs=1)
+        one = result.parameters["s1_sigma_plus"]
+        off.append((one.b - slope) / one.b_stderr)
+        hits.append(one.b_ci95[0] <= slope <= one.b_ci95[1])
+        apart = np.log(np.array(result.rates) / RATES)
+        errors.append(apart - apart.mean())
+    study = f"displacement noise {100 * level:g} %"
+    scale = (len(RATES) / (len(RATES) - 1)) ** 0.5
+    yield {"study": study, "what": "error of a rate", "draws": draws,
+           "mean": scale * float(np.std(errors))}  # fmt: skip
+    yield {"study": study, "what": "slope b", "draws": draws, "mean": float(np.mean(off)),
+           "spread": float(np.std(off))} | coverage(hits)  # fmt: skip
 
 
 VELOCITIES = (2.0, 2.3, 2.7, 3.2, 4.0)  # m/s
@@ -311,7 +341,8 @@ def save(rows: list[Row], folder: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument(
-        "--only", choices=("four", "scatter", "log", "power", "impacts", "predict", "time")
+        "--only",
+        choices=("four", "scatter", "log", "power", "shaken", "impacts", "predict", "time"),
     )
     parser.add_argument("--draws", type=int, help="default: 100 of groups, 200 of laws, 20 else")
     parser.add_argument("--jobs", type=int, default=2, help="processes of the timing")
@@ -323,6 +354,7 @@ def main() -> None:
         "scatter": [lambda at, s=s: scatter(given.draws or 100, at, s) for s in (0.1, 0.03)],
         "log": [lambda at: rates(given.draws or 200, at, "log rate", 0.05)],
         "power": [lambda at: rates(given.draws or 200, at, "power rate", 0.05)],
+        "shaken": [lambda at, s=s: shaken(given.draws or 30, at, s) for s in (1e-3, 3e-3)],
         "impacts": [lambda at, b=b: impacts(given.draws or 20, at, b) for b in (0.0, 0.2)],
         "predict": [lambda at, k=k: predictions(given.draws or 60, at, k) for k in TOGETHER],
         "time": [lambda at: timing(at, given.jobs)],

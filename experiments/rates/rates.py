@@ -363,7 +363,6 @@ def write_page(
             sigma_80s=f"{min(values[5:]) / 1e3:.0f} to {max(values[5:]) / 1e3:.0f}",
             kinds=kinds_of(content),
             laws=laws_of(content),
-            seconds=f"{content['runtime_s']:.0f}",
             stress_inside=percent(pooled(struck[struck["curve"] == "stress_time"]), 3),
             motion_inside=percent(pooled(struck[struck["curve"] == "displacement_time"]), 3),
             by_parameters=percent(struck["parameters"].max()),
