@@ -46,6 +46,7 @@ SPRING = {
 }  # fmt: skip
 SPECIMEN = f'[specimen]\nheight = "10 mm"\narea = "1 cm^2"\n[noise]\nstress = "{NOISE} Pa"\n'
 RATES = np.geomspace(0.01, 1.0, 5)
+STUDIES = ("four", "scatter", "log", "power", "shaken", "impacts", "predict", "time")
 Row = dict[str, str | float | int]
 
 
