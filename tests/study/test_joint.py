@@ -17,6 +17,7 @@ from scipy import stats
 import foamfit as ff
 from conftest import without_pictures
 from foamfit.cli import main
+from foamfit.fitting.together import fit_linked
 from foamfit.study import joint_fit, study_file
 from foamfit.study.joint_estimates import parameter_of
 from foamfit.study.joint_fit import open_slope
@@ -188,16 +189,35 @@ def unlike(tmp_path_factory):
     return ff.joint(study, jobs=1), 5.5e5 * 0.05 * np.std(deviates, ddof=1) / 5**0.5
 
 
-def test_the_range_of_a_shared_value_is_that_of_a_mean_over_other_specimens(unlike):
+def test_the_range_of_a_shared_value_holds_that_of_a_mean_over_other_specimens(unlike):
     joint, error = unlike
     k0 = joint.parameters["s1_k0"]
-    half = 0.5 * (k0.range[1] - k0.range[0])
-    assert half == pytest.approx(stats.t.ppf(0.975, 4) * error, rel=0.3)
-    assert k0.range[0] < 5.5e5 < k0.range[1]
-    assert half > 5.0 * 0.5 * (k0.ci95[1] - k0.ci95[0])  # noise says nothing of specimens
-    assert "its range over specimens is ±" in k0.why
+    low, high = joint_fit._over_specimens(joint.fit.found, map)["s1_k0"]
+    assert 0.5 * (high - low) == pytest.approx(stats.t.ppf(0.975, 4) * error, rel=0.3)
+    assert low < 5.5e5 < high
+    assert k0.range[0] <= low < high <= k0.range[1]
+    assert high - low > 5.0 * (k0.ci95[1] - k0.ci95[0])  # noise says nothing of specimens
+    assert "its range is ±" in k0.why
     content = json.loads(json.dumps(joint.to_json_dict()))
     assert content["parameters"]["s1_k0"]["range"] == list(k0.range)
+
+
+def test_a_shared_value_is_held_off_as_far_as_the_tests_are_followed_about_as_well(unlike):
+    joint, _ = unlike
+    point, found = joint.fit.point, joint.fit.found
+    errors = [error for errors in point.errors for error in errors]
+    sizes = [problem.objective.n_data for problem in found.problems]
+    rise = 0.44 * sum(n * error.law**2 for n, error in zip(sizes, errors, strict=True))
+    for name, sign in (("s1_k0", 1.0), ("s1_kc", -1.0), ("s1_eps_star", 1.0)):
+        end, (value,) = joint_fit._held(point, name, sign), found.common[name]
+        assert sign * (end - value) > 0.0
+        near = [found.values]
+        held = [problem.holding(name, end) for problem in found.problems]
+        assert fit_linked(held, found.links, near).cost - found.cost <= rise
+        farther = [problem.holding(name, value + 3.0 * (end - value)) for problem in found.problems]
+        assert fit_linked(farther, found.links, near).cost - found.cost > rise
+        low, high = joint.parameters[name].range
+        assert low <= end <= high
 
 
 def test_the_state_of_a_shared_value_is_that_of_the_wider_of_interval_and_range(unlike):

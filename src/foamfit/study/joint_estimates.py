@@ -110,7 +110,7 @@ def _judged(
     of = scale_in_words(name, value, size)
     wider, what = half, "95 % interval"
     if span is not None and 0.5 * (span[1] - span[0]) > half:
-        wider, what = 0.5 * (span[1] - span[0]), "range over specimens"
+        wider, what = 0.5 * (span[1] - span[0]), "range"
     state, why = covariance.state(value, wider, size, low, high, of, what)
     if not half <= covariance.NOTHING * size:
         return None, None, state, why

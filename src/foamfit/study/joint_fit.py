@@ -24,6 +24,7 @@ from foamfit.fitting.together import Together, fit_linked
 from foamfit.study.shared import bic, effective_samples
 from foamfit.trust import covariance
 from foamfit.trust.joint_covariance import JointCovariance, JointPoint
+from foamfit.trust.ranges import ALIKE, ITERATIONS, TRIALS
 from foamfit.trust.residuals.law_error import CurveError, curve_errors
 from foamfit.trust.residuals.noise_process import noise_processes
 from foamfit.trust.scatter import Spread, common_and_spread
@@ -147,16 +148,29 @@ def errors_of(found: Together, each: Map = map) -> tuple[tuple[CurveError, ...],
 
 
 def ranges_of(point: JointPoint, each: Map = map) -> dict[str, tuple[float, float]]:
-    """Where what tests share would lie, were it found from as many other specimens (95 %).
+    """What the error of the law leaves open of what tests share; empty where all is noise.
 
-    Where the law misses more than noise, each specimen draws shared values its own way, and noise
-    says nothing of that. The fit without each test in turn does: a jackknife (of at most `GROUPS`
-    groups of tests), with Student's t of one less than their number. Empty where all is noise.
+    Two things are in it, and the wider end counts. Each specimen draws a shared value its own way:
+    where it would lie (95 %), were it found from as many other specimens, is told by the fits
+    without each test in turn (a jackknife, of at most `GROUPS` groups of tests, with Student's t of
+    one less than their number). And a shared value can be held off its best one while all tests are
+    followed about as well, as for one test (`trust.ranges`).
     """
-    found = point.found
-    names = [name for name in found.shared if found.links.kind(name) != "scatter"]
-    if not point.errs or not names:
+    if not point.errs:
         return {}
+    out = _over_specimens(point.found, each)
+    shared = [name for name in point.found.shared if point.found.links.kind(name) == "shared"]
+    ways = [(name, sign) for name in shared for sign in (-1.0, 1.0)]
+    held = each(_held, [point] * len(ways), *zip(*ways, strict=True)) if ways else ()
+    for (name, _), end in zip(ways, held, strict=True):
+        low, high = out.get(name, (end, end))
+        (value,) = point.found.common[name]
+        out[name] = min(low, end, value), max(high, end, value)
+    return out
+
+
+def _over_specimens(found: Together, each: Map) -> dict[str, tuple[float, float]]:
+    """Ranges of shared values and of slopes by the fits without each test in turn."""
     count = len(found.problems)
     groups = [range(first, count, GROUPS) for first in range(min(count, GROUPS))]
     kept = [[t for t in range(count) if t not in group] for group in groups]
@@ -164,7 +178,7 @@ def ranges_of(point: JointPoint, each: Map = map) -> dict[str, tuple[float, floa
     if len(others) < 2:
         return {}
     out, quantile = dict[str, tuple[float, float]](), covariance.half_width(1.0, len(others) - 1)
-    for name in names:
+    for name in found.shared:
         values = np.array([common[name] for common in others if name in common])
         if len(values) < len(others):  # a test that alone has it says nothing of others
             continue
@@ -173,6 +187,33 @@ def ranges_of(point: JointPoint, each: Map = map) -> dict[str, tuple[float, floa
         for at, (value, half) in enumerate(zip(found.common[name], halves, strict=True)):
             out[f"{name}:b" if at else name] = (float(value - half), float(value + half))
     return out
+
+
+def _held(point: JointPoint, name: str, sign: float) -> float:
+    """How far a shared value can be held off while the tests are followed about as well."""
+    found, (value,) = point.found, point.found.common[name]
+    rise = (ALIKE**2 - 1.0) * sum(
+        size * error.law**2
+        for best, errors in zip(point.bests, point.errors, strict=True)
+        for size, error in zip(best.problem.objective.sizes, errors, strict=True)
+    )
+    low, high = next(best for best in point.bests if name in best.problem.free()).limits(name)
+    off = math.sqrt(rise) * point.reach(name)
+    for _ in range(TRIALS):
+        end = min(max(value + sign * off, low), high) if math.isfinite(off) else value
+        if end == value:
+            break
+        start = point.moved(name, end - value)
+        problems = [problem.holding(name, end) for problem in found.problems]
+        try:
+            missed = fit_linked(problems, found.links, [start], iterations=ITERATIONS).cost
+        except SimulationError:
+            off *= 0.5
+            continue
+        if missed - found.cost <= rise:
+            return end
+        off = abs(end - value) * min(max(math.sqrt(rise / (missed - found.cost)), 0.3), 0.8)
+    return value
 
 
 def _without(found: Together, kept: Sequence[int]) -> dict[str, tuple[float, ...]] | None:

@@ -70,7 +70,7 @@ class JointParameter:
     b: float | None = None
     b_stderr: float | None = None
     b_ci95: tuple[float, float] | None = None
-    # Where it would lie, found from as many other specimens; None where only noise is left.
+    # What the error of the law leaves open of it (`joint_fit.ranges_of`); None where all is noise.
     range: tuple[float, float] | None = None
     b_range: tuple[float, float] | None = None
 

@@ -218,6 +218,14 @@ class Arrow:
         """Shared coordinates of which the tests say nothing, (s,)."""
         return self._shared[1]
 
+    def step(self, at: int) -> Array:
+        """Column of the inverse curvature of the shared coordinates, (s,)."""
+        return np.asarray(self._shared[0][:, at])
+
+    def after(self, test: int, shared: Array) -> Array:
+        """How the own parameters of a test follow a step of the shared coordinates, (q,)."""
+        return np.asarray(-self._own[test][1] @ shared)
+
     def lost(self, test: int) -> NDArray[np.bool_]:
         """Own parameters of which a test says nothing, (q,)."""
         return self._own[test][2]
@@ -381,6 +389,27 @@ class JointPoint:
     @cached_property
     def _plain(self) -> Arrow:
         return Arrow(self.blocks)
+
+    def reach(self, name: str) -> float:
+        """How far a shared value is off where the cost has risen by one; 0 where it is unseen."""
+        at = self.names.index(name)
+        if self._plain.unseen[at]:
+            return 0.0
+        return float(np.sqrt(self._plain.step(at)[at]) * self._scales[at])
+
+    def moved(self, name: str, change: float) -> list[Array]:
+        """Values of each test with a shared one moved, and the others after it, were all linear."""
+        at, out = self.names.index(name), list[Array]()
+        step = self._plain.step(at)
+        shared = change / self._scales[at] * step / step[at]
+        for t, (block, best) in enumerate(zip(self.blocks, self.bests, strict=True)):
+            values, own = best.values.copy(), self._plain.after(t, shared)
+            moves = block.through @ np.concatenate([shared, own]) * best.sizes
+            for one, by in zip(best.names, moves, strict=True):
+                low, high = best.limits(one)
+                values[best.index[one]] = np.clip(values[best.index[one]] + by, low, high)
+            out.append(values)
+        return out
 
     def taken(self, test: int) -> Array:
         """What the joint fit took of the noise of a test; see `noise_processes`.
