@@ -13,7 +13,6 @@ Writes damage.md, twins.csv, twins.png, lattice.csv and lattice.png beside this 
 
 from __future__ import annotations
 
-import csv
 import math
 import os
 import sys
@@ -31,28 +30,19 @@ from foamfit.study.shared import Group, Selection, select_own
 from foamfit.text import significant
 
 HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parent))
+from specimens import twins, write_specimen  # noqa: E402
+
 MODEL = {"model": "microscale", "relaxation": 1}
 LAW = ("k0", "kc", "eps_star", "sigma_plus", "spread_plus", "sigma_minus", "spread_minus")
 NAMES = tuple(f"s1_{name}" for name in (*LAW, "g1", "tau1"))
 TOGETHER = (1, 2, 4)
 LATTICES, LATTICE_CYCLES = ("tpu87-20", "tpu87-35", "tpu87-50"), (1, 2, 10, 100, 1000)
-TWIN = """\
-[specimen]
-height = "{height_mm} mm"
-diameter = "{diameter_mm} mm"
-[columns]
-displacement = {{ column = "Gap (um)", counts_down = true }}
-"""
 LATTICE = """\
-[specimen]
-height = "12 mm"
-diameter = "20 mm"
-[columns]
 time = { column = "Total Time (s)" }
 displacement = { column = "Position(Linear:Position) (mm)", counts_down = true }
 force = { column = "Force(Linear:Load) (kN)", scale = -1 }
-cycle = { column = "Total Cycles" }
-"""
+cycle = { column = "Total Cycles" }"""
 PAGE = """\
 # What changes from cycle to cycle
 
@@ -113,11 +103,8 @@ def percent(share: float) -> str:
 def fit_twins(data: Path, toml: Path) -> tuple[pd.DataFrame, list[Group]]:
     """One row per specimen and cycle, and for each specimen the cycles to be fitted together."""
     rows, groups = [], []
-    with (data / "shoe-foam-twins" / "specimens.csv").open() as file:
-        specimens = list(csv.DictReader(file))
-    for specimen in specimens:
-        name = specimen["test"]
-        toml.write_text(TWIN.format(**specimen))
+    for name, height, diameter in twins(data / "shoe-foam-twins"):
+        write_specimen(toml, height, diameter)
         path = data / "shoe-foam-twins" / f"{name}_raw.txt"
         found = ff.fit_cycles(path, toml, together=False, intervals="local", **MODEL)
         table = found.table.reset_index()
@@ -254,7 +241,7 @@ def draw_twins(table: pd.DataFrame) -> None:
 
 
 def fit_lattices(data: Path, toml: Path) -> tuple[pd.DataFrame, dict[str, ff.CycleFits]]:
-    toml.write_text(LATTICE)
+    write_specimen(toml, "12 mm", "20 mm", LATTICE)
     rows, found = [], {}
     for name in LATTICES:
         path = data / "lattice-cycles" / f"{name}_raw.csv"
@@ -358,7 +345,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.path.insert(0, str(HERE.parent))
     from unchanged import keep_unchanged
 
     with keep_unchanged(HERE):

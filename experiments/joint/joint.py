@@ -10,8 +10,12 @@ of 0.25 % of the largest stress, which the TOML states.
   the common value and of the spread hold the truth?
 - log, power: 5 tests over two decades of rate, sigma_plus following a law: bias of value and slope
   over the standard error, coverage of their intervals, and what the evidence chooses.
+- shaken: the same with noise of the displacement, which makes errors of the rates: are they in the
+  interval of the slope?
 - impacts: foam-1 (model-1 of the paper, with a dashpot) struck at five velocities, its k_h+ free of
   rate or following a power law: what does the evidence choose, and does it find the law?
+- predict: a new specimen predicted from 4 to 6 whose own values go together (correlation 0.96 to
+  0.99): how many of its samples lie inside the 95 % band, above and below it?
 - time: seconds of a fit of 10, 20 and 50 tests with nine parameters, three of them shared, 1000
   samples each, with relaxation.
 
@@ -42,18 +46,23 @@ SPRING = {
 }  # fmt: skip
 SPECIMEN = f'[specimen]\nheight = "10 mm"\narea = "1 cm^2"\n[noise]\nstress = "{NOISE} Pa"\n'
 RATES = np.geomspace(0.01, 1.0, 5)
+STUDIES = ("four", "scatter", "log", "power", "shaken", "impacts", "predict", "time")
 Row = dict[str, str | float | int]
 
 
 def write_test(
-    path: Path, spring: ff.MicroscaleSpring, rate: float, rng: np.random.Generator, samples: int
-) -> None:
+    path: Path, spring: ff.MicroscaleSpring, rate: float, rng: np.random.Generator, samples: int,
+    shake: float = 0.0,
+) -> None:  # fmt: skip
+    """Write a test; `shake` is the noise of the displacement over its range."""
     up = np.linspace(0.0, TOP, samples // 2 + 1)
     strain = np.concatenate([up, up[::-1][1:]])
     clock = np.arange(strain.size) * (up[1] / rate)
     drive = ff.DisplacementDrive(HEIGHT * strain)
     stress = ff.simulate(ff.Chain([spring], [HEIGHT], 1e-4), drive, clock).base_stress
     stress = stress + NOISE * rng.standard_normal(stress.size)
+    if shake:
+        strain = strain + shake * TOP * rng.standard_normal(strain.size)
     columns = np.column_stack([clock, stress, 1e3 * HEIGHT * strain])
     header = "time (s),stress (Pa),displacement (mm)"
     np.savetxt(path, columns, fmt="%.10g", delimiter=",", header=header, comments="")
@@ -139,6 +148,30 @@ def rates(draws: int, folder: Path, kind: str, slope: float) -> Iterator[Row]:
                "share": chosen.count(name) / draws}  # fmt: skip
 
 
+def shaken(draws: int, folder: Path, level: float) -> Iterator[Row]:
+    """Slope of a power law where noise of the displacement makes errors of the rates."""
+    slope, off, hits, errors = 0.2, [], [], []
+    kinds = dict.fromkeys(SPRING, "shared") | {"sigma_plus": "power rate"}
+    for draw in range(draws):
+        rng = np.random.default_rng([7, round(1e5 * level), draw])
+        for i, rate in enumerate(RATES):
+            own = SPRING["sigma_plus"] * (rate / RATES[2]) ** slope
+            spring = ff.MicroscaleSpring(**SPRING | {"sigma_plus": own})
+            write_test(folder / f"t{i}.csv", spring, rate, rng, 101, level)
+        result = ff.joint(write_study(folder, kinds), jobs=1)
+        one = result.parameters["s1_sigma_plus"]
+        off.append((one.b - slope) / one.b_stderr)
+        hits.append(one.b_ci95[0] <= slope <= one.b_ci95[1])
+        apart = np.log(np.array(result.rates) / RATES)
+        errors.append(apart - apart.mean())
+    study = f"displacement noise {100 * level:g} %"
+    scale = (len(RATES) / (len(RATES) - 1)) ** 0.5
+    yield {"study": study, "what": "error of a rate", "draws": draws,
+           "mean": scale * float(np.std(errors))}  # fmt: skip
+    yield {"study": study, "what": "slope b", "draws": draws, "mean": float(np.mean(off)),
+           "spread": float(np.std(off))} | coverage(hits)  # fmt: skip
+
+
 VELOCITIES = (2.0, 2.3, 2.7, 3.2, 4.0)  # m/s
 BISTABLE = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus", "eta")
 
@@ -193,6 +226,49 @@ def impacts(draws: int, folder: Path, slope: float) -> Iterator[Row]:
     if hits:
         yield {"study": name, "what": "slope b", "draws": len(hits), "mean": float(np.mean(off)),
                "spread": float(np.std(off))} | coverage(hits)  # fmt: skip
+
+
+def specimen(rng: np.random.Generator, along: dict[str, float], apart: float) -> dict[str, float]:
+    """One specimen: its parameters go with one density, and a little each their own way."""
+    z = rng.standard_normal()
+    return SPRING | {
+        name: SPRING[name] * float(np.exp(share * z + apart * rng.standard_normal()))
+        for name, share in along.items()
+    }
+
+
+# By how much parameters change with one standard deviation of the density: their logarithms.
+TOGETHER = {
+    "stiffness": {"k0": 0.25, "kc": 0.25, "sigma_plus": 0.25, "sigma_minus": 0.25},
+    "density": {"k0": 0.15, "kc": 0.3, "eps_star": -0.15, "sigma_plus": 0.15, "sigma_minus": 0.15},
+}
+
+
+def predictions(draws: int, folder: Path, kind: str) -> Iterator[Row]:
+    """A new specimen predicted from four to six whose own values are strongly correlated."""
+    found, kinds = [], dict.fromkeys(SPRING, "shared") | dict.fromkeys(TOGETHER[kind], "own")
+    for draw in range(draws):
+        rng = np.random.default_rng([6, len(kind), draw])
+        for old in folder.glob("t*.csv"):
+            old.unlink()
+        count = 4 + draw % 3
+        for i in range(count + 1):
+            spring = ff.MicroscaleSpring(**specimen(rng, TOGETHER[kind], 0.03))
+            name = f"t{i}" if i < count else "new"
+            write_test(folder / f"{name}.csv", spring, 0.1, rng, 101)
+        result = ff.joint(write_study(folder, kinds), jobs=1)
+        test = ff.read_test(folder / "new.csv", folder / "foam.toml")
+        one = ff.predict(result, test, draws=200).curves["stress_strain"]
+        above, below = np.mean(one.measured > one.hi), np.mean(one.measured < one.lo)
+        found.append([one.inside, above, below, one.half_width / one.range])
+    shares, study = np.array(found), f"predict, {kind}"
+    for j, what in enumerate(("inside the band", "above it", "below it")):
+        half = 1.96 * float(shares[:, j].std(ddof=1)) / draws**0.5
+        mean = float(shares[:, j].mean())
+        yield {"study": study, "what": what, "draws": draws, "share": mean,
+               "low": max(mean - half, 0.0), "high": min(mean + half, 1.0)}  # fmt: skip
+    yield {"study": study, "what": "half of the band over the range", "draws": draws,
+           "mean": float(shares[:, 3].mean())}  # fmt: skip
 
 
 def timing(folder: Path, jobs: int) -> Iterator[Row]:
@@ -265,7 +341,10 @@ def save(rows: list[Row], folder: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--only", choices=("four", "scatter", "log", "power", "impacts", "time"))
+    parser.add_argument(
+        "--only",
+        choices=("four", "scatter", "log", "power", "shaken", "impacts", "predict", "time"),
+    )
     parser.add_argument("--draws", type=int, help="default: 100 of groups, 200 of laws, 20 else")
     parser.add_argument("--jobs", type=int, default=2, help="processes of the timing")
     parser.add_argument("--out", type=Path, default=HERE)
@@ -276,7 +355,9 @@ def main() -> None:
         "scatter": [lambda at, s=s: scatter(given.draws or 100, at, s) for s in (0.1, 0.03)],
         "log": [lambda at: rates(given.draws or 200, at, "log rate", 0.05)],
         "power": [lambda at: rates(given.draws or 200, at, "power rate", 0.05)],
+        "shaken": [lambda at, s=s: shaken(given.draws or 30, at, s) for s in (1e-3, 3e-3)],
         "impacts": [lambda at, b=b: impacts(given.draws or 20, at, b) for b in (0.0, 0.2)],
+        "predict": [lambda at, k=k: predictions(given.draws or 60, at, k) for k in TOGETHER],
         "time": [lambda at: timing(at, given.jobs)],
     }
     for name, makers in studies.items():

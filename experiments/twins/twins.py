@@ -12,7 +12,6 @@ Writes README.md, batch.csv, wear.csv, new_against_worn.png and by_cycle.png bes
 
 from __future__ import annotations
 
-import csv
 import math
 import os
 import sys
@@ -37,16 +36,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parent))
+from specimens import twins, write_specimen  # noqa: E402
+
 SOURCE = "measurements: arXiv:2602.12694, LivingMatterLab/CANN"
 GROUPS, COLOURS = ("new", "worn"), {"new": BLUE, "worn": VERMILION}
 FIRST, LATER = 1, 5  # cycles that the page has tables of
-SPECIMEN = """\
-[specimen]
-height = "{height_mm} mm"
-diameter = "{diameter_mm} mm"
-[columns]
-displacement = {{ column = "Gap (um)", counts_down = true }}
-"""
 STUDY = """\
 name = "shoe foam, {group} heel, cycle {cycle}"
 tests = ["{group}-heel-comp-*_raw.txt"]
@@ -80,11 +75,10 @@ Found = Mapping[int, Mapping[str, Mapping[str, Any]]]
 
 def place_tests(data: Path, folder: Path) -> None:
     """Link the tests into a folder, with the TOML of each beside it."""
-    with (data / "specimens.csv").open(encoding="utf-8") as file:
-        for row in csv.DictReader(file):
-            stem = f"{row['test']}_raw"
-            (folder / f"{stem}.txt").symlink_to((data / f"{stem}.txt").resolve())
-            (folder / f"{stem}.toml").write_text(SPECIMEN.format(**row), encoding="utf-8")
+    for test, height, diameter in twins(data):
+        stem = f"{test}_raw"
+        (folder / f"{stem}.txt").symlink_to((data / f"{stem}.txt").resolve())
+        write_specimen(folder / f"{stem}.toml", height, diameter)
 
 
 def fit_each(folder: Path) -> pd.DataFrame:
@@ -626,7 +620,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.path.insert(0, str(HERE.parent))
     from unchanged import keep_unchanged
 
     with keep_unchanged(HERE):

@@ -95,6 +95,35 @@ def test_the_page_has_every_parameter_and_test(found):
     assert page.count("<td>log rate</td>") == 2  # of the parameter, and of the evidence
 
 
+def test_the_page_tells_the_noise_of_each_test_beside_its_share_of_chi2(found):
+    page = joint_page(found, b"\x89PNG")
+    body = page.split('<table class="sortable">')[1]
+    heads = re.findall(r"<th><button>(.*?)</button>", body)
+    at = heads.index("noise loop (Pa)")
+    assert heads[at - 1] == "share of χ² (%)"
+    row = re.findall(r"<td[^>]*>(.*?)</td>", body.split("<tr>")[2])
+    assert row[at] == '400.0<i class="ends">stated</i>'
+    # what is estimated counts for more than it is
+    level = {"sigma": 250.0, "given": False, "time": 2.5, "scale": 1e3, "range": 1e5}
+    one, *others = found.noise
+    vars(found)["noise"] = ({"stress_strain": level}, *others)
+    told = joint_page(found, b"\x89PNG")
+    vars(found)["noise"] = (one, *others)
+    assert "250.0<i" in told
+    assert "estimated, correlated over 2.5 samples, counted as 1000" in told
+
+
+def test_ranges_are_told_where_there_are_some(found):
+    assert "<th>range</th>" not in joint_page(found, b"\x89PNG")
+    k0 = replace(found.parameters["s1_k0"], range=(5.2e5, 5.8e5))
+    ranged = replace(found, parameters={**found.parameters, "s1_k0": k0})
+    page = joint_page(ranged, b"\x89PNG")
+    assert "<th>range</th>" in page
+    assert ">520 to 580 kPa<" in page
+    assert "the range is where it would lie (95 %)" in page
+    assert "520.0 to 580.0 kPa" in joint_text(ranged)
+
+
 def test_the_picture_has_a_loop_for_each_test_and_a_panel_for_what_differs(found):
     figure = plot_joint(found)
     titles = [ax.get_title() for part in figure.subfigs for ax in part.axes]

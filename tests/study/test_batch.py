@@ -15,6 +15,7 @@ import threading
 import time
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pandas as pd
@@ -28,9 +29,10 @@ from foamfit.cli import batch as command
 from foamfit.cli import main
 from foamfit.report.studies.batch import MOST_ON_PAGE, Row, row_of, table_rows, write_page
 from foamfit.study import batch as module
-from foamfit.study import batch_work
+from foamfit.study import batch_work, processes
 from foamfit.study.batch_work import work
 from foamfit.study.processes import ATTEMPTS, EndedError, Processes
+from foamfit.terminal import TerminatedError
 
 posix = pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 QUICK = {"starts": 1, "intervals": "local"}
@@ -262,6 +264,18 @@ def seen_once(path):
 
 
 @posix
+def test_what_another_thread_imports_while_a_process_starts_stays_imported(monkeypatch):
+    """`unittest.mock.patch.dict` would put all of `sys.modules` back, without it."""
+    name = "foamfit_imported_in_the_meantime"
+    monkeypatch.delitem(sys.modules, name, raising=False)
+    script = sys.modules["__main__"]
+    with processes._starting():
+        assert sys.modules["__main__"] is not script
+        sys.modules[name] = ModuleType(name)
+    assert name in sys.modules
+    assert sys.modules["__main__"] is script
+
+
 def test_one_process_that_ends_takes_nothing_else_with_it(tmp_path):
     with Processes(2) as pool:
         calls = [pool.submit(time.sleep, 0.05) for _ in range(6)]
@@ -279,6 +293,62 @@ def test_one_process_that_ends_takes_nothing_else_with_it(tmp_path):
     pool.stop()
     assert time.monotonic() - began < 10
     assert sleeping.exception() is not None or sleeping.cancelled()
+
+
+def shown(out):
+    """Tests and their states, as the page of a batch has them."""
+    page = (Path(out) / "summary.html").read_text(encoding="utf-8")
+    return re.findall(r'<tr><td><span[^>]*>(\w+)<.*?<span class="badge [^"]*">([^<]*)<', page)
+
+
+@pytest.mark.parametrize("end", [KeyboardInterrupt, lambda: TerminatedError(signal.SIGTERM)])
+def test_ctrl_c_and_sigterm_leave_what_is_done_and_a_summary(here, tried, end):
+    def interrupt(state):
+        raise end()
+
+    with pytest.raises((KeyboardInterrupt, TerminatedError)):
+        again(progress=interrupt)
+    assert shown("out") == [
+        ("a", "warnings"), ("b", "not fitted"), ("bad", "not fitted"), ("c", "not fitted"),
+    ]  # fmt: skip
+
+
+def test_what_is_killed_leaves_a_page_as_current_as_the_table(here, tried, monkeypatch):
+    """Nothing is written after the last test: what kills a process lets it do nothing more."""
+    monkeypatch.setattr(module, "PAUSE", 0.0)
+    monkeypatch.setattr(module, "SHARE", 0.0)
+    seen = list[tuple[list[tuple[str, str]], list[str]]]()
+
+    def look(state):
+        if state.done > 1:
+            frame = pd.read_csv("out/summary.csv")
+            seen.append((shown("out"), list(frame["status"])))
+
+    again(progress=look)
+    assert [len(one) for one, _ in seen] == [4, 4, 4]
+    for page, table in seen:
+        assert [status for _, status in page] == table
+    assert [status for _, status in seen[0][0]] == ["warnings", *["not fitted"] * 3]
+
+
+def test_the_pages_of_a_long_batch_take_a_fiftieth_of_its_time(here, tried, monkeypatch):
+    """A page takes longer with every test: the next one waits the longer."""
+    clock, saved = [0.0], list[float]()
+
+    def save(made):
+        saved.append(clock[0])
+        clock[0] += 1.0  # s
+
+    monkeypatch.setattr(module.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(module.Batch, "save", save)
+
+    def second(state):
+        clock[0] += 1.0
+
+    for seed in range(3, 23):
+        write(here / "tests", f"t{seed:02d}", seed)
+    again(progress=second)
+    assert saved == [5.0, 25.0]  # after the pause, and at the end
 
 
 def test_ctrl_c_leaves_what_is_done_and_a_summary(here):

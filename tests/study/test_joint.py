@@ -1,18 +1,29 @@
 """Several tests in one fit, from files and STUDY.toml as a user has them."""
 
+import importlib
 import json
 import pickle
+import re
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from scipy import stats
 
 import foamfit as ff
 from conftest import without_pictures
 from foamfit.cli import main
+from foamfit.fitting.together import fit_linked
+from foamfit.study import joint_fit, study_file
+from foamfit.study.joint_estimates import parameter_of
+from foamfit.study.joint_fit import open_slope
+from foamfit.study.prediction.identified import read_source
 
+joint_module = importlib.import_module("foamfit.study.joint")  # `foamfit.study` has its function
 HEIGHT, AREA, TOP = 10e-3, 1e-4, 0.5
 SPRING = {
     "k0": 5.5e5, "kc": 4e5, "eps_star": 0.3, "sigma_plus": 1.1e5, "spread_plus": 0.4,
@@ -135,6 +146,25 @@ def test_joint_json_says_everything(found):
     assert content["statistics"]["n_vary"] == 4 + 2 + 3 + 3
 
 
+def test_joint_json_tells_the_noise_by_which_each_test_is_weighted(found, tmp_path, monkeypatch):
+    without_pictures(monkeypatch)
+    found.save(tmp_path / "out", jobs=1, reports=False)
+    content = json.loads((tmp_path / "out" / "joint.json").read_text())
+    for name, test in content["tests"].items():
+        (curve, level), *more = test["noise"].items()
+        assert curve == "stress_strain"
+        assert not more
+        assert (level["sigma"], level["given"], level["how"]) == (NOISE, True, "given")
+        assert (level["time"], level["scale"]) == (1.0, NOISE)
+        single = json.loads((tmp_path / "out" / name / "fit.json").read_text())
+        assert level.keys() == single["noise"][curve].keys()
+        assert level["range"] == single["noise"][curve]["range"]
+    # so that a prediction takes off the noise of each fitted test what its law missed
+    wanted = [NOISE / one["noise"]["stress_strain"]["range"] for one in content["tests"].values()]
+    source = read_source(tmp_path / "out")
+    assert [one.noise for one in source.misses["stress"]] == pytest.approx(wanted)
+
+
 def test_evidence_is_for_the_law_that_there_is(found):
     scores = {one.kind: one.bic for one in found.evidence}
     assert scores["log rate"] < scores["shared"] - 10.0
@@ -142,11 +172,123 @@ def test_evidence_is_for_the_law_that_there_is(found):
     assert not any("evidence" in warning for warning in found.warnings)
 
 
+def test_what_noise_alone_is_left_of_has_no_range(found):
+    assert found.fit.ranges == {}
+    content = found.to_json_dict()["parameters"]
+    assert content["s1_k0"]["range"] is None
+    assert content["s1_sigma_plus"]["b_range"] is None
+
+
+@pytest.fixture(scope="module")
+def unlike(tmp_path_factory):
+    """Five specimens that differ in k0 by 5 %, and a study that says they do not."""
+    here, deviates = tmp_path_factory.mktemp("unlike"), np.array([-1.2, -0.6, 0.1, 0.4, 1.3])
+    for i, z in enumerate(deviates):
+        write_test(here, f"t{i}", seed=i, noise=0.1 * NOISE, k0=5.5e5 * (1.0 + 0.05 * z))
+    study = write_study(here, "\n".join(f'{name} = "shared"' for name in NAMES))
+    return ff.joint(study, jobs=1), 5.5e5 * 0.05 * np.std(deviates, ddof=1) / 5**0.5
+
+
+def test_the_range_of_a_shared_value_holds_that_of_a_mean_over_other_specimens(unlike):
+    joint, error = unlike
+    k0 = joint.parameters["s1_k0"]
+    low, high = joint_fit._over_specimens(joint.fit.found, map)["s1_k0"]
+    assert 0.5 * (high - low) == pytest.approx(stats.t.ppf(0.975, 4) * error, rel=0.3)
+    assert low < 5.5e5 < high
+    assert k0.range[0] <= low < high <= k0.range[1]
+    assert high - low > 5.0 * (k0.ci95[1] - k0.ci95[0])  # noise says nothing of specimens
+    assert "its range is ±" in k0.why
+    content = json.loads(json.dumps(joint.to_json_dict()))
+    assert content["parameters"]["s1_k0"]["range"] == list(k0.range)
+
+
+def test_a_shared_value_is_held_off_as_far_as_the_tests_are_followed_about_as_well(unlike):
+    joint, _ = unlike
+    point, found = joint.fit.point, joint.fit.found
+    errors = [error for errors in point.errors for error in errors]
+    sizes = [problem.objective.n_data for problem in found.problems]
+    rise = 0.44 * sum(n * error.law**2 for n, error in zip(sizes, errors, strict=True))
+    for name, sign in (("s1_k0", 1.0), ("s1_kc", -1.0), ("s1_eps_star", 1.0)):
+        end, (value,) = joint_fit._held(point, name, sign), found.common[name]
+        assert sign * (end - value) > 0.0
+        near = [found.values]
+        held = [problem.holding(name, end) for problem in found.problems]
+        assert fit_linked(held, found.links, near).cost - found.cost <= rise
+        farther = [problem.holding(name, value + 3.0 * (end - value)) for problem in found.problems]
+        assert fit_linked(farther, found.links, near).cost - found.cost > rise
+        low, high = joint.parameters[name].range
+        assert low <= end <= high
+
+
+def test_the_state_of_a_shared_value_is_that_of_the_wider_of_interval_and_range(unlike):
+    joint, _ = unlike
+    fit = joint.fit
+    value = joint.parameters["s1_k0"].value
+    for half, state in ((0.4, "determined"), (0.6, "weak"), (4.0, "not determined")):
+        ranges = {"s1_k0": (value * (1.0 - half), value * (1.0 + half))}
+        one = parameter_of(replace(fit, ranges=ranges), joint.tests, "s1_k0")
+        assert one.state == state
+        assert one.ci95 == joint.parameters["s1_k0"].ci95
+
+
 def test_evidence_chooses_a_kind(folder):
     parameters = '\ns1_sigma_plus = "auto"\ns1_k0 = "auto"\ns1_kc = "own"' + SHARED
     chosen = ff.joint(write_study(folder, parameters), jobs=1)
     assert chosen.parameters["s1_sigma_plus"].kind in ("log rate", "power rate")
     assert chosen.parameters["s1_k0"].kind == "shared"
+
+
+def test_a_law_of_rate_is_no_kind_where_the_rates_span_too_little(tmp_path):
+    """Repeats at one rate, as a machine makes them: 2 to 3 % about it, and specimens scatter."""
+    rates = (0.0985, 0.0992, 0.1, 0.101, 0.1016)
+    for i, (rate, k0) in enumerate(zip(rates, (5.1e5, 5.6e5, 5.4e5, 5.8e5, 5.9e5), strict=True)):
+        write_test(tmp_path, f"t{i}", rate=rate, seed=i, k0=k0)
+    rest = "".join(f'\n{name} = "shared"' for name in NAMES if name != "s1_k0")
+    one = ff.joint(write_study(tmp_path, 's1_k0 = "auto"' + rest), jobs=1)
+    assert one.parameters["s1_k0"].kind == "own"
+    assert {other.kind for other in one.evidence} == {"shared", "own"}
+    (told,) = (sentence for sentence in one.sentences if "No law of rate" in sentence)
+    assert re.search(
+        r"was tried for s1_k0: over 0\.0985 to 0\.102 1/s the values .* open by ±[1-9]", told
+    )
+    named = ff.joint(write_study(tmp_path, 's1_k0 = "power rate"' + rest), jobs=1)
+    (told,) = (warning for warning in named.warnings if "a law of rate needs more" in warning)
+    assert told.startswith("s1_k0 (power rate): its own values in the tests, at 0.0985 to 0.102")
+
+
+@pytest.mark.parametrize(
+    ("x", "half"),
+    [
+        (np.log([0.1, 0.3, 1.0, 3.0]), (0.0, 0.05)),  # a span of rates
+        (np.log([0.1, 0.101, 0.102, 0.103]), (1.0, 10.0)),  # repeats
+        (np.zeros(4), (np.inf, np.inf)),
+        (np.array([0.0, 1.0]), (np.inf, np.inf)),  # no scatter about a line through two
+    ],
+)
+def test_how_open_a_slope_is_says_the_scatter_of_the_tests_about_it(x, half):
+    values = 5e5 * np.exp(0.2 * x + 0.02 * np.array([1.0, -1.0, 0.5, -0.5])[: x.size])
+    problem = SimpleNamespace(free=lambda: ("s1_k0",))
+    fit = SimpleNamespace(
+        problems=[problem] * x.size, links=SimpleNamespace(log_rates=x),
+        value=lambda name: values.tolist(),
+    )  # fmt: skip
+    low, high = half
+    assert low <= open_slope(fit, "s1_k0") <= high
+
+
+def test_a_kind_that_no_test_can_be_simulated_with_is_not_chosen(folder, monkeypatch):
+    """The values in common of a law may be no admissible spring, as they are relative to others."""
+    real = joint_fit.fit_linked
+
+    def fit_linked(problems, links, starts, **options):
+        if links.kind("s1_sigma_plus") == "log rate":
+            raise ff.SimulationError("no start of the fit can be simulated")
+        return real(problems, links, starts, **options)
+
+    monkeypatch.setattr(joint_fit, "fit_linked", fit_linked)
+    chosen = ff.joint(write_study(folder, 's1_sigma_plus = "auto"\ns1_kc = "own"' + SHARED), jobs=1)
+    assert chosen.parameters["s1_sigma_plus"].kind == "power rate"
+    assert "log rate" not in {one.kind for one in chosen.evidence}
 
 
 def test_what_goes_to_other_processes_gives_the_same_numbers(folder, found, monkeypatch):
@@ -282,6 +424,34 @@ def test_bad_studies_are_refused_in_one_sentence(folder, tmp_path, parameters, m
     assert wanted in result.stderr
     assert result.stderr.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_a_study_is_read_once(folder, tmp_path, monkeypatch):
+    real, read = study_file.load_toml, list[Path]()
+
+    def load_toml(path, *words):
+        read.append(path)
+        return real(path, *words)
+
+    monkeypatch.setattr(study_file, "load_toml", load_toml)
+    monkeypatch.setattr(joint_module, "_read", lambda *_: (_ for _ in ()).throw(ff.InputError("x")))
+    study = write_study(folder, 's1_k0 = "shared"')
+    assert run("joint", study, "--out", tmp_path / "out").stderr == "foamfit: x\n"
+    assert read == [study]
+
+
+def test_what_the_folders_need_is_imported_beside_the_fit(folder, tmp_path, monkeypatch):
+    """Where other processes draw them: not for one job, and not without reports."""
+    begun = list[tuple[str, ...]]()
+    monkeypatch.setattr("foamfit.study.workers.prepare", begun.append)
+    monkeypatch.setattr(joint_module, "_read", lambda *_: (_ for _ in ()).throw(ff.InputError("x")))
+    words = ["joint", write_study(folder, 's1_k0 = "shared"'), "--out", tmp_path / "out"]
+    for more in (["--jobs", "1"], ["--jobs", "2", "--no-report"]):
+        assert run(*words, *more).exit_code == 1
+    assert begun == []
+    assert run(*words, "--jobs", "2").exit_code == 1
+    (preload,) = begun
+    assert "matplotlib.backends.backend_agg" in preload
 
 
 def test_a_law_of_rate_needs_two_rates(tmp_path):

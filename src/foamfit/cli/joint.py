@@ -66,11 +66,15 @@ def joint(
     read = read_study(study)
     spare(folder, [study, *(path for _, path in read.tests)])
     with compiling(quiet or as_json, read.model, read.relaxation) as compile_rest:
+        from foamfit.study.joint import FEW_FOLDERS
         from foamfit.study.joint import joint as fit_jointly
+        from foamfit.study.workers import begin
 
         compile_rest()
+        if not no_report:
+            begin(jobs, len(read.tests), FEW_FOLDERS)
         with progress_bar(quiet or as_json) as progress:
-            result = fit_jointly(study, jobs=jobs, seed=seed, progress=progress)
+            result = fit_jointly(read, jobs=jobs, seed=seed, progress=progress)
         try:
             with without_ctrl_c():
                 result.save(folder, jobs=jobs, reports=not no_report)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from foamfit.arrays import Array
@@ -12,6 +14,9 @@ SURE = 3.0
 # The motion has come close to its peak at this share of it; one that takes longer from there than
 # it took to get there is held.
 CLOSE = 0.95
+# Copies of a record with other noise that tell the error of its rate.
+COPIES = 30
+NORMAL = 0.6745  # median of the size of a normal deviate
 
 
 def loading_rate(test: Measurement, fitted: Array | None = None) -> float | None:
@@ -24,24 +29,58 @@ def loading_rate(test: Measurement, fitted: Array | None = None) -> float | None
     """
     if test.time is None or test.displacement is None:
         return None
-    motion = test.displacement if fitted is None else fitted
-    time, motion = test.time - test.time[0], motion - motion[0]
+    time = test.time - test.time[0]
+    if fitted is None:
+        velocity = _with_noise(time, test.displacement, _sigma(test))
+    else:
+        velocity = _without_noise(time, fitted - fitted[0])
+    return None if velocity is None else velocity / test.specimen.height
+
+
+def rate_error(test: Measurement) -> float:
+    """Standard error of the logarithm of the rate by the noise of the measured displacement.
+
+    From the rates of `COPIES` of the record to which as much noise is added again. Noise that is
+    estimated is no larger than the samples differ from a parabola through their neighbours.
+    """
+    if test.time is None or test.displacement is None or test.displacement.size < 5:
+        return 0.0
+    sigma = _sigma(test)
+    scatter = sigma
+    if test.noise.displacement is None:
+        third = np.abs(np.diff(test.displacement, 3))
+        scatter = min(sigma, float(np.median(third)) / (NORMAL * math.sqrt(20.0)))
+    time, rng, rates = test.time - test.time[0], np.random.default_rng(0), list[float]()
+    for _ in range(COPIES if scatter > 0.0 else 0):
+        noisy = test.displacement + scatter * rng.standard_normal(time.size)
+        if (rate := _with_noise(time, noisy, sigma)) is not None:
+            rates.append(rate)
+    return float(np.std(np.log(rates), ddof=1)) if len(rates) > 1 else 0.0
+
+
+def _sigma(test: Measurement) -> float:
+    """Standard deviation of the noise of the displacement, as far as it is known."""
+    noise = test.noise.of("displacement")
+    return 0.0 if noise is None else noise.sigma
+
+
+def _with_noise(time: Array, motion: Array, sigma: float) -> float | None:
+    """Mean velocity up to the peak of a measured motion; None where it does not go up."""
+    motion = motion - motion[0]
     most = float(motion.max())
     if most <= 0.0 or time[np.argmax(motion)] <= 0.0:
         return None
-    if fitted is not None:
-        return _without_noise(time, motion) / test.specimen.height
-    noise = test.noise.of("displacement")
-    high = motion >= most - SURE * (0.0 if noise is None else noise.sigma)
-    when = float(np.mean(time[high]))
+    when = float(np.mean(time[motion >= most - SURE * sigma]))
     reached = float(time[np.argmax(motion >= CLOSE * most)]) / CLOSE
     if when > 2.0 * reached > 0.0:
         when = reached
-    return most / test.specimen.height / when
+    return most / when
 
 
-def _without_noise(time: Array, motion: Array) -> float:
+def _without_noise(time: Array, motion: Array) -> float | None:
     """Mean velocity up to the peak of a smooth motion, which lies between samples."""
+    if motion.max() <= 0.0 or time[np.argmax(motion)] <= 0.0:
+        return None
     at = int(np.clip(np.argmax(motion), 1, motion.size - 2))
     near = slice(at - 1, at + 2)
     bend, slope, most = np.polyfit(time[near] - time[at], motion[near], 2)

@@ -30,13 +30,15 @@ class Links:
     """What the parameters are to n tests.
 
     `kinds` has one of `KINDS` for each parameter that is named; the others are own. `log_rates`
-    (n,) are ln(rate/rate0), needed by laws of rate. `pulls` (n,) of a scattering parameter are the
+    (n,) are ln(rate/rate0), needed by laws of rate, and `rate_errors` (n,) their standard errors
+    (none where there is none). `pulls` (n,) of a scattering parameter are the
     roots of the weights of (ln v - ln common value)²; where there is none nothing pulls.
     """
 
     kinds: Mapping[str, str]
     log_rates: Array | None = None
     pulls: Mapping[str, Array] = field(default_factory=dict)
+    rate_errors: Array | None = None
 
     def kind(self, name: str) -> str:
         """Kind of a parameter."""

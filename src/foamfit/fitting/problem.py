@@ -194,6 +194,14 @@ class Problem:
         """Names of the parameters that vary."""
         return tuple(name for name in self.names if self.params[name].vary)
 
+    def holding(self, name: str, value: float) -> Problem:
+        """The same problem with a parameter held at a value; itself where it does not vary."""
+        if name not in self.free():
+            return self
+        params = self.params.copy()
+        params[name].set(value=value, vary=False)
+        return replace(self, params=params)
+
     def tied(self) -> Callable[[Array], Array] | None:
         """Completion of a vector by the expressions among the parameters; None if there is none."""
         tied = [name for name in self.names if self.params[name].expr is not None]

@@ -43,8 +43,8 @@ if TYPE_CHECKING:
 _LOG = logging.getLogger(__name__)
 # What is given to an executor ahead of what it has done: tests, and bytes of their files.
 MOST_AHEAD, MOST_BYTES = 1000, 2**28
-# Seconds between two summaries, and how much longer than one takes to write.
-PAUSE, SHARE = 30.0, 50.0
+# Seconds between two summaries, and how much longer than both its files take to write.
+PAUSE, SHARE = 5.0, 50.0
 Tests = str | Path | Iterable[str | Path]
 Cycles = int | Sequence[int] | Literal["all"] | None
 
@@ -400,11 +400,11 @@ class _Run:
         self.progress(State(len(made.rows), self.wrong, left, self.fitted))
 
     def _save_sometimes(self) -> None:
-        """Write summary.csv from time to time."""
+        """Write the summary from time to time: what is killed leaves it as it was then."""
         began = time.monotonic()
         if began - self.saved < max(PAUSE, SHARE * self.took):
             return
-        write_summary(self.batch.summary, self.batch.out)
+        self.batch.save()
         self.saved = time.monotonic()
         self.took = self.saved - began
 

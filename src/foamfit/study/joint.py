@@ -15,7 +15,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.data.csv_file import read_test
 from foamfit.data.measurement import Measurement
-from foamfit.data.rate import loading_rate
+from foamfit.data.rate import loading_rate, rate_error
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.links import KINDS, RATES, Links
 from foamfit.fitting.problem import Problem, make_params
@@ -38,7 +38,7 @@ from foamfit.study.joint_result import Alone, JointData
 from foamfit.study.joint_words import sentences_of, warnings_of
 from foamfit.study.shared import bic
 from foamfit.study.study_file import AUTO, Study, read_study
-from foamfit.study.workers import workers
+from foamfit.study.workers import begin, workers
 from foamfit.text import counted
 
 # Tests that are searched as a fit of their own is; the others start at what these have found.
@@ -80,10 +80,11 @@ class _Test:
     problem: Problem
     params: lmfit.Parameters  # Before any fit
     rate: float | None
+    rate_error: float = 0.0  # Of its logarithm
 
 
 def joint(
-    path: str | Path,
+    path: str | Path | Study,
     *,
     jobs: int | None = None,
     out: str | Path | None = None,
@@ -95,9 +96,10 @@ def joint(
 
     Parameters
     ----------
-    path : str or Path
-        STUDY.toml: tests, model, drive, and what each parameter is: "shared", "own", "scatter",
-        "log rate", "power rate" or "auto", or a number that it is held at.
+    path : str, Path or Study
+        STUDY.toml, or what `read_study` has read of it: tests, model, drive, and what each
+        parameter is: "shared", "own", "scatter", "log rate", "power rate" or "auto", or a number
+        that it is held at.
     jobs : int, optional
         Processes; by default one for each core. The numbers are the same with any.
     out : str or Path, optional
@@ -119,9 +121,12 @@ def joint(
     SimulationError
         If no start of the joint fit can be simulated.
     """
-    began, study, tell = time.perf_counter(), read_study(path), progress or (lambda *_: None)
+    began, tell = time.perf_counter(), progress or (lambda *_: None)
+    study = path if isinstance(path, Study) else read_study(path)
     if out is not None:
         check_target(out)
+        if reports:
+            begin(jobs, len(study.tests), FEW_FOLDERS)
     seed = study.seed if seed is None else seed
     options = Options(
         drive=study.drive, seed=seed, starts=study.starts, relaxation=study.relaxation
@@ -137,8 +142,8 @@ def joint(
         links = _chosen(study, problems, links, starts, n_eff, choices)
         fit = fit_jointly(problems, links, starts, each=each)
     tell(0.9, "evidence")
-    alternatives = _evidence(study, fit, n_eff, vectors, choices)
-    result = _conclude(study, seed, tests, fit, vectors, alternatives, n_eff, refused, began)
+    tried = _evidence(study, fit, n_eff, vectors, choices)
+    result = _conclude(study, seed, tests, fit, vectors, tried, n_eff, refused, began)
     tell(1.0, "done")
     if out is not None:
         result.save(out, jobs=jobs, reports=reports)
@@ -163,10 +168,12 @@ def _read(study: Study, options: Options, tell: Progress) -> tuple[list[_Test], 
     if len(found) < 2:
         _too_few(study, len(found), refused)
     params = _params(study, [test for _, _, test in found])
-    return [
-        _Test(name, path, options.problem(test, study.model, own), own, loading_rate(test))
-        for (name, path, test), own in zip(found, params, strict=True)
-    ], refused
+    out = list[_Test]()
+    for (name, path, test), own in zip(found, params, strict=True):
+        problem = options.problem(test, study.model, own)
+        rate, doubt = loading_rate(test), rate_error(problem.measurement)
+        out.append(_Test(name, path, problem, own, rate, doubt))
+    return out, refused
 
 
 def _too_few(study: Study, count: int, refused: Mapping[str, str]) -> NoReturn:
@@ -228,7 +235,11 @@ def _links(study: Study, tests: Sequence[_Test]) -> Links:
     middle = _median_rate(rates)
     if middle is None:
         return Links(study.kinds)
-    return Links(study.kinds, np.log([(rate or middle) / middle for rate in rates]))
+    return Links(
+        study.kinds,
+        np.log([(rate or middle) / middle for rate in rates]),
+        rate_errors=np.array([test.rate_error for test in tests]),
+    )
 
 
 def _median_rate(rates: Sequence[float | None]) -> float | None:
@@ -290,7 +301,8 @@ def _with_rate(test: _Test, values: Array) -> _Test:
     if objective.drive != "impact" or test.rate is None:
         return test
     moved = objective.simulate(values, everything=True).curves["displacement_time"]
-    return replace(test, rate=loading_rate(test.problem.measurement, moved))
+    rate = loading_rate(test.problem.measurement, moved)
+    return replace(test, rate=rate, rate_error=0.0)  # what is off in it, the fit has in its errors
 
 
 def _own_fit(
@@ -355,14 +367,14 @@ def _choices(tests: Sequence[_Test]) -> tuple[str, ...]:
 
 def _evidence(
     study: Study, fit: JointFit, n_eff: int, vectors: Sequence[Array], choices: tuple[str, ...]
-) -> tuple[Alternative, ...]:
+) -> tuple[tuple[Alternative, ...], dict[str, float]]:
     """Every parameter with a law of rate, or of which evidence was to choose, as other kinds."""
     found = fit.found
     names = [
         name for name in (*found.shared, *found.own)
         if found.links.kind(name) in RATES or study.kinds.get(name) == AUTO
     ]  # fmt: skip
-    return tuple(evidence(found, names, n_eff, choices, [list(vectors)]))
+    return evidence(found, names, n_eff, choices, [list(vectors)])
 
 
 # ------------------------------------------------------------------------------- the result
@@ -370,7 +382,8 @@ def _evidence(
 
 def _conclude(
     study: Study, seed: int, tests: Sequence[_Test], fit: JointFit, vectors: Sequence[Array],
-    alternatives: tuple[Alternative, ...], n_eff: int, refused: Mapping[str, str], began: float,
+    tried: tuple[tuple[Alternative, ...], dict[str, float]], n_eff: int,
+    refused: Mapping[str, str], began: float,
 ) -> JointResult:  # fmt: skip
     """Assemble the result."""
     names = tuple(test.name for test in tests)
@@ -386,7 +399,8 @@ def _conclude(
         fit=fit,
         parameters=parameters,
         covariance=common_covariance(fit),
-        evidence=alternatives,
+        evidence=tried[0],
+        open_slopes=tried[1],
         n_eff=n_eff,
         alone=_alone(tests, vectors, n_eff),
         refused=refused,

@@ -48,10 +48,11 @@ def parameter_of(fit: JointFit, tests: tuple[str, ...], name: str) -> JointParam
     first = found.problems[there[0]]
     (value, *slope) = found.common[name]
     stderr, freedom = fit.covariance.of_common(name)
-    judged = _judged(first, name, value, stderr, freedom, found.values[there[0]])
+    span = fit.ranges.get(name)
+    judged = _judged(first, name, value, stderr, freedom, found.values[there[0]], span)
     words = f"one value for {counted(len(there), 'test')}"
     if not slope:
-        return _estimate(kind, value, unit, judged, words)
+        return replace(_estimate(kind, value, unit, judged, words), range=span)
     b_error, b_freedom = fit.covariance.of_common(f"{name}:b")
     half = covariance.half_width(b_error, b_freedom)
     known = math.isfinite(half)
@@ -59,6 +60,7 @@ def parameter_of(fit: JointFit, tests: tuple[str, ...], name: str) -> JointParam
     return replace(
         one, tests=_values(fit, tests, name), b=slope[0], b_stderr=b_error if known else None,
         b_ci95=(slope[0] - half, slope[0] + half) if known else None,
+        range=span, b_range=fit.ranges.get(f"{name}:b"),
     )  # fmt: skip
 
 
@@ -94,15 +96,22 @@ def _estimate(kind: str, value: float, unit: str, judged: _Judged, words: str) -
 
 
 def _judged(
-    problem: Problem, name: str, value: float, stderr: float, freedom: float, values: Array
-) -> _Judged:
-    """Standard error, interval, state and reason of a value; see `trust.covariance.RULE`."""
+    problem: Problem, name: str, value: float, stderr: float, freedom: float, values: Array,
+    span: tuple[float, float] | None = None,
+) -> _Judged:  # fmt: skip
+    """Standard error, interval, state and reason of a value; see `trust.covariance.RULE`.
+
+    `span` is its range, if there is one; the state is that of the wider of the two.
+    """
     parameter = problem.params[name]
     low, high = float(parameter.min), float(parameter.max)
     size = float(problem.sizes((name,), values)[0])
     half = covariance.half_width(stderr, freedom)
     of = scale_in_words(name, value, size)
-    state, why = covariance.state(value, half, size, low, high, of)
+    wider, what = half, "95 % interval"
+    if span is not None and 0.5 * (span[1] - span[0]) > half:
+        wider, what = 0.5 * (span[1] - span[0]), "range"
+    state, why = covariance.state(value, wider, size, low, high, of, what)
     if not half <= covariance.NOTHING * size:
         return None, None, state, why
     return stderr, (max(value - half, low), min(value + half, high)), state, why

@@ -17,11 +17,14 @@ from typing import Any
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.fitting.links import Links
+from foamfit.errors import SimulationError
+from foamfit.fitting.links import RATES, Links
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.together import Together, fit_linked
 from foamfit.study.shared import bic, effective_samples
+from foamfit.trust import covariance
 from foamfit.trust.joint_covariance import JointCovariance, JointPoint
+from foamfit.trust.ranges import ALIKE, ITERATIONS, TRIALS
 from foamfit.trust.residuals.law_error import CurveError, curve_errors
 from foamfit.trust.residuals.noise_process import noise_processes
 from foamfit.trust.scatter import Spread, common_and_spread
@@ -32,15 +35,21 @@ ROUNDS, STILL = 12, 0.01
 # Nothing is drawn harder than by a spread of so much of the errors of a single test: with no spread
 # at all the values of the tests would be one, and nothing would say what they are undrawn.
 LEAST_SPREAD = 0.3
+# Groups of tests that are left out in turn, and steps of a fit without one of them.
+GROUPS, REFIT = 10, 15
 Map = Callable[..., Iterable[Any]]
 
 
 @dataclass(frozen=True, eq=False)
 class JointFit:
-    """Several tests fitted together: the best point, and the spread of what scatters."""
+    """Several tests fitted together: the best point, and the spread of what scatters.
+
+    `ranges` are those of shared values, and with ":b" of slopes by rate; see `ranges_of`.
+    """
 
     point: JointPoint
     spreads: Mapping[str, Spread] = field(default_factory=dict)
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def found(self) -> Together:
@@ -71,7 +80,7 @@ def fit_jointly(
     point, spreads = JointPoint(found, errors), dict[str, Spread]()
     scatter = [name for name in scatter if name in found.own]
     if not scatter:
-        return JointFit(point)
+        return JointFit(point, ranges=ranges_of(point, each))
     for _ in range(ROUNDS):
         before, inflations, pulls = spreads, dict[str, Array](), dict[str, Array]()
         spreads = {}
@@ -97,7 +106,7 @@ def fit_jointly(
             break
         found = fit_linked(problems, replace(links, pulls=pulls), [found.values])
         point = JointPoint(found, errors, inflations)
-    return JointFit(point, spreads)
+    return JointFit(point, spreads, ranges_of(point, each))
 
 
 def _drawn(found: Together, name: str) -> Array:
@@ -135,6 +144,99 @@ def errors_of(found: Together, each: Map = map) -> tuple[tuple[CurveError, ...],
     )
 
 
+# ------------------------------------------------------------------------------- ranges
+
+
+def ranges_of(point: JointPoint, each: Map = map) -> dict[str, tuple[float, float]]:
+    """What the error of the law leaves open of what tests share; empty where all is noise.
+
+    Two things are in it, and the wider end counts. Each specimen draws a shared value its own way:
+    where it would lie (95 %), were it found from as many other specimens, is told by the fits
+    without each test in turn (a jackknife, of at most `GROUPS` groups of tests, with Student's t of
+    one less than their number). And a shared value can be held off its best one while all tests are
+    followed about as well, as for one test (`trust.ranges`).
+    """
+    if not point.errs:
+        return {}
+    out = _over_specimens(point.found, each)
+    shared = [name for name in point.found.shared if point.found.links.kind(name) == "shared"]
+    ways = [(name, sign) for name in shared for sign in (-1.0, 1.0)]
+    held = each(_held, [point] * len(ways), *zip(*ways, strict=True)) if ways else ()
+    for (name, _), end in zip(ways, held, strict=True):
+        low, high = out.get(name, (end, end))
+        (value,) = point.found.common[name]
+        out[name] = min(low, end, value), max(high, end, value)
+    return out
+
+
+def _over_specimens(found: Together, each: Map) -> dict[str, tuple[float, float]]:
+    """Ranges of shared values and of slopes by the fits without each test in turn."""
+    count = len(found.problems)
+    groups = [range(first, count, GROUPS) for first in range(min(count, GROUPS))]
+    kept = [[t for t in range(count) if t not in group] for group in groups]
+    others = [common for common in each(_without, [found] * len(kept), kept) if common]
+    if len(others) < 2:
+        return {}
+    out, quantile = dict[str, tuple[float, float]](), covariance.half_width(1.0, len(others) - 1)
+    for name in found.shared:
+        values = np.array([common[name] for common in others if name in common])
+        if len(values) < len(others):  # a test that alone has it says nothing of others
+            continue
+        off = values - values.mean(axis=0)
+        halves = quantile * np.sqrt((1.0 - 1.0 / len(values)) * np.sum(off**2, axis=0))
+        for at, (value, half) in enumerate(zip(found.common[name], halves, strict=True)):
+            out[f"{name}:b" if at else name] = (float(value - half), float(value + half))
+    return out
+
+
+def _held(point: JointPoint, name: str, sign: float) -> float:
+    """How far a shared value can be held off while the tests are followed about as well."""
+    found, (value,) = point.found, point.found.common[name]
+    rise = (ALIKE**2 - 1.0) * sum(
+        size * error.law**2
+        for best, errors in zip(point.bests, point.errors, strict=True)
+        for size, error in zip(best.problem.objective.sizes, errors, strict=True)
+    )
+    low, high = next(best for best in point.bests if name in best.problem.free()).limits(name)
+    off = math.sqrt(rise) * point.reach(name)
+    for _ in range(TRIALS):
+        end = min(max(value + sign * off, low), high) if math.isfinite(off) else value
+        if end == value:
+            break
+        start = point.moved(name, end - value)
+        problems = [problem.holding(name, end) for problem in found.problems]
+        try:
+            missed = fit_linked(problems, found.links, [start], iterations=ITERATIONS).cost
+        except SimulationError:
+            off *= 0.5
+            continue
+        if missed - found.cost <= rise:
+            return end
+        off = abs(end - value) * min(max(math.sqrt(rise / (missed - found.cost)), 0.3), 0.8)
+    return value
+
+
+def _without(found: Together, kept: Sequence[int]) -> dict[str, tuple[float, ...]] | None:
+    """What the kept tests have in common; None where they cannot be fitted alone."""
+    links, rates = found.links, found.links.log_rates
+    some = replace(
+        links,
+        log_rates=None if rates is None else rates[kept],
+        rate_errors=None if links.rate_errors is None else links.rate_errors[kept],
+        pulls={name: pull[kept] for name, pull in links.pulls.items()},
+    )
+    laws = any(links.kind(name) in RATES for name in found.shared)
+    if laws and some.log_rates is not None and not np.ptp(some.log_rates) > 0.0:
+        return None
+    try:
+        near = [[found.values[t] for t in kept]]
+        return fit_linked(
+            [found.problems[t] for t in kept], some, near, iterations=REFIT
+        ).common  # fmt: skip
+    except SimulationError:
+        return None
+
+
 # ------------------------------------------------------------------------------- evidence
 
 
@@ -153,18 +255,19 @@ class Alternative:
 def evidence(
     fit: Together, names: Sequence[str], n_eff: int, kinds: Sequence[str],
     near: Sequence[Sequence[Array]],
-) -> Iterator[Alternative]:  # fmt: skip
+) -> tuple[tuple[Alternative, ...], dict[str, float]]:  # fmt: skip
     """Evidence for each of these kinds of each of these parameters, the others as they are.
 
-    The fits start at that fit, and at the points `near`.
+    The fits start at that fit, and at the points `near`. Then the parameters whose slope by rate
+    the tests leave open (`open_slope`), and by how much.
     """
+    found, wide = list[Alternative](), dict[str, float]()
     for name in names:
-        own = fit.links.kind(name)
-        for kind in dict.fromkeys((own, *kinds)):
-            links = replace(fit.links, kinds={**fit.links.kinds, name: kind})
-            one = fit if kind == own else fit_linked(fit.problems, links, [fit.values, *near])
+        mine = fit.links.kind(name)
+        for kind, one in _kinds_of(fit, name, (mine, *kinds), [fit.values, *near], wide):
             score = bic(one.cost, one.n_data, one.n_vary, n_eff)
-            yield Alternative(name, kind, kind == own, score, one.n_vary, one.cost)
+            found.append(Alternative(name, kind, kind == mine, score, one.n_vary, one.cost))
+    return tuple(found), wide
 
 
 def choose_kinds(
@@ -173,7 +276,8 @@ def choose_kinds(
 ) -> Links:  # fmt: skip
     """Links in which each of these parameters has the kind of the least BIC.
 
-    All are shared at first; in each round the change of one kind that lowers BIC most is taken.
+    All are shared at first; in each round the change of one kind that lowers BIC most is taken. A
+    law of rate is none of the kinds where the tests leave its slope open (`open_slope`).
     """
     links = replace(links, kinds={**links.kinds, **dict.fromkeys(names, "shared")})
     now = fit_linked(problems, links, starts)
@@ -182,18 +286,65 @@ def choose_kinds(
         near = [now.values, *starts[:1]]
         trials = list[tuple[float, Together]]()
         for name in names:
-            for kind in kinds:
-                if kind == now.links.kind(name):
-                    continue
-                other = replace(now.links, kinds={**now.links.kinds, name: kind})
-                one = fit_linked(problems, other, near)
-                trials.append((bic(one.cost, one.n_data, one.n_vary, n_eff), one))
+            for kind, one in _kinds_of(now, name, kinds, near, {}):
+                if kind != now.links.kind(name):
+                    trials.append((bic(one.cost, one.n_data, one.n_vary, n_eff), one))
         if not trials:
             return now.links
         least, found = min(trials, key=lambda trial: trial[0])
         if least >= score:
             return now.links
         now, score = found, least
+
+
+def _kinds_of(
+    fit: Together, name: str, kinds: Sequence[str], near: Sequence[Sequence[Array]],
+    wide: dict[str, float],
+) -> Iterator[tuple[str, Together]]:  # fmt: skip
+    """Fits with a parameter of these kinds, and of its present one, the others as they are.
+
+    A kind with which no start can be simulated is left out, and so is another law of rate than the
+    present one where the slope of one is left open, which is added to `wide`.
+    """
+    mine = fit.links.kind(name)
+    for kind in sorted(dict.fromkeys(kinds), key=lambda kind: (kind in RATES, kind != mine)):
+        if kind in RATES and kind != mine and name in wide:
+            continue
+        try:
+            links = replace(fit.links, kinds={**fit.links.kinds, name: kind})
+            one = fit if kind == mine else fit_linked(fit.problems, links, near)
+        except SimulationError:
+            continue
+        yield kind, one
+        if kind == "own" and any(other in RATES for other in kinds):
+            half = open_slope(one, name)
+            if half > covariance.WEAK:
+                wide[name] = half
+
+
+def open_slope(fit: Together, name: str) -> float:
+    """Half of the 95 % interval of a parameter's slope by rate from its own value in each test.
+
+    The slope of the logarithm is of the order of one: so much doubles a value with the rate. The
+    values scatter about a law of rate as the specimens and the errors of the law make them, which
+    is in no error of a fit in which that law holds.
+    """
+    there = [name in problem.free() for problem in fit.problems]
+    values = np.array(fit.value(name))[there]
+    if fit.links.log_rates is None or values.size < 3:
+        return math.inf
+    x = fit.links.log_rates[there]
+    x = x - x.mean()
+    square = float(x @ x)
+    level = float(np.median(values))
+    if not square > 0.0 or level == 0.0:
+        return math.inf
+    logs = np.log(values / level) if np.all(values / level > 0.0) else values / level
+    logs = logs - logs.mean()
+    left = logs - x * float(x @ logs) / square
+    return covariance.half_width(
+        math.sqrt(float(left @ left) / (values.size - 2) / square), values.size - 2
+    )
 
 
 def samples_of(problems: Sequence[Problem], vectors: Sequence[Array]) -> int:

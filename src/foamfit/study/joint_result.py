@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -22,13 +23,13 @@ from foamfit.study.study_file import Study
 from foamfit.text import counted
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.checklist import status_of, warnings_of
-from foamfit.trust.conclude import conclude
+from foamfit.trust.conclude import conclude, noise_of
 
 # Keys of a parameter that only some kinds have.
 _SCATTER = ("scatter", "scatter_stderr", "scatter_ci95")
 # Questions to a search of one test.
 _OF_A_SEARCH = ("ended", "agree")
-_RATE = ("b", "b_stderr", "b_ci95")
+_RATE = ("b", "b_stderr", "b_ci95", "b_range")
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,9 @@ class JointParameter:
     b: float | None = None
     b_stderr: float | None = None
     b_ci95: tuple[float, float] | None = None
+    # What the error of the law leaves open of it (`joint_fit.ranges_of`); None where all is noise.
+    range: tuple[float, float] | None = None
+    b_range: tuple[float, float] | None = None
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return its part of joint.json."""
@@ -134,6 +138,8 @@ class JointData:
     warnings: tuple[str, ...]
     sentences: tuple[str, ...]
     runtime_s: float
+    # Parameters whose slope by rate the tests leave open, and by how much; see `open_slope`.
+    open_slopes: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def problems(self) -> tuple[Problem, ...]:
@@ -163,6 +169,13 @@ class JointData:
         costs = np.array(self.fit.found.costs)
         total = float(costs.sum())
         return tuple((costs / total if total else np.full(costs.size, 1.0 / costs.size)).tolist())
+
+    @cached_property
+    def noise(self) -> tuple[dict[str, dict[str, Any]], ...]:
+        """Noise of each counted curve of each test, by which it is weighted; as in fit.json."""
+        point = self.fit.point
+        errors = point.errors or ((),) * len(point.bests)
+        return tuple(noise_of(*pair) for pair in zip(point.bests, errors, strict=True))
 
     def estimates(self, test: int) -> dict[str, ParameterEstimate]:
         """Parameters of one test, as its fit.json has them."""
@@ -210,6 +223,7 @@ class JointData:
                     "rate": self.rates[t],
                     "misfit": found.misfits[t],
                     "chi2_share": self.shares[t],
+                    "noise": self.noise[t],
                     "n_data": self.problems[t].objective.n_data,
                     "data_sha256": self.measurements[t].data_sha256,
                     "values": dict(zip(names, found.values[t].tolist(), strict=True)),

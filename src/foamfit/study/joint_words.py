@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from foamfit.fitting.links import RATES
 from foamfit.study.cycle_fits import loop_misfits
 from foamfit.study.joint_result import JointData
 from foamfit.text import counted, listed, percent
@@ -51,6 +53,13 @@ def warnings_of(result: JointData) -> tuple[bool, list[str]]:
     for name, one in result.parameters.items():
         if one.kind not in ("own", "fixed") and one.state != "determined":
             out.append(f"{name} ({one.kind}) is {one.state}: {one.why}.")
+    for name, half in result.open_slopes.items():
+        if (kind := result.parameters[name].kind) in RATES:
+            out.append(
+                f"{name} ({kind}): its own values in the tests, at {_rates(result)}, leave its "
+                f"slope b open by {_open(half)}; a law of rate needs more tests over a wider span "
+                "of rates."
+            )
     for name in dict.fromkeys(one.parameter for one in result.evidence):
         tried = [one for one in result.evidence if one.parameter == name]
         mine, best = next(o for o in tried if o.chosen), min(tried, key=lambda one: one.bic)
@@ -60,6 +69,17 @@ def warnings_of(result: JointData) -> tuple[bool, list[str]]:
                 f"(BIC {mine.bic - best.bic:.1f} lower)."
             )
     return bool(lost), out
+
+
+def _rates(result: JointData) -> str:
+    """The rates of the tests in words."""
+    known = [rate for rate in result.rates if rate is not None]
+    return f"{min(known):.3g} to {max(known):.3g} 1/s"
+
+
+def _open(half: float) -> str:
+    """By how much slopes are left open."""
+    return f"±{half:.2g}" if math.isfinite(half) else "any amount"
 
 
 def _span(found: Sequence[float | None]) -> str:
@@ -79,6 +99,16 @@ def sentences_of(result: JointData) -> Iterator[str]:
         f"{counted(len(result.tests), 'test')} fitted with {counted(found.n_vary, 'number')} "
         f"({'; '.join(parts)})."
     )
+    untried = {
+        name: half for name, half in result.open_slopes.items()
+        if result.parameters[name].kind not in RATES
+    }  # fmt: skip
+    if untried:
+        yield (
+            f"No law of rate was tried for {listed(untried)}: over {_rates(result)} the values of "
+            f"single tests leave a slope b open by {_open(min(untried.values()))} or more, and it "
+            "is of the order of one."
+        )
     spreads = {
         name: (one.scatter, *one.scatter_ci95) for name, one in result.parameters.items()
         if one.kind == "scatter" and one.scatter is not None and one.scatter_ci95 is not None

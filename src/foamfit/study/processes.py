@@ -143,15 +143,18 @@ def _starting() -> Iterator[None]:
 
 @contextmanager
 def _set(values: MutableMapping[str, Any], for_now: Mapping[str, Any]) -> Iterator[None]:
-    """Change some values of a mapping within; as `unittest.mock`, which takes long to import."""
+    """Change some values of a mapping within, and no others, which another thread may change.
+
+    As `unittest.mock.patch.dict`, which takes long to import and puts the whole mapping back.
+    """
     before = {name: values[name] for name in for_now if name in values}
     values.update(for_now)
     try:
         yield
     finally:
-        for name in for_now:
-            del values[name]
         values.update(before)
+        for name in for_now.keys() - before.keys():
+            del values[name]
 
 
 def _begin(stop: connection.Connection) -> None:

@@ -7,10 +7,23 @@ from contextlib import contextmanager
 from typing import Any
 
 from foamfit.errors import InputError
-from foamfit.study.processes import Processes, cores
+from foamfit.study.processes import PAGES, Processes, cores, prepare
 
-# Modules that every process needs.
-_NEEDED = ("foamfit.study.joint",)
+# Modules that every process needs, and by which most of its start is gone: they are imported once.
+_NEEDED = ("foamfit.study.joint", "foamfit.report.plots", *PAGES)
+
+
+def begin(jobs: int | None, count: int, few: int) -> None:
+    """Have imported what `workers` with these arguments will need, beside what goes on here."""
+    if _wanted(jobs, count, few) > 1:
+        prepare(_NEEDED)
+
+
+def _wanted(jobs: int | None, count: int, few: int) -> int:
+    """How many processes; one is this one."""
+    if jobs is not None and (type(jobs) is not int or jobs < 1):
+        raise InputError(f"jobs = {jobs!r} is not admissible; it must be a whole number from 1 up")
+    return 1 if count <= few else min(cores() if jobs is None else jobs, count)
 
 
 @contextmanager
@@ -20,10 +33,8 @@ def workers(jobs: int | None, count: int, few: int) -> Iterator[Callable[..., It
     With one job, or up to `few` pieces of work, it is the built-in one: to start a process takes
     some seconds.
     """
-    if jobs is not None and (type(jobs) is not int or jobs < 1):
-        raise InputError(f"jobs = {jobs!r} is not admissible; it must be a whole number from 1 up")
-    wanted = min(cores() if jobs is None else jobs, count)
-    if wanted < 2 or count <= few:
+    wanted = _wanted(jobs, count, few)
+    if wanted < 2:
         yield map
         return
     pool = Processes(wanted, _NEEDED)

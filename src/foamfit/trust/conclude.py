@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -30,6 +31,7 @@ from foamfit.trust import covariance
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.checklist import MAY_VANISH, Findings, make_checklist, status_of, warnings_of
 from foamfit.trust.identifiability import Insight, look
+from foamfit.trust.residuals.law_error import CurveError
 
 # Factor between an interval and the local one from which on the local standard error is given up.
 ASTRAY = 2.0
@@ -82,21 +84,22 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         loss=objective.loss,
         relaxation=problem.model.relaxation,
         interior_mass=objective.interior_mass,
-        noise=_noise(best),
+        noise=noise_of(best, best.errors if best.names else ()),
         intervals=intervals,
     )
 
 
-def _noise(best: BestPoint) -> dict[str, dict[str, Any]]:
+def noise_of(best: BestPoint, errors: Sequence[CurveError]) -> dict[str, dict[str, Any]]:
     """Noise of each counted curve, how it is known, its scale, and the residuals over it.
 
-    `law_error` is the RMS of what the law misses beyond the noise, SI, None where it misses nothing
-    else; `law_error_evidence` by how much the Bayesian information criterion is for it.
+    `errors` are those of the counted curves, or none if nothing varies. `law_error` is the RMS of
+    what the law misses beyond the noise, SI, None where it misses nothing else;
+    `law_error_evidence` by how much the Bayesian information criterion is for it.
     """
     objective, found = best.problem.objective, {}
-    errors = dict(zip(objective.counted, best.errors, strict=True)) if best.names else {}
+    known = dict(zip(objective.counted, errors, strict=True)) if errors else {}
     for name, rms in objective.rms(best.residual).items():
-        level, error = objective.noise(name), errors.get(name)
+        level, error = objective.noise(name), known.get(name)
         law = error is not None and error.found
         found[name] = asdict(level) | {
             "scale": objective.scale[name],

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.arrays import Array
-from foamfit.fitting.links import RATES, law_bend, law_slopes
+from foamfit.fitting.links import LOG_RATE, RATES, law, law_bend, law_slopes
 from foamfit.fitting.together import Together
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import AT_LIMIT, FLATTEST
@@ -68,7 +68,8 @@ class _Block:
     Everything is scaled. `through` (k, s + q) leads from shared and own coordinates to the k
     parameters of the test, `bend` (s, s) is what the bend of the links adds to the curvature.
     `pulls` are rows (r, s + q) by which scattering parameters are drawn to their common value, and
-    `drawn` the same for the covariance of what draws them.
+    `drawn` the same for the covariance of what draws them. `rated` (k,) is what one standard error
+    of the rate of the test does to parameters that follow a law of it.
     """
 
     best: BestPoint
@@ -78,6 +79,7 @@ class _Block:
     bend: Array
     pulls: Array
     drawn: Array
+    rated: Array
     noise: tuple[NoiseProcess, ...]  # Of each curve
     curvature: Array | None = None  # (k, k), where it is not JᵀJ
 
@@ -87,11 +89,15 @@ class _Block:
         return self.jacobian @ self.through
 
     @cached_property
+    def _inner(self) -> Array:
+        """Curvature of half the cost by the parameters of the test, (k, k)."""
+        return self.jacobian.T @ self.jacobian if self.curvature is None else self.curvature
+
+    @cached_property
     def hessian(self) -> Array:
         """Curvature of half the cost, (s + q, s + q)."""
         s = len(self.bend)
-        inner = self.jacobian.T @ self.jacobian if self.curvature is None else self.curvature
-        out = self.through.T @ inner @ self.through + self.pulls.T @ self.pulls
+        out = self.through.T @ self._inner @ self.through + self.pulls.T @ self.pulls
         if self.curvature is not None:
             out[:s, :s] += self.bend
         return np.asarray(out)
@@ -100,6 +106,9 @@ class _Block:
     def meat(self) -> Array:
         """Covariance of the gradient, (s + q, s + q)."""
         out = self.drawn.T @ self.drawn
+        if self.rated.any():
+            pull = self.through.T @ self._inner @ self.rated
+            out = out + np.outer(pull, pull)
         return np.asarray(out + self.slopes.T @ self.times(self.slopes))
 
     def times(self, columns: Array) -> Array:
@@ -208,6 +217,14 @@ class Arrow:
     def unseen(self) -> NDArray[np.bool_]:
         """Shared coordinates of which the tests say nothing, (s,)."""
         return self._shared[1]
+
+    def step(self, at: int) -> Array:
+        """Column of the inverse curvature of the shared coordinates, (s,)."""
+        return np.asarray(self._shared[0][:, at])
+
+    def after(self, test: int, shared: Array) -> Array:
+        """How the own parameters of a test follow a step of the shared coordinates, (q,)."""
+        return np.asarray(-self._own[test][1] @ shared)
 
     def lost(self, test: int) -> NDArray[np.bool_]:
         """Own parameters of which a test says nothing, (q,)."""
@@ -352,13 +369,47 @@ class JointPoint:
         none = np.zeros((0, through.shape[1]))
         return _Block(
             best, best.names, jacobian, through, bend, np.array(rows) if rows else none,
-            np.array(wide) if wide else none,
+            np.array(wide) if wide else none, self._rated(t),
             tuple(error.noise for error in self.errors[t]) if self.errors else (),
         )  # fmt: skip
+
+    def _rated(self, t: int) -> Array:
+        """What one standard error of the rate does to the scaled parameters of a test, (k,)."""
+        best, links = self.bests[t], self.found.links
+        out = np.zeros(len(best.names))
+        if links.rate_errors is None:
+            return out
+        for i, name in enumerate(best.names):
+            if (kind := links.kind(name)) in RATES and name in self.found.shared:
+                v, b = self.found.common[name]
+                x = 0.0 if links.log_rates is None else float(links.log_rates[t])
+                out[i] = b * (v if kind == LOG_RATE else law(kind, v, b, x)) / best.sizes[i]
+        return np.asarray(out * links.rate_errors[t])
 
     @cached_property
     def _plain(self) -> Arrow:
         return Arrow(self.blocks)
+
+    def reach(self, name: str) -> float:
+        """How far a shared value is off where the cost has risen by one; 0 where it is unseen."""
+        at = self.names.index(name)
+        if self._plain.unseen[at]:
+            return 0.0
+        return float(np.sqrt(self._plain.step(at)[at]) * self._scales[at])
+
+    def moved(self, name: str, change: float) -> list[Array]:
+        """Values of each test with a shared one moved, and the others after it, were all linear."""
+        at, out = self.names.index(name), list[Array]()
+        step = self._plain.step(at)
+        shared = change / self._scales[at] * step / step[at]
+        for t, (block, best) in enumerate(zip(self.blocks, self.bests, strict=True)):
+            values, own = best.values.copy(), self._plain.after(t, shared)
+            moves = block.through @ np.concatenate([shared, own]) * best.sizes
+            for one, by in zip(best.names, moves, strict=True):
+                low, high = best.limits(one)
+                values[best.index[one]] = np.clip(values[best.index[one]] + by, low, high)
+            out.append(values)
+        return out
 
     def taken(self, test: int) -> Array:
         """What the joint fit took of the noise of a test; see `noise_processes`.
@@ -510,10 +561,10 @@ class JointPoint:
         for t, block in enumerate(self.blocks):
             columns = np.array([*free, *range(s, block.through.shape[1])], dtype=np.intp)
             none = np.zeros((0, columns.size))
-            curved = replace(block, curvature=self._curvatures[t]) if self._errs else block
+            curved = replace(block, curvature=self._curvatures[t]) if self.errs else block
             kept = replace(curved.kept(columns), pulls=none, drawn=none)
             blocks.append(kept)
-        arrow = Arrow(tuple(blocks), plain=not self._errs)
+        arrow = Arrow(tuple(blocks), plain=not self.errs)
         places, factors = list[int | None](), list[float]()
         for block in self.blocks:
             mine = [one for one in block.names if one in self.found.own]
@@ -526,7 +577,8 @@ class JointPoint:
         return matrix * scale, bread * scale
 
     @property
-    def _errs(self) -> bool:
+    def errs(self) -> bool:
+        """Whether the law misses more of some test than noise."""
         return any(error.found for errors in self.errors for error in errors)
 
 

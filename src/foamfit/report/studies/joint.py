@@ -31,12 +31,14 @@ def save_joint(
         text = json.dumps(found.to_json_dict(), indent=2, ensure_ascii=False, allow_nan=False)
         (fresh / "joint.json").write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
         folders = [fresh / name for name in found.tests]
-        for _ in each(_write_test, found.test_fits(), folders, [reports] * len(folders)):
-            pass
+        # Where other processes make the folders, the picture of all is drawn beside them.
+        made = each(_write_test, found.test_fits(), folders, [reports] * len(folders))
         png = image(plot_joint(found), "png", DPI)
         (fresh / "joint.png").write_bytes(png)
         page = joint_page(found, png, linked=reports)
         (fresh / "joint.html").write_text(page, encoding="utf-8", errors="replace")
+        for _ in made:
+            pass
 
     return save_whole(folder, write)
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from foamfit.report.page import environment
@@ -31,6 +31,7 @@ class _Row:
     kind: str
     value: str
     interval: str
+    range: str
     between: str
     state: str | None
     why: str
@@ -64,6 +65,7 @@ def joint_page(found: JointData, picture: bytes, *, linked: bool = True) -> str:
             if one.kind != "fixed" or one.value
         ],
         rule=RULE,
+        ranged=any(one.range for one in found.parameters.values()),
         evidence=evidence,
         heads=_heads(found, names),
         rows=[list(_cells(found, t, names, linked)) for t in range(len(found.tests))],
@@ -73,14 +75,16 @@ def joint_page(found: JointData, picture: bytes, *, linked: bool = True) -> str:
 
 def _row(name: str, one: JointParameter) -> _Row:
     estimate = ParameterEstimate(
-        one.value, one.stderr, one.ci95, one.unit, True, one.state or "", one.why or ""
-    )
+        one.value, one.stderr, one.ci95, one.unit, True, one.state or "", one.why or "",
+        range=one.range,
+    )  # fmt: skip
     shown = readable(name, estimate)
     unit = "" if shown.unit == "–" else f" {shown.unit}"
     interval = f"{shown.interval}{unit}" if shown.interval else ""
     value = f"{shown.with_error}{unit}"
+    span = f"{shown.range}{unit}" if shown.range else ""
     return _Row(
-        name, shown.symbol, one.kind, value, interval, between(one), one.state, one.why or ""
+        name, shown.symbol, one.kind, value, interval, span, between(one), one.state, one.why or ""
     )
 
 
@@ -90,9 +94,34 @@ def _curves(found: JointData) -> list[str]:
     return [name for name in CURVES if any(one.get(name) is not None for one in every)]
 
 
+def _counted(found: JointData) -> list[str]:
+    """Curves whose noise weights some test."""
+    return [name for name in CURVES if any(name in one for one in found.noise)]
+
+
+def _noise_unit(found: JointData, curve: str) -> tuple[float, str]:
+    """Factor and unit in which the noise of a curve reads well."""
+    top = max(one[curve]["sigma"] for one in found.noise if curve in one)
+    return readable_unit(top, "m" if curve.startswith("displacement") else "Pa")
+
+
+def _noise(level: Mapping[str, Any] | None, factor: float) -> _Cell:
+    """The noise of a curve of a test: one standard deviation, and where it is from."""
+    if level is None:
+        return _Cell("")
+    told = ["stated" if level["given"] else "estimated"]
+    if level["time"] > 1.05:
+        told.append(f"correlated over {level['time']:.2g} samples")
+    if level["scale"] > level["sigma"]:
+        told.append(f"counted as {number(level['scale'] / factor)}")
+    sigma = level["sigma"] / factor
+    return _Cell(number(sigma), f"{level['sigma']:.8g}", ", ".join(told))
+
+
 def _heads(found: JointData, names: list[str]) -> list[str]:
     heads = ["test", "rate (1/s)", *(f"misfit {CURVES[c]} (%)" for c in _curves(found))]
     heads.append("share of χ² (%)")
+    heads += [f"noise {CURVES[c]} ({_noise_unit(found, c)[1]})" for c in _counted(found)]
     for name in names:
         one = found.parameters[name]
         stem, index = symbol(name)
@@ -109,6 +138,8 @@ def _cells(found: JointData, t: int, names: list[str], linked: bool) -> Iterator
         miss = off.get(curve)
         yield _Cell("" if miss is None else f"{100 * miss:.2f}")
     yield _Cell(f"{100 * found.shares[t]:.1f}")
+    for curve in _counted(found):
+        yield _noise(found.noise[t].get(curve), _noise_unit(found, curve)[0])
     for name in names:
         one = found.parameters[name]
         assert one.tests is not None  # such were chosen

@@ -37,13 +37,16 @@ def joint_text(found: JointData) -> str:
 
 def parameter_rows(found: JointData) -> list[list[str]]:
     """Table of the parameters, the header first."""
-    rows = [["parameter", "", "value", "95 % interval", "", "between tests"]]
+    ranged = any(one.range for one in found.parameters.values())
+    span = ["range"] if ranged else []
+    rows = [["parameter", "", "value", "95 % interval", *span, "", "between tests"]]
     for name, one in found.parameters.items():
         if one.kind == "fixed" and one.value == 0.0:
             continue
         ends = "" if one.ci95 is None else in_unit(one.ci95, one.unit)
-        rows.append([name, one.kind, in_unit((one.value,), one.unit), ends, one.state or "",
-                     between(one)])  # fmt: skip
+        span = [in_unit(one.range, one.unit) if one.range else ""] if ranged else []
+        rows.append([name, one.kind, in_unit((one.value,), one.unit), ends, *span,
+                     one.state or "", between(one)])  # fmt: skip
     return rows
 
 
