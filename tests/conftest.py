@@ -81,7 +81,8 @@ def compiled() -> Iterator[None]:
 
 def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let a result folder be written with pictures of a few bytes and an empty page."""
-    monkeypatch.setattr(result_folder, "plot_fit", lambda _: None)
+    monkeypatch.setattr(result_folder, "plot_fit", lambda *_, **__: None)
+    monkeypatch.setattr(result_folder, "plotted", lambda _: ())
     monkeypatch.setattr(result_folder, "laid_out", lambda _: nullcontext())
     monkeypatch.setattr(result_folder, "image", lambda *_: b"\x89PNG" + bytes(20))
     monkeypatch.setattr(result_folder, "render_report", lambda *_, **__: "")

@@ -21,7 +21,10 @@ from foamfit.cli import main
 from foamfit.report.page import STATISTICS
 
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
-FILES = {"fit.json", "parameters.csv", "curves.csv", "report.html", "fit.png", "fit.pdf"}
+FILES = {
+    "fit.json", "parameters.csv", "curves.csv", "report.html", "fit.png", "fit.pdf", "fit.csv",
+    "residuals.csv", "sensitivities.csv",
+}  # fmt: skip
 COMMANDS = (
     "batch", "check", "fit", "simulate", "compare", "published", "joint", "predict"
 )  # fmt: skip
@@ -229,7 +232,7 @@ def test_compare(here: Path, fitted: tuple[Path, Result]) -> None:
     folder = next(fitted[0].rglob("fit.json")).parent
     args = ("--published", "foam-1/model-1", "--plot", "comparison.png")
     assert "beside published foam-1/model-1" in accepted("compare", folder, *args).stdout
-    assert set(files(here)) == {"comparison.png"}
+    assert set(files(here)) == {"comparison.png", "comparison.csv"}
 
 
 # Scenes.

@@ -8,26 +8,32 @@ import os
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import Outliers, interior_channel
 from foamfit.errors import InputError
 from foamfit.files import reason, replacing
-from foamfit.report.figures import image, laid_out
+from foamfit.report.figures import TWO, image, laid_out
 from foamfit.report.page import render_report
 from foamfit.report.plots import plot_fit
+from foamfit.report.plotted import plotted
 from foamfit.results import SCHEMA, Curves, Fit, ParameterEstimate, plain
 from foamfit.trust.intervals import Intervals
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # All that `save_result` may write, and what `studies.cycles.save_cycles` writes beside the folders
 # of the cycles.
 RESULT_FILES = (
     "fit.json", "parameters.csv", "curves.csv", "profiles.csv", "ladder.csv", "fit.png",
-    "fit.pdf", "report.html",
+    "fit.pdf", "fit.csv", "residuals.csv", "sensitivities.csv", "report.html",
 )  # fmt: skip
-CYCLES_FILES = ("cycles.json", "cycles.csv", "cycles.png")
-JOINT_FILES = ("joint.json", "joint.html", "joint.png")
+# What is plotted in cycles.png; cycles.csv is the table of all numbers by cycle.
+CYCLES_PLOTTED = "cycles-plotted.csv"
+CYCLES_FILES = ("cycles.json", "cycles.csv", "cycles.png", CYCLES_PLOTTED)
+JOINT_FILES = ("joint.json", "joint.html", "joint.png", "joint.csv")
 # What `studies.batch` writes beside the folders of the tests, and into each of them.
 BATCH_FILES = ("summary.csv", "summary.html", "batch.json")
 PREDICTION_FILES = ("prediction.json", "prediction.csv", "prediction.png", "prediction.pdf")
@@ -36,14 +42,15 @@ MARKS = ("fit.json", "cycles.json", "joint.json", "batch.json", "prediction.json
 _FILES = (*RESULT_FILES, *CYCLES_FILES, *JOINT_FILES, *PREDICTION_FILES, "batch.json")
 
 
-def save_result(result: Fit, folder: str | Path) -> Path:
+def save_result(result: Fit, folder: str | Path, *, width: str = TWO) -> Path:
     """Write the result folder whole, replacing an older one at the end.
 
     It is made with its parents; InputError if something else stands there (see `check_target`) or
     it cannot be written, and nothing is changed then. ``profiles.csv`` is written where there are
-    profiles, ``ladder.csv`` where there is a ladder. Returns the folder.
+    profiles, ``ladder.csv`` where there is a ladder. `width` is that of fit.png and fit.pdf, see
+    `foamfit.report.plots.plot_fit`. Returns the folder.
     """
-    return save_whole(folder, lambda fresh: write_result(result, fresh))
+    return save_whole(folder, lambda fresh: write_result(result, fresh, width=width))
 
 
 def save_whole(folder: str | Path, write: Callable[[Path], None], *, swept: bool = False) -> Path:
@@ -165,8 +172,12 @@ def load_result(folder: str | Path) -> dict[str, Any]:
     return content
 
 
-def write_result(result: Fit, folder: Path, *, pages: bool = True) -> None:
+def write_result(result: Fit, folder: Path, *, pages: bool = True, width: str = TWO) -> None:
     """Write all files of a result into a folder that is there; the report and figures if wanted."""
+
+    def keep(name: str, figure: Figure) -> None:
+        write_table(folder / f"{name}.csv", plotted(figure))
+
     text = json.dumps(result.to_json_dict(), indent=2, ensure_ascii=False, allow_nan=False)
     # A name that is no UTF-8 keeps its bytes as an escape of JSON.
     (folder / "fit.json").write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
@@ -178,12 +189,13 @@ def write_result(result: Fit, folder: Path, *, pages: bool = True) -> None:
         write_table(folder / "ladder.csv", result.ladder.rows())
     if not pages:
         return
-    figure = plot_fit(result)
+    figure = plot_fit(result, width=width)
     with laid_out(figure):
         png, pdf = image(figure, "png"), image(figure, "pdf")
     (folder / "fit.png").write_bytes(png)
     (folder / "fit.pdf").write_bytes(pdf)
-    page = render_report(result, fit_png=png)
+    keep("fit", figure)
+    page = render_report(result, fit_png=png if width == TWO else None, keep=keep)
     (folder / "report.html").write_text(page, encoding="utf-8", errors="replace")
 
 

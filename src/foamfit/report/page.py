@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import functools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +23,7 @@ from foamfit.trust.covariance import RULE
 
 if TYPE_CHECKING:
     from jinja2 import Environment
+    from matplotlib.figure import Figure
 
 DRIVES = {
     "impact": "The motion follows from the mass and the velocity of the striker; nothing measured "
@@ -99,16 +100,24 @@ def environment() -> Environment:
     return made
 
 
-def render_report(result: Fit, *, fit_png: bytes | None = None) -> str:
+def render_report(
+    result: Fit, *, fit_png: bytes | None = None, keep: Callable[[str, Figure], None] | None = None
+) -> str:
     """Return the report as one HTML page that needs nothing else.
 
-    `fit_png` is the figure of `plots.plot_fit` as PNG, if it is there already.
+    `fit_png` is the figure of `plots.plot_fit` as PNG, if it is there already; the page is as wide
+    as two columns. `keep` is given the other figures with a name for what is plotted in them.
     """
     plain = result.to_json_dict()
     energy = plain["energy"]
     profiled = result.intervals is not None and result.intervals.profiles
     matrix = None if result.correlation is None else result.correlation.matrix
     insight = None if result.insight is None else plot_insight(result.insight, matrix)
+    residuals = plot_residuals(result)
+    if keep is not None:
+        keep("residuals", residuals)
+        if insight is not None:
+            keep("sensitivities", insight)
     return (
         environment()
         .get_template("report.html")
@@ -146,7 +155,8 @@ def render_report(result: Fit, *, fit_png: bytes | None = None) -> str:
             answers=ANSWERS,
             badges=BADGES,
             insight_figure=insight and _figure(image(insight, "png", COARSE), COARSE),
-            residual_figure=_figure(image(plot_residuals(result), "png")),
+            residual_figure=_figure(image(residuals, "png")),
+            kept=keep is not None,
             profile_figure=_figure(image(plot_profiles(result), "png")) if profiled else None,
             citation=CITATION,
         )
