@@ -218,7 +218,7 @@ def test_the_terminal_is_one_screen_and_verbose_says_the_rest(
 ) -> None:
     found = fabricated.result(notes=("Noise of stress 30 kPa, given.",))
     monkeypatch.setattr("foamfit.api.fit", lambda *_, **__: found)
-    monkeypatch.setattr("foamfit.api.save_result", lambda _, folder: folder)
+    monkeypatch.setattr("foamfit.api.save_result", lambda _, folder, **__: folder)
     short = accepted("fit", RECONSTRUCTION).stdout
     assert len(short.splitlines()) <= 30
     assert "rows: 601 read, 601 used" in short

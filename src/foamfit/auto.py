@@ -283,7 +283,7 @@ class _Comparison:
         if damping == "without":
             for name in _dampers(params):
                 params[name].set(value=0.0, vary=False)
-        label = f"model {int(part[0]) + 1} of at most {self.of}: "
+        label = f"model {int(part[0]) + 1} of {self.of}: "
         label += rung_name(model.name, damping, model.relaxation)
 
         def tell(share: float, what: str) -> None:

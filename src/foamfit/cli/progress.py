@@ -19,8 +19,9 @@ if TYPE_CHECKING:
     from foamfit.fitting.problem import Problem
 
 REDRAWN = 0.2  # s between two looks whether the line has changed
-# Simulations for the best misfit take at most this share of the time of a fit.
-SHARE = 0.01
+# Simulations for the best misfit take at most this share of the time of a fit, and are no nearer to
+# each other, s.
+SHARE, APART = 0.02, 0.2
 # The time left is told after this share of the work, s; by the pace of this share of the time.
 ENOUGH, RECENT = 0.03, 0.4
 BAR = 24  # characters at most; below a third of it there is none
@@ -53,7 +54,8 @@ class ProgressLine(Progress):
         self.misfit: float | None = None
         self.marks = deque([(self.began, 0.0)], maxlen=400)
         self.watch = self._watch
-        self._spent, self._shown = 0.0, ""
+        self._best: tuple[Problem, Array] | None = None
+        self._next, self._looked, self._shown = 0.0, False, ""
         self._lock, self._ended = threading.Lock(), threading.Event()
         self._thread = threading.Thread(target=self._keep, daemon=True)
         self._thread.start()
@@ -62,24 +64,31 @@ class ProgressLine(Progress):
         """Take how far the command is: the share of its time, and what is being done."""
         scope = what.rpartition(": ")[0]
         if scope != self.scope and not scope.startswith("model"):
-            self.misfit = None  # it was of another test
+            self.misfit = self._best = None  # it was of another test
         self.what, self.scope = what, scope
         if fraction > self.fraction:
             self.fraction = fraction
             self.marks.append((time.monotonic(), fraction))
+        self._look()
 
     def _watch(self, problem: Problem, values: Array) -> None:
-        """Take the best point so far; to simulate it must not slow the fit."""
-        began = time.monotonic()
-        if self._spent > SHARE * (began - self.began):
+        """Take the best point so far."""
+        self._best = problem, values
+        self._look()
+
+    def _look(self) -> None:
+        """Simulate the best point, unless that would slow the fit."""
+        if self._best is None or (began := time.monotonic()) < self._next:
             return
+        (problem, values), self._best = self._best, None
         objective = problem.objective
         if (found := objective.look(values)) is not None:
             pairs = zip(objective.counted, objective.sizes, strict=True)
             squares = sum(size * (found[name] or 0.0) ** 2 for name, size in pairs)
             misfit = math.sqrt(squares / objective.n_data)
             self.misfit = misfit if self.misfit is None else min(self.misfit, misfit)
-        self._spent += time.monotonic() - began
+        took = time.monotonic() - began if self._looked else 0.0  # the first one loads the solver
+        self._next, self._looked = began + took + max(took / SHARE, APART), True
 
     def tell(self, told: str) -> None:
         """Print a sentence above the line."""
@@ -105,12 +114,14 @@ class ProgressLine(Progress):
         parts = [] if self.misfit is None else [f"best misfit {100.0 * self.misfit:.2g} %"]
         if (left := self.left()) is not None:
             parts.append(f"{duration(left)} left")
-        head, tail = f"{self.name}: {self.what}", ", ".join(parts)
+        head, tail = printable(f"{self.name}: {self.what}"), ", ".join(parts)
         room = min(BAR, width - len(head) - len(tail) - 6)
-        if room < BAR // 3:
-            return printable(f"{head}  {tail}")[: width - 1]
+        if room < BAR // 3:  # what is best and when it ends is worth more than what is done
+            most = width - len(tail) - 3
+            head = head if len(head) <= most else f"{head[: max(most - 1, 0)]}…"
+            return f"{head}  {tail}".rstrip()[: width - 1]
         done = round(room * min(self.fraction, 1.0))
-        return printable(f"{head} [{'#' * done}{'-' * (room - done)}] {tail}")
+        return f"{head} [{'#' * done}{'-' * (room - done)}] {tail}".rstrip()
 
     def close(self) -> None:
         """Take the line away."""

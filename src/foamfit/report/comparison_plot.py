@@ -108,7 +108,7 @@ def _draw_comparison(ax: Axes, pairs: list[Pair]) -> None:
             if row.lost:
                 ax.annotate(
                     "not determined", (0.0, y), ha="center", va="center", fontsize=6.5,
-                    color=color, style="italic",
+                    color=color, style="italic", label=f"_{side}: {row.label}:",
                 )  # fmt: skip
             elif row.standard_errors is not None:
                 ax.plot([0.0, row.standard_errors], [y, y], color=color, lw=0.9, zorder=2)

@@ -163,6 +163,24 @@ def image(figure: Figure, form: Literal["png", "pdf", "svg"], dpi: int = DPI) ->
     return buffer.getvalue()
 
 
+def write_haloed(ax: Axes, name: str, at: Array, offset: tuple[float, float], **style: Any) -> None:
+    """Write beside a place, in points from it, on a white rim that parts it from lines."""
+    from matplotlib.patheffects import Stroke
+    from matplotlib.text import Annotation
+
+    class Haloed(Annotation):
+        """A text with a rim, for which matplotlib would make outlines of its letters."""
+
+        def draw(self, renderer: Any) -> None:
+            self.set_path_effects([Stroke(linewidth=1.5, foreground="white")])
+            super().draw(renderer)
+            self.set_path_effects([])
+            super().draw(renderer)
+
+    text = Haloed(name, tuple(at), offset, textcoords="offset points", clip_on=False, **style)
+    ax.add_artist(text)
+
+
 def say_nothing_there(ax: Axes) -> None:
     """Write into an empty panel that there is no curve."""
     ax.set_axis_off()

@@ -26,6 +26,7 @@ from foamfit.report.figures import (
     legend_below,
     save,
     say_nothing_there,
+    write_haloed,
 )
 from foamfit.report.readable import readable_unit
 from foamfit.springs.spring import LinearSpring
@@ -54,6 +55,7 @@ MARKERS = 60  # of a measured curve: more of them blot
 PALE = "#A6CEE3"
 # Of masses inside, from the base up: beside their colours, for who sees or prints grey.
 DASHES: Any = ((0, (5, 1.2)), (0, (2.5, 1.2)), (0, (1, 1)), (0, (5, 1.2, 1, 1.2)))
+MARKS = ("^", "v", "D", "p")
 # Typographic points: height of a panel beside others and above others, what its labels take beside
 # and below it, and what title and legend take.
 HEIGHT, STACKED, BESIDE_IT, BELOW_IT, AROUND = 133.0, 112.0, 31.0, 26.0, 39.0
@@ -245,13 +247,16 @@ def _draw(ax: Axes, panel: _Panel) -> None:
         dashes = DASHES[(line.node - 1) % len(DASHES)] if line.node else "-"
         if line.kind == "measured":
             some = _evenly(x, y, MARKERS)
-            mark, name = "o", f"_measured, mass {line.node}" if line.node else "measured"
-            if line.source != "measured":
+            mark, name, edge = "o", "measured", "0.6"
+            if line.node:
+                mark, edge = MARKS[(line.node - 1) % len(MARKS)], color
+                name = f"_measured, mass {line.node}"
+            elif line.source != "measured":
                 mark, name = "s", f"measured, motion {line.source}"
             every = f"_{name.removeprefix('_')}, all samples"
             ax.plot(x, y, color="0.82", lw=0.5, zorder=1, label=every)
             ax.plot(
-                x[some], y[some], mark, label=name, ms=3.4, mfc="white", mec="0.6", mew=0.6,
+                x[some], y[some], mark, label=name, ms=3.4, mfc="white", mec=edge, mew=0.6,
                 zorder=3,
             )  # fmt: skip
         elif line.kind == "fitted":
@@ -331,16 +336,11 @@ class _Labels:
         self, name: str, at: Array, wanted: tuple[float, float], *, stay: bool = False, **style: Any
     ) -> None:
         """Write a name beside a place; `stay`: on no other side of it than is wanted."""
-        from matplotlib.patheffects import withStroke
-
         avoid = np.concatenate([np.empty((0, 2)), *self.curves, *self.marks])
         anchor, avoid = (at - self.corner) * self.span, (avoid - self.corner) * self.span
         offset = _free_offset(anchor, name, wanted, avoid, self.taken, self.size, stay=stay)
-        self.ax.annotate(
-            name, tuple(at), offset, textcoords="offset points", zorder=6,
-            ha="left" if offset[0] > 0 else "right", va="center",
-            path_effects=[withStroke(linewidth=1.5, foreground="white")], **style,
-        )  # fmt: skip
+        side = "left" if offset[0] > 0 else "right"
+        write_haloed(self.ax, name, at, offset, zorder=6, ha=side, va="center", **style)
 
 
 def _mark_switches(labels: _Labels, panel: _Panel, result: Fit) -> None:

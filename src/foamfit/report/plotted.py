@@ -94,8 +94,8 @@ def _series(ax: Axes) -> Iterator[tuple[str, list[str], list[str]]]:
             yield name, *_columns(ax, line, np.asarray(line.get_xydata(), dtype=float))
     for patch in ax.patches:
         if name := _name(patch):
-            outline = patch.get_patch_transform().transform(np.asarray(patch.get_path().vertices)[:-1])
-            yield name, *_columns(ax, patch, outline)
+            corners = patch.get_patch_transform().transform(patch.get_path().vertices)
+            yield name, *_columns(ax, patch, corners[:-1])
     for drawn in ax.collections:
         if (name := _name(drawn)) and isinstance(drawn, LineCollection | PolyCollection):
             for path in drawn.get_paths():

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 # Columns of the picture, and inches of a loop and of a parameter.
 LOOPS, LOOP, COLUMNS, PANEL = 6, (1.25, 1.15), 3, (2.5, 1.6)
-LEAST_LOOP, LEAST_PANEL = 1.05, 2.1  # in
+LEAST_LOOP, LEAST_PANEL = 1.05, 1.55  # in
 MEASURED = "0.65"  # wide and light below what is fitted, which is darker in grey too
 MOST_LOOPS = 48
 MOST_NAMES = 12  # of tests that stand at an axis
@@ -55,14 +55,16 @@ def plot_joint(found: JointData, *, width: str = TWO) -> Figure:
         line
         for part in (
             f"{found.study.name} · {found.study.model} · {len(found.tests)} tests together",
-            f"loops: measured grey and wide, fitted blue{more}; below: 95 % intervals by test, "
-            "hollow if not well determined; red: in common",
+            f"loops: measured grey and wide, fitted blue and thin{more}; below: 95 % intervals by "
+            "test, hollow if not well determined; lines: in common",
         )
         for line in textwrap.wrap(part, int(17 * wide))
     ]
     with drawing(wide, sum(heights) + 0.2 + 0.13 * len(lines)) as figure:
         top, bottom = figure.subfigures(2, 1, height_ratios=heights, squeeze=False)[:, 0]
-        _draw_loops(top.subplots(rows, across, squeeze=False).ravel().tolist(), found, shown)
+        most = int(72.0 * wide / across / 3.7)  # letters of a name
+        loops = top.subplots(rows, across, squeeze=False).ravel().tolist()
+        _draw_loops(loops, found, shown, most)
         axes = bottom.subplots(low, columns, squeeze=False).ravel().tolist()
         for ax, name in zip(axes, names, strict=False):
             _parameter(ax, found, name)
@@ -82,7 +84,8 @@ def _shown(found: JointData) -> list[int]:
     return [order[place] for place in places]
 
 
-def _draw_loops(axes: list[Axes], found: JointData, shown: list[int]) -> None:
+def _draw_loops(axes: list[Axes], found: JointData, shown: list[int], most: int) -> None:
+    """Draw the loop of each test that is shown; names have so many letters at most."""
     tests = found.measurements
     top = max(float(np.max(t.stress)) for t in tests if t.stress is not None)
     factor, unit = readable_unit(top, "Pa")
@@ -100,7 +103,7 @@ def _draw_loops(axes: list[Axes], found: JointData, shown: list[int]) -> None:
         ax.set_label(found.tests[t])
         rate = found.rates[t] if by_rate(found) else None
         told = found.tests[t] if rate is None else f"{found.tests[t]}, {rate:.2g}/s"
-        ax.set_title(told if len(told) < 24 else f"…{told[-22:]}", fontsize=6)
+        ax.set_title(told if len(told) <= most else f"…{told[-most + 1 :]}", fontsize=6)
         ax.tick_params(labelsize=5.5, length=2, pad=1.5)
         ax.locator_params(nbins=3)
         ax.set_xlabel(label, fontsize=6, labelpad=1, visible=t == shown[0])
