@@ -42,10 +42,12 @@ class Terminal:
         self.stream = os.fdopen(slave, "w", encoding="utf-8")
 
     def read(self) -> str:
-        try:
-            return os.read(self.master, 1 << 20).decode()
-        except BlockingIOError:
-            return ""
+        found = b""
+        while True:
+            try:
+                found += os.read(self.master, 1 << 16)
+            except BlockingIOError:
+                return found.decode()
 
 
 @pytest.fixture
@@ -61,7 +63,7 @@ def quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Reports without pictures, a line that is redrawn at once, an empty working directory."""
     monkeypatch.chdir(tmp_path)
     without_pictures(monkeypatch)
-    monkeypatch.setattr(module, "REDRAWN", 0.005)
+    monkeypatch.setattr(module, "REDRAWN", 0.02)
     monkeypatch.setattr(module, "APART", 0.0)
 
 

@@ -14,6 +14,7 @@ from foamfit.fitting.problem import make_problem
 from foamfit.report.figures import image
 from foamfit.report.studies.joint_page import joint_page
 from foamfit.report.studies.joint_plot import plot_joint
+from foamfit.report.plotted import plotted
 from foamfit.report.studies.joint_text import joint_text
 from foamfit.study.joint_estimates import common_covariance, parameter_of
 from foamfit.study.joint_fit import Alternative, fit_jointly
@@ -148,3 +149,23 @@ def test_the_words_have_the_same_numbers(found):
     assert "warning: x.csv is left out" in told
     assert re.search(r"s1_sigma_plus +log rate +1\d\d\.\d kPa", told)
     assert "*  log rate" in told
+
+
+def test_what_the_picture_shows_is_in_its_table(found) -> None:
+    head, *rows = plotted(plot_joint(found))
+    assert head[:2] == ("panel", "series")
+    for t, (test, measurement) in enumerate(zip(found.tests, found.measurements, strict=True)):
+        drawn = [row for row in rows if row[:2] == (test, "measured")]
+        step = max(measurement.stress.size // 400, 1)
+        strain = measurement.displacement[::step] / measurement.specimen.height
+        np.testing.assert_allclose([float(row[4]) for row in drawn], strain, rtol=1e-5, atol=1e-12)
+        assert {row[2] for row in drawn} == {"strain"}
+        assert all(row[3].startswith("stress (") for row in drawn)
+        assert any(row[:2] == (test, "fitted") for row in rows), t
+    assert {"95 % interval", "determined"} <= {row[1] for row in rows}
+
+
+def test_in_one_column_nothing_is_wider(found) -> None:
+    narrow, wide = plot_joint(found, width="one"), plot_joint(found)
+    assert (narrow.get_figwidth(), wide.get_figwidth()) == (3.25, 7.0)
+    assert [ax.get_title() for ax in narrow.axes][-1] == [ax.get_title() for ax in wide.axes][-1]

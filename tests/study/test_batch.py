@@ -149,6 +149,21 @@ def test_reports_are_there_unless_they_are_not_wanted(here, tried, monkeypatch):
     assert len(tried) == 6
 
 
+def test_figures_of_another_width_are_made_again_where_there_are_any(here, tried, monkeypatch):
+    without_pictures(monkeypatch)
+    again(report=True)
+    assert len(tried) == 3
+    again(report=True, figure_width="177.8 mm")  # two columns
+    again(report=False, figure_width="one")
+    assert len(tried) == 3
+    again(report=True, figure_width="one")
+    assert len(tried) == 6
+    again(report=True, figure_width="3.25 in")
+    assert len(tried) == 6
+    with pytest.raises(ff.InputError, match="the width of figures = 'narrow'"):
+        again(figure_width="narrow")
+
+
 def test_a_cycle_is_a_row_and_its_folder_is_in_that_of_the_test(here, monkeypatch):
     from foamfit.study.cycles import CycleFits
 

@@ -62,7 +62,7 @@ def inches(width: str) -> float:
         return known
     from foamfit.data.units import parse_quantity
 
-    wide = parse_quantity(width, "m", "the width of figures", "85 mm") / 0.0254
+    wide = round(parse_quantity(width, "m", "the width of figures", "85 mm") / 0.0254, 6)
     if not NARROWEST <= wide <= WIDEST:
         low, high = (f"{25.4 * end:.0f}" for end in (NARROWEST, WIDEST))
         raise InputError(
