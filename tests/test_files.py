@@ -102,7 +102,7 @@ def test_what_is_put_into_the_folder_while_it_is_written_stays(
 ) -> None:
     folder = fabricated.result(seed=1).save("r")
 
-    def late(_: object) -> None:
+    def late(*_: object, **__: object) -> None:
         (here / "r" / "notes.txt").write_text("x")
 
     monkeypatch.setattr(foamfit.report.folder, "plot_fit", late)
@@ -183,19 +183,19 @@ def test_a_full_disk_leaves_the_older_file(
     monkeypatch.setattr(Path, "write_bytes", full)
     for path, make in (
         (here / "a.csv", lambda path: write_csv(comparison, path)),
-        (here / "a.png", lambda path: plot_fit(fabricated.result(), path)),
+        (here / "b.png", lambda path: plot_fit(fabricated.result(), path)),
     ):
         path.write_text("older")
         with pytest.raises(InputError, match="No space left on device"):
             make(path)
         assert path.read_text() == "older"
-    assert names(here) == ["a.csv", "a.png", "r"]
+    assert names(here) == ["a.csv", "b.png", "r"]
 
 
 def test_a_full_disk_loses_no_numbers(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The folder cannot be written: the numbers are printed all the same, the exit code is true."""
 
-    def full(*_: object) -> None:
+    def full(*_: object, **__: object) -> None:
         raise InputError("the result cannot be written to r: No space left on device")
 
     monkeypatch.setattr(FitResult, "save", full)

@@ -12,9 +12,9 @@ from foamfit.data.measurement import Measurement, Noise, Specimen
 from foamfit.fitting.links import Links
 from foamfit.fitting.problem import make_problem
 from foamfit.report.figures import image
+from foamfit.report.plotted import plotted
 from foamfit.report.studies.joint_page import joint_page
 from foamfit.report.studies.joint_plot import plot_joint
-from foamfit.report.plotted import plotted
 from foamfit.report.studies.joint_text import joint_text
 from foamfit.study.joint_estimates import common_covariance, parameter_of
 from foamfit.study.joint_fit import Alternative, fit_jointly

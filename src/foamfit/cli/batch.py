@@ -164,7 +164,7 @@ def _progress_line(quiet: bool) -> Iterator[Callable[[State], None]]:
             bar.label = f"{state.done} done, {state.wrong} without a fit, {state.left} left"
             if state.fitted and state.left:
                 rest = (time.monotonic() - began) / state.fitted * state.left
-                bar.label += f", {duration(rest)}"
+                bar.label += f", about {duration(rest)}"
             total = max(state.done + state.left, 1)
             bar.update(round(1000 * state.done / total) - bar.pos)
 

@@ -97,4 +97,4 @@ def check(
         else:
             title = f"{name} · {outlook.problem.model.name} · before the fit"
             plot_insight(insight, title=title, path=plot, width=figure_width)
-            say(f"\ndrawn in {plot}")
+            say(f"\ndrawn in {plot}, its data in {plot.with_suffix('.csv')}")

@@ -42,7 +42,7 @@ def compare(
     say(comparison_text(comparison))
     if plot is not None:
         plot_comparison(comparison, plot, width=figure_width, table=own)
-        say(f"\ndrawn in {plot}")
+        say(f"\ndrawn in {plot}, its data in {plot.with_suffix('.csv')}")
     if table is not None:
         write_csv(comparison, table)
         say(f"\nwritten to {table}")

@@ -96,24 +96,31 @@ class ProgressLine(Progress):
             self._write("")
             super().tell(told)
 
-    def left(self) -> float | None:
-        """Seconds that are left, as the pace of late tells; None where it does not tell."""
+    def left(self) -> str:
+        """Say what time is left, by the pace of late and the limit; "" where neither tells."""
+        if self.fraction >= 1.0:
+            return ""
+        now, ahead = time.monotonic(), self._ahead()
+        rest = math.inf if self.limit is None else max(self.limit - (now - self.began), 0.0)
+        if rest <= ahead:
+            return "" if rest == math.inf else f"at most {duration(rest)} left"
+        return f"about {duration(ahead)} left"
+
+    def _ahead(self) -> float:
+        """Seconds that are left by the pace of late; infinite where it does not tell."""
         now, (at, done) = time.monotonic(), self.marks[-1]
-        rest = None if self.limit is None else max(self.limit - (now - self.began), 0.0)
-        if self.fraction < ENOUGH or self.fraction >= 1.0:
-            return rest if self.fraction < 1.0 else None
+        if self.fraction < ENOUGH:
+            return math.inf
         since = at - RECENT * (at - self.began)
         before = [mark for mark in self.marks if mark[0] <= since] or [self.marks[0]]
         pace = (done - before[-1][1]) / max(at - before[-1][0], 1e-6)
         ahead = (1.0 - done) / pace
-        ahead = max(ahead - (now - at), 0.5 * ahead)  # past that nobody knows
-        return ahead if rest is None else min(ahead, rest)
+        return max(ahead - (now - at), 0.5 * ahead)  # past that nobody knows
 
     def line(self, width: int) -> str:
         """Return what is shown in so many columns."""
         parts = [] if self.misfit is None else [f"best misfit {100.0 * self.misfit:.2g} %"]
-        if (left := self.left()) is not None:
-            parts.append(f"{duration(left)} left")
+        parts += filter(None, [self.left()])
         head, tail = printable(f"{self.name}: {self.what}"), ", ".join(parts)
         room = min(BAR, width - len(head) - len(tail) - 6)
         if room < BAR // 3:  # what is best and when it ends is worth more than what is done
@@ -157,8 +164,8 @@ def _columns(stream: TextIO) -> int:
 def duration(seconds: float) -> str:
     """Write a time that is only about known."""
     if seconds < 90:
-        return f"about {max(seconds, 1.0):.0f} s"
-    return f"about {seconds / 60:.0f} min" if seconds < 5400 else f"about {seconds / 3600:.1f} h"
+        return f"{max(seconds, 1.0):.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 @contextmanager

@@ -67,4 +67,4 @@ def simulate(
         from foamfit.report.plots import plot_response
 
         plot_response(response, plot, width=figure_width, table=table)
-        say(f"drawn in {plot}")
+        say(f"drawn in {plot}, its data in {plot.with_suffix('.csv')}")

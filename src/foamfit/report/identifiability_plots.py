@@ -142,7 +142,6 @@ def _draw_sensitivities(figure: FigureBase, insight: Insight, width: float) -> N
         for name in insight.names
     }
     reach = {name: max(float(np.max(np.abs(row))) for row in rows[name]) for name in rows}
-    told = "noise s.d. per 1 % of the parameter"
     for j, (ax, curve) in enumerate(zip(axes, insight.curves, strict=False)):
         _shade(ax, x, insight.sections)
         for i, name in enumerate(insight.names):
@@ -159,11 +158,11 @@ def _draw_sensitivities(figure: FigureBase, insight: Insight, width: float) -> N
         ax.set_ylim(k - 0.5, -0.5)
         ax.set_title(curve.replace("_", "-"), loc="left", fontsize=7.5, pad=11)
         ax.set_xlabel(f"time ({unit})" if unit else "sample")
-        ax.set_ylabel(told, visible=False)
+        ax.set_ylabel("noise s.d. per 1 %", visible=False)
         ax.tick_params(axis="y", length=0)
         ax.spines["left"].set_visible(False)
     axes[0].set_yticks(range(k), [f"{name}\n±{reach[name]:.2g}" for name in insight.names])
-    figure.supylabel(told, fontsize=6.5)
+    figure.supylabel("noise s.d. per 1 % of the parameter", fontsize=6.5)
 
 
 def _shade(ax: Axes, x: Array, cuts: tuple[Section, ...]) -> None:
