@@ -130,7 +130,7 @@ def main() -> None:
     summary = f"{finding(comparison)}\n\n{in_parts(folders)}"
     page = PAGE.format(finding=summary, text=text)
     (HERE / "comparison.md").write_text(page, encoding="utf-8")
-    plot_comparison(comparison, HERE / "comparison.png")
+    plot_comparison(comparison, HERE / "comparison.png", table=False)  # which is in the page
     print(text, summary, sep="\n\n")
 
 

@@ -195,11 +195,10 @@ def figure_format(path: str | Path) -> Literal["png", "pdf", "svg"]:
     raise InputError(f"a figure is saved as .png, .pdf or .svg, not {Path(path).name!r}")
 
 
-def save(figure: Figure, path: str | Path | None, *, table: bool = True) -> Figure:
+def save(figure: Figure, path: str | Path | None, *, table: bool = False) -> Figure:
     """Save a figure, if there is a path, in the format of its suffix; returns the figure.
 
-    What is plotted in it is written beside it as CSV (see `foamfit.report.plotted`), without
-    `table` not.
+    With `table` what is plotted in it is written beside it as CSV; see `foamfit.report.plotted`.
     """
     if path is not None:
         data = Path(path).with_suffix(".csv")

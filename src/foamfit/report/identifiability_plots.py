@@ -75,7 +75,7 @@ def plot_insight(
         halves = figure.subfigures(2, 1, height_ratios=heights, squeeze=False)[:, 0]
         _draw_sensitivities(halves[0], insight, wide)
         _draw_information(halves[1], insight, correlation, wide)
-    return save(figure, path)
+    return save(figure, path, table=True)
 
 
 # ---------------------------------------------------------------- profiles
@@ -94,11 +94,12 @@ def plot_profiles(result: Fit, path: str | Path | None = None) -> Figure:
             _draw_profile(ax, profile, result.parameters[profile.name])
         for ax in axes[len(profiles) :]:
             ax.set_axis_off()
-        for ax in axes[: len(profiles) : 4]:
-            ax.set_ylabel("rise of χ²")
+        for at, (ax, profile) in enumerate(zip(axes, profiles, strict=False)):
+            ax.set_ylabel("rise of χ²", visible=at % 4 == 0)
+            ax.set_label(profile.name)
         if not profiles:
             say_nothing_there(axes[0])
-    return save(figure, path)
+    return save(figure, path, table=True)
 
 
 def _draw_profile(ax: Axes, profile: Profile, estimate: ParameterEstimate) -> None:
@@ -106,16 +107,17 @@ def _draw_profile(ax: Axes, profile: Profile, estimate: ParameterEstimate) -> No
     factor, unit = readable_unit(float(np.max(np.abs(profile.values))), estimate.unit)
     top = 2.0 * profile.cut
     x = profile.values / factor
-    ax.axhline(profile.cut, color=GREY, lw=0.6, ls=(0, (2, 2)))
-    ax.axvspan(*(end / factor for end in profile.ci95), color="0.92", lw=0)
+    ax.axhline(profile.cut, color=GREY, lw=0.6, ls=(0, (2, 2)), label="_95 % cut")
+    ax.axvspan(*(end / factor for end in profile.ci95), color="0.92", lw=0, label="_95 % interval")
     fine = np.linspace(x.min(), x.max(), 200)
     if estimate.stderr:
         parabola = ((fine * factor - estimate.value) / estimate.stderr) ** 2
-        ax.plot(fine, np.where(parabola <= top, parabola, np.nan), color=GREY, lw=0.8, ls="--")
+        below = np.where(parabola <= top, parabola, np.nan)
+        ax.plot(fine, below, color=GREY, lw=0.8, ls="--", label="_local covariance")
     root = np.sign(profile.values - estimate.value) * np.sqrt(np.maximum(profile.rises, 0.0))
-    ax.plot(fine, np.interp(fine, x, root) ** 2, color=BLUE, lw=1.1)
-    ax.plot(x, profile.rises, "o", color=BLUE, ms=2.2)
-    ax.plot(estimate.value / factor, 0.0, "o", color=VERMILION, ms=3.5)
+    ax.plot(fine, np.interp(fine, x, root) ** 2, color=BLUE, lw=1.1, label="_profile, between")
+    ax.plot(x, profile.rises, "o", color=BLUE, ms=2.2, label="_profile")
+    ax.plot(estimate.value / factor, 0.0, "o", color=VERMILION, ms=3.5, label="_best fit")
     ax.set_ylim(-0.04 * top, top)
     ax.locator_params(axis="x", nbins=4)
     name = f"{profile.name} ({unit})" if unit else profile.name

@@ -93,7 +93,7 @@ def plot_fit(result: Fit, path: str | Path | None = None, *, width: str = TWO) -
                 _name_branches(labels, panel, result)
         _head(figure, result)
         figure.align_ylabels()
-    return save(figure, path)
+    return save(figure, path, table=True)
 
 
 def plot_residuals(result: Fit, path: str | Path | None = None) -> Figure:
@@ -116,7 +116,7 @@ def plot_residuals(result: Fit, path: str | Path | None = None) -> Figure:
             column[-1].set_xlabel(f"time ({unit})" if unit else "sample")
         if not strips:
             say_nothing_there(column[0])
-    return save(figure, path)
+    return save(figure, path, table=True)
 
 
 def plot_response(
@@ -503,7 +503,8 @@ def _head(figure: Figure, result: Fit) -> None:
         title += f" · {word}"
     if result.stopped:
         title += f" · stopped by {result.stopped}"
-    title = textwrap.fill(title, int(12 * figure.get_figwidth()))
+    # A dot stays with what is before it.
+    title = textwrap.fill(title.replace(" · ", "\u00a0· "), int(12 * figure.get_figwidth()))
     # A name may hold a dollar sign: it is no formula.
     figure.suptitle(title, x=0.012, ha="left", fontsize=8.5, weight="bold", parse_math=False)
     entries: dict[str, Any] = {}
