@@ -64,8 +64,13 @@ def insight() -> Insight:
     return found
 
 
-def figures(width: str = "two") -> Iterator[tuple[str, Figure]]:
-    """All figures that can be made of little."""
+@functools.cache
+def figures(width: str = "two") -> tuple[tuple[str, Figure], ...]:
+    """All figures that can be made of little; they are not to be changed."""
+    return tuple(_figures(width))
+
+
+def _figures(width: str) -> Iterator[tuple[str, Figure]]:
     for name, make in RESULTS.items():
         yield name, plot_fit(make(), width=width)
     yield "response", plot_response(response(), width=width)

@@ -168,10 +168,10 @@ def compare_models(
     best = choose(tried).best
     wanted = options.choice.method != "local" or tried[best].best.misfits
     if stopped is None and wanted:
-        name, progressed = tried[best].name, progress
+        label = f"model chosen, {tried[best].name}"
         result, point = one_model.judge(
             state.fits[best], options.choice, announce,
-            lambda share, what: progressed(CHOSEN + (1.0 - CHOSEN) * share, f"{name}: {what}"),
+            lambda share, what: progress(CHOSEN + (1.0 - CHOSEN) * share, f"{label}: {what}"),
         )  # fmt: skip
         tried[best] = replace(tried[best], result=result, best=point)  # it may be a better point
     progress(1.0, "done")

@@ -53,7 +53,7 @@ TOGETHER = 0.8
 MOVED = 0.999
 # Evaluations over those of the search that ranges and profiles take, as measured: where the law has
 # an error, and where none.
-JUDGED, JUDGED_NOISE = 1.6, 0.15
+JUDGED, JUDGED_NOISE = 2.0, 0.15
 # Share of its time that a fit has searched, where the law has an error or none.
 SEARCHED = 0.5
 

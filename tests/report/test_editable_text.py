@@ -59,7 +59,7 @@ def letters(pdf: bytes) -> set[str]:
 
 def test_every_letter_is_that_of_an_embedded_truetype_font() -> None:
     for name, figure in figures():
-        if name in ("bistable", "microscale, relaxing", "insight", "comparison"):
+        if name in ("microscale, relaxing", "comparison"):
             pdf = image(figure, "pdf")
             kinds = fonts(pdf)
             assert kinds, name

@@ -1,5 +1,6 @@
 """The picture and the page of a joint fit."""
 
+import os
 import re
 from dataclasses import replace
 
@@ -12,6 +13,7 @@ from foamfit.data.measurement import Measurement, Noise, Specimen
 from foamfit.fitting.links import Links
 from foamfit.fitting.problem import make_problem
 from foamfit.report.figures import image
+from foamfit.report.folder import write_table
 from foamfit.report.plotted import plotted
 from foamfit.report.studies.joint_page import joint_page
 from foamfit.report.studies.joint_plot import plot_joint
@@ -163,6 +165,14 @@ def test_what_the_picture_shows_is_in_its_table(found) -> None:
         assert all(row[3].startswith("stress (") for row in drawn)
         assert any(row[:2] == (test, "fitted") for row in rows), t
     assert {"95 % interval", "determined"} <= {row[1] for row in rows}
+
+
+def test_a_name_that_is_no_unicode_stands_in_the_table(found, tmp_path) -> None:
+    odd = replace(found, tests=(os.fsdecode(b"foam \xe9"), *found.tests[1:]))
+    parameters = {n: replace(p, tests=None) for n, p in found.parameters.items()}
+    figure = plot_joint(replace(odd, parameters=parameters))
+    write_table(tmp_path / "joint.csv", plotted(figure))
+    assert b"foam \\udce9,measured" in (tmp_path / "joint.csv").read_bytes()
 
 
 def test_in_one_column_nothing_is_wider(found) -> None:

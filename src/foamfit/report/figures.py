@@ -79,7 +79,10 @@ def abreast(width: float, panels: int, least: float = 2.1) -> int:
 
 @contextmanager
 def drawing(width: float, height: float) -> Iterator[Figure]:
-    """Give an empty figure of a size in inches, and the style of all figures to draw it in."""
+    """Give an empty figure of a size in inches, and the style of all figures to draw it in.
+
+    Long lines are thinned in the end to what can be seen of them.
+    """
     import matplotlib
     from matplotlib.figure import Figure
 

@@ -201,7 +201,8 @@ def write_result(result: Fit, folder: Path, *, pages: bool = True, width: str = 
 
 def write_table(path: Path, rows: Iterable[Iterable[object]]) -> None:
     """Write rows of cells as CSV."""
-    with path.open("w", encoding="utf-8", newline="") as file:
+    # A name that is no UTF-8 keeps its bytes as an escape.
+    with path.open("w", encoding="utf-8", errors="backslashreplace", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows(rows)
 
 
