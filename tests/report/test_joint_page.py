@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib import rc_context
 
 import foamfit as ff
 from conftest import AREA, HEIGHT
 from foamfit.data.measurement import Measurement, Noise, Specimen
 from foamfit.fitting.links import Links
 from foamfit.fitting.problem import make_problem
-from foamfit.report.figures import image
+from foamfit.report.figures import STYLE, image, laid_out
 from foamfit.report.folder import write_table
 from foamfit.report.plotted import plotted
 from foamfit.report.studies.joint_page import joint_page
@@ -178,4 +179,11 @@ def test_a_name_that_is_no_unicode_stands_in_the_table(found, tmp_path) -> None:
 def test_in_one_column_nothing_is_wider(found) -> None:
     narrow, wide = plot_joint(found, width="one"), plot_joint(found)
     assert (narrow.get_figwidth(), wide.get_figwidth()) == (3.25, 7.0)
+    for figure in (narrow, wide):
+        with laid_out(figure, 100), rc_context(STYLE):
+            figure.dpi = 100
+            for ax in (one for one in figure.axes if one.axison or one.texts):
+                box = ax.get_tightbbox()
+                assert box.x0 > -1.5
+                assert box.x1 < figure.bbox.x1 + 1.5
     assert [ax.get_title() for ax in narrow.axes][-1] == [ax.get_title() for ax in wide.axes][-1]

@@ -81,7 +81,7 @@ def _sides(ax: Axes) -> tuple[str, str]:
     for side, shared in (("x", ax.get_shared_x_axes()), ("y", ax.get_shared_y_axes())):
         labels = [getattr(one, f"get_{side}label")() for one in (ax, *shared.get_siblings(ax))]
         found.append(next(filter(None, labels), ""))
-    return found[0], found[1] or ax.get_title()
+    return found[0], found[1] or " ".join(ax.get_title().split())
 
 
 def _series(ax: Axes) -> Iterator[tuple[str, list[str], list[str]]]:

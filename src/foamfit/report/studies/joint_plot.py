@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 # Columns of the picture, and inches of a loop and of a parameter.
 LOOPS, LOOP, COLUMNS, PANEL = 6, (1.25, 1.15), 3, (2.5, 1.6)
-LEAST_LOOP, LEAST_PANEL = 1.05, 1.55  # in
+LEAST_LOOP, LEAST_PANEL, LEAST_TABLE = 1.05, 1.55, 2.1  # in
 MEASURED = "0.65"  # wide and light below what is fitted, which is darker in grey too
 MOST_LOOPS = 48
 MOST_NAMES = 12  # of tests that stand at an axis
@@ -62,16 +62,17 @@ def plot_joint(found: JointData, *, width: str = TWO) -> Figure:
     ]
     with drawing(wide, sum(heights) + 0.2 + 0.13 * len(lines)) as figure:
         top, bottom = figure.subfigures(2, 1, height_ratios=heights, squeeze=False)[:, 0]
-        most = int(72.0 * wide / across / 3.7)  # letters of a name
+        most = int(72.0 * wide / across / 4.2)  # letters of a name
         loops = top.subplots(rows, across, squeeze=False).ravel().tolist()
         _draw_loops(loops, found, shown, most)
         axes = bottom.subplots(low, columns, squeeze=False).ravel().tolist()
+        narrow = wide / columns < LEAST_TABLE
         for ax, name in zip(axes, names, strict=False):
-            _parameter(ax, found, name)
+            _parameter(ax, found, name, parted=narrow)
         for ax in axes[len(names) :]:
             ax.set_axis_off()
         if shared:
-            _list(axes[len(names)], found, shared)
+            _list(axes[len(names)], found, shared, stacked=narrow)
         figure.suptitle("\n".join(lines), x=0.01, ha="left", fontsize=8, parse_math=False)
     return figure
 
@@ -146,13 +147,15 @@ def _along(
     return test.time, curves.get("stress_time"), "time (s)"
 
 
-def _parameter(ax: Axes, found: JointData, name: str) -> None:
-    """One parameter by test, or by rate."""
+def _parameter(ax: Axes, found: JointData, name: str, *, parted: bool) -> None:
+    """One parameter by test, or by rate; its title in two lines if `parted`."""
     one = found.parameters[name]
     rated = by_rate(found)
     factor, unit = readable_unit(abs(one.value), one.unit)
     x = np.array(found.rates, dtype=float) if rated else np.arange(1.0, len(found.tests) + 1)
-    ax.set_title(f"{_title(found, name)}{f' ({unit})' if unit else ''}: {one.kind}")
+    told = f"{_title(found, name)}{f' ({unit})' if unit else ''}:"
+    ax.set_title(f"{told}\n{one.kind}" if parted else f"{told} {one.kind}")
+    ax.set_label(f"{told} {one.kind}")
     there = [
         (at, one.tests[test]) for at, test in zip(x, found.tests, strict=True)
         if one.tests and one.tests[test].state != "fixed"
@@ -221,14 +224,18 @@ def _common(ax: Axes, found: JointData, name: str, x: Array, factor: float) -> N
         _say(ax, f"spread {percent(one.scatter)}")
 
 
-def _list(ax: Axes, found: JointData, names: list[str]) -> None:
-    """Write the values that all tests share."""
+def _list(ax: Axes, found: JointData, names: list[str], *, stacked: bool) -> None:
+    """Write the values that all tests share, side by side or `stacked` below their names."""
     lines = [["shared by all tests", "", ""]]
     for name in names:
         one = found.parameters[name]
         half = None if one.ci95 is None else 0.5 * (one.ci95[1] - one.ci95[0])
         error = f"±{percent(half / abs(one.value))}" if half and one.value else one.state or ""
-        lines.append([_title(found, name), in_unit((one.value,), one.unit), error])
+        value = in_unit((one.value,), one.unit)
+        if stacked:
+            lines += [[_title(found, name), "", ""], [f"   {value} {error}", "", ""]]
+        else:
+            lines.append([_title(found, name), value, error])
     size = min(7.0, 90.0 / len(lines))
     for column, x in ((0, 0.0), (1, 0.42), (2, 0.78)):
         told = "\n".join(line[column] for line in lines)
