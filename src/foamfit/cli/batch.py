@@ -21,10 +21,10 @@ from foamfit.cli.options import (
     OPEN,
     SPECIMEN,
     WIDTH,
+    check_open,
     compiling,
     cycles_of,
-    refuse_json,
-    show_in_browser,
+    open_if_asked,
 )
 from foamfit.cli.progress import duration
 from foamfit.errors import InputError
@@ -61,7 +61,7 @@ PATIENCE = 10
 def batch(
     tests: tuple[str, ...], specimen: Path | None, cycle: str | None, model: str, out: Path | None,
     jobs: int | None, scheduler: str | None, fresh: bool, no_report: bool, figure_width: str,
-    open_it: bool, as_json: bool, quiet: bool, **search: Any,
+    as_json: bool, quiet: bool, **search: Any,
 ) -> int:  # fmt: skip
     """Fit every test on its own: a result folder for each, summary.csv and summary.html.
 
@@ -80,7 +80,7 @@ def batch(
     """
     if jobs is not None and scheduler is not None:
         raise InputError("--jobs and --scheduler exclude each other; leave one of them out")
-    refuse_json(open_it, as_json)
+    check_open(as_json)
     search |= intervals_of(**{way: search.pop(way) for way in ("profile", "bootstrap", "mcmc")})
     alone, several = cycles_of(cycle)
     from foamfit.study import processes
@@ -118,8 +118,7 @@ def batch(
     if wrong:
         told = f"{wrong} of {len(rows)} tests {'has' if wrong == 1 else 'have'} no acceptable fit"
         say(f"foamfit: {told}; see {found.out / 'summary.csv'}", err=True)
-    if open_it:
-        show_in_browser(found.out / "summary.html")
+    open_if_asked(found.out / "summary.html")
     return NOT_ACCEPTABLE if wrong else 0
 
 

@@ -18,10 +18,10 @@ from foamfit.cli.options import (
     SPECIMEN,
     TEST,
     WIDTH,
+    check_open,
     compiling,
     cycles_of,
-    refuse_json,
-    show_in_browser,
+    open_if_asked,
     spare,
 )
 from foamfit.cli.progress import progress_line
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 def fit(
     test: Path, specimen: Path | None, cycle: str | None, model: str, out: Path | None,
     fix: dict[str, float], vary: tuple[str, ...], figure_width: str,
-    open_it: bool, as_json: bool, quiet: bool, verbose: bool, **search: Any,
+    as_json: bool, quiet: bool, verbose: bool, **search: Any,
 ) -> int:  # fmt: skip
     """Identify the parameters of TEST.csv and write a result folder.
 
@@ -72,7 +72,7 @@ def fit(
     from foamfit.data.csv_file import read_test
     from foamfit.springs.model import Model
 
-    refuse_json(open_it, as_json)
+    check_open(as_json)
     search |= intervals_of(**{way: search.pop(way) for way in ("profile", "bootstrap", "mcmc")})
     model = "auto" if model.strip() == "auto" else Model.parse(model).name
     alone, several = cycles_of(cycle)
@@ -98,8 +98,7 @@ def fit(
                 result = api.fit(measurement, model=model, params=params, **told, **search)
         if several is not None:
             code = _tell_cycles(found, folder, figure_width, as_json, quiet)
-            if open_it:
-                show_in_browser(folder / "cycles.png")
+            open_if_asked(folder / "cycles.png")
             return code
         try:
             _save(result, folder, figure_width, quiet or as_json)
@@ -109,8 +108,7 @@ def fit(
     _tell_result(result, as_json, quiet, verbose)
     if not quiet and not as_json:
         say(f"\nwritten to {folder}: open {folder / 'report.html'}")
-    if open_it:
-        show_in_browser(folder / "report.html")
+    open_if_asked(folder / "report.html")
     if result.status == "failed":
         say(f"foamfit: no acceptable fit was found; see {folder}", err=True)
         return NOT_ACCEPTABLE

@@ -14,9 +14,9 @@ from foamfit.cli.options import (
     FILE,
     OPEN,
     WIDTH,
+    check_open,
     compiling,
-    refuse_json,
-    show_in_browser,
+    open_if_asked,
     spare,
 )
 from foamfit.cli.progress import progress_line
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 @click.option("--quiet", is_flag=True, help="Print nothing but warnings of failure.")
 def joint(
     study: Path, out: Path | None, jobs: int | None, seed: int | None,
-    no_report: bool, figure_width: str, open_it: bool, as_json: bool, quiet: bool,
+    no_report: bool, figure_width: str, as_json: bool, quiet: bool,
 ) -> int:  # fmt: skip
     """Fit the tests of STUDY.toml together: shared, own, scattering, rate-dependent parameters.
 
@@ -68,7 +68,7 @@ def joint(
         s1_eps_star = 0.3                       # held at a number (SI)
     Also: seed, cycle, starts, and [specimens] with a TOML for single tests: new-heel-1 = "a.toml".
     """
-    refuse_json(open_it, as_json)
+    check_open(as_json)
     from foamfit.report.folder import check_target
 
     folder = Path("fits", study.stem) if out is None else out
@@ -95,8 +95,7 @@ def joint(
     _tell(result, as_json, quiet)
     if not quiet and not as_json:
         say(f"\nwritten to {folder}: open {folder / 'joint.html'}")
-    if open_it:
-        show_in_browser(folder / "joint.html")
+    open_if_asked(folder / "joint.html")
     if result.status == "failed":
         say(f"foamfit: no acceptable fit was found; see {folder}", err=True)
         return NOT_ACCEPTABLE

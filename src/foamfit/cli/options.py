@@ -41,8 +41,15 @@ WIDTH = click.option(
     "--figure-width", metavar="one|two|LENGTH", default="two", show_default=True, callback=_width,
     help='Width of figures: one column (3.25 in), two (7 in), or a length as "85 mm".',
 )  # fmt: skip
+_OPENING = "foamfit.open"  # whether the command of a context is to open what it writes
+
+
+def _keep_open(context: click.Context, option: click.Parameter, value: bool) -> None:
+    context.meta[_OPENING] = value
+
+
 OPEN = click.option(
-    "--open", "open_it", is_flag=True,
+    "--open", is_flag=True, expose_value=False, callback=_keep_open,
     help="Open what was found in the browser, also with exit code 2; not together with --json.",
 )  # fmt: skip
 DRIVE = click.option(
@@ -87,14 +94,16 @@ def compiling(
         yield finish
 
 
-def refuse_json(open_it: bool, as_json: bool) -> None:
-    """Refuse to open a browser, which may print, where nothing but JSON is to be printed."""
-    if open_it and as_json:
+def check_open(as_json: bool) -> None:
+    """Refuse --open, as a browser may print, where nothing but JSON is to be printed."""
+    if click.get_current_context().meta[_OPENING] and as_json:
         raise InputError("--open and --json exclude each other; leave one of them out")
 
 
-def show_in_browser(page: Path) -> None:
-    """Open a file in the browser, or say in a sentence that there is none."""
+def open_if_asked(page: Path) -> None:
+    """With --open open a file in the browser, or say in a sentence that there is none."""
+    if not click.get_current_context().meta[_OPENING]:
+        return
     import webbrowser
 
     try:

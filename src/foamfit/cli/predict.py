@@ -16,9 +16,9 @@ from foamfit.cli.options import (
     SPECIMEN,
     TEST,
     WIDTH,
+    check_open,
     compiling,
-    refuse_json,
-    show_in_browser,
+    open_if_asked,
     spare,
 )
 from foamfit.errors import InputError
@@ -62,7 +62,7 @@ if TYPE_CHECKING:
 def predict(
     result: Path, test: Path, specimen: Path | None, cycle: int | None, drive: str | None,
     extrapolate: bool, draws: int, seed: int, out: Path | None, figure_width: str,
-    open_it: bool, as_json: bool, quiet: bool,
+    as_json: bool, quiet: bool,
 ) -> int:  # fmt: skip
     """Predict TEST.csv from RESULT: the folder of a fit or of a joint fit, or its JSON.
 
@@ -76,7 +76,7 @@ def predict(
         foamfit predict fits/TEST/microscale OTHER.csv
         foamfit predict joint/new-heel OTHER.csv --cycle 2 --out predictions/second
     """
-    refuse_json(open_it, as_json)
+    check_open(as_json)
     from foamfit.data.csv_file import read_test
     from foamfit.report.studies.prediction import check_replaceable
     from foamfit.study.prediction.identified import read_source
@@ -102,8 +102,7 @@ def predict(
     _tell(found, as_json, quiet)
     if not quiet and not as_json:
         say(f"\nwritten to {folder}: open {folder / 'prediction.png'}")
-    if open_it:
-        show_in_browser(folder / "prediction.png")
+    open_if_asked(folder / "prediction.png")
     return 0
 
 
