@@ -475,9 +475,9 @@ def test_only_the_chosen_rung_gets_the_intervals_that_were_asked_for(monkeypatch
     given = []
     original = one_model.judge
 
-    def watched(found, choice, tell):
+    def watched(found, choice, *rest):
         given.append((found.problem.model.name, choice.method, found.problem.objective.loss))
-        return original(found, choice, tell)
+        return original(found, choice, *rest)
 
     monkeypatch.setattr(auto.one_model, "judge", watched)
     loop = synthetic_loop()[1]

@@ -21,7 +21,10 @@ from foamfit.cli import main
 from foamfit.report.page import STATISTICS
 
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
-FILES = {"fit.json", "parameters.csv", "curves.csv", "report.html", "fit.png", "fit.pdf"}
+FILES = {
+    "fit.json", "parameters.csv", "curves.csv", "report.html", "fit.png", "fit.pdf", "fit.csv",
+    "residuals.csv", "sensitivities.csv",
+}  # fmt: skip
 COMMANDS = (
     "batch", "check", "fit", "simulate", "compare", "published", "joint", "predict"
 )  # fmt: skip
@@ -215,7 +218,7 @@ def test_the_terminal_is_one_screen_and_verbose_says_the_rest(
 ) -> None:
     found = fabricated.result(notes=("Noise of stress 30 kPa, given.",))
     monkeypatch.setattr("foamfit.api.fit", lambda *_, **__: found)
-    monkeypatch.setattr("foamfit.report.folder.save_result", lambda *_: None)
+    monkeypatch.setattr("foamfit.report.folder.save_result", lambda *_, **__: None)
     short = accepted("fit", RECONSTRUCTION).stdout
     assert len(short.splitlines()) <= 30
     assert "rows: 601 read, 601 used" in short
@@ -229,7 +232,7 @@ def test_compare(here: Path, fitted: tuple[Path, Result]) -> None:
     folder = next(fitted[0].rglob("fit.json")).parent
     args = ("--published", "foam-1/model-1", "--plot", "comparison.png")
     assert "beside published foam-1/model-1" in accepted("compare", folder, *args).stdout
-    assert set(files(here)) == {"comparison.png"}
+    assert set(files(here)) == {"comparison.png", "comparison.csv"}
 
 
 # Scenes.
@@ -268,6 +271,24 @@ def test_simulate_an_impact_on_a_published_chain(here: Path) -> None:
     header = (here / "scene.csv").read_text().splitlines()[0]
     assert header == "time (s),base stress (Pa),strain,displacement_1 (m)"
     assert table(here / "scene.csv")[:, 1].max() == pytest.approx(4.93e6, rel=0.01)
+    assert "drawn in response.png, its data in response.csv" in result.stdout
+    assert (here / "response.csv").read_text(encoding="utf-8").startswith("panel,series,")
+
+
+def test_one_table_is_that_of_a_response_and_of_its_figure(here: Path) -> None:
+    path = scene(here, PUBLISHED + IMPACT)
+    args = ("--plot", "scene.pdf", "--figure-width", "one")
+    assert "its data in scene.csv" in accepted("simulate", path, *args).stdout
+    assert (here / "scene.csv").read_text(encoding="utf-8").startswith("time (s),base stress (Pa)")
+    assert set(files(here)) == {"scene.toml", "scene.csv", "scene.pdf"}
+
+
+def test_the_data_of_a_figure_take_the_place_of_no_other_table(here: Path) -> None:
+    path = write(here)
+    before = path.read_bytes()
+    args = ("--model", "bistable", "--plot", path.with_suffix(".png"))
+    refused(here, "check", path, *args, words=(path.name, "plotted data", "name the figure"))
+    assert path.read_bytes() == before
 
 
 def test_simulate_own_springs(here: Path) -> None:

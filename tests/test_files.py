@@ -185,19 +185,19 @@ def test_a_full_disk_leaves_the_older_file(
     monkeypatch.setattr(Path, "write_bytes", full)
     for path, make in (
         (here / "a.csv", lambda path: write_csv(comparison, path)),
-        (here / "a.png", lambda path: plot_fit(fabricated.result(), path)),
+        (here / "b.png", lambda path: plot_fit(fabricated.result(), path)),
     ):
         path.write_text("older")
         with pytest.raises(InputError, match="No space left on device"):
             make(path)
         assert path.read_text() == "older"
-    assert names(here) == ["a.csv", "a.png", "r"]
+    assert names(here) == ["a.csv", "b.png", "r"]
 
 
 def test_a_full_disk_loses_no_numbers(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The folder cannot be written: the numbers are printed all the same, the exit code is true."""
 
-    def full(*_: object) -> None:
+    def full(*_: object, **__: object) -> None:
         raise InputError("the result cannot be written to r: No space left on device")
 
     monkeypatch.setattr(foamfit.report.folder, "save_result", full)

@@ -9,7 +9,8 @@ import lmfit
 
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError
-from foamfit.one_model import Keywords, Options, Progress, identify, judge
+from foamfit.one_model import SEARCHED, Keywords, Options, Progress, identify, judge
+from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import save_result
 from foamfit.results import Fit
 from foamfit.trust.intervals import Announce
@@ -18,9 +19,13 @@ from foamfit.trust.intervals import Announce
 class FitResult(Fit):
     """Everything that a fit found, and how it is written; its fields are those of `results.Fit`."""
 
-    def save(self, folder: str | Path) -> Path:
-        """Write the result folder whole, as `report.folder.save_result` does; returns it."""
-        return save_result(self, folder)
+    def save(self, folder: str | Path, *, figure_width: str = TWO) -> Path:
+        """Write the result folder whole, as `report.folder.save_result` does; returns it.
+
+        Its figure is "one" or "two" columns wide, or as wide as a length ("85 mm").
+        """
+        inches(figure_width)  # refuses what is no width
+        return save_result(self, folder, width=figure_width)
 
 
 def fit(
@@ -113,6 +118,12 @@ def fit(
 
         found = compare_models(measurement, chosen, progress, tell)
     else:
-        searched = identify(measurement, model, params, chosen, progress)
-        found, _ = judge(searched, chosen.choice, tell)
+        searched = identify(
+            measurement, model, params, chosen, lambda share, what: progress(SEARCHED * share, what)
+        )
+        found, _ = judge(
+            searched, chosen.choice, tell,
+            lambda share, what: progress(SEARCHED + (1.0 - SEARCHED) * share, what),
+        )  # fmt: skip
+        progress(1.0, "done")
     return FitResult(**vars(found))

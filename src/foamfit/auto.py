@@ -67,6 +67,8 @@ HOPELESS = 1.1
 # Two of them take a minute even under a known motion: they are not tried where one, perhaps with
 # relaxation, misses the curves by no more than this share of the range.
 CLOSE = 0.01
+# Share of the time of a comparison after which what is left is to judge the chosen model.
+CHOSEN = 0.9
 # Of a model that is compared: ranges and better intervals are made of the chosen one alone. They
 # cost as much as its search, and the comparison does not go by them.
 COMPARED = Choice("local", ranges=False)
@@ -135,14 +137,15 @@ def compare_models(
     tried: list[Tried] = []
     ended, stopped, idle = "there are no richer ones that this test allows", None, 0
     try:
-        for i, group in enumerate(groups):
+        state.of, number = sum(map(len, groups)), 0
+        for group in groups:
             below = len(tried)
-            for k, model in enumerate(group):
+            for model in group:
+                number += 1
                 if why := _hopeless(model, tried):
                     skipped.append(f"{rung_name(model.name, 'none', model.relaxation)}: {why}")
                     continue
-                done = (i + k / len(group)) / len(groups)
-                family = state.family(model, done, tried, skipped)
+                family = state.family(model, number, tried, skipped)
                 if state.stopped or any(one.structureless for one in family):
                     break
             if state.stopped:
@@ -165,7 +168,11 @@ def compare_models(
     best = choose(tried).best
     wanted = options.choice.method != "local" or tried[best].best.misfits
     if stopped is None and wanted:
-        result, point = one_model.judge(state.fits[best], options.choice, announce)
+        label = f"model chosen, {tried[best].name}"
+        result, point = one_model.judge(
+            state.fits[best], options.choice, announce,
+            lambda share, what: progress(CHOSEN + (1.0 - CHOSEN) * share, f"{label}: {what}"),
+        )  # fmt: skip
         tried[best] = replace(tried[best], result=result, best=point)  # it may be a better point
     progress(1.0, "done")
     ended = f"it was stopped by {stopped}" if stopped else ended
@@ -217,6 +224,7 @@ class _Comparison:
     measurement: Measurement
     options: Options
     progress: Progress
+    of: int = 0  # how many models there are
     stopped: str | None = None
     fits: list[Found] = field(default_factory=list)  # of what was tried, in its order
 
@@ -228,21 +236,22 @@ class _Comparison:
             self.options = replace(self.options, drive=choose_drive(self.measurement))
 
     def family(
-        self, model: Model, done: float, tried: list[Tried], skipped: list[str]
+        self, model: Model, number: int, tried: list[Tried], skipped: list[str]
     ) -> list[Tried]:
-        """Fit one model without damping and, unless that is enough, with it.
+        """Fit one model, the `number`-th, without damping and, unless that is enough, with it.
 
-        What is fitted is added to `tried` at once. `done` is the share of the comparison before it.
+        What is fitted is added to `tried` at once.
         """
         dampings = ("without", "with") if _dampers(self.params(model)) else ("none",)
         family: list[Tried] = []
-        for damping in dampings:
+        for i, damping in enumerate(dampings):
+            part = number - 1 + i / len(dampings), 1.0 / len(dampings)
             left = None if self.deadline is None else max(self.deadline - time.monotonic(), 1e-6)
             if left == 1e-6 and tried:
                 self.stopped = "the time limit"
                 break
             try:
-                found, one = self.rung(model, damping, _nested(tried, model), left, done)
+                found, one = self.rung(model, damping, _nested(tried, model), left, part)
             except SimulationError as error:
                 told = str(error).removeprefix(f"{self.measurement.name}: ")
                 skipped.append(f"{rung_name(model.name, 'none', model.relaxation)}: {told}")
@@ -261,22 +270,32 @@ class _Comparison:
         return make_params(self.measurement, model, options.drive, time_shift=options.time_shift)
 
     def rung(
-        self, model: Model, damping: str, below: Tried | None, left: float | None, done: float
-    ) -> tuple[Found, Tried]:
-        """Fit one model with or without damping."""
+        self, model: Model, damping: str, below: Tried | None, left: float | None,
+        part: tuple[float, float],
+    ) -> tuple[Found, Tried]:  # fmt: skip
+        """Fit one model with or without damping; `part` is where it begins, and what it takes.
+
+        Both count models.
+        """
         began = time.perf_counter()
         params = self.params(model)
         _carry(params, model, None if below is None else below.result)
         if damping == "without":
             for name in _dampers(params):
                 params[name].set(value=0.0, vary=False)
-        label = rung_name(model.name, damping, model.relaxation)
+        label = f"model {int(part[0]) + 1} of {self.of}: "
+        label += rung_name(model.name, damping, model.relaxation)
+
+        def tell(share: float, what: str) -> None:
+            done = CHOSEN * (part[0] + 0.8 * part[1] * share) / self.of
+            self.progress(done, f"{label}: {what}")
+
         found = one_model.identify(
             self.measurement,
             model.name,
             params,
             replace(self.options, max_time=left, relaxation=model.relaxation),
-            lambda share, what: self.progress(done + 0.1 * share, f"{label}: {what}"),
+            tell,
         )
         result, best = one_model.judge(found, COMPARED, lambda _: None)
         predicted = None if result.stopped else self.predicted(best)

@@ -19,6 +19,7 @@ from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.search import (
+    REFINED,
     STOPPING,
     SearchRecord,
     SearchStoppedError,
@@ -32,7 +33,7 @@ from foamfit.springs.parameters import HYSTERETIC, split_name
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
 from foamfit.trust.covariance import AT_LIMIT
-from foamfit.trust.intervals import Announce, Choice, assess
+from foamfit.trust.intervals import Announce, Choice, assess, evaluations_of
 from foamfit.trust.ranges import Open, left_open
 
 Progress = Callable[[float, str], None]
@@ -50,6 +51,11 @@ PROFILE_SHARE, IMPROVEMENTS = 0.5, 3
 TOGETHER = 0.8
 # Cost over the one before below which the ranges are made anew from a better point.
 MOVED = 0.999
+# Evaluations over those of the search that ranges and profiles take, as measured: where the law has
+# an error, and where none.
+JUDGED, JUDGED_NOISE = 2.0, 0.15
+# Share of its time that a fit has searched, where the law has an error or none.
+SEARCHED = 0.5
 
 
 class Keywords(TypedDict, total=False):
@@ -169,11 +175,14 @@ def _why_not(problem: Problem) -> str:
     return "check the drive, the heights and the bounds"
 
 
-def judge(found: Found, choice: Choice, announce: Announce) -> tuple[Fit, BestPoint]:
+def judge(
+    found: Found, choice: Choice, announce: Announce, progress: Progress = lambda *_: None
+) -> tuple[Fit, BestPoint]:
     """Make the intervals (and ranges) that were chosen, and the result of the best point."""
     try:
         best, record, intervals = found.best(), found.record, Intervals()
         if record.stopped is None:
+            found.tracker.pulse = _pulse(found, best, choice, progress)
             best, record, intervals = _assess(found, best, choice, announce)
         return _finish(found, best, record, intervals)
     except KeyboardInterrupt:  # what was found is not given up for a late Ctrl-C
@@ -187,6 +196,19 @@ def _finish(
     """Write the point into the parameters, and conclude."""
     found.problem.put(best.values)
     return conclude(best, record, intervals), best
+
+
+def _pulse(found: Found, best: BestPoint, choice: Choice, progress: Progress) -> Callable[[], None]:
+    """Tell the share of the evaluations done that ranges and intervals are expected to take."""
+    objective, spent = found.problem.objective, found.problem.objective.evaluations
+    share = JUDGED if choice.ranges and best.misfits else JUDGED_NOISE
+    expected = max(share * spent, 1.0) + evaluations_of(best, choice)
+    progress(0.0, "intervals")
+
+    def tell() -> None:
+        progress(min((objective.evaluations - spent) / expected, 0.97), "intervals")
+
+    return tell
 
 
 def _assess(
@@ -213,6 +235,7 @@ def _assess(
                 made = assess(
                     best, choice, minima=[*tracker.ends, *left.minima],
                     deadline=tracker.deadline, budget=budget, announce=announce,
+                    pulse=tracker.pulse,
                 )  # fmt: skip
             if made.better is None:
                 return best, record, replace(made, ranges=left.ranges)
@@ -234,7 +257,7 @@ def _search(
     try:
         costs = search(tracker, problem.space(), starts=record.starts, rng=rng, progress=progress)
         record = replace(record, costs=tuple(costs))
-        progress(0.95, "refinement")
+        progress(REFINED, "refinement")
         _refine(problem, tracker)
     except STOPPING as error:
         ensure_feasible(tracker, problem.space(), np.random.default_rng(record.seed))

@@ -75,7 +75,7 @@ def test_masses_inside_are_drawn_with_the_top() -> None:
     figure = plot_fit(result)
     _, displacement_time, _ = figure.axes
     np.testing.assert_allclose(line(displacement_time, "mass 1").get_ydata(), fitted * 1e6)
-    points = line(displacement_time, "_measured inside")
+    points = line(displacement_time, "_measured, mass 1")
     expected = np.interp(points.get_xdata() / 1e6, time, measured * 1e6)
     np.testing.assert_allclose(points.get_ydata(), expected, atol=1e-9)
     legend = [text.get_text() for text in figure.legends[0].get_texts()]

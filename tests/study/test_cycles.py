@@ -12,6 +12,7 @@ from click.testing import CliRunner
 import foamfit as ff
 from conftest import DATA, needs_data, without_pictures
 from foamfit.cli import main
+from foamfit.report.plotted import plotted
 from foamfit.report.studies import cycles as cycles_report
 
 HEIGHT, AREA = 10e-3, 1e-4
@@ -143,13 +144,17 @@ def test_ctrl_c_keeps_what_was_found(record, monkeypatch, at):
 
 def test_the_folder_holds_every_cycle_and_replaces_an_older_one(found, tmp_path, monkeypatch):
     without_pictures(monkeypatch)
-    monkeypatch.setattr(cycles_report, "plot_cycles", lambda _: None)
+    monkeypatch.setattr(cycles_report, "plot_cycles", lambda *_, **__: None)
+    monkeypatch.setattr(cycles_report, "table", lambda _: b"")
     monkeypatch.setattr(cycles_report, "image", lambda *_: b"\x89PNG")
     folder = tmp_path / "out"
     found.results[1].save(folder)  # of a fit of one cycle
     found.save(folder)
     names = {path.name for path in folder.iterdir()}
-    assert names == {"cycle-1", "cycle-2", "cycle-3", "cycles.csv", "cycles.json", "cycles.png"}
+    assert names == {
+        "cycle-1", "cycle-2", "cycle-3", "cycles.csv", "cycles.json", "cycles.png",
+        "cycles-plotted.csv",
+    }  # fmt: skip
     assert json.loads((folder / "cycle-2" / "fit.json").read_text())["data"]["cycle"] == 2
     with (folder / "cycles.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -170,13 +175,38 @@ def test_the_folder_holds_every_cycle_and_replaces_an_older_one(found, tmp_path,
 @pytest.mark.parametrize("place", ["mine.txt", "cycle-2/mine.txt"])
 def test_what_foamfit_did_not_write_is_not_replaced(found, tmp_path, monkeypatch, place):
     without_pictures(monkeypatch)
-    monkeypatch.setattr(cycles_report, "plot_cycles", lambda _: None)
+    monkeypatch.setattr(cycles_report, "plot_cycles", lambda *_, **__: None)
+    monkeypatch.setattr(cycles_report, "table", lambda _: b"")
     monkeypatch.setattr(cycles_report, "image", lambda *_: b"\x89PNG")
     found.save(tmp_path / "out")
     (tmp_path / "out" / place).write_text("mine")
     with pytest.raises(ff.InputError, match="did not write"):
         found.save(tmp_path / "out")
     assert (tmp_path / "out" / place).read_text() == "mine"
+
+
+def test_what_the_picture_shows_is_in_its_table(found):
+    _, *rows = plotted(cycles_report.plot_cycles(found))
+    loop = [row for row in rows if row[1] == "cycle 2"]
+    measured = found.results[2].curves.measured_stress
+    np.testing.assert_allclose([float(row[5]) for row in loop], measured / 1e3, rtol=1e-5)
+    assert {row[2:4] for row in loop} == {("strain from the first contact", "stress (kPa)")}
+    (value,) = [
+        float(row[5]) for row in rows
+        if row[0].startswith("k0 (") and row[1] == "each cycle alone, determined" and row[4] == "2"
+    ]  # fmt: skip
+    k0 = found.results[2].parameters["s1_k0"]
+    assert value == pytest.approx(k0.value / (1e6 if k0.value >= 1e6 else 1e3), rel=1e-5)
+    names = {row[1] for row in rows}
+    assert {"95 % interval", "fitted together", "cycle 1, fitted", "cycle 3, fitted"} <= names
+
+
+def test_in_one_column_two_panels_stand_side_by_side(found):
+    figure = cycles_report.plot_cycles(found, width="one")
+    assert figure.get_figwidth() == 3.25
+    grid = figure.axes[1].get_subplotspec().get_gridspec()
+    assert grid.ncols == 2
+    assert len(figure.axes) == len(cycles_report.plot_cycles(found).axes)
 
 
 def test_the_picture_has_a_panel_for_each_parameter(found):
@@ -222,7 +252,8 @@ def test_one_cycle_is_fitted_as_any_test(record, tmp_path, monkeypatch):
 
 def test_all_cycles_are_fitted_in_turn(record, tmp_path, monkeypatch):
     without_pictures(monkeypatch)
-    monkeypatch.setattr(cycles_report, "plot_cycles", lambda _: None)
+    monkeypatch.setattr(cycles_report, "plot_cycles", lambda *_, **__: None)
+    monkeypatch.setattr(cycles_report, "table", lambda _: b"")
     monkeypatch.setattr(cycles_report, "image", lambda *_: b"\x89PNG")
     words = ("fit", record, "--cycle", "all", "--starts", 2, "--out", tmp_path / "out")
     result = run(*words, "--fix", "s1_kc=20e6")
@@ -235,7 +266,8 @@ def test_all_cycles_are_fitted_in_turn(record, tmp_path, monkeypatch):
 
 def test_json_holds_every_cycle(record, tmp_path, monkeypatch):
     without_pictures(monkeypatch)
-    monkeypatch.setattr(cycles_report, "plot_cycles", lambda _: None)
+    monkeypatch.setattr(cycles_report, "plot_cycles", lambda *_, **__: None)
+    monkeypatch.setattr(cycles_report, "table", lambda _: b"")
     monkeypatch.setattr(cycles_report, "image", lambda *_: b"\x89PNG")
     words = ("--starts", 1, "--json", "--out", tmp_path / "out")
     result = run("fit", record, "--cycle", "1,9", *words)

@@ -562,6 +562,14 @@ def test_the_command_writes_a_folder_whole(tmp_path, monkeypatch, record, result
     )
     parts = ("parameters", "scatter", "noise", "law error")
     assert {f"stress half width, {part} (Pa)" for part in parts} <= rows[0].keys()
+    strain = np.array([float(row["measured strain"]) for row in rows])
+    moved = np.array([float(row["measured displacement (m)"]) for row in rows])
+    np.testing.assert_allclose(strain * (moved.max() / strain.max()), moved, rtol=1e-9)
+    found = ff.predict(result, record, draws=DRAWS)
+    narrow = prediction_report.plot_prediction(found, width="one")
+    assert narrow.get_figwidth() == 3.25
+    lefts = {round(ax.get_position().x0, 3) for ax in narrow.axes}
+    assert len(lefts) == 1  # one above the other
 
 
 def test_the_command_prints_json_and_nothing_else(tmp_path, monkeypatch, record, result):

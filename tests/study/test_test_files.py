@@ -32,6 +32,23 @@ def test_a_folder_gives_its_tables_but_no_list_of_specimens_and_no_result(here):
         find_tests("tuesday/fits")
 
 
+@pytest.mark.parametrize(
+    ("mark", "table"),
+    [
+        ("fit.json", "fit.csv"), ("fit.json", "residuals.csv"), ("fit.json", "sensitivities.csv"),
+        ("cycles.json", "cycles-plotted.csv"), ("joint.json", "joint.csv"),
+        ("prediction.json", "prediction.csv"),
+    ],
+)  # fmt: skip
+def test_tables_of_figures_are_no_tests(here, mark, table):
+    (here / "out").mkdir()
+    (here / "out" / table).write_text("x")
+    assert names("out") == [table.removesuffix(".csv")]  # someone's own
+    (here / "out" / mark).write_text("{}")
+    with pytest.raises(InputError, match="out: the folder has no test"):
+        find_tests("out")
+
+
 def test_names_that_collide_get_their_parents(here):
     assert names("monday", "tuesday") == ["monday-a", "b", "tuesday-a", "c"]
     (here / "monday/a.txt").write_text("x")

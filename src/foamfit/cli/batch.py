@@ -15,7 +15,18 @@ import click
 
 from foamfit.cli.fit_options import fit_options, intervals_of
 from foamfit.cli.group import NOT_ACCEPTABLE, main
-from foamfit.cli.options import CYCLE, FILE, SPECIMEN, compiling, cycles_of
+from foamfit.cli.options import (
+    CYCLE,
+    FILE,
+    OPEN,
+    SPECIMEN,
+    WIDTH,
+    check_open,
+    compiling,
+    cycles_of,
+    open_if_asked,
+)
+from foamfit.cli.progress import duration
 from foamfit.errors import InputError
 from foamfit.terminal import say
 
@@ -43,18 +54,20 @@ PATIENCE = 10
 @click.option("--fresh", is_flag=True, help="Fit everything again, what is done already too.")
 @click.option("--no-report", is_flag=True, help="No report.html, fit.png and fit.pdf of each fit.")
 @fit_options
+@WIDTH
+@OPEN
 @click.option("--json", "as_json", is_flag=True, help="Print the rows as JSON, nothing else.")
 @click.option("--quiet", is_flag=True, help="Print nothing but warnings of failure.")
 def batch(
     tests: tuple[str, ...], specimen: Path | None, cycle: str | None, model: str, out: Path | None,
-    jobs: int | None, scheduler: str | None, fresh: bool, no_report: bool,
+    jobs: int | None, scheduler: str | None, fresh: bool, no_report: bool, figure_width: str,
     as_json: bool, quiet: bool, **search: Any,
 ) -> int:  # fmt: skip
     """Fit every test on its own: a result folder for each, summary.csv and summary.html.
 
     A test that cannot be read or fitted is a row of the summary with its sentence. Called again,
-    only what is missing or has changed is fitted: data, TOML, settings or version. What is done
-    stays, however the command ends.
+    only what is missing or has changed is fitted: data, TOML, settings, width of the figures or
+    version. What is done stays, however the command ends.
 
     Exit code 0: every test has a fit; 1: the call is wrong, or the results cannot be written; 2:
     some tests have no fit; 70, 130 and 143 as of fit.
@@ -67,6 +80,7 @@ def batch(
     """
     if jobs is not None and scheduler is not None:
         raise InputError("--jobs and --scheduler exclude each other; leave one of them out")
+    check_open(as_json)
     search |= intervals_of(**{way: search.pop(way) for way in ("profile", "bootstrap", "mcmc")})
     alone, several = cycles_of(cycle)
     from foamfit.study import processes
@@ -78,7 +92,8 @@ def batch(
     from foamfit.study.batch_work import Recipe
 
     fix, vary = search.pop("fix") or None, search.pop("vary")
-    recipe = Recipe(model, {}, alone if several is None else several, fix, vary, not no_report)
+    cycles = alone if several is None else several
+    recipe = Recipe(model, {}, cycles, fix, vary, not no_report, figure_width)
     if scheduler is None:
         with compiling(quiet or as_json, model, search["relaxation"]) as compile_rest:
             compile_rest()
@@ -103,6 +118,7 @@ def batch(
     if wrong:
         told = f"{wrong} of {len(rows)} tests {'has' if wrong == 1 else 'have'} no acceptable fit"
         say(f"foamfit: {told}; see {found.out / 'summary.csv'}", err=True)
+    open_if_asked(found.out / "summary.html")
     return NOT_ACCEPTABLE if wrong else 0
 
 
@@ -147,14 +163,8 @@ def _progress_line(quiet: bool) -> Iterator[Callable[[State], None]]:
             bar.label = f"{state.done} done, {state.wrong} without a fit, {state.left} left"
             if state.fitted and state.left:
                 rest = (time.monotonic() - began) / state.fitted * state.left
-                bar.label += f", {_duration(rest)}"
+                bar.label += f", about {duration(rest)}"
             total = max(state.done + state.left, 1)
             bar.update(round(1000 * state.done / total) - bar.pos)
 
         yield progress
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 90:
-        return f"about {seconds:.0f} s"
-    return f"about {seconds / 60:.0f} min" if seconds < 5400 else f"about {seconds / 3600:.1f} h"

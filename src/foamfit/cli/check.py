@@ -16,6 +16,7 @@ from foamfit.cli.options import (
     RELAXATION,
     SPECIMEN,
     TEST,
+    WIDTH,
     check_files,
     compiling,
 )
@@ -35,9 +36,11 @@ from foamfit.terminal import say
     help="Start from an earlier result. Default: a quick descent from the measured loop.",
 )  # fmt: skip
 @PLOT
+@WIDTH
 def check(
     test: Path, specimen: Path | None, model: str | None, drive: str | None,
-    published_set: str | None, params: Path | None, plot: Path | None, relaxation: int,
+    published_set: str | None, params: Path | None, plot: Path | None, figure_width: str,
+    relaxation: int,
 ) -> None:  # fmt: skip
     """Say what the loader understood of TEST.csv: columns, contact, specimen, energy.
 
@@ -93,5 +96,5 @@ def check(
             say("\nnothing is drawn: no parameter changes the curves")
         else:
             title = f"{name} · {outlook.problem.model.name} · before the fit"
-            plot_insight(insight, title=title, path=plot)
-            say(f"\ndrawn in {plot}")
+            plot_insight(insight, title=title, path=plot, width=figure_width)
+            say(f"\ndrawn in {plot}, its data in {plot.with_suffix('.csv')}")

@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from foamfit.cli.group import main
-from foamfit.cli.options import FILE, PLOT, check_files
+from foamfit.cli.options import FILE, PLOT, WIDTH, check_files
 from foamfit.terminal import say
 
 
@@ -20,10 +20,12 @@ from foamfit.terminal import say
     help="The published set to compare with. Default: the one that the name of the test contains.",
 )  # fmt: skip
 @PLOT
+@WIDTH
 @click.option("--csv", "table", type=FILE, help="Also write a table.")
 def compare(
-    results: tuple[Path, ...], name: str | None, plot: Path | None, table: Path | None
-) -> None:
+    results: tuple[Path, ...], name: str | None, plot: Path | None, figure_width: str,
+    table: Path | None,
+) -> None:  # fmt: skip
     """Put result folders beside the published parameters, or beside the first of them.
 
     \b
@@ -35,12 +37,12 @@ def compare(
     from foamfit.report.comparison_plot import plot_comparison
     from foamfit.report.comparison_text import comparison_text, write_csv
 
-    check_files(table, plot, [p / "fit.json" if p.is_dir() else p for p in results])
+    own = check_files(table, plot, [p / "fit.json" if p.is_dir() else p for p in results])
     comparison = side_by_side(results, name)
     say(comparison_text(comparison))
     if plot is not None:
-        plot_comparison(comparison, plot)
-        say(f"\ndrawn in {plot}")
+        plot_comparison(comparison, plot, width=figure_width, table=own)
+        say(f"\ndrawn in {plot}, its data in {plot.with_suffix('.csv')}")
     if table is not None:
         write_csv(comparison, table)
         say(f"\nwritten to {table}")

@@ -4,7 +4,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,20 +17,23 @@ from foamfit.cli.group import NOT_ACCEPTABLE, main
 from foamfit.cli.options import (
     CYCLE,
     FILE,
+    OPEN,
     SPECIMEN,
     TEST,
+    WIDTH,
+    check_open,
     compiling,
     cycles_of,
     drawing_beside,
-    progress_bar,
+    open_if_asked,
     spare,
 )
+from foamfit.cli.progress import progress_line
 from foamfit.errors import InputError
 from foamfit.terminal import say, without_ctrl_c
 
 if TYPE_CHECKING:
     from foamfit.api import FitResult
-    from foamfit.report.result_figures import Mapped
     from foamfit.study.cycles import CycleFits
 
 
@@ -38,6 +43,8 @@ if TYPE_CHECKING:
 @CYCLE
 @click.option("--out", type=FILE, help="Result folder. Default: fits/<test>/<model>.")
 @fit_options
+@WIDTH
+@OPEN
 @click.option("--json", "as_json", is_flag=True, help="Print fit.json on stdout, nothing else.")
 @click.option("--quiet", is_flag=True, help="Print nothing but warnings of failure.")
 @click.option(
@@ -45,7 +52,7 @@ if TYPE_CHECKING:
 )
 def fit(
     test: Path, specimen: Path | None, cycle: str | None, model: str, out: Path | None,
-    fix: dict[str, float], vary: tuple[str, ...],
+    fix: dict[str, float], vary: tuple[str, ...], figure_width: str,
     as_json: bool, quiet: bool, verbose: bool, **search: Any,
 ) -> int:  # fmt: skip
     """Identify the parameters of TEST.csv and write a result folder.
@@ -60,15 +67,16 @@ def fit(
     \b
     Examples:
         foamfit fit TEST.csv
-        foamfit fit TEST.csv --model auto
+        foamfit fit TEST.csv --model auto --open
         foamfit fit TEST.csv --model microscale --relaxation 1
         foamfit fit TEST.csv --model microscale --relaxation 1 --cycle all
-        foamfit fit TEST.csv --drive displacement --out results/today
+        foamfit fit TEST.csv --drive displacement --out results/today --figure-width one
         foamfit fit TEST.csv --model linear+bistable --fix s1_k0=60e6
     """
     from foamfit.data.csv_file import read_test
     from foamfit.springs.model import Model
 
+    check_open(as_json)
     search |= intervals_of(**{way: search.pop(way) for way in ("profile", "bootstrap", "mcmc")})
     model = "auto" if model.strip() == "auto" else Model.parse(model).name
     alone, several = cycles_of(cycle)
@@ -84,49 +92,63 @@ def fit(
         params = params_of(measurement, model, search, fix, vary)
         compile_rest()
         mapped = beside.enter_context(drawing_beside())
-        tell = None if quiet else lambda told: say(f"foamfit: {told}", err=True)
-        with progress_bar(quiet or as_json) as progress:
+        limit = search["max_time"] if several is None else None  # it is that of each cycle
+        with progress_line(quiet or as_json, "fit", limit) as shown:
+            told: dict[str, Any] = {"progress": shown.progress, "watch": shown.watch}
+            told["tell"] = None if quiet else shown.tell
             if several is not None:
                 from foamfit.study.cycles import fit_cycles
 
                 found = fit_cycles(
-                    test, specimen, cycles=several or None, model=model, progress=progress,
-                    tell=tell, **search,
+                    test, specimen, cycles=several or None, model=model, **told, **search,
                     params=lambda one: params_of(one, model, search, fix, vary),
                 )  # fmt: skip
             else:
-                result = api.fit(
-                    measurement, model=model, params=params, progress=progress, tell=tell, **search
-                )
+                result = api.fit(measurement, model=model, params=params, **told, **search)
+        save: Callable[[], Path]
         if several is not None:
-            return _tell_cycles(found, folder, mapped, as_json, quiet)
+            from foamfit.report.studies.cycles import save_cycles
+
+            save = partial(save_cycles, found, folder, width=figure_width, mapped=mapped)
+            code = _tell_cycles(found, folder, save, as_json, quiet)
+            open_if_asked(folder / "cycles.png")
+            return code
         try:
-            with without_ctrl_c():
-                save_result(result, folder, mapped)
+            save = partial(save_result, result, folder, width=figure_width, mapped=mapped)
+            _save(save, quiet or as_json)
         except InputError:  # the numbers are not lost with the folder
             _tell_result(result, as_json, quiet, verbose)
             raise
     _tell_result(result, as_json, quiet, verbose)
     if not quiet and not as_json:
         say(f"\nwritten to {folder}: open {folder / 'report.html'}")
+    open_if_asked(folder / "report.html")
     if result.status == "failed":
         say(f"foamfit: no acceptable fit was found; see {folder}", err=True)
         return NOT_ACCEPTABLE
     return 0
 
 
-def _tell_cycles(found: CycleFits, folder: Path, mapped: Mapped, as_json: bool, quiet: bool) -> int:
+def _save(save: Callable[[], Path], silent: bool) -> None:
+    """Write the folder; the line on the terminal says so."""
+    with progress_line(silent, "fit") as shown, without_ctrl_c():
+        shown.progress(1.0, "writing the report")
+        save()
+
+
+def _tell_cycles(
+    found: CycleFits, folder: Path, save: Callable[[], Path], as_json: bool, quiet: bool
+) -> int:
     """Write and print the fits of several cycles; returns the exit code."""
     import json
 
-    from foamfit.report.studies.cycles import cycles_text, save_cycles
+    from foamfit.report.studies.cycles import cycles_text
 
     content = found.to_json_dict()
     content["cycles"] = {n: one.to_json_dict() for n, one in sorted(found.results.items())}
     shown = json.dumps(content, allow_nan=False) if as_json else cycles_text(found)
     try:
-        with without_ctrl_c():
-            save_cycles(found, folder, mapped)
+        _save(save, quiet or as_json)
     finally:  # the numbers are not lost with the folder
         if as_json or not quiet:
             say(shown)

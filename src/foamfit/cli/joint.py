@@ -10,7 +10,16 @@ from typing import TYPE_CHECKING
 import click
 
 from foamfit.cli.group import NOT_ACCEPTABLE, main
-from foamfit.cli.options import FILE, compiling, progress_bar, spare
+from foamfit.cli.options import (
+    FILE,
+    OPEN,
+    WIDTH,
+    check_open,
+    compiling,
+    open_if_asked,
+    spare,
+)
+from foamfit.cli.progress import progress_line
 from foamfit.errors import InputError
 from foamfit.terminal import say, without_ctrl_c
 
@@ -28,11 +37,13 @@ if TYPE_CHECKING:
     "--seed", type=click.IntRange(min=0), help="Same tests and seed, same numbers. Default: 0."
 )
 @click.option("--no-report", is_flag=True, help="Write no report and no figures of single tests.")
+@WIDTH
+@OPEN
 @click.option("--json", "as_json", is_flag=True, help="Print joint.json on stdout, nothing else.")
 @click.option("--quiet", is_flag=True, help="Print nothing but warnings of failure.")
 def joint(
     study: Path, out: Path | None, jobs: int | None, seed: int | None,
-    no_report: bool, as_json: bool, quiet: bool,
+    no_report: bool, figure_width: str, as_json: bool, quiet: bool,
 ) -> int:  # fmt: skip
     """Fit the tests of STUDY.toml together: shared, own, scattering, rate-dependent parameters.
 
@@ -57,6 +68,7 @@ def joint(
         s1_eps_star = 0.3                       # held at a number (SI)
     Also: seed, cycle, starts, and [specimens] with a TOML for single tests: new-heel-1 = "a.toml".
     """
+    check_open(as_json)
     from foamfit.report.folder import check_target
 
     folder = Path("fits", study.stem) if out is None else out
@@ -73,17 +85,21 @@ def joint(
         compile_rest()
         if not no_report:
             begin(jobs, len(read.tests), FEW_FOLDERS)
-        with progress_bar(quiet or as_json) as progress:
-            result = fit_jointly(read, jobs=jobs, seed=seed, progress=progress)
+        with progress_line(quiet or as_json, "joint fit") as shown:
+            result = fit_jointly(read, jobs=jobs, seed=seed, progress=shown.progress)
         try:
-            with without_ctrl_c():
-                result.save(folder, jobs=jobs, reports=not no_report)
+            with progress_line(quiet or as_json, "joint fit") as shown, without_ctrl_c():
+                shown.progress(1.0, "writing the reports")
+                result.save(
+                    folder, jobs=jobs, reports=not no_report, figure_width=figure_width
+                )  # fmt: skip
         except InputError:  # the numbers are not lost with the folder
             _tell(result, as_json, quiet)
             raise
     _tell(result, as_json, quiet)
     if not quiet and not as_json:
         say(f"\nwritten to {folder}: open {folder / 'joint.html'}")
+    open_if_asked(folder / "joint.html")
     if result.status == "failed":
         say(f"foamfit: no acceptable fit was found; see {folder}", err=True)
         return NOT_ACCEPTABLE

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,7 +26,36 @@ CYCLE = click.option(
     "--cycle", metavar="N|all",
     help="Cycle of a slow record: a number, several as 1,2,10, or all. Default: the first.",
 )  # fmt: skip
-PLOT = click.option("--plot", type=FILE, help="Also draw a PNG, PDF or SVG.")
+PLOT = click.option(
+    "--plot", type=FILE,
+    help="Also draw a PNG, PDF or SVG; what is plotted in it is beside it as CSV.",
+)  # fmt: skip
+
+
+def _width(context: click.Context, option: click.Parameter, value: str) -> str:
+    """Refuse what is no width before anything is computed."""
+    if value not in ("one", "two"):  # these need no import
+        from foamfit.report.figures import inches
+
+        inches(value)
+    return value
+
+
+WIDTH = click.option(
+    "--figure-width", metavar="one|two|LENGTH", default="two", show_default=True, callback=_width,
+    help='Width of figures: one column (3.25 in), two (7 in), or a length as "85 mm".',
+)  # fmt: skip
+_OPENING = "foamfit.open"  # whether the command of a context is to open what it writes
+
+
+def _keep_open(context: click.Context, option: click.Parameter, value: bool) -> None:
+    context.meta[_OPENING] = value
+
+
+OPEN = click.option(
+    "--open", is_flag=True, expose_value=False, callback=_keep_open,
+    help="Open what was found in the browser, also with exit code 2; not together with --json.",
+)  # fmt: skip
 DRIVE = click.option(
     "--drive",
     type=click.Choice(["impact", "stress", "displacement"]),
@@ -102,19 +130,24 @@ def drawing_beside() -> Iterator[Mapped]:
         pool.stop()
 
 
-@contextmanager
-def progress_bar(quiet: bool) -> Iterator[Callable[[float, str], None]]:
-    """Give a progress bar on stderr; silent when stderr is no terminal."""
-    if quiet or not sys.stderr.isatty():
-        yield lambda fraction, what: None
+def check_open(as_json: bool) -> None:
+    """Refuse --open, as a browser may print, where nothing but JSON is to be printed."""
+    if click.get_current_context().meta[_OPENING] and as_json:
+        raise InputError("--open and --json exclude each other; leave one of them out")
+
+
+def open_if_asked(page: Path) -> None:
+    """With --open open a file in the browser, or say in a sentence that there is none."""
+    if not click.get_current_context().meta[_OPENING]:
         return
-    with click.progressbar(length=1000, label="fit", file=sys.stderr, show_eta=False) as bar:
+    import webbrowser
 
-        def progress(fraction: float, what: str) -> None:
-            bar.label = f"fit: {what:<10}"
-            bar.update(round(1000 * fraction) - bar.pos)
-
-        yield progress
+    try:
+        opened = webbrowser.open(page.resolve().as_uri())
+    except (webbrowser.Error, OSError):
+        opened = False
+    if not opened:
+        say(f"foamfit: no browser could be opened; open {page} by hand", err=True)
 
 
 def spare(folder: Path, inputs: Iterable[Path]) -> None:
@@ -126,8 +159,11 @@ def spare(folder: Path, inputs: Iterable[Path]) -> None:
             )
 
 
-def check_files(table: Path | None, plot: Path | None, inputs: Iterable[Path]) -> None:
-    """Refuse files that could not be written, or that are read too, before anything is computed."""
+def check_files(table: Path | None, plot: Path | None, inputs: Iterable[Path]) -> bool:
+    """Refuse files that could not be written, or that are read too, before anything is computed.
+
+    Returns whether what is plotted needs a table of its own: `table` may be it already.
+    """
     given = [path for path in (table, plot) if path is not None]
     for path in given:
         check_file(path)
@@ -135,7 +171,14 @@ def check_files(table: Path | None, plot: Path | None, inputs: Iterable[Path]) -
             raise InputError(f"{path} is read by this command and would be lost; name another file")
     if len({path.resolve() for path in given}) < len(given):
         raise InputError(f"{given[0]} cannot be two things; name two files")
-    if plot is not None:
-        from foamfit.report.figures import figure_format
+    if plot is None:
+        return False
+    from foamfit.report.figures import figure_format
+    from foamfit.report.plotted import check_table
 
-        figure_format(plot)
+    figure_format(plot)
+    data = plot.with_suffix(".csv")
+    if table is not None and data.resolve() == table.resolve():
+        return False
+    check_table(data)
+    return True

@@ -10,7 +10,17 @@ from typing import TYPE_CHECKING
 import click
 
 from foamfit.cli.group import main
-from foamfit.cli.options import FILE, SPECIMEN, TEST, compiling, spare
+from foamfit.cli.options import (
+    FILE,
+    OPEN,
+    SPECIMEN,
+    TEST,
+    WIDTH,
+    check_open,
+    compiling,
+    open_if_asked,
+    spare,
+)
 from foamfit.errors import InputError
 from foamfit.terminal import say, without_ctrl_c
 
@@ -43,13 +53,16 @@ if TYPE_CHECKING:
     help="Same result, test and seed, same numbers.",
 )  # fmt: skip
 @click.option("--out", type=FILE, help="Folder. Default: predictions/<test>.")
+@WIDTH
+@OPEN
 @click.option(
     "--json", "as_json", is_flag=True, help="Print prediction.json on stdout, nothing else."
 )
 @click.option("--quiet", is_flag=True, help="Print nothing.")
 def predict(
     result: Path, test: Path, specimen: Path | None, cycle: int | None, drive: str | None,
-    extrapolate: bool, draws: int, seed: int, out: Path | None, as_json: bool, quiet: bool,
+    extrapolate: bool, draws: int, seed: int, out: Path | None, figure_width: str,
+    as_json: bool, quiet: bool,
 ) -> int:  # fmt: skip
     """Predict TEST.csv from RESULT: the folder of a fit or of a joint fit, or its JSON.
 
@@ -63,6 +76,7 @@ def predict(
         foamfit predict fits/TEST/microscale OTHER.csv
         foamfit predict joint/new-heel OTHER.csv --cycle 2 --out predictions/second
     """
+    check_open(as_json)
     from foamfit.data.csv_file import read_test
     from foamfit.report.studies.prediction import check_replaceable
     from foamfit.study.prediction.identified import read_source
@@ -81,13 +95,14 @@ def predict(
         )
         try:
             with without_ctrl_c():
-                found.save(folder)
+                found.save(folder, figure_width=figure_width)
         except InputError:  # the numbers are not lost with the folder
             _tell(found, as_json, quiet)
             raise
     _tell(found, as_json, quiet)
     if not quiet and not as_json:
         say(f"\nwritten to {folder}: open {folder / 'prediction.png'}")
+    open_if_asked(folder / "prediction.png")
     return 0
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from foamfit.cli.group import main
-from foamfit.cli.options import FILE, PLOT, check_files, compiling
+from foamfit.cli.options import FILE, PLOT, WIDTH, check_files, compiling
 from foamfit.terminal import say
 
 
@@ -17,11 +17,14 @@ from foamfit.terminal import say
 @click.argument("scene", metavar="SCENE.toml", type=FILE)
 @click.option("--out", type=FILE, help="CSV. Default: SCENE.csv here.")
 @PLOT
+@WIDTH
 @click.option(
     "--rtol", type=click.FloatRange(1e-14, 0.1), default=1e-6, show_default=True,
     help="Wanted error over the range.",
 )  # fmt: skip
-def simulate(scene: Path, out: Path | None, plot: Path | None, rtol: float) -> None:
+def simulate(
+    scene: Path, out: Path | None, plot: Path | None, figure_width: str, rtol: float
+) -> None:
     """Run any chain under any drive forward and write its response as CSV.
 
     \b
@@ -53,7 +56,7 @@ def simulate(scene: Path, out: Path | None, plot: Path | None, rtol: float) -> N
     from foamfit.solve.simulation import simulate as run
 
     target = Path(scene.with_suffix(".csv").name) if out is None else out
-    check_files(target, plot, files_of_scene(scene))
+    table = check_files(target, plot, files_of_scene(scene))
     with compiling(quiet=False) as compile_rest:
         chain, drive, time = read_scene(scene)
         compile_rest()
@@ -63,5 +66,5 @@ def simulate(scene: Path, out: Path | None, plot: Path | None, rtol: float) -> N
     if plot is not None:
         from foamfit.report.plots import plot_response
 
-        plot_response(response, plot)
-        say(f"drawn in {plot}")
+        plot_response(response, plot, width=figure_width, table=table)
+        say(f"drawn in {plot}, its data in {plot.with_suffix('.csv')}")

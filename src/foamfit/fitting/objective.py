@@ -405,6 +405,19 @@ class Objective:
         there = [name for name in self.curves if name in self.counted or name not in derived]
         return {name: self.off(curves, name) if name in there else None for name in self.curves}
 
+    def look(self, values: Array, *, everything: bool = False) -> dict[str, float | None] | None:
+        """Misfits of a point, see `misfit`, which is counted as no step of a fit.
+
+        None if it cannot be simulated.
+        """
+        counts = self.evaluations, self.failures
+        try:
+            return self.misfit(self.simulate(values, everything=everything))
+        except SimulationError:
+            return None
+        finally:
+            self.evaluations, self.failures = counts
+
     def off(self, curves: Simulated, name: str) -> float | None:
         """RMS of simulated minus measured over the measured range of one curve, if it is there."""
         measured, simulated = self.measured.get(name), curves.curves.get(name)

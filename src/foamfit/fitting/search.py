@@ -26,6 +26,9 @@ from foamfit.springs.parameters import HYSTERETIC
 Progress = Callable[[float, str], None]
 
 LOOP_SAMPLES = 240
+PULSE = 16  # evaluations
+# Shares of the time of a search, as measured, at which its parts begin.
+DESCENTS, ON_CURVES, REFINED = 0.25, 0.75, 0.95
 CURVE_STARTS = 300
 # Minima of the loop whose cost on the drive's curves is within this factor of the best go on.
 PROMISING = 100.0
@@ -69,7 +72,7 @@ class Tracker:
     """Counts and times the evaluations of an objective and keeps the best point ever seen.
 
     `ends` holds the parameters at which the descents on the drive's curves ended; `better` is
-    called with every point that is the best so far.
+    called with every point that is the best so far, `pulse` at every so many evaluations.
     """
 
     objective: Objective
@@ -77,11 +80,14 @@ class Tracker:
     better: Callable[[Array], None] | None = None
     best_values: Array | None = None
     best_cost: float = np.inf
+    pulse: Callable[[], None] | None = None
     ends: list[Array] = field(default_factory=list)
 
     def residual(self, values: Array, shift: Array | float = 0.0) -> Array:
         """Residual of the objective; raises SearchStoppedError once the time is up."""
         residual = self.consider(values, shift)
+        if self.pulse is not None and self.objective.evaluations % PULSE == 0:
+            self.pulse()
         if self.deadline is not None and time.monotonic() > self.deadline:
             raise SearchStoppedError
         return residual
@@ -335,6 +341,7 @@ def search(
     drive. Returned are the final costs there, best first, and how many descents on the loop led to
     each. Raises SearchStoppedError when the time is up.
     """
+    progress(0.0, "start values")
     points = [space.encode(space.values), *box_starts(space, rng, CURVE_STARTS // 3)]
     counts: dict[int, int] = {}
     if tracker.objective.measurement.displacement is not None:
@@ -343,13 +350,13 @@ def search(
         counts = {id(point): count for count, point in found}
     ranked = rank(tracker, space, points)
     if tracker.objective.interior_mass:
-        progress(0.7, "vibration")
+        progress(ON_CURVES, "vibration")
         ranked = sorted(ranked + _scan_vibration(tracker, space, points[0]), key=_cost)
     promising = [item for item in ranked if item[0] <= PROMISING * ranked[0][0]]
     points = [point for _, point in distinct(promising)][: max(3, starts // 4)]
     out = []
     for i, point in enumerate(points):
-        progress(0.7 + 0.25 * i / len(points), "curves")
+        progress(ON_CURVES + (REFINED - ON_CURVES) * i / len(points), "curves")
         cost, end = descend(tracker, space, point, 60)
         tracker.ends.append(space.decode(end))
         out.append((cost, counts.get(id(point), 1)))
@@ -384,7 +391,7 @@ def _search_loop(
         points = [point for _, point in ranked]
         ends = []
         for i, point in enumerate(spread_out(space, points, starts)):
-            progress(0.7 * i / starts, "loop")
+            progress(DESCENTS + (ON_CURVES - DESCENTS) * i / starts, "loop")
             ends.append(descend(inner, space, point, 40))
     finally:
         objective.add_counts(inner.objective)

@@ -169,18 +169,13 @@ class _Teller:
 
 def _standing(problem: Problem, values: Array) -> dict[str, Any]:
     """Return parameters and misfits of a point; nothing of it is counted as a step of the fit."""
-    own = problem.objective
-    counts = own.evaluations, own.failures
-    try:
-        misfit = own.misfit(own.simulate(values, everything=True))
-    except SimulationError:
+    misfit = problem.objective.look(values, everything=True)
+    if misfit is None:
         return {}
-    finally:
-        own.evaluations, own.failures = counts
     return {
         "model": problem.model.name,
         "relaxation": problem.model.relaxation,
-        "drive": own.drive,
+        "drive": problem.objective.drive,
         "values": dict(zip(problem.names, values.tolist(), strict=True)),
         "misfit": misfit,
     }

@@ -9,7 +9,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from foamfit.report.comparison import Comparison, Pair, Row
-from foamfit.report.figures import BLUE, GREY, VERMILION, drawing, save, say_nothing_there
+from foamfit.report.figures import (
+    BLUE,
+    GREY,
+    TWO,
+    VERMILION,
+    abreast,
+    drawing,
+    inches,
+    save,
+    say_nothing_there,
+)
 from foamfit.text import signed
 
 if TYPE_CHECKING:
@@ -28,31 +38,35 @@ MATH |= {f"τ_{k}": rf"$\tau_{k}$" for k in range(1, 10)}
 IN_MATH = re.compile("|".join(map(re.escape, MATH)))
 
 
-def plot_comparison(comparison: Comparison, path: str | Path | None = None) -> Figure:
+def plot_comparison(
+    comparison: Comparison, path: str | Path | None = None, *, width: str = TWO, table: bool = True
+) -> Figure:
     """Draw how far each parameter is from its reference, in standard errors, and in percent.
 
-    One panel for each reference, 7 in wide; shaded are one and three standard errors. What is not
-    compared is left out, what is not determined is named.
+    One panel for each reference; shaded are one and three standard errors. What is not compared is
+    left out, what is not determined is named. For `path` and `width` see `plots.plot_fit`; without
+    `table` no CSV of what is plotted is written.
     """
     groups: dict[str, list[Pair]] = {}
     for pair in comparison.pairs:
         groups.setdefault(pair.reference, []).append(pair)
-    columns = min(len(groups), 2)
+    wide = inches(width)
+    columns = abreast(wide, min(len(groups), 2), 2.9)
     lines = [max(len(_shown(pairs)), 1) * (len(_lanes(pairs)) + 1) for pairs in groups.values()]
     rows = [max(lines[i : i + columns]) for i in range(0, len(lines), columns)]
-    with drawing(7.0, 0.5 + sum(0.6 + 0.12 * n for n in rows)) as figure:
+    with drawing(wide, 0.5 + sum(0.6 + 0.12 * n for n in rows)) as figure:
         ratios = [n + 2 for n in rows]
         axes = figure.subplots(len(rows), columns, squeeze=False, height_ratios=ratios).ravel()
         for ax in axes[len(groups) :]:
             ax.remove()
         for ax, (reference, pairs) in zip(axes, groups.items(), strict=False):
             _draw_comparison(ax, pairs)
-            title = textwrap.fill(f"beside {reference}", 58 if columns == 2 else 110)
+            title = textwrap.fill(f"beside {reference}", int(16 * wide / columns))
             ax.set_title(title, loc="left", fontsize=7.5, pad=4, weight="bold", parse_math=False)
         for ax in figure.axes[-columns:]:  # the lowest ones
             ax.set_xlabel("deviation (standard errors)")
         _name_results(figure, list(groups.values()))
-    return save(figure, path)
+    return save(figure, path, table=table)
 
 
 def _is_shown(row: Row) -> bool:
@@ -86,6 +100,7 @@ def _draw_comparison(ax: Axes, pairs: list[Pair]) -> None:
     step = len(lanes) + 1
     for lane, k in enumerate(lanes):
         color, mark = MARKS[k % len(MARKS)]
+        side = f"{pairs[k].test}, {pairs[k].model}, {pairs[k].drive} drive"
         for row in pairs[k].rows:
             if row.label not in labels:
                 continue
@@ -93,12 +108,13 @@ def _draw_comparison(ax: Axes, pairs: list[Pair]) -> None:
             if row.lost:
                 ax.annotate(
                     "not determined", (0.0, y), ha="center", va="center", fontsize=6.5,
-                    color=color, style="italic",
+                    color=color, style="italic", label=f"_{side}: {row.label}:",
                 )  # fmt: skip
             elif row.standard_errors is not None:
                 ax.plot([0.0, row.standard_errors], [y, y], color=color, lw=0.9, zorder=2)
                 ax.plot(
                     row.standard_errors, y, mark, ms=3.4, color=color, zorder=3,
+                    label=f"_{side}: {row.label}",
                     mfc="white" if row.state == "weak" else color,
                 )  # fmt: skip
                 ax.annotate(
@@ -135,8 +151,14 @@ def _name_results(figure: Figure, groups: list[list[Pair]]) -> None:
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(
         handles, [label.replace("$", r"\$") for label in labels], loc="outside lower center",
-        ncols=1 if max(map(len, labels)) > 30 else len(labels), handletextpad=0.2,
+        ncols=_columns_of(labels, figure.get_figwidth()), handletextpad=0.2,
     )  # fmt: skip
+
+
+def _columns_of(labels: list[str], width: float) -> int:
+    """How many columns of a legend have room, inches."""
+    longest = max(map(len, labels))
+    return 1 if longest > 30 else min(len(labels), max(int(72.0 * width / (4.2 * longest + 26)), 1))
 
 
 def _percent(row: Row) -> str:

@@ -6,15 +6,22 @@ import io
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from foamfit.errors import InputError
 from foamfit.files import write_file
+from foamfit.report import plotted
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from foamfit.arrays import Array
 
 GREY, BLUE, VERMILION = "#6b6b6b", "#0072B2", "#D55E00"  # of Okabe and Ito, told apart by all
 INSIDE = ("#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # of masses inside, from the base up
@@ -33,20 +40,86 @@ STYLE: Any = {  # matplotlib types its keys one by one
     "ytick.major.width": 0.6,
     "legend.frameon": False,
     "legend.fontsize": 7.5,
+    # Text stays text, to be edited and searched: TrueType in a PDF, text elements in an SVG.
     "pdf.fonttype": 42,
+    "svg.fonttype": "none",
 }
 NO_LAYOUT = {"figure.autolayout": False, "figure.constrained_layout.use": False}
 DPI = 250  # of a PNG
+# Widths of a figure in inches by what they are called: one column of the Journal of Applied
+# Mechanics, and both.
+TWO = "two"
+COLUMNS = {"one": 3.25, TWO: 7.0}
+NARROWEST, WIDEST = 2.5, 20.0
+# Points of a drawn line: a longer one is drawn through the first, last and extreme samples of so
+# many stretches, which no print tells from all samples.
+MOST_POINTS, STRETCHES = 3000, 500
+
+
+def inches(width: str) -> float:
+    """Return the width of a figure that "one" or "two" columns or a length ("85 mm") name."""
+    if (known := COLUMNS.get(width.strip().lower())) is not None:
+        return known
+    from foamfit.data.units import parse_quantity
+
+    wide = round(parse_quantity(width, "m", "the width of figures", "85 mm") / 0.0254, 6)
+    if not NARROWEST <= wide <= WIDEST:
+        low, high = (f"{25.4 * end:.0f}" for end in (NARROWEST, WIDEST))
+        raise InputError(
+            f"the width of figures = {width!r} is not admissible; it must be one, two (columns) or "
+            f"a length from {low} to {high} mm"
+        )
+    return wide
+
+
+def abreast(width: float, panels: int, least: float = 2.1) -> int:
+    """Return how many of the panels, each at least so many inches wide, stand side by side."""
+    return max(1, min(panels, int(width / least)))
 
 
 @contextmanager
 def drawing(width: float, height: float) -> Iterator[Figure]:
-    """Give an empty figure of a size in inches, and the style of all figures to draw it in."""
+    """Give an empty figure of a size in inches, and the style of all figures to draw it in.
+
+    Long lines are thinned in the end to what can be seen of them.
+    """
     import matplotlib
     from matplotlib.figure import Figure
 
     with matplotlib.rc_context(STYLE):
-        yield Figure(figsize=(width, height), layout="constrained")
+        yield (figure := Figure(figsize=(width, height), layout="constrained"))
+        for line in (line for ax in figure.axes for line in ax.lines):
+            x, y = np.asarray(line.get_xdata()), np.asarray(line.get_ydata())
+            if x.size > MOST_POINTS:
+                kept = _seen(x, y)
+                line.set_data(x[kept], y[kept])
+
+
+def _seen(x: Array, y: Array) -> NDArray[np.intp]:
+    """Return the samples of a long line through which it looks as through all of them."""
+    ends = np.linspace(0, x.size, STRETCHES + 1).astype(np.intp)
+    kept = [ends[:-1], ends[1:] - 1]
+    for values in (x, y):
+        low, high = (np.where(np.isfinite(values), values, fill) for fill in (np.inf, -np.inf))
+        for start, stop in pairwise(ends):
+            kept.append(start + np.array([low[start:stop].argmin(), high[start:stop].argmax()]))
+    return np.unique(np.concatenate(kept))
+
+
+def legend_below(figure: Figure, entries: dict[str, Any]) -> int:
+    """Name what is drawn in a legend below all panels; returns in how many lines it stands."""
+    if not entries:
+        return 0
+    handles, names = list(entries.values()), list(entries)
+    # Typographic points: of a letter, and of a handle with what stands about it.
+    sizes, room = [4.2 * len(name) + 33.0 for name in names], 72.0 * figure.get_figwidth()
+    for columns in range(len(names), 0, -1):
+        lines = -(-len(names) // columns)
+        widths = [max(sizes[i : i + lines]) for i in range(0, len(names), lines)]
+        if sum(widths) <= room:
+            break
+    figure.legend(handles, names, loc="outside lower center", ncols=len(widths))
+    return lines
 
 
 @contextmanager
@@ -93,6 +166,24 @@ def image(figure: Figure, form: Literal["png", "pdf", "svg"], dpi: int = DPI) ->
     return buffer.getvalue()
 
 
+def write_haloed(ax: Axes, name: str, at: Array, offset: tuple[float, float], **style: Any) -> None:
+    """Write beside a place, in points from it, on a white rim that parts it from lines."""
+    from matplotlib.patheffects import Stroke
+    from matplotlib.text import Annotation
+
+    class Haloed(Annotation):
+        """A text with a rim, for which matplotlib would make outlines of its letters."""
+
+        def draw(self, renderer: Any) -> None:
+            self.set_path_effects([Stroke(linewidth=1.5, foreground="white")])
+            super().draw(renderer)
+            self.set_path_effects([])
+            super().draw(renderer)
+
+    text = Haloed(name, tuple(at), offset, textcoords="offset points", clip_on=False, **style)
+    ax.add_artist(text)
+
+
 def say_nothing_there(ax: Axes) -> None:
     """Write into an empty panel that there is no curve."""
     ax.set_axis_off()
@@ -107,8 +198,16 @@ def figure_format(path: str | Path) -> Literal["png", "pdf", "svg"]:
     raise InputError(f"a figure is saved as .png, .pdf or .svg, not {Path(path).name!r}")
 
 
-def save(figure: Figure, path: str | Path | None) -> Figure:
-    """Save a figure, if there is a path, in the format of its suffix; returns the figure."""
+def save(figure: Figure, path: str | Path | None, *, table: bool = False) -> Figure:
+    """Save a figure, if there is a path, in the format of its suffix; returns the figure.
+
+    With `table` what is plotted in it is written beside it as CSV; see `foamfit.report.plotted`.
+    """
     if path is not None:
+        data = Path(path).with_suffix(".csv")
+        if table:
+            plotted.check_table(data)
         write_file(path, image(figure, figure_format(path)))
+        if table:
+            write_file(data, plotted.table(figure))
     return figure

@@ -8,24 +8,30 @@ import os
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import Outliers, interior_channel
 from foamfit.errors import InputError
 from foamfit.files import reason, replacing
+from foamfit.report.figures import TWO
 from foamfit.report.page import render_report
 from foamfit.report.result_figures import Mapped, draw_all
 from foamfit.results import SCHEMA, Curves, Fit, Intervals, ParameterEstimate, plain
+
+if TYPE_CHECKING:
+    pass
 
 # All that `save_result` may write, and what `studies.cycles.save_cycles` writes beside the folders
 # of the cycles.
 RESULT_FILES = (
     "fit.json", "parameters.csv", "curves.csv", "profiles.csv", "ladder.csv", "fit.png",
-    "fit.pdf", "report.html",
+    "fit.pdf", "fit.csv", "residuals.csv", "sensitivities.csv", "report.html",
 )  # fmt: skip
-CYCLES_FILES = ("cycles.json", "cycles.csv", "cycles.png")
-JOINT_FILES = ("joint.json", "joint.html", "joint.png")
+# What is plotted in cycles.png; cycles.csv is the table of all numbers by cycle.
+CYCLES_PLOTTED = "cycles-plotted.csv"
+CYCLES_FILES = ("cycles.json", "cycles.csv", "cycles.png", CYCLES_PLOTTED)
+JOINT_FILES = ("joint.json", "joint.html", "joint.png", "joint.csv")
 # What `studies.batch` writes beside the folders of the tests, and into each of them.
 BATCH_FILES = ("summary.csv", "summary.html", "batch.json")
 PREDICTION_FILES = ("prediction.json", "prediction.csv", "prediction.png", "prediction.pdf")
@@ -34,15 +40,15 @@ MARKS = ("fit.json", "cycles.json", "joint.json", "batch.json", "prediction.json
 _FILES = (*RESULT_FILES, *CYCLES_FILES, *JOINT_FILES, *PREDICTION_FILES, "batch.json")
 
 
-def save_result(result: Fit, folder: str | Path, mapped: Mapped = map) -> Path:
+def save_result(result: Fit, folder: str | Path, *, width: str = TWO, mapped: Mapped = map) -> Path:
     """Write the result folder whole, replacing an older one at the end.
 
     It is made with its parents; InputError if something else stands there (see `check_target`) or
     it cannot be written, and nothing is changed then. ``profiles.csv`` is written where there are
-    profiles, ``ladder.csv`` where there is a ladder. `mapped` draws the figures; see
-    `result_figures.draw_all`. Returns the folder.
+    profiles, ``ladder.csv`` where there is a ladder. `width` and `mapped` are those of the figures,
+    see `foamfit.report.result_figures.draw_all`. Returns the folder.
     """
-    return save_whole(folder, lambda fresh: write_result(result, fresh, mapped=mapped))
+    return save_whole(folder, lambda fresh: write_result(result, fresh, width=width, mapped=mapped))
 
 
 def save_whole(folder: str | Path, write: Callable[[Path], None], *, swept: bool = False) -> Path:
@@ -164,9 +170,11 @@ def load_result(folder: str | Path) -> dict[str, Any]:
     return content
 
 
-def write_result(result: Fit, folder: Path, *, pages: bool = True, mapped: Mapped = map) -> None:
+def write_result(
+    result: Fit, folder: Path, *, pages: bool = True, width: str = TWO, mapped: Mapped = map
+) -> None:
     """Write all files of a result into a folder that is there; the report and figures if wanted."""
-    figures = draw_all(result, mapped) if pages else ()
+    figures = draw_all(result, width, mapped) if pages else ()
     text = json.dumps(result.to_json_dict(), indent=2, ensure_ascii=False, allow_nan=False)
     # A name that is no UTF-8 keeps its bytes as an escape of JSON.
     (folder / "fit.json").write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
@@ -178,9 +186,9 @@ def write_result(result: Fit, folder: Path, *, pages: bool = True, mapped: Mappe
         write_table(folder / "ladder.csv", result.ladder.rows())
     drawn = dict(figures)
     for name, images in drawn.items():
-        if images is not None and images.pdf is not None:
-            (folder / f"{name}.png").write_bytes(images.png)
-            (folder / f"{name}.pdf").write_bytes(images.pdf)
+        if images is not None:
+            for form, content in images.files():
+                (folder / f"{name}.{form}").write_bytes(content)
     if pages:
         page = render_report(result, drawn)
         (folder / "report.html").write_text(page, encoding="utf-8", errors="replace")
@@ -188,7 +196,8 @@ def write_result(result: Fit, folder: Path, *, pages: bool = True, mapped: Mappe
 
 def write_table(path: Path, rows: Iterable[Iterable[object]]) -> None:
     """Write rows of cells as CSV."""
-    with path.open("w", encoding="utf-8", newline="") as file:
+    # A name that is no UTF-8 keeps its bytes as an escape.
+    with path.open("w", encoding="utf-8", errors="backslashreplace", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows(rows)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,12 +10,25 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.report.figures import BLUE, GREY, INSIDE, VERMILION, drawing, save, say_nothing_there
+from foamfit.report.figures import (
+    BLUE,
+    GREY,
+    INSIDE,
+    TWO,
+    VERMILION,
+    abreast,
+    drawing,
+    inches,
+    save,
+    say_nothing_there,
+)
+from foamfit.report.plotted import name_cells
 from foamfit.report.readable import readable_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, FigureBase
+    from matplotlib.image import AxesImage
 
     from foamfit.fitting.branches import Section
     from foamfit.results import Fit, ParameterEstimate, Profile
@@ -26,8 +40,9 @@ SHADES = {
     "snap-through": "#fbeedd", "held": "#e6ddd5", "snap-back": "#e3f1ea",
 }  # fmt: skip
 OTHERS = ("#f3f3f3", "#e4e4e4")  # of several springs' branches, in turn
-STRIP = 0.4  # height of a strip, in
+STRIP, LOW_STRIP = 0.4, 0.28  # height of a strip, and where panels stand above others, in
 CELL = 0.24  # height of a cell, in
+SIDE_BY_SIDE = 5.0  # in, from which on two matrices stand side by side
 
 
 def plot_insight(
@@ -35,22 +50,31 @@ def plot_insight(
     correlation: Array | None = None,
     title: str = "",
     path: str | Path | None = None,
+    *,
+    width: str = TWO,
 ) -> Figure:
     """Draw the sensitivity of each curve to each parameter, what fixes it, and the correlation.
 
     Above, a row has one scale, its largest value, in standard deviations of the noise per 1 % of
     the parameter's scale. `correlation` is (k, k), where it is better known than from `insight`.
+    For `path` and `width` see `plots.plot_fit`.
     """
-    heights = [0.75 + STRIP * len(insight.names), 1.15 + CELL * len(insight.names)]
-    with drawing(7.0, sum(heights) + 0.3 * bool(title)) as figure:
+    wide = inches(width)
+    rows = -(-len(insight.curves) // abreast(wide, len(insight.curves)))
+    heights = [
+        rows * (0.75 + (STRIP if rows == 1 else LOW_STRIP) * len(insight.names)),
+        (1.15 + CELL * len(insight.names)) * (1 if wide >= SIDE_BY_SIDE else 2),
+    ]
+    title = textwrap.fill(title, int(12 * wide))
+    with drawing(wide, sum(heights) + 0.15 * (title.count("\n") + 2) * bool(title)) as figure:
         if title:
             figure.suptitle(
                 title, x=0.012, ha="left", fontsize=8.5, weight="bold", parse_math=False
             )
         halves = figure.subfigures(2, 1, height_ratios=heights, squeeze=False)[:, 0]
-        _draw_sensitivities(halves[0], insight)
-        _draw_information(halves[1], insight, correlation)
-    return save(figure, path)
+        _draw_sensitivities(halves[0], insight, wide)
+        _draw_information(halves[1], insight, correlation, wide)
+    return save(figure, path, table=True)
 
 
 # ---------------------------------------------------------------- profiles
@@ -69,11 +93,12 @@ def plot_profiles(result: Fit, path: str | Path | None = None) -> Figure:
             _draw_profile(ax, profile, result.parameters[profile.name])
         for ax in axes[len(profiles) :]:
             ax.set_axis_off()
-        for ax in axes[: len(profiles) : 4]:
-            ax.set_ylabel("rise of χ²")
+        for at, (ax, profile) in enumerate(zip(axes, profiles, strict=False)):
+            ax.set_ylabel("rise of χ²", visible=at % 4 == 0)
+            ax.set_label(profile.name)
         if not profiles:
             say_nothing_there(axes[0])
-    return save(figure, path)
+    return save(figure, path, table=True)
 
 
 def _draw_profile(ax: Axes, profile: Profile, estimate: ParameterEstimate) -> None:
@@ -81,16 +106,17 @@ def _draw_profile(ax: Axes, profile: Profile, estimate: ParameterEstimate) -> No
     factor, unit = readable_unit(float(np.max(np.abs(profile.values))), estimate.unit)
     top = 2.0 * profile.cut
     x = profile.values / factor
-    ax.axhline(profile.cut, color=GREY, lw=0.6, ls=(0, (2, 2)))
-    ax.axvspan(*(end / factor for end in profile.ci95), color="0.92", lw=0)
+    ax.axhline(profile.cut, color=GREY, lw=0.6, ls=(0, (2, 2)), label="_95 % cut")
+    ax.axvspan(*(end / factor for end in profile.ci95), color="0.92", lw=0, label="_95 % interval")
     fine = np.linspace(x.min(), x.max(), 200)
     if estimate.stderr:
         parabola = ((fine * factor - estimate.value) / estimate.stderr) ** 2
-        ax.plot(fine, np.where(parabola <= top, parabola, np.nan), color=GREY, lw=0.8, ls="--")
+        below = np.where(parabola <= top, parabola, np.nan)
+        ax.plot(fine, below, color=GREY, lw=0.8, ls="--", label="_local covariance")
     root = np.sign(profile.values - estimate.value) * np.sqrt(np.maximum(profile.rises, 0.0))
-    ax.plot(fine, np.interp(fine, x, root) ** 2, color=BLUE, lw=1.1)
-    ax.plot(x, profile.rises, "o", color=BLUE, ms=2.2)
-    ax.plot(estimate.value / factor, 0.0, "o", color=VERMILION, ms=3.5)
+    ax.plot(fine, np.interp(fine, x, root) ** 2, color=BLUE, lw=1.1, label="_profile, between")
+    ax.plot(x, profile.rises, "o", color=BLUE, ms=2.2, label="_profile")
+    ax.plot(estimate.value / factor, 0.0, "o", color=VERMILION, ms=3.5, label="_best fit")
     ax.set_ylim(-0.04 * top, top)
     ax.locator_params(axis="x", nbins=4)
     name = f"{profile.name} ({unit})" if unit else profile.name
@@ -100,10 +126,16 @@ def _draw_profile(ax: Axes, profile: Profile, estimate: ParameterEstimate) -> No
 # ---------------------------------------------------------------- sensitivities
 
 
-def _draw_sensitivities(figure: FigureBase, insight: Insight) -> None:
+def _draw_sensitivities(figure: FigureBase, insight: Insight, width: float) -> None:
     """Set all rows of a curve in one panel: as panels of their own they take seconds to lay out."""
+    from matplotlib.transforms import Affine2D
+
     k = len(insight.names)
-    axes = figure.subplots(1, len(insight.curves), sharey=True, squeeze=False)[0]
+    n = len(insight.curves)
+    across = abreast(width, n)
+    axes = figure.subplots(-(-n // across), across, sharey=True, squeeze=False).ravel()
+    for ax in axes[n:]:
+        ax.set_axis_off()
     factor, unit = readable_unit(float(insight.clock[-1]), "s") if insight.timed else (1.0, "")
     x = insight.clock / factor
     rows = {
@@ -111,17 +143,23 @@ def _draw_sensitivities(figure: FigureBase, insight: Insight) -> None:
         for name in insight.names
     }
     reach = {name: max(float(np.max(np.abs(row))) for row in rows[name]) for name in rows}
-    for j, (ax, curve) in enumerate(zip(axes, insight.curves, strict=True)):
+    for j, (ax, curve) in enumerate(zip(axes, insight.curves, strict=False)):
         _shade(ax, x, insight.sections)
         for i, name in enumerate(insight.names):
             ax.axhline(i, color=GREY, lw=0.5)
-            ax.plot(x, i - 0.44 * rows[name][j] / (reach[name] or 1.0), color=_color(curve), lw=1.0)
+            # The row's own numbers, moved to its place.
+            moved = Affine2D().scale(1.0, -0.44 / (reach[name] or 1.0)).translate(0.0, i)
+            ax.plot(
+                x, rows[name][j], color=_color(curve), lw=1.0, transform=moved + ax.transData,
+                label=f"_{name}",
+            )  # fmt: skip
         for i in range(1, k):
             ax.axhline(i - 0.5, color="white", lw=1.6, zorder=1)
         ax.set_xlim(x[0], x[-1])
         ax.set_ylim(k - 0.5, -0.5)
         ax.set_title(curve.replace("_", "-"), loc="left", fontsize=7.5, pad=11)
         ax.set_xlabel(f"time ({unit})" if unit else "sample")
+        ax.set_ylabel("noise s.d. per 1 %", visible=False)
         ax.tick_params(axis="y", length=0)
         ax.spines["left"].set_visible(False)
     axes[0].set_yticks(range(k), [f"{name}\n±{reach[name]:.2g}" for name in insight.names])
@@ -133,10 +171,11 @@ def _shade(ax: Axes, x: Array, cuts: tuple[Section, ...]) -> None:
         left, right = x[cut.start], x[min(cut.stop, x.size - 1)]
         flies = " " in cut.branches
         shade = SHADES.get(cut.branches, "white" if flies else OTHERS[turn % 2])
-        ax.axvspan(left, right, color=shade, lw=0, zorder=0)
+        name = "flight" if flies else cut.branches
+        ax.axvspan(left, right, color=shade, lw=0, zorder=0, label=f"_branch {name}")
         if right - left > 0.03 * (x[-1] - x[0]):
             ax.annotate(
-                "flight" if flies else cut.branches, (0.5 * (left + right), 1.0), (0, 2),
+                name, (0.5 * (left + right), 1.0), (0, 2),
                 xycoords=("data", "axes fraction"), textcoords="offset points",
                 ha="center", va="bottom", fontsize=6.5, color=GREY,
             )  # fmt: skip
@@ -167,14 +206,20 @@ def _color(curve: str) -> str:
 # ---------------------------------------------------------------- information and correlation
 
 
-def _draw_information(figure: FigureBase, insight: Insight, correlation: Array | None) -> None:
+def _draw_information(
+    figure: FigureBase, insight: Insight, correlation: Array | None, width: float
+) -> None:
     """Draw which part of which curve fixes each parameter, and the correlation."""
     parts, shares = insight.shares()
     told = [c for c in range(len(parts)) if np.nanmax(shares[:, c], initial=0.0) > 0.005]
     parts, shares = tuple(parts[c] for c in told), shares[:, told]
     k = len(insight.names)
-    left, right = figure.subplots(1, 2, width_ratios=[max(len(parts) + 1.0, 0.6 * k), k])
-    _cells(left, 100.0 * shares, "Blues", (0.0, 130.0), "{:.0f}")
+    if width >= SIDE_BY_SIDE:
+        left, right = figure.subplots(1, 2, width_ratios=[max(len(parts) + 1.0, 0.6 * k), k])
+    else:
+        left, right = figure.subplots(2, 1)
+    picture = _cells(left, 100.0 * shares, "Blues", (0.0, 130.0), "{:.0f}")
+    name_cells(picture, insight.names, [f"{curve}: {branch}" for curve, branch in parts])
     left.set_title("where the information comes from (%)", loc="left", fontsize=7.5, pad=4)
     left.set_yticks(range(k), insight.names)
     labels = ["flight" if " " in branch else branch for _, branch in parts]
@@ -192,15 +237,21 @@ def _draw_information(figure: FigureBase, insight: Insight, correlation: Array |
         )  # fmt: skip
     matrix = insight.correlation if correlation is None else correlation
     below = np.where(np.tri(k, dtype=bool), matrix, np.nan)
-    _cells(right, below, "RdBu_r", (-1.4, 1.4), "{:.2f}")
+    picture = _cells(right, below, "RdBu_r", (-1.4, 1.4), "{:.2f}")
+    name_cells(picture, insight.names, insight.names)
     right.set_title("correlation of the estimates", loc="left", fontsize=7.5, pad=4)
     right.set_xticks(range(k), insight.names, rotation=90)
-    right.set_yticks([])
+    if width >= SIDE_BY_SIDE:
+        right.set_yticks([])
+    else:
+        right.set_yticks(range(k), insight.names)
 
 
-def _cells(ax: Axes, values: Array, colors: str, limits: tuple[float, float], form: str) -> None:
+def _cells(
+    ax: Axes, values: Array, colors: str, limits: tuple[float, float], form: str
+) -> AxesImage:
     """Draw a matrix as shaded cells with their numbers; NaN is left blank."""
-    ax.imshow(values, cmap=colors, vmin=limits[0], vmax=limits[1], aspect="auto")
+    picture = ax.imshow(values, cmap=colors, vmin=limits[0], vmax=limits[1], aspect="auto")
     for (i, j), value in np.ndenumerate(values):
         if np.isfinite(value):
             shown = form.format(value).replace("-", "−").replace("0.", ".")
@@ -210,3 +261,4 @@ def _cells(ax: Axes, values: Array, colors: str, limits: tuple[float, float], fo
             text.set_in_layout(False)  # inside its cell anyway; to measure each takes long
     ax.tick_params(length=0, labelsize=6.5)
     ax.spines[:].set_visible(False)
+    return picture

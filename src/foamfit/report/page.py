@@ -100,7 +100,7 @@ def environment() -> Environment:
 def render_report(result: Fit, figures: Mapping[str, Images | None] | None = None) -> str:
     """Return the report as one HTML page that needs nothing else.
 
-    `figures` are those of `draw_all`, if they are drawn already.
+    `figures` are those of `draw_all`, if they are drawn already and kept as files beside it.
     """
     drawn = dict(draw_all(result)) if figures is None else figures
     plain = result.to_json_dict()
@@ -140,6 +140,7 @@ def render_report(result: Fit, figures: Mapping[str, Images | None] | None = Non
             ladder_rows=[] if result.ladder is None else ladder_cells(result.ladder),
             answers=ANSWERS,
             badges=BADGES,
+            kept=figures is not None,
             figures={name: images and _figure(images) for name, images in drawn.items()},
             citation=CITATION,
         )

@@ -14,7 +14,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.arrays import Array
-from foamfit.report.figures import BLUE, GREY, INSIDE, VERMILION, drawing, save, say_nothing_there
+from foamfit.report.figures import (
+    BLUE,
+    GREY,
+    INSIDE,
+    TWO,
+    VERMILION,
+    abreast,
+    drawing,
+    inches,
+    legend_below,
+    save,
+    say_nothing_there,
+    write_haloed,
+)
 from foamfit.report.readable import readable_unit
 from foamfit.springs.spring import LinearSpring
 from foamfit.terminal import printable
@@ -40,31 +53,47 @@ IN_WORDS = {"snap-through": (-6.0, 6.0), "held": (-6.0, 4.0), "snap-back": (7.0,
 BESIDE = {"a": (-6, 4), "d": (-6, 4), "c": (7, -3), "e": (4, -7)}  # points from the branch
 MARKERS = 60  # of a measured curve: more of them blot
 PALE = "#A6CEE3"
-PANEL = (137.0, 133.0)  # size of one of three panels, typographic points
+# Of masses inside, from the base up: beside their colours, for who sees or prints grey.
+DASHES: Any = ((0, (5, 1.2)), (0, (2.5, 1.2)), (0, (1, 1)), (0, (5, 1.2, 1, 1.2)))
+MARKS = ("^", "v", "D", "p")
+# Typographic points: height of a panel beside others and above others, what its labels take beside
+# and below it, and what title and legend take.
+HEIGHT, STACKED, BESIDE_IT, BELOW_IT, AROUND = 133.0, 112.0, 31.0, 26.0, 39.0
+MOST_WIDE = {0: 4.0, 1: 4.0, 2: 5.4, 3: 7.0}  # in, by the number of panels
 
 
-def plot_fit(result: Fit, path: str | Path | None = None) -> Figure:
+def plot_fit(result: Fit, path: str | Path | None = None, *, width: str = TWO) -> Figure:
     """Draw stress-time, displacement-time and stress-strain, measured and fitted.
 
-    A panel of which the fit has no curve is left out; 7 in wide where all three are there. Saved at
-    `path`, if one is given, in the format of its suffix.
+    A panel of which the fit has no curve is left out. `width` is "one" or "two" columns, or a
+    length such as "85 mm"; panels for which it has no room side by side stand one above the other,
+    and a figure of fewer panels is no wider than these need. Saved at `path`, if one is given, in
+    the format of its suffix, with what is plotted in a CSV beside it.
     """
     panels = list(_panels(result))
-    with drawing({0: 4.0, 1: 4.0, 2: 5.4, 3: 7.0}[len(panels)], 2.75) as figure:
-        axes = figure.subplots(1, max(len(panels), 1), squeeze=False)[0]
+    wide = min(inches(width), MOST_WIDE[len(panels)])
+    across = abreast(wide, max(len(panels), 1))
+    rows = -(-max(len(panels), 1) // across)
+    size = 72.0 * wide / across - BESIDE_IT, HEIGHT if rows == 1 else STACKED
+    with drawing(wide, (rows * (size[1] + BELOW_IT) + AROUND) / 72.0) as figure:
+        axes = figure.subplots(rows, across, squeeze=False).ravel()
+        for ax in axes[len(panels) :]:
+            ax.set_axis_off()
         if not panels:
             say_nothing_there(axes[0])
         for ax, panel in zip(axes, panels, strict=False):
+            ax.set_label(panel.key.replace("_", "-"))
             _draw(ax, panel)
             _mark_outliers(ax, panel, result)
-            labels = _Labels(ax, panel)
+            labels = _Labels(ax, panel, size)
             if panel.key == "stress_strain":
                 _draw_law(labels, result)
             _mark_switches(labels, panel, result)
             if panel.key == "stress_strain":
                 _name_branches(labels, panel, result)
         _head(figure, result)
-    return save(figure, path)
+        figure.align_ylabels()
+    return save(figure, path, table=True)
 
 
 def plot_residuals(result: Fit, path: str | Path | None = None) -> Figure:
@@ -81,25 +110,36 @@ def plot_residuals(result: Fit, path: str | Path | None = None) -> Figure:
             factor, unit = readable_unit(_size(time), "s") if time is not None else (1.0, "")
             x = np.arange(residual.size) if time is None else time / factor
             ax.axhline(0.0, color=GREY, lw=0.6)
-            ax.plot(x, 100.0 * residual, color=VERMILION, lw=0.9)
+            ax.plot(x, 100.0 * residual, color=VERMILION, lw=0.9, label="fitted − measured")
             ax.set_ylabel("% of range")
             ax.set_title(f"{name}: fitted − measured", loc="left", fontsize=7.5, pad=3)
             column[-1].set_xlabel(f"time ({unit})" if unit else "sample")
         if not strips:
             say_nothing_there(column[0])
-    return save(figure, path)
+    return save(figure, path, table=True)
 
 
-def plot_response(response: Response, path: str | Path | None = None) -> Figure:
-    """Draw what a forward run gave: base stress and displacements over time, stress over strain."""
+def plot_response(
+    response: Response, path: str | Path | None = None, *, width: str = TWO, table: bool = True
+) -> Figure:
+    """Draw what a forward run gave: base stress and displacements over time, stress over strain.
+
+    For `path` and `width` see `plot_fit`; without `table` no CSV of what is plotted is written.
+    """
     time, stress, nodes = response.time, response.base_stress, response.displacement
-    with drawing(7.0, 2.75) as figure:
-        axes = figure.subplots(1, 3)
+    wide = min(inches(width), MOST_WIDE[3])
+    across = abreast(wide, 3)
+    rows = -(-3 // across)
+    tall = rows * ((HEIGHT if rows == 1 else STACKED) + BELOW_IT) + AROUND
+    with drawing(wide, tall / 72.0) as figure:
+        axes = figure.subplots(rows, across, squeeze=False).ravel()
+        for ax in axes[3:]:
+            ax.set_axis_off()
         ft, t_unit = readable_unit(_size(time), "s")
         fs, s_unit = readable_unit(_size(stress), "Pa")
         fw, w_unit = readable_unit(_size(nodes), "m")
-        last = {"color": VERMILION, "lw": 1.3}
-        axes[0].plot(time / ft, stress / fs, **last)
+        last: Any = {"color": VERMILION, "lw": 1.3}
+        axes[0].plot(time / ft, stress / fs, **last, label="_base stress")
         # From the base up: light to dark, the top in the colour of what is simulated.
         shades = np.linspace(0.7, 0.35, max(len(nodes) - 1, 1))
         for i, node in enumerate(nodes[:-1]):
@@ -107,14 +147,17 @@ def plot_response(response: Response, path: str | Path | None = None) -> Figure:
         axes[1].plot(time / ft, nodes[-1] / fw, label="top", **last)
         end = response.contact_end
         loop = time <= (np.inf if end is None else end)  # then the striker flies
-        axes[2].plot(response.strain[loop], stress[loop] / fs, **last)
+        axes[2].plot(response.strain[loop], stress[loop] / fs, **last, label="_base stress")
         x, base = f"time ({t_unit})", f"base stress ({s_unit})"
+        names = "stress-time", "displacement-time", "stress-strain"
+        for ax, name in zip(axes, names, strict=False):
+            ax.set_label(name)
         axes[0].set(xlabel=x, ylabel=base, xmargin=0.05, ymargin=0.11)
         axes[1].set(xlabel=x, ylabel=f"displacement ({w_unit})", xmargin=0.05, ymargin=0.11)
         axes[2].set(xlabel="overall strain (–)", ylabel=base, xmargin=0.05, ymargin=0.11)
         if end is not None:
             for ax in axes[:2]:
-                ax.axvline(end / ft, color=GREY, lw=0.6, ls=(0, (2, 2)))
+                ax.axvline(end / ft, color=GREY, lw=0.6, ls=(0, (2, 2)), label="_end of contact")
             axes[0].annotate(
                 "end of contact", (end / ft, 1.0), (-3, -3),
                 xycoords=("data", "axes fraction"), textcoords="offset points",
@@ -122,7 +165,8 @@ def plot_response(response: Response, path: str | Path | None = None) -> Figure:
             )  # fmt: skip
         if len(nodes) > 1:
             axes[1].legend(loc="best", handlelength=1.4)
-    return save(figure, path)
+        figure.align_ylabels()
+    return save(figure, path, table=table)
 
 
 def origin_word(result: Fit) -> str | None:
@@ -200,19 +244,24 @@ def _draw(ax: Axes, panel: _Panel) -> None:
     for line in panel.lines:
         x, y = line.x / fx, line.y / fy
         color = INSIDE[(line.node - 1) % len(INSIDE)] if line.node else VERMILION
+        dashes = DASHES[(line.node - 1) % len(DASHES)] if line.node else "-"
         if line.kind == "measured":
             some = _evenly(x, y, MARKERS)
-            mark, name = "o", "_measured inside" if line.node else "measured"
-            if line.source != "measured":
+            mark, name, edge = "o", "measured", "0.6"
+            if line.node:
+                mark, edge = MARKS[(line.node - 1) % len(MARKS)], color
+                name = f"_measured, mass {line.node}"
+            elif line.source != "measured":
                 mark, name = "s", f"measured, motion {line.source}"
-            ax.plot(x, y, color="0.82", lw=0.5, zorder=1)
+            every = f"_{name.removeprefix('_')}, all samples"
+            ax.plot(x, y, color="0.82", lw=0.5, zorder=1, label=every)
             ax.plot(
-                x[some], y[some], mark, label=name, ms=3.4, mfc="white", mec="0.6", mew=0.6,
+                x[some], y[some], mark, label=name, ms=3.4, mfc="white", mec=edge, mew=0.6,
                 zorder=3,
             )  # fmt: skip
         elif line.kind == "fitted":
             name = f"mass {line.node}" if line.node else "fitted"
-            ax.plot(x, y, color=color, lw=0.9, zorder=4, label=name)
+            ax.plot(x, y, color=color, ls=dashes, lw=0.9, zorder=4, label=name)
         else:
             # Wide and pale below the others, with which it coincides where the fit is good.
             ax.plot(x, y, color=PALE, lw=3.2, zorder=2, label="springs along measured strain")
@@ -258,11 +307,13 @@ def _mark_outliers(ax: Axes, panel: _Panel, result: Fit) -> None:
 class _Labels:
     """Places names in a panel: on no other name, and on little of the fitted curves and marks."""
 
-    def __init__(self, ax: Axes, panel: _Panel) -> None:
+    def __init__(self, ax: Axes, panel: _Panel, size: tuple[float, float]) -> None:
+        """Take a panel and about how large it will be, typographic points."""
         self.ax, (self.fx, _, self.fy, _) = ax, panel.scale()
         low = np.array([ax.get_xlim()[0], ax.get_ylim()[0]])
-        self.corner, span = low, np.array(PANEL)
-        self.span = span / [np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim())]  # points per unit
+        self.corner, self.size = low, size
+        limits = np.array([np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim())])
+        self.span = np.array(size) / limits  # points per unit
         self.curves = [
             np.column_stack((s.x / self.fx, s.y / self.fy))[_evenly(s.x, s.y, 4 * MARKERS)]
             for s in panel.lines
@@ -271,30 +322,25 @@ class _Labels:
         self.marks: list[Array] = []
         self.taken: list[Array] = []
 
-    def mark(self, places: Array) -> None:
+    def mark(self, name: str, places: Array) -> None:
         """Draw dots at places (n, 2), in the units of the axes, that names are to leave free."""
-        self.ax.plot(*places.T, "o", ms=3.2, color="black", zorder=5)
+        self.ax.plot(*places.T, "o", ms=3.2, color="black", zorder=5, label=f"_{name}")
         self.marks += [places, places]
 
     def has_room(self, name: str, at: Array, wanted: tuple[float, float]) -> bool:
         """Whether a name beside a place stays in the width of the panel."""
         anchor, width = (at[0] - self.corner[0]) * self.span[0], 5.5 * len(name) + abs(wanted[0])
-        return bool(anchor > width if wanted[0] < 0 else anchor + width < PANEL[0])
+        return bool(anchor > width if wanted[0] < 0 else anchor + width < self.size[0])
 
     def write(
         self, name: str, at: Array, wanted: tuple[float, float], *, stay: bool = False, **style: Any
     ) -> None:
         """Write a name beside a place; `stay`: on no other side of it than is wanted."""
-        from matplotlib.patheffects import withStroke
-
         avoid = np.concatenate([np.empty((0, 2)), *self.curves, *self.marks])
         anchor, avoid = (at - self.corner) * self.span, (avoid - self.corner) * self.span
-        offset = _free_offset(anchor, name, wanted, avoid, self.taken, stay=stay)
-        self.ax.annotate(
-            name, tuple(at), offset, textcoords="offset points", zorder=6,
-            ha="left" if offset[0] > 0 else "right", va="center",
-            path_effects=[withStroke(linewidth=1.5, foreground="white")], **style,
-        )  # fmt: skip
+        offset = _free_offset(anchor, name, wanted, avoid, self.taken, self.size, stay=stay)
+        side = "left" if offset[0] > 0 else "right"
+        write_haloed(self.ax, name, at, offset, zorder=6, ha=side, va="center", **style)
 
 
 def _mark_switches(labels: _Labels, panel: _Panel, result: Fit) -> None:
@@ -303,8 +349,8 @@ def _mark_switches(labels: _Labels, panel: _Panel, result: Fit) -> None:
     for name, x, y in (*_switches(panel, result), *_halves(panel, result)):
         at.setdefault(name, []).append((x / labels.fx, y / labels.fy))
     wanted = IN_LOOP if panel.key == "stress_strain" else IN_TIME
-    for places in at.values():
-        labels.mark(np.array(places))
+    for name, places in at.items():
+        labels.mark(name, np.array(places))
     for name, places in at.items():
         labels.write(name, np.array(places[0]), wanted.get(name[-2:], (5, 5)), fontsize=7)
 
@@ -348,7 +394,7 @@ def _draw_law(labels: _Labels, result: Fit) -> None:
     for name, strain, along in (("a", on_a, 0.9), ("c", on_c, 0.5)):
         line = np.column_stack((strain, stress / labels.fy))[strain < right]
         if len(line):  # branch c may lie beyond all that the test reached
-            ax.plot(*line.T, color="0.72", lw=0.7, zorder=1.5)
+            ax.plot(*line.T, color="0.72", lw=0.7, zorder=1.5, label=f"_branch {name}")
             at = line[int(along * (len(line) - 1))]
             labels.write(name, at, LIGHT[name], color=GREY, fontsize=7)
     if spring.relaxation and "s1" in result.snapping and result.strain is not None:
@@ -365,6 +411,7 @@ def _free_offset(
     wanted: tuple[float, float],
     avoid: Array,
     taken: list[Array],
+    panel: tuple[float, float],
     *,
     stay: bool = False,
 ) -> tuple[float, float]:
@@ -380,7 +427,7 @@ def _free_offset(
             low = np.add(anchor, (dx - (size[0] if dx < 0 else 0.0), dy - 0.5 * size[1]))
             high = low + size
             names = sum(bool(np.all((low < b[2:]) & (b[:2] < high))) for b in taken)
-            beyond = bool(np.any((low < 0.0) | (high > PANEL)))
+            beyond = bool(np.any((low < 0.0) | (high > panel)))
             inside = int(np.all((avoid > low) & (avoid < high), axis=1).sum())
             cost = 1000 * names + 50 * beyond + inside + 2.0 * factor
             if cost < best:
@@ -401,14 +448,14 @@ def _name_branches(labels: _Labels, panel: _Panel, result: Fit) -> None:
         if branch in BESIDE and result.bistable_springs:
             labels.ax.annotate(
                 branch, (x[middle], y[middle]), BESIDE[branch], textcoords="offset points",
-                ha="center", va="center", zorder=6, color=BLUE,
+                ha="center", va="center", zorder=6, color=BLUE, label="_on branch",
             )  # fmt: skip
         elif branch in IN_WORDS:
             inner = np.column_stack((x, y))[_evenly(x, y, 9)]
             around = sorted(inner, key=lambda at: float(abs(at[0] - x[middle])))
             wanted = IN_WORDS[branch]
             at = next((at for at in around if labels.has_room(branch, at, wanted)), around[0])
-            labels.write(branch, at, wanted, stay=True, fontsize=7, color=BLUE)
+            labels.write(branch, at, wanted, stay=True, fontsize=7, color=BLUE, label="_on branch")
 
 
 def _first_visits(result: Fit, fitted: _Line) -> Iterator[tuple[str, int, int]]:
@@ -455,16 +502,16 @@ def _head(figure: Figure, result: Fit) -> None:
         title += f" · {word}"
     if result.stopped:
         title += f" · stopped by {result.stopped}"
-    title = textwrap.fill(title, int(12 * figure.get_figwidth()))
+    # A dot stays with what is before it.
+    title = textwrap.fill(title.replace(" · ", "\u00a0· "), int(12 * figure.get_figwidth()))
     # A name may hold a dollar sign: it is no formula.
     figure.suptitle(title, x=0.012, ha="left", fontsize=8.5, parse_math=False)
     entries: dict[str, Any] = {}
     for ax in figure.axes:
         entries |= dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
-    if entries:
-        figure.legend(
-            list(entries.values()), list(entries), loc="outside lower center", ncols=len(entries)
-        )
+    lines = legend_below(figure, entries)
+    more = 11.0 * max(lines - 1, 0) + 11.0 * title.count("\n")
+    figure.set_figheight(figure.get_figheight() + more / 72.0)
 
 
 def _residuals(result: Fit) -> Iterator[tuple[str, Array]]:

@@ -1,15 +1,16 @@
-"""The figures of a result: each is drawn once for all images of it, in whatever process."""
+"""The figures of a result: each is drawn once for all files of it, in whatever process."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, fields
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from foamfit.report.figures import DPI, image, laid_out
+from foamfit.report.figures import DPI, TWO, image, inches, laid_out
 from foamfit.report.identifiability_plots import plot_insight, plot_profiles
 from foamfit.report.plots import plot_fit, plot_residuals
+from foamfit.report.plotted import table
 from foamfit.results import Fit
 
 if TYPE_CHECKING:
@@ -17,45 +18,62 @@ if TYPE_CHECKING:
 
 Mapped = Callable[..., Iterable[Any]]  # as the built-in `map`
 COARSE = 160  # dots per inch of what is only on the page, and should not take long
-# In the order in which they are begun: what takes longest first.
-FIGURES: dict[str, Callable[[Fit], Figure | None]] = {
-    "fit": plot_fit,
-    "insight": lambda result: _insight(result),
-    "residuals": plot_residuals,
-    "profiles": lambda result: _profiles(result),
-}
-PUBLISHED, COARSELY = ("fit",), ("insight",)  # also as a PDF; at `COARSE`
 
 
 @dataclass(frozen=True)
 class Images:
-    """A figure as the bytes of files."""
+    """A figure as the bytes of files: `pdf` where it is for print, `table` what is plotted."""
 
     png: bytes
     dpi: int  # of the PNG
     pdf: bytes | None = None
+    table: bytes | None = None
+
+    def files(self) -> Iterator[tuple[str, bytes]]:
+        """Suffix and content of the files that are kept beside the report."""
+        if self.pdf is not None:
+            yield "png", self.png
+            yield "pdf", self.pdf
+        if self.table is not None:
+            yield "csv", self.table
 
 
-def draw_all(result: Fit, mapped: Mapped = map) -> Iterable[tuple[str, Images | None]]:
+def draw_all(
+    result: Fit, width: str = TWO, mapped: Mapped = map
+) -> Iterator[tuple[str, Images | None]]:
     """Draw all figures of a result by a `map`; one that the result does not have is None.
 
-    That of an executor draws them in its processes: it begins at once, and what is given is waited
-    for when it is asked for.
+    A `map` of an executor draws them in its processes: it begins at once, and what is given is
+    waited for when it is asked for. `width` is that of "fit" (`foamfit.report.plots.plot_fit`);
+    the others are on the report, two columns wide, and there "shown" is the fit.
     """
+    again = inches(width) != inches(TWO)
+    names = [name for name in _DRAWN if again or name != "shown"]
     drawn: dict[str, Any] = {field.name: getattr(result, field.name) for field in fields(Fit)}
     # No figure shows them, and another process would import lmfit, which takes it longest.
     drawn["params"] = None
-    return zip(FIGURES, mapped(partial(_draw, Fit(**drawn)), FIGURES), strict=True)
+    return _with_shown(names, mapped(partial(_draw, Fit(**drawn), width), names))
 
 
-def _draw(result: Fit, name: str) -> Images | None:
-    figure = FIGURES[name](result)
+def _with_shown(
+    names: list[str], images: Iterable[Images | None]
+) -> Iterator[tuple[str, Images | None]]:
+    for name, one in zip(names, images, strict=True):
+        yield name, one
+        if name == "fit" and "shown" not in names:
+            assert one is not None
+            yield "shown", Images(one.png, one.dpi)
+
+
+def _draw(result: Fit, width: str, name: str) -> Images | None:
+    figure = _DRAWN[name](result, width)
     if figure is None:
         return None
-    dpi = COARSE if name in COARSELY else DPI
+    dpi = COARSE if name == "sensitivities" else DPI
     with laid_out(figure, dpi):
-        pdf = image(figure, "pdf") if name in PUBLISHED else None
-        return Images(image(figure, "png", dpi), dpi, pdf)
+        pdf = image(figure, "pdf") if name == "fit" else None
+        png = image(figure, "png", dpi)
+    return Images(png, dpi, pdf, table(figure) if name in _TABLES else None)
 
 
 def _insight(result: Fit) -> Figure | None:
@@ -66,3 +84,15 @@ def _insight(result: Fit) -> Figure | None:
 def _profiles(result: Fit) -> Figure | None:
     there = result.intervals is not None and result.intervals.profiles
     return plot_profiles(result) if there else None
+
+
+# In the order in which they are begun: what takes longest first.
+_DRAWN: dict[str, Callable[[Fit, str], Figure | None]] = {
+    "fit": lambda result, width: plot_fit(result, width=width),
+    "shown": lambda result, _: plot_fit(result),
+    "sensitivities": lambda result, _: _insight(result),
+    "residuals": lambda result, _: plot_residuals(result),
+    "profiles": lambda result, _: _profiles(result),
+}
+# What is plotted in profiles is in profiles.csv.
+_TABLES = ("fit", "sensitivities", "residuals")

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Literal, Unpack
 from foamfit.errors import InputError
 from foamfit.files import is_left, reason, sweep
 from foamfit.one_model import Keywords, Options
+from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import BATCH_FILES, MARKS, is_written
 from foamfit.report.studies.batch import OPEN, REFUSED, Row, table, write_page, write_summary
 from foamfit.results import law_in_words
@@ -97,11 +98,11 @@ def batch(
     executor: Executor | None = None,
     jobs: int | None = None,
     fresh: bool = False,
-    report: bool = True,
     specimen: str | Path | None = None,
     cycle: Cycles = None,
     fix: Mapping[str, float] | None = None,
     vary: Sequence[str] = (),
+    figure_width: str | None = TWO,
     progress: Progress | None = None,
     **options: Unpack[Keywords],
 ) -> pd.DataFrame:
@@ -128,8 +129,6 @@ def batch(
         How many processes of this machine.
     fresh : bool
         Whether everything is fitted again.
-    report : bool
-        Whether there are ``report.html``, ``fit.png`` and ``fit.pdf`` of each fit.
     specimen : str or Path, optional
         One TOML for all tests; by default the one beside each.
     cycle : int, sequence of int or "all", optional
@@ -137,6 +136,10 @@ def batch(
         row of the summary.
     fix, vary : optional
         Parameters to hold at a value (SI), and to vary though they are held by default.
+    figure_width : str or None
+        "one" or "two" columns, or a length such as "85 mm"; None for neither report nor figures of
+        each fit. A test whose figures have another width is fitted again, as its curves are not
+        kept.
     progress : callable, optional
         Told the `State` after each test.
     options
@@ -152,7 +155,9 @@ def batch(
     InputError
         If the call is wrong, or a result cannot be written, as to a full disk.
     """
-    recipe = Recipe(model, {}, _cycles(cycle), fix, tuple(vary), report)
+    recipe = Recipe(
+        model, {}, _cycles(cycle), fix, tuple(vary), figure_width is not None, figure_width or TWO
+    )
     found = run(
         tests, recipe, out=out, executor=executor, jobs=jobs, fresh=fresh, specimen=specimen,
         progress=progress, **options,
@@ -179,6 +184,7 @@ def run(
         raise InputError(f"jobs = {jobs!r} is not admissible; it must be a whole number from 1 up")
     if jobs is not None and executor is not None:
         raise InputError("jobs and an executor exclude each other; leave one of them out")
+    inches(recipe.width)  # refuses what is no width
     toml = None if specimen is None else Path(specimen)
     if toml is not None and not toml.is_file():
         raise InputError(f"{toml}: no such file; name the TOML of the specimen of all tests")
@@ -340,7 +346,7 @@ class _Run:
         except OSError:  # who reads the test says it better
             data, settings = b"", None
         mark = fingerprint(self.key, data, settings)
-        known = None if self.fresh else stored(folder, mark, made.recipe.pages)
+        known = None if self.fresh else stored(folder, mark, made.recipe)
         if known is not None:
             moved = tuple(replace(row, file=str(path)) for row in known)
             self._keep(name, moved)

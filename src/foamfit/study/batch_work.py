@@ -25,6 +25,7 @@ from foamfit.errors import InputError, SimulationError
 from foamfit.files import scratch
 from foamfit.fitting.curves import check_time_shift, choose_drive
 from foamfit.fitting.problem import fix_and_vary, make_params
+from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import save_whole, write_result
 from foamfit.report.studies.batch import REFUSED, Row, Sketch, row_of
 from foamfit.report.studies.cycles import write_cycles
@@ -50,6 +51,7 @@ class Recipe:
     fix: Mapping[str, float] | None = None
     vary: tuple[str, ...] = ()
     pages: bool = True
+    width: str = TWO  # of the figures
 
     def params(self, test: Measurement) -> lmfit.Parameters | None:
         """The parameters of a test, as `fix` and `vary` want them; None for what fit chooses."""
@@ -96,8 +98,12 @@ class Outcome:
 
 
 def settings_key(recipe: Recipe) -> str:
-    """What a result is made by: settings and version, not whether there is a page of it."""
+    """What a result is made by: settings and version, not whether there is a page of it.
+
+    Nor how wide its figures are; see `stored`.
+    """
     parts = asdict(replace(recipe, pages=True)) | {"foamfit": version("foamfit")}
+    del parts["width"]
     return json.dumps(parts, sort_keys=True)
 
 
@@ -107,11 +113,17 @@ def fingerprint(key: str, data: bytes, toml: bytes | None) -> str:
     return hashlib.sha256(json.dumps([key, *digests]).encode()).hexdigest()
 
 
-def stored(folder: Path, wanted: str, pages: bool) -> tuple[Row, ...] | None:
-    """The rows in a test's folder if they were made from what is `wanted`; else None."""
+def stored(folder: Path, wanted: str, recipe: Recipe) -> tuple[Row, ...] | None:
+    """The rows in a test's folder if they were made from what is `wanted`; else None.
+
+    Where figures are wanted, they must be there and as wide as the recipe says.
+    """
     try:
         content = json.loads((folder / RECORD).read_text(encoding="utf-8"))
-        if content["fingerprint"] != wanted or (pages and not content["pages"]):
+        if content["fingerprint"] != wanted:
+            return None
+        there = content.get("figure_width", inches(TWO)) if content["pages"] else None
+        if recipe.pages and there != inches(recipe.width):
             return None
         rows = [
             row | {"sketch": row["sketch"] and Sketch(**row["sketch"])} for row in content["rows"]
@@ -134,6 +146,7 @@ def work(task: Task) -> Outcome:
             "foamfit": version("foamfit"),
             "fingerprint": task.fingerprint,
             "pages": task.recipe.pages,
+            "figure_width": inches(task.recipe.width),
             "rows": [asdict(row) for row in rows],
         }
 
@@ -191,7 +204,8 @@ def _one(task: Task, path: Path, toml: Path) -> tuple[tuple[Row, ...], Write]:
     test = read_test(path, toml, recipe.cycles)
     result = fit(test, model=recipe.model, params=recipe.params(test), **recipe.options)
     row = row_of(task.name, str(task.path), result)
-    return (row,), lambda folder: write_result(result, folder, pages=recipe.pages)
+    pictures: dict[str, Any] = {"pages": recipe.pages, "width": recipe.width}
+    return (row,), lambda folder: write_result(result, folder, **pictures)
 
 
 def _several(task: Task, path: Path, toml: Path) -> tuple[tuple[Row, ...], Write]:
@@ -211,7 +225,8 @@ def _several(task: Task, path: Path, toml: Path) -> tuple[tuple[Row, ...], Write
         return row_of(name, str(task.path), result)
 
     rows = (row(n, found.results.get(n)) for n in sorted({*found.results, *found.refused}))
-    return tuple(rows), lambda folder: write_cycles(found, folder, pages=recipe.pages)
+    pictures: dict[str, Any] = {"pages": recipe.pages, "width": recipe.width}
+    return tuple(rows), lambda folder: write_cycles(found, folder, **pictures)
 
 
 @contextmanager

@@ -15,6 +15,7 @@ from foamfit.data.csv_file import read_test
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError
 from foamfit.one_model import Keywords, Options, Progress
+from foamfit.report.figures import TWO, inches
 from foamfit.report.studies.cycles import save_cycles
 from foamfit.study.cycle_fits import FittedCycles, loop_misfits
 from foamfit.study.shared import Group, Selection, select_own
@@ -31,12 +32,15 @@ Params = Callable[[Measurement], lmfit.Parameters | None]
 class CycleFits(FittedCycles):
     """Fits of the cycles of one record, and how they are written; see `FittedCycles`."""
 
-    def save(self, folder: str | Path) -> Path:
+    def save(self, folder: str | Path, *, figure_width: str = TWO) -> Path:
         """Write ``cycle-<n>/``, cycles.csv, cycles.png and cycles.json whole; returns the folder.
 
-        An older result there is replaced as a whole, at the end.
+        cycles-plotted.csv holds what is plotted in cycles.png. An older result there is replaced as
+        a whole, at the end. Figures are "one" or "two" columns wide, or as wide as a length
+        ("85 mm").
         """
-        return save_cycles(self, folder)
+        inches(figure_width)  # refuses what is no width
+        return save_cycles(self, folder, width=figure_width)
 
 
 def fit_cycles(

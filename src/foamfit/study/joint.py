@@ -21,6 +21,7 @@ from foamfit.fitting.links import KINDS, RATES, Links
 from foamfit.fitting.problem import Problem, make_params
 from foamfit.fitting.search import Tracker, descend
 from foamfit.one_model import Options, Progress, identify
+from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import check_target
 from foamfit.report.studies.joint import save_joint
 from foamfit.springs.model import Model
@@ -60,15 +61,21 @@ SAME_RATE = 0.02
 class JointResult(JointData):
     """Everything that a joint fit found, and how it is written; its fields are `JointData`'s."""
 
-    def save(self, folder: str | Path, *, jobs: int | None = None, reports: bool = True) -> Path:
+    def save(
+        self, folder: str | Path, *, jobs: int | None = None, reports: bool = True,
+        figure_width: str = TWO,
+    ) -> Path:  # fmt: skip
         """Write joint.json, joint.html, joint.png and a result folder per test; returns the folder.
 
-        An older result there is replaced as a whole, at the end. The folders of the tests are made
-        by `jobs` processes (by default one for each core), without `reports` with tables alone.
+        joint.csv holds what is plotted in joint.png. An older result there is replaced as a whole,
+        at the end. The folders of the tests are made by `jobs` processes (by default one for each
+        core), without `reports` with tables alone. Figures are "one" or "two" columns wide, or as
+        wide as a length ("85 mm").
         """
+        inches(figure_width)  # refuses what is no width
         check_target(folder)
         with workers(jobs, len(self.tests), FEW_FOLDERS) as each:
-            return save_joint(self, folder, each, reports=reports)
+            return save_joint(self, folder, each, reports=reports, width=figure_width)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,6 +16,7 @@ from foamfit.data.rate import loading_rate
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.curves import check_drive, choose_drive
 from foamfit.fitting.problem import Problem, make_problem
+from foamfit.report.figures import TWO, inches
 from foamfit.report.studies.prediction import save_prediction
 from foamfit.study.prediction.identified import HasContent, Source, read_source
 from foamfit.study.prediction.population import NORMAL, Population
@@ -39,12 +40,14 @@ BAND = (0.025, 0.975)
 class Prediction(PredictedTest):
     """A test that was not fitted, predicted with its 95 % band, and how it is written."""
 
-    def save(self, folder: str | Path) -> Path:
+    def save(self, folder: str | Path, *, figure_width: str = TWO) -> Path:
         """Write ``prediction.json``, ``.csv``, ``.png`` and ``.pdf`` whole; returns the folder.
 
-        An older prediction there is replaced as a whole, at the end.
+        An older prediction there is replaced as a whole, at the end. The figure is "one" or "two"
+        columns wide, or as wide as a length ("85 mm"); prediction.csv holds all that it shows.
         """
-        return save_prediction(self, folder)
+        inches(figure_width)  # refuses what is no width
+        return save_prediction(self, folder, width=figure_width)
 
 
 def predict(

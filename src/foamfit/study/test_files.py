@@ -8,14 +8,21 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from foamfit.errors import InputError
-from foamfit.report.folder import BATCH_FILES, CYCLES_FILES, MARKS, RESULT_FILES
+from foamfit.report.folder import (
+    BATCH_FILES,
+    CYCLES_FILES,
+    JOINT_FILES,
+    MARKS,
+    PREDICTION_FILES,
+    RESULT_FILES,
+)
 from foamfit.text import listed
 
 ENDINGS = (".csv", ".txt", ".tsv", ".dat")
 WANTED = f"a test is a table that ends in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}"
 # Stems of tables that say what the specimens are, beside the tests.
 _SPECIMENS = ("specimen", "specimens")
-_WRITTEN = (*RESULT_FILES, *CYCLES_FILES, *BATCH_FILES)
+_WRITTEN = (*RESULT_FILES, *CYCLES_FILES, *BATCH_FILES, *JOINT_FILES, *PREDICTION_FILES)
 
 
 def find_tests(

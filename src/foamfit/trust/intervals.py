@@ -29,6 +29,8 @@ BENT = 0.15
 METHODS = ("auto", "local", "profile", "bootstrap", "mcmc")
 # Refits of an average profile, for the announcement; draws that percentiles need.
 REFITS, ENOUGH_DRAWS = 9, 40
+# Evaluations of a refit, and its slopes.
+EVALUATIONS, SLOPES = 6.0, 0.6
 Announce = Callable[[str], None]
 
 
@@ -65,16 +67,19 @@ def assess(
     deadline: float | None = None,
     budget: float = math.inf,
     announce: Announce = lambda _: None,
+    pulse: Callable[[], None] | None = None,
 ) -> Intervals:
     """Make the intervals that were chosen.
 
     `minima` are points at which the descents of the search ended. It ends at the `deadline` (of
     `time.monotonic`) with what was done; after `budget` evaluations "auto" begins no further
-    profile. `announce` is called with the expected run time before it is spent.
+    profile. `announce` is called with the expected run time before it is spent, `pulse` at every so
+    many evaluations.
     """
     if choice.method == "local":
         return Intervals()
-    tracker, known = Tracker(best.problem.objective, deadline, best_cost=best.cost), best.known
+    tracker = Tracker(best.problem.objective, deadline, best_cost=best.cost, pulse=pulse)
+    known = best.known
     if not known:
         none = "The test determines no parameter, so no intervals were made."
         return Intervals(warnings=() if choice.method == "auto" else (none,))
@@ -90,6 +95,18 @@ def assess(
     order = sorted(known, key=lambda name: -far[best.names.index(name)])
     bent = [name for name in order if far[best.names.index(name)] > BENT]
     return _with_minima(best, _by_profiles(best, bent, minima, tracker, budget), minima, tracker)
+
+
+def evaluations_of(best: BestPoint, choice: Choice) -> float:
+    """Evaluations that intervals which were asked for are expected to take; 0 by default."""
+    match choice.method:
+        case "mcmc":
+            return float((choice.draws + 1) * walkers(best))
+        case "bootstrap":
+            return EVALUATIONS * choice.draws
+        case "profile":
+            return EVALUATIONS * REFITS * len(best.known)
+    return 0.0
 
 
 def _with_minima(
@@ -245,4 +262,5 @@ def _seconds(best: BestPoint) -> tuple[float, float]:
 def _cost_told(best: BestPoint, what: str, refits: int) -> str:
     """Announcement of so many refits."""
     evaluation, slopes = _seconds(best)
-    return f"{what}: {refits} refits, about {refits * (6.0 * evaluation + 0.6 * slopes):.2g} s"
+    seconds = refits * (EVALUATIONS * evaluation + SLOPES * slopes)
+    return f"{what}: {refits} refits, about {seconds:.2g} s"

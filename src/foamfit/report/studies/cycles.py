@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from foamfit.report.figures import BLUE, GREY, VERMILION, drawing, image
-from foamfit.report.folder import save_whole, write_result, write_table
+from foamfit.report.figures import BLUE, GREY, TWO, VERMILION, abreast, drawing, image, inches
+from foamfit.report.folder import CYCLES_PLOTTED, save_whole, write_result, write_table
+from foamfit.report.plotted import table
 from foamfit.text import aligned, percent, wrapped
 
 if TYPE_CHECKING:
@@ -21,30 +23,37 @@ if TYPE_CHECKING:
     from foamfit.study.cycle_fits import FittedCycles
 
 COLUMNS, PANEL = 4, (1.85, 1.5)  # of the picture; inches
+LEAST = 1.55  # in, of a panel
 MOST_LOOPS = 12
+DPI = 200
 FAR = 20  # a last cycle that is so many times the first is drawn on a logarithmic axis
 
 
-def save_cycles(found: FittedCycles, folder: str | Path, mapped: Mapped = map) -> Path:
+def save_cycles(
+    found: FittedCycles, folder: str | Path, *, width: str = TWO, mapped: Mapped = map
+) -> Path:
     """Write the folder whole, replacing an older result at the end; returns it.
 
-    `mapped` draws the figures of the reports; see `result_figures.draw_all`.
+    `width` and `mapped` are those of the figures, see `foamfit.report.result_figures.draw_all`.
     """
-    return save_whole(folder, lambda fresh: write_cycles(found, fresh, mapped=mapped))
+    return save_whole(folder, lambda fresh: write_cycles(found, fresh, width=width, mapped=mapped))
 
 
 def write_cycles(
-    found: FittedCycles, folder: Path, *, pages: bool = True, mapped: Mapped = map
+    found: FittedCycles, folder: Path, *, pages: bool = True, width: str = TWO, mapped: Mapped = map
 ) -> None:
     """Write all files of the cycles into a folder that is there; reports and pictures if wanted."""
     for number, result in found.results.items():
         (folder / f"cycle-{number}").mkdir()
-        write_result(result, folder / f"cycle-{number}", pages=pages, mapped=mapped)
+        inner = folder / f"cycle-{number}"
+        write_result(result, inner, pages=pages, width=width, mapped=mapped)
     write_table(folder / "cycles.csv", found.rows())
     text = json.dumps(found.to_json_dict(), indent=2, ensure_ascii=False, allow_nan=False)
     (folder / "cycles.json").write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
     if pages:
-        (folder / "cycles.png").write_bytes(image(plot_cycles(found), "png", 200))
+        figure = plot_cycles(found, width=width)
+        (folder / "cycles.png").write_bytes(image(figure, "png", DPI))
+        (folder / CYCLES_PLOTTED).write_bytes(table(figure))
 
 
 # ------------------------------------------------------------------------------- in words
@@ -95,20 +104,28 @@ def _steps(found: FittedCycles) -> list[str]:
 # ------------------------------------------------------------------------------- the picture
 
 
-def plot_cycles(found: FittedCycles) -> Figure:
+def plot_cycles(found: FittedCycles, *, width: str = TWO) -> Figure:
     """Draw the loops laid over each other, and start strain, energy, misfit, parameters by cycle.
 
     Bars are 95 % intervals; a hollow mark is a parameter that its cycle does not determine well.
-    Lines are the fit of several cycles together: level where the parameter is shared.
+    Lines are the fit of several cycles together: level where the parameter is shared. `width` is
+    "one" or "two" columns, or a length such as "85 mm".
     """
     results = dict(sorted(found.results.items()))
     varied = [n for n in found.names if any(r.parameters[n].vary for r in results.values())]
-    panels = 3 + len(varied)
-    rows = 2 + max(0, -(-(panels - 2 * (COLUMNS - 2)) // COLUMNS))
-    with drawing(COLUMNS * PANEL[0], rows * PANEL[1] + 0.35) as figure:
-        grid = figure.add_gridspec(rows, COLUMNS)
+    panels, wide = 3 + len(varied), inches(width)
+    columns = max(abreast(wide, COLUMNS, LEAST), 2)
+    rows = 2 + max(0, -(-(panels - 2 * (columns - 2)) // columns))
+    told = "points: each cycle alone with 95 % interval, hollow if weak or not determined"
+    told += "; lines: fitted together" if found.selection is not None else ""
+    lines = [
+        line for part in (f"{found.test} · {found.model}", told)
+        for line in textwrap.wrap(part, int(16 * wide))
+    ]  # fmt: skip
+    with drawing(wide, rows * PANEL[1] + 0.13 * len(lines) + 0.1) as figure:
+        grid = figure.add_gridspec(rows, columns)
         _loops(figure.add_subplot(grid[:2, :2]), found)
-        places = [(i, j) for i in range(rows) for j in range(COLUMNS) if i > 1 or j > 1]
+        places = [(i, j) for i in range(rows) for j in range(columns) if i > 1 or j > 1]
         axes = [figure.add_subplot(grid[place]) for place in places[:panels]]
         if results:
             _by_cycle(axes[0], {n: 100 * r.measurement.start_strain for n, r in results.items()})
@@ -123,10 +140,7 @@ def plot_cycles(found: FittedCycles) -> Figure:
             _parameter(ax, found, name)
         for ax in axes:
             _axis(ax, sorted(results))
-        told = "points: each cycle alone with 95 % interval, hollow if weak or not determined"
-        told += "; lines: fitted together" if found.selection is not None else ""
-        title = f"{found.test} · {found.model}\n{told}"
-        figure.suptitle(title, x=0.01, ha="left", fontsize=8)
+        figure.suptitle("\n".join(lines), x=0.01, ha="left", fontsize=8, parse_math=False)
     return figure
 
 
@@ -150,7 +164,8 @@ def _loops(ax: Axes, found: FittedCycles) -> None:
             label = f"cycle {number}"
             ax.plot(strain, measured / 1e3, color=colour, linewidth=0.9, label=label)
         if fitted is not None and number in (shown[0], shown[-1]):
-            ax.plot(strain, fitted / 1e3, ":", color="black", linewidth=0.8)
+            label = f"_cycle {number}, fitted"
+            ax.plot(strain, fitted / 1e3, ":", color="black", linewidth=0.8, label=label)
     ax.set_xlabel("strain from the first contact")
     ax.set_ylabel("stress (kPa)")
     ax.set_title("measured; first and last fitted (dotted)")
@@ -159,7 +174,8 @@ def _loops(ax: Axes, found: FittedCycles) -> None:
 
 
 def _by_cycle(ax: Axes, values: dict[int, float]) -> None:
-    ax.plot(list(values), list(values.values()), "o-", color=BLUE, markersize=3, linewidth=0.8)
+    style: dict[str, Any] = {"color": BLUE, "markersize": 3, "linewidth": 0.8}
+    ax.plot(list(values), list(values.values()), "o-", label="_each cycle alone", **style)
 
 
 def _short(name: str, found: FittedCycles) -> str:
@@ -186,14 +202,19 @@ def _parameter(ax: Axes, found: FittedCycles, name: str) -> None:
     for number, p in points:
         sure = p.state == "determined"
         if p.ci95 is not None and np.all(np.isfinite(p.ci95)):
-            ax.plot([number] * 2, [factor * end for end in p.ci95], color=GREY, linewidth=0.8)
-        face = BLUE if sure else "white"
-        ax.plot(number, factor * p.value, "o", color=BLUE, markerfacecolor=face, markersize=3.5)
+            ends = [factor * end for end in p.ci95]
+            ax.plot([number] * 2, ends, color=GREY, linewidth=0.8, label="_95 % interval")
+        face, label = BLUE if sure else "white", f"_each cycle alone, {p.state}"
+        ax.plot(
+            number, factor * p.value, "o", color=BLUE, markerfacecolor=face, markersize=3.5,
+            label=label,
+        )  # fmt: skip
     if found.selection is not None:
         best = found.selection.best.fits[0]
         if name in (*best.shared, *best.own):
             values = factor * np.array(best.value(name))
-            ax.plot(found.together, values, color=VERMILION, linewidth=0.9, zorder=0)
+            label = "_fitted together"
+            ax.plot(found.together, values, color=VERMILION, linewidth=0.9, zorder=0, label=label)
     _limit(ax, factor, [p for _, p in points], found, name)
 
 

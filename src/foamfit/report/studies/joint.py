@@ -7,8 +7,9 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from foamfit.report.figures import image
+from foamfit.report.figures import TWO, image
 from foamfit.report.folder import save_whole, write_result
+from foamfit.report.plotted import table
 from foamfit.report.studies.joint_page import joint_page
 from foamfit.report.studies.joint_plot import plot_joint
 
@@ -20,11 +21,11 @@ DPI = 180  # of the picture
 
 def save_joint(
     found: JointData, folder: str | Path, each: Callable[..., Iterable[Any]] = map, *,
-    reports: bool = True,
+    reports: bool = True, width: str = TWO,
 ) -> Path:  # fmt: skip
     """Write the folder whole, replacing an older result at the end; returns it.
 
-    `each` maps a function over the tests, as `map` does.
+    `each` maps a function over the tests, as `map` does; `width` is that of the figures.
     """
 
     def write(fresh: Path) -> None:
@@ -32,9 +33,14 @@ def save_joint(
         (fresh / "joint.json").write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
         folders = [fresh / name for name in found.tests]
         # Where other processes make the folders, the picture of all is drawn beside them.
-        made = each(_write_test, found.test_fits(), folders, [reports] * len(folders))
-        png = image(plot_joint(found), "png", DPI)
+        n = len(folders)
+        made = each(_write_test, found.test_fits(), folders, [reports] * n, [width] * n)
+        figure = plot_joint(found, width=width)
+        png = image(figure, "png", DPI)
         (fresh / "joint.png").write_bytes(png)
+        (fresh / "joint.csv").write_bytes(table(figure))
+        if width != TWO:  # the page is as wide as two columns
+            png = image(plot_joint(found), "png", DPI)
         page = joint_page(found, png, linked=reports)
         (fresh / "joint.html").write_text(page, encoding="utf-8", errors="replace")
         for _ in made:
@@ -43,7 +49,7 @@ def save_joint(
     return save_whole(folder, write)
 
 
-def _write_test(one: TestFit, folder: Path, reports: bool) -> None:
+def _write_test(one: TestFit, folder: Path, reports: bool, width: str) -> None:
     """Write the result folder of one test."""
     folder.mkdir()
-    write_result(one.fit(), folder, pages=reports)
+    write_result(one.fit(), folder, pages=reports, width=width)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from itertools import takewhile
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from foamfit.fitting.links import RATES, law_values
-from foamfit.report.figures import BLUE, GREY, VERMILION, drawing
+from foamfit.report.figures import BLUE, GREY, TWO, VERMILION, abreast, drawing, inches
 from foamfit.report.readable import readable_unit
 from foamfit.report.studies.joint_text import in_unit
 from foamfit.text import percent
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 
 # Columns of the picture, and inches of a loop and of a parameter.
 LOOPS, LOOP, COLUMNS, PANEL = 6, (1.25, 1.15), 3, (2.5, 1.6)
+LEAST_LOOP, LEAST_PANEL, LEAST_TABLE = 1.05, 1.55, 2.1  # in
+MEASURED = "0.65"  # wide and light below what is fitted, which is darker in grey too
 MOST_LOOPS = 48
 MOST_NAMES = 12  # of tests that stand at an axis
 # Largest over smallest rate from which on the tests stand by rate though nothing follows a law of
@@ -32,39 +35,45 @@ SEVERAL_RATES = 1.5
 POINTS = 400
 
 
-def plot_joint(found: JointData) -> Figure:
+def plot_joint(found: JointData, *, width: str = TWO) -> Figure:
     """Draw the loop of each test and every parameter by test, or by rate where there are several.
 
     Bars are 95 % intervals; a hollow mark is a test that does not determine the parameter well. The
     line is what the tests have in common: a value, a law of rate, a common value with its spread
-    between specimens.
+    between specimens. `width` is "one" or "two" columns, or a length such as "85 mm".
     """
     shown = _shown(found)
     names = [n for n, one in found.parameters.items() if one.kind not in ("fixed", "shared")]
     shared = [n for n, one in found.parameters.items() if one.kind == "shared"]
-    panels = len(names) + bool(shared)
-    across = min(LOOPS, max(len(shown), COLUMNS))
-    rows, low = -(-len(shown) // across), -(-panels // COLUMNS)
+    panels, wide = len(names) + bool(shared), inches(width)
+    across = abreast(wide, min(LOOPS, max(len(shown), COLUMNS)), LEAST_LOOP)
+    columns = abreast(wide, COLUMNS, LEAST_PANEL)
+    rows, low = -(-len(shown) // across), -(-panels // columns)
     heights = [rows * LOOP[1], low * PANEL[1]]
-    with drawing(max(LOOPS * LOOP[0], COLUMNS * PANEL[0]), sum(heights) + 0.55) as figure:
+    more = f"; {len(shown)} of {len(found.tests)} drawn" if len(shown) < len(found.tests) else ""
+    lines = [
+        line
+        for part in (
+            f"{found.study.name} · {found.study.model} · {len(found.tests)} tests together",
+            f"loops: measured grey and wide, fitted blue and thin{more}; below: 95 % intervals by "
+            "test, hollow if not well determined; lines: in common",
+        )
+        for line in textwrap.wrap(part, int(17 * wide))
+    ]
+    with drawing(wide, sum(heights) + 0.2 + 0.13 * len(lines)) as figure:
         top, bottom = figure.subfigures(2, 1, height_ratios=heights, squeeze=False)[:, 0]
-        _draw_loops(top.subplots(rows, across, squeeze=False).ravel().tolist(), found, shown)
-        axes = bottom.subplots(low, COLUMNS, squeeze=False).ravel().tolist()
+        most = int(72.0 * wide / across / 4.2)  # letters of a name
+        loops = top.subplots(rows, across, squeeze=False).ravel().tolist()
+        _draw_loops(loops, found, shown, most)
+        axes = bottom.subplots(low, columns, squeeze=False).ravel().tolist()
+        narrow = wide / columns < LEAST_TABLE
         for ax, name in zip(axes, names, strict=False):
-            _parameter(ax, found, name)
+            _parameter(ax, found, name, parted=narrow)
         for ax in axes[len(names) :]:
             ax.set_axis_off()
         if shared:
-            _list(axes[len(names)], found, shared)
-        more = (
-            f"; {len(shown)} of {len(found.tests)} drawn" if len(shown) < len(found.tests) else ""
-        )
-        figure.suptitle(
-            f"{found.study.name} · {found.study.model} · {len(found.tests)} tests together\n"
-            f"loops: measured grey, fitted blue{more}; below: 95 % intervals by test, hollow if "
-            "not well determined; red: in common",
-            x=0.01, ha="left", fontsize=8,
-        )  # fmt: skip
+            _list(axes[len(names)], found, shared, stacked=narrow)
+        figure.suptitle("\n".join(lines), x=0.01, ha="left", fontsize=8, parse_math=False)
     return figure
 
 
@@ -76,7 +85,8 @@ def _shown(found: JointData) -> list[int]:
     return [order[place] for place in places]
 
 
-def _draw_loops(axes: list[Axes], found: JointData, shown: list[int]) -> None:
+def _draw_loops(axes: list[Axes], found: JointData, shown: list[int], most: int) -> None:
+    """Draw the loop of each test that is shown; names have so many letters at most."""
     tests = found.measurements
     top = max(float(np.max(t.stress)) for t in tests if t.stress is not None)
     factor, unit = readable_unit(top, "Pa")
@@ -87,17 +97,18 @@ def _draw_loops(axes: list[Axes], found: JointData, shown: list[int]) -> None:
         if along is None or test.stress is None:
             continue
         step = max(along.size // POINTS, 1)
-        ax.plot(along[::step], test.stress[::step] / factor, color=GREY, linewidth=1.1)
+        seen = along[::step]
+        ax.plot(seen, test.stress[::step] / factor, color=MEASURED, lw=1.5, label="_measured")
         if fitted is not None:
-            ax.plot(along[::step], fitted[::step] / factor, color=BLUE, linewidth=0.7)
+            ax.plot(seen, fitted[::step] / factor, color=BLUE, lw=0.7, label="_fitted")
+        ax.set_label(found.tests[t])
         rate = found.rates[t] if by_rate(found) else None
         told = found.tests[t] if rate is None else f"{found.tests[t]}, {rate:.2g}/s"
-        ax.set_title(told if len(told) < 24 else f"…{told[-22:]}", fontsize=6)
+        ax.set_title(told if len(told) <= most else f"…{told[-most + 1 :]}", fontsize=6)
         ax.tick_params(labelsize=5.5, length=2, pad=1.5)
         ax.locator_params(nbins=3)
-        if t == shown[0]:
-            ax.set_xlabel(label, fontsize=6, labelpad=1)
-            ax.set_ylabel(f"stress ({unit})", fontsize=6, labelpad=1)
+        ax.set_xlabel(label, fontsize=6, labelpad=1, visible=t == shown[0])
+        ax.set_ylabel(f"stress ({unit})", fontsize=6, labelpad=1, visible=t == shown[0])
     for ax in axes[len(shown) :]:
         ax.set_axis_off()
 
@@ -136,13 +147,15 @@ def _along(
     return test.time, curves.get("stress_time"), "time (s)"
 
 
-def _parameter(ax: Axes, found: JointData, name: str) -> None:
-    """One parameter by test, or by rate."""
+def _parameter(ax: Axes, found: JointData, name: str, *, parted: bool) -> None:
+    """One parameter by test, or by rate; its title in two lines if `parted`."""
     one = found.parameters[name]
     rated = by_rate(found)
     factor, unit = readable_unit(abs(one.value), one.unit)
     x = np.array(found.rates, dtype=float) if rated else np.arange(1.0, len(found.tests) + 1)
-    ax.set_title(f"{_title(found, name)}{f' ({unit})' if unit else ''}: {one.kind}")
+    told = f"{_title(found, name)}{f' ({unit})' if unit else ''}:"
+    ax.set_title(f"{told}\n{one.kind}" if parted else f"{told} {one.kind}")
+    ax.set_label(f"{told} {one.kind}")
     there = [
         (at, one.tests[test]) for at, test in zip(x, found.tests, strict=True)
         if one.tests and one.tests[test].state != "fixed"
@@ -150,7 +163,10 @@ def _parameter(ax: Axes, found: JointData, name: str) -> None:
     bars = [(at, *v.ci95) for at, v in there if v.ci95 is not None]
     ends = np.array(bars, dtype=float).reshape(-1, 3)
     ends[:, 1:] /= factor
-    ax.vlines(ends[:, 0], ends[:, 1], ends[:, 2], color=GREY, linewidth=0.8, zorder=1)
+    ax.vlines(
+        ends[:, 0], ends[:, 1], ends[:, 2], color=GREY, linewidth=0.8, zorder=1,
+        label="_95 % interval",
+    )  # fmt: skip
     middle = [v.value / factor for _, v in there]
     if one.kind not in RATES:
         size = 3.5 if len(found.tests) < 60 else 1.5
@@ -158,8 +174,10 @@ def _parameter(ax: Axes, found: JointData, name: str) -> None:
             points = [
                 (at, v.value / factor) for at, v in there if (v.state == "determined") == sure
             ]
-            ax.plot(*np.array(points).reshape(-1, 2).T, "o", color=BLUE, markerfacecolor=face,
-                    markersize=size)  # fmt: skip
+            ax.plot(
+                *np.array(points).reshape(-1, 2).T, "o", color=BLUE, markerfacecolor=face,
+                markersize=size, label="_determined" if sure else "_not well determined",
+            )  # fmt: skip
     if rated:
         ax.set_xscale("log")
         ax.set_xlabel("strain rate (1/s)", labelpad=1)
@@ -185,31 +203,39 @@ def _common(ax: Axes, found: JointData, name: str, x: Array, factor: float) -> N
     if one.kind in RATES and one.b is not None and found.rate0 is not None:
         span = np.geomspace(span[0], span[1], 50)
         values = law_values(one.kind, one.value, one.b, np.log(span / found.rate0))
-        ax.plot(span, values / factor, color=VERMILION, linewidth=1.0)
+        ax.plot(span, values / factor, color=VERMILION, linewidth=1.0, label="_law of rate")
         told = f"b = {one.b:.3g}"
         if one.b_ci95 is not None:
             told += f" ({one.b_ci95[0]:.3g} to {one.b_ci95[1]:.3g})"
         _say(ax, told, below=one.b > 0.0)
         return
-    ax.plot(span, [one.value / factor] * 2, color=VERMILION, linewidth=1.0, zorder=0)
+    style: dict[str, Any] = {"color": VERMILION, "zorder": 0}
+    ax.plot(span, [one.value / factor] * 2, linewidth=1.0, label="_in common", **style)
     if one.ci95 is not None:
         low, high = (end / factor for end in one.ci95)
-        ax.fill_between(span, low, high, color=VERMILION, alpha=0.18, linewidth=0, zorder=0)
+        ax.fill_between(
+            span, low, high, alpha=0.18, linewidth=0, label="_95 % interval in common", **style
+        )
     if one.scatter:
         for sign in (-1.0, 1.0):
             edge = one.value * np.exp(sign * one.scatter) / factor
-            ax.plot(span, [edge] * 2, "--", color=VERMILION, linewidth=0.7, zorder=0)
+            label = "_spread between specimens"
+            ax.plot(span, [edge] * 2, "--", linewidth=0.7, label=label, **style)
         _say(ax, f"spread {percent(one.scatter)}")
 
 
-def _list(ax: Axes, found: JointData, names: list[str]) -> None:
-    """Write the values that all tests share."""
+def _list(ax: Axes, found: JointData, names: list[str], *, stacked: bool) -> None:
+    """Write the values that all tests share, side by side or `stacked` below their names."""
     lines = [["shared by all tests", "", ""]]
     for name in names:
         one = found.parameters[name]
         half = None if one.ci95 is None else 0.5 * (one.ci95[1] - one.ci95[0])
         error = f"±{percent(half / abs(one.value))}" if half and one.value else one.state or ""
-        lines.append([_title(found, name), in_unit((one.value,), one.unit), error])
+        value = in_unit((one.value,), one.unit)
+        if stacked:
+            lines += [[_title(found, name), "", ""], [f"   {value} {error}", "", ""]]
+        else:
+            lines.append([_title(found, name), value, error])
     size = min(7.0, 90.0 / len(lines))
     for column, x in ((0, 0.0), (1, 0.42), (2, 0.78)):
         told = "\n".join(line[column] for line in lines)

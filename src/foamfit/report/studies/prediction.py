@@ -4,12 +4,22 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from foamfit.errors import InputError
-from foamfit.report.figures import BLUE, GREY, INSIDE, VERMILION, drawing, image, laid_out
+from foamfit.report.figures import (
+    BLUE,
+    INSIDE,
+    TWO,
+    VERMILION,
+    abreast,
+    drawing,
+    image,
+    inches,
+    laid_out,
+)
 from foamfit.report.folder import PREDICTION_FILES, check_target, save_whole, write_table
 from foamfit.report.readable import readable_unit
 from foamfit.text import aligned, percent, wrapped
@@ -22,17 +32,21 @@ if TYPE_CHECKING:
     from foamfit.study.prediction.predicted import PredictedCurve, PredictedTest
 
 PANEL = (2.6, 2.2)  # inches
-# Colour of each part of the band.
-COLOURS = {
-    "parameters": BLUE,
-    "scatter": INSIDE[1],
-    "noise": INSIDE[2],
-    "law_error": INSIDE[0],
+MEASURED = "0.65"  # wide and light below what is predicted, which is darker in grey too
+# Colour of each part of the band, and its dashes, for who sees or prints grey.
+COLOURS: dict[str, tuple[str, Any]] = {
+    "parameters": (BLUE, "-"),
+    "scatter": (INSIDE[1], (0, (5, 1.2))),
+    "noise": (INSIDE[2], (0, (2.5, 1.2))),
+    "law_error": (INSIDE[0], (0, (5, 1.2, 1, 1.2))),
 }
 
 
-def save_prediction(found: PredictedTest, folder: str | Path) -> Path:
-    """Write the folder whole, replacing an older prediction at the end; returns it."""
+def save_prediction(found: PredictedTest, folder: str | Path, *, width: str = TWO) -> Path:
+    """Write the folder whole, replacing an older prediction at the end; returns it.
+
+    `width` is that of the figure, see `plot_prediction`.
+    """
 
     def write(fresh: Path) -> None:
         text = json.dumps(found.to_json_dict(), indent=2, ensure_ascii=False, allow_nan=False)
@@ -40,7 +54,7 @@ def save_prediction(found: PredictedTest, folder: str | Path) -> Path:
             text + "\n", encoding="utf-8", errors="backslashreplace"
         )
         write_table(fresh / "prediction.csv", found.rows())
-        figure = plot_prediction(found)
+        figure = plot_prediction(found, width=width)
         with laid_out(figure):
             (fresh / "prediction.png").write_bytes(image(figure, "png"))
             (fresh / "prediction.pdf").write_bytes(image(figure, "pdf"))
@@ -109,24 +123,34 @@ def _table(found: PredictedTest) -> list[str]:
 # ------------------------------------------------------------------------------- the picture
 
 
-def plot_prediction(found: PredictedTest) -> Figure:
+def plot_prediction(found: PredictedTest, *, width: str = TWO) -> Figure:
     """Draw each curve with its band, the loop, and what makes the band.
 
     Above are the loop and each curve in time, below the half width that each part alone would give.
+    `width` is "one" or "two" columns, or a length such as "85 mm"; what has no room beside the
+    others stands below them.
     """
     curves = list(found.curves.values())
-    with drawing(PANEL[0] * (1 + len(curves)), 1.7 * PANEL[1] + 0.4) as figure:
+    wide = min(inches(width), PANEL[0] * (1 + len(curves)))
+    across = abreast(wide, 1 + len(curves))
+    bands = -(-(1 + len(curves)) // across)  # each a row of panels with a lower one beneath
+    lines = [line for part in _title(found) for line in wrapped(part, 0, int(16 * wide))]
+    tall = bands * 1.7 * PANEL[1] + 0.4 + 0.15 * max(len(lines) - 2, 0)
+    with drawing(wide, tall) as figure:
         axes = figure.subplots(
-            2, 1 + len(curves), squeeze=False, height_ratios=(1.0, 0.6),
+            2 * bands, across, squeeze=False, height_ratios=(1.0, 0.6) * bands,
             gridspec_kw={"hspace": 0.06},
         )  # fmt: skip
-        _loop(axes[0, 0], found)
-        for column, curve in enumerate(curves, start=1):
-            _in_time(axes[0, column], axes[1, column], found, curve)
+        places = [(2 * (i // across), i % across) for i in range(bands * across)]
+        _loop(axes[places[0]], found)
+        for (row, column), curve in zip(places[1:], curves, strict=False):
+            _in_time(axes[row, column], axes[row + 1, column], found, curve)
+        for row, column in places[1 + len(curves) :]:
+            axes[row, column].set_axis_off()
+            axes[row + 1, column].set_axis_off()
         _legend(axes[1, 0], found)
-        width = int(16 * PANEL[0] * (1 + len(curves)))
-        title = "\n".join(line for part in _title(found) for line in wrapped(part, 0, width))
-        figure.suptitle(title, x=0.01, ha="left", fontsize=8, parse_math=False)
+        figure.suptitle("\n".join(lines), x=0.01, ha="left", fontsize=8, parse_math=False)
+        figure.align_ylabels()
     return figure
 
 
@@ -151,7 +175,7 @@ def _loop(ax: Axes, found: PredictedTest) -> None:
     pressed = m.stress if stress is None else stress.predicted
     height = m.specimen.height
     factor, unit = readable_unit(float(np.max(m.stress)), "Pa")
-    ax.plot(m.displacement / height, m.stress / factor, color=GREY, linewidth=0.8)
+    ax.plot(m.displacement / height, m.stress / factor, color=MEASURED, linewidth=1.4)
     ax.plot(motion / height, pressed / factor, color=VERMILION, linewidth=0.9)
     if stress is not None and moved is None:
         turn = int(np.argmax(motion))
@@ -178,12 +202,13 @@ def _in_time(above: Axes, below: Axes, found: PredictedTest, curve: PredictedCur
         x, label = time / scale, f"time ({unit})"
     factor, unit = readable_unit(float(np.max(np.abs(curve.measured))), curve.unit)
     _band(above, x, curve, factor, slice(None))
-    above.plot(x, curve.measured / factor, color=GREY, linewidth=0.8)
+    above.plot(x, curve.measured / factor, color=MEASURED, linewidth=1.4)
     above.plot(x, curve.predicted / factor, color=VERMILION, linewidth=0.9)
     above.set_ylabel(f"{curve.channel.replace('_', ' ')} ({unit})")
-    for part, colour in COLOURS.items():
+    for part, (colour, dashes) in COLOURS.items():
         if np.any(curve.parts[part]):
-            below.plot(x, curve.parts[part] / factor, color=colour, linewidth=0.9)
+            style: Any = {"color": colour, "linestyle": dashes, "linewidth": 0.9}
+            below.plot(x, curve.parts[part] / factor, **style)
     below.plot(x, 0.5 * (curve.hi - curve.lo) / factor, ":", color="black", linewidth=0.9)
     below.set_ylim(bottom=0.0)
     below.set_ylabel(f"half width ({unit})")
@@ -197,14 +222,20 @@ def _legend(ax: Axes, found: PredictedTest) -> None:
 
     ax.set_axis_off()
     handles: list[Line2D | Patch] = [
-        Line2D([], [], color=GREY, label="measured"),
+        Line2D([], [], color=MEASURED, linewidth=1.4, label="measured"),
         Line2D([], [], color=VERMILION, label="predicted"),
         Patch(color=VERMILION, alpha=0.18, label="95 % band"),
         Line2D([], [], color="black", linestyle=":", label="half width: all"),
     ]
-    for part, colour in COLOURS.items():
+    for part, (colour, dashes) in COLOURS.items():
         if any(np.any(curve.parts[part]) for curve in found.curves.values()):
             handles.append(
-                Line2D([], [], color=colour, label=f"half width: {part.replace('_', ' ')}")
+                Line2D(
+                    [],
+                    [],
+                    color=colour,
+                    linestyle=dashes,
+                    label=f"half width: {part.replace('_', ' ')}",
+                )
             )
     ax.legend(handles=handles, loc="upper left", fontsize=7, borderaxespad=0.0)

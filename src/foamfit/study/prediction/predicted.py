@@ -163,7 +163,10 @@ class PredictedTest:
         return content
 
     def rows(self) -> Iterator[list[object]]:
-        """Rows of prediction.csv, the header first: one row per sample, SI."""
+        """Rows of prediction.csv, the header first: one row per sample, SI.
+
+        Everything that `prediction.png` shows is in them.
+        """
         m, columns = self.measurement, dict[str, Array]()
         if m.time is not None:
             columns["time (s)"] = m.time
@@ -183,6 +186,11 @@ class PredictedTest:
                 ]
             if not curve.kept.all():
                 columns[f"outliers of {channel} left out"] = (~curve.kept).astype(int)
+        height = m.specimen.height
+        if m.displacement is not None:
+            columns["measured strain"] = m.displacement / height
+        if (moved := self.curves.get("displacement_time")) is not None:
+            columns["predicted strain"] = moved.predicted / height
         yield list(columns)
         for row in zip(*(column.tolist() for column in columns.values()), strict=True):
             yield list(row)

@@ -1,0 +1,173 @@
+"""Colours that stand for something are told apart by all eyes, and in grey.
+
+Colour vision without one kind of cone is simulated by the matrices of Machado, Oliveira and
+Fernandes (2009, IEEE Trans. Vis. Comput. Graph. 15, 1291), in linear RGB; differences are those of
+CIE76 in L*a*b* (D65).
+"""
+
+from __future__ import annotations
+
+import re
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgb
+
+import foamfit.report
+from drawn import figures
+from foamfit.report.plots import DASHES, MARKS
+from foamfit.report.studies import cycles, joint_plot, prediction
+
+EYES = {
+    "normal": np.eye(3),
+    "protanopia": [
+        [0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216],
+        [-0.003882, -0.048116, 1.051998],
+    ],
+    "deuteranopia": [
+        [0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413],
+        [-0.011820, 0.042940, 0.968881],
+    ],
+    "tritanopia": [
+        [1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602],
+        [0.004733, 0.691367, 0.303900],
+    ],
+    "grey": [[0.2126, 0.7152, 0.0722]] * 3,
+}  # fmt: skip
+# Difference from which on colours of lines are told apart at a glance, and in grey, where it is one
+# of lightness alone.
+APART, APART_IN_GREY = 20.0, 12.0
+XYZ = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
+
+
+def lab(colour: Any, eye: str) -> np.ndarray:
+    rgb = np.array(to_rgb(colour))
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    seen = np.clip(np.array(EYES[eye]) @ linear, 0.0, 1.0)
+    x, y, z = np.array(XYZ) @ seen / [0.9505, 1.0, 1.089]
+    f = [t ** (1 / 3) if t > 0.008856 else 7.787 * t + 16 / 116 for t in (x, y, z)]
+    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
+
+
+def apart(one: Any, other: Any, eye: str) -> float:
+    return float(np.linalg.norm(lab(one, eye) - lab(other, eye)))
+
+
+def is_told(one: Any, other: Any) -> dict[str, float]:
+    """By which eyes two colours are not told apart, and how far they are from each other."""
+    found = {eye: apart(one, other, eye) for eye in EYES}
+    return {
+        eye: round(far, 1) for eye, far in found.items()
+        if far < (APART_IN_GREY if eye == "grey" else APART)
+    }  # fmt: skip
+
+
+def test_the_simulation_is_that_of_the_textbooks() -> None:
+    """Pure red and green are far apart, and close in hue to eyes without the long cones."""
+    assert lab("white", "normal") == pytest.approx([100.0, 0.0, 0.0], abs=0.05)
+    assert apart("#ff0000", "#00ff00", "normal") == pytest.approx(170.6, abs=0.5)
+    assert lab("#ff0000", "grey")[1:] == pytest.approx([0.0, 0.0], abs=0.05)
+    for eye in ("protanopia", "deuteranopia"):
+        assert apart("#909000", "#c06000", eye) < 0.6 * apart("#909000", "#c06000", "normal")
+    assert apart("#0080ff", "#00a0a0", "tritanopia") < 0.6 * apart("#0080ff", "#00a0a0", "normal")
+
+
+def cue(line: Any) -> tuple[Any, ...]:
+    """What tells a line from another one beside its colour: its mark, dashes, width."""
+    width = line.get_linewidth()
+    dashes = str(line._unscaled_dash_pattern) if line.get_linestyle() != "None" else ""
+    marked = line.get_marker() not in ("None", None, "")
+    hollow = marked and line.get_markerfacecolor() == "white"
+    return (
+        line.get_marker(),
+        hollow,
+        dashes,
+        0 if marked else int(width >= 1.4) + int(width >= 2.5),
+    )
+
+
+def test_series_of_a_panel_are_told_apart_by_colour_or_shape() -> None:
+    compared = 0
+    for name, figure in figures():
+        for ax in figure.axes:
+            lines = {str(line.get_label()): line for line in ax.lines}
+            rows = name == "insight"  # a line of each parameter, in a row that bears its name
+            shown = [k for k in lines if not (k.startswith("_child") or "all samples" in k)]
+            named = {} if rows else {k: lines[k] for k in shown}
+            for (k, one), (m, other) in combinations(named.items(), 2):
+                by_name = one.get_marker() == "o" or k.startswith("_branch")
+                if cue(one) == cue(other) and not (by_name and k.startswith("_")):
+                    compared += 1
+                    told = is_told(one.get_color(), other.get_color())
+                    assert not told, (name, k, m, told)
+    assert compared >= 3
+
+
+def test_parts_of_a_band_have_dashes_of_their_own() -> None:
+    dashes = [str(dash) for _, dash in prediction.COLOURS.values()]
+    assert len(set(dashes)) == len(dashes)
+    assert len({str(dash) for dash in DASHES}) == len(set(MARKS)) == 4
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (prediction.MEASURED, prediction.VERMILION),
+        (joint_plot.MEASURED, joint_plot.BLUE),
+        (cycles.BLUE, "white"),  # hollow marks
+    ],
+)
+def test_measured_and_simulated_are_told_apart(one: str, other: str) -> None:
+    assert not is_told(one, other)
+
+
+def test_cycles_run_from_light_to_dark_for_all_eyes() -> None:
+    colours = matplotlib.colormaps["viridis_r"](np.linspace(0.1, 0.95, cycles.MOST_LOOPS))
+    for eye in EYES:
+        lightness = [lab(colour[:3], eye)[0] for colour in colours]
+        assert np.all(np.diff(lightness) < -2.0), eye
+
+
+TEMPLATES = Path(foamfit.report.__file__).parent / "templates"
+
+
+def backgrounds(template: str) -> dict[str, tuple[str, str]]:
+    """Background and letters of each state on a page."""
+    style = (TEMPLATES / template).read_text(encoding="utf-8")
+    rule = r"([^{}\n]*)\{[^{}]*background: (#\w+); color: (#\w+);[^{}]*\}"
+    return {
+        name: (back, letters)
+        for names, back, letters in re.findall(rule, style)
+        for name in re.findall(r"\.([\w-]+)(?:,|\s*$)", names.strip() + " ")
+    }
+
+
+@pytest.mark.parametrize(
+    ("template", "states"),
+    [
+        ("report.html", ("determined", "weak", "not-determined")),
+        ("report.html", ("ok", "warnings-state", "failed")),
+        ("joint.html", ("determined", "weak", "not-determined")),
+        ("summary.html", ("ok", "warnings", "failed")),
+    ],
+)
+def test_states_on_the_pages_are_told_apart_and_can_be_read(
+    template: str, states: tuple[str, ...]
+) -> None:
+    found = backgrounds(template)
+    for one, other in combinations(states, 2):
+        assert not is_told(found[one][0], found[other][0]), (one, other)
+    for back, letters in (found[state] for state in states):
+        for eye in EYES:
+            assert abs(lab(back, eye)[0] - lab(letters, eye)[0]) > 50.0
+
+
+def test_what_is_unsure_in_a_summary_is_told_from_what_is_sure() -> None:
+    style = (TEMPLATES / "summary.html").read_text(encoding="utf-8")
+    strokes = dict(re.findall(r"\.(\w+) \{ stroke: (#\w+);", style))
+    assert not is_told(strokes["dots"], strokes["unsure"])
+    assert not is_told(strokes["m"], strokes["f"])

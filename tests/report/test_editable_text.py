@@ -1,0 +1,89 @@
+"""Text in the figures stays text: letters of embedded TrueType fonts, with what they stand for."""
+
+from __future__ import annotations
+
+import re
+import zlib
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+import fabricated
+from drawn import figures
+from foamfit.report.comparison import compare
+from foamfit.report.comparison_plot import plot_comparison
+from foamfit.report.figures import image
+from foamfit.report.plots import plot_fit
+
+
+def objects(pdf: bytes) -> dict[int, bytes]:
+    """The objects of a PDF, streams inflated."""
+    found = {}
+    for number, body in re.findall(rb"(\d+) 0 obj\s(.*?)\sendobj", pdf, re.DOTALL):
+        head, mark, rest = body.partition(b"stream\n")
+        stream = rest.rpartition(b"\nendstream")[0] if mark else b""
+        if b"/FlateDecode" in head:
+            stream = zlib.decompress(stream)
+        found[int(number)] = head + stream
+    return found
+
+
+def fonts(pdf: bytes) -> list[tuple[str, bool]]:
+    """Kind of each font, and whether a TrueType file is embedded."""
+    there = objects(pdf).values()
+    kinds = [
+        kind.decode()
+        for body in there if b"/Type /Font " in body or b"/Type /Font\n" in body
+        for kind in re.findall(rb"/Subtype /(\w+)", body)[:1]
+    ]  # fmt: skip
+    embedded = b"".join(there).count(b"/FontFile2")
+    whole = [kind for kind in kinds if kind != "CIDFontType2"]  # which is a part of a Type0
+    return [(kind, embedded >= len(whole)) for kind in whole]
+
+
+def letters(pdf: bytes) -> set[str]:
+    """The characters that the glyphs of a PDF say they stand for."""
+    found = set[str]()
+    for body in objects(pdf).values():
+        if b"beginbfrange" in body or b"beginbfchar" in body:
+            for line in re.findall(rb"<\w+> (?:<\w+> )?\[?(<[\w<> ]+>)", body):
+                for code in re.findall(rb"<(\w+)>", line):
+                    found.add(bytes.fromhex(code.decode()).decode("utf-16-be"))
+            for first, last, code in re.findall(rb"<(\w+)> <(\w+)> <(\w+)>", body):
+                span = int(last, 16) - int(first, 16)
+                found |= {chr(int(code, 16) + i) for i in range(span + 1)}
+    return found
+
+
+def test_every_letter_is_that_of_an_embedded_truetype_font() -> None:
+    for name, figure in figures():
+        if name in ("microscale, relaxing", "comparison"):
+            pdf = image(figure, "pdf")
+            kinds = fonts(pdf)
+            assert kinds, name
+            assert all(kind in ("TrueType", "Type0") and whole for kind, whole in kinds), name
+            assert b"/Type3" not in pdf, name
+
+
+@pytest.mark.parametrize("form", ["pdf", "svg"])
+def test_greek_letters_indices_and_minus_signs_are_characters(form: str) -> None:
+    one = fabricated.result()
+    named = replace(one, measurement=replace(one.measurement, name="foam-1/model-1"))
+    text = set[str]()
+    pictures = (plot_fit(fabricated.microscale_result()), plot_comparison(compare([named])))
+    for figure in pictures:
+        content = image(figure, form)
+        if form == "pdf":
+            text |= letters(content)
+        else:
+            text |= set("".join(ElementTree.fromstring(content).itertext()))
+    assert set("σεΔ₊₋−–·kh%") <= text
+
+
+def test_an_svg_holds_its_words_as_text(tmp_path: Path) -> None:
+    plot_fit(fabricated.result(), tmp_path / "fit.svg")
+    root = ElementTree.fromstring((tmp_path / "fit.svg").read_text(encoding="utf-8"))
+    words = {"".join(one.itertext()) for one in root.iter("{http://www.w3.org/2000/svg}text")}
+    assert {"stress (MPa)", "time (µs)", "A1", "springs along measured strain"} <= words

@@ -1,0 +1,97 @@
+"""Figures for one and two columns of print: nothing is cut off, nothing overlaps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import fabricated
+from drawn import figures
+from foamfit.cli import main
+from foamfit.errors import InputError
+from foamfit.report.figures import DPI, STYLE, inches, laid_out
+from foamfit.report.plots import plot_fit
+
+
+@pytest.mark.parametrize(
+    ("width", "wide"), [("one", 3.25), ("Two", 7.0), ("85 mm", 85 / 25.4), ("3.25in", 3.25)]
+)
+def test_a_width_is_columns_or_a_length(width: str, wide: float) -> None:
+    assert inches(width) == pytest.approx(wide)
+
+
+@pytest.mark.parametrize(
+    ("width", "words"),
+    [("wide", "is no quantity"), ("3 mm", "from 64 to 508 mm"), ("5 s", "is of another kind")],
+)
+def test_what_is_no_width_is_refused_before_anything_is_done(
+    width: str, words: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=words):
+        fabricated.result().save(tmp_path / "r", figure_width=width)
+    told = CliRunner().invoke(main, ["fit", "none.csv", "--figure-width", width])
+    assert told.exit_code == 1
+    assert words in told.stderr
+    assert told.stderr.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_panels_stand_above_each_other_in_one_column_and_letters_keep_their_size() -> None:
+    narrow, wide = (plot_fit(fabricated.result(), width=width) for width in ("one", "two"))
+    assert (narrow.get_figwidth(), wide.get_figwidth()) == (3.25, 7.0)
+    assert narrow.get_figheight() < 9.0  # a page
+    with laid_out(narrow):
+        boxes = [ax.get_position() for ax in narrow.axes]
+    assert [round(box.x0, 3) for box in boxes] == [round(boxes[0].x0, 3)] * 3
+    assert boxes[0].y0 > boxes[1].y1 > boxes[1].y0 > boxes[2].y1
+
+    def sizes(figure: Any) -> list[float]:
+        return [text.get_fontsize() for ax in figure.axes for text in ax.get_xticklabels()][:3] + [
+            ax.xaxis.label.get_fontsize() for ax in figure.axes
+        ]
+
+    assert sizes(narrow) == sizes(wide)
+
+
+@pytest.mark.parametrize("width", ["one", "two"])
+def test_nothing_is_cut_off_and_no_panel_overlaps_another(width: str) -> None:
+    for name, figure in figures(width):
+        with laid_out(figure, DPI), matplotlib.rc_context(STYLE):
+            figure.dpi = DPI
+            least = DPI / 72.0  # a typographic point
+            parts = [ax for ax in figure.axes if ax.axison]
+            boxes = [part.get_tightbbox() for part in parts]
+            low = np.min([[box.x0, box.y0] for box in boxes], axis=0)
+            high = np.max([[box.x1, box.y1] for box in boxes], axis=0)
+            assert np.all(low > -least), name
+            assert np.all(high - figure.bbox.max < least), name
+            for legend in figure.legends:
+                box = legend.get_window_extent()
+                assert box.x0 > -least, name
+                assert box.x1 < figure.bbox.x1 + least, name
+                assert box.y1 < min(one.y0 for one in boxes) + least, name
+            for one, other in combinations(boxes, 2):
+                wide = min(one.x1, other.x1) - max(one.x0, other.x0)
+                tall = min(one.y1, other.y1) - max(one.y0, other.y0)
+                assert min(wide, tall) < 2.0 * least, name
+
+
+def test_a_narrow_figure_leaves_the_page_as_it_is(tmp_path: Path) -> None:
+    one = fabricated.result()
+    bare = replace(one, curves=replace(one.curves, displacement=None, time=None), misfit={})
+    pages = []
+    for width in ("one", "two"):
+        folder = bare.save(tmp_path / width, figure_width=width)
+        pages.append((folder / "report.html").read_text(encoding="utf-8"))
+        png = (folder / "fit.png").read_bytes()
+        assert int.from_bytes(png[16:20]) == pytest.approx(
+            250 * {"one": 3.25, "two": 4.0}[width], 2
+        )
+    assert pages[0] == pages[1]

@@ -1,0 +1,237 @@
+"""What a fit shows on a terminal while it runs, and where nothing is shown."""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import foamfit as ff
+from conftest import EXPERIMENTS, synthetic_impact, without_pictures
+from foamfit import api
+from foamfit.cli import main
+from foamfit.cli import progress as module
+from foamfit.cli.progress import ProgressLine, progress_line
+from foamfit.one_model import Options
+from foamfit.trust.best_point import BestPoint
+from foamfit.trust.prediction import misfit_of
+
+pty = pytest.importorskip("pty")
+RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
+
+
+class Terminal:
+    """A pseudo terminal of 80 columns."""
+
+    def __init__(self) -> None:
+        import fcntl
+        import struct
+        import termios
+
+        self.master, slave = pty.openpty()
+        fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+        os.set_blocking(self.master, False)
+        self.stream = os.fdopen(slave, "w", encoding="utf-8")
+
+    def read(self) -> str:
+        found = b""
+        while True:
+            try:
+                found += os.read(self.master, 1 << 16)
+            except BlockingIOError:
+                return found.decode()
+
+
+@pytest.fixture
+def terminal() -> Iterator[Terminal]:
+    made = Terminal()
+    with made.stream:
+        yield made
+    os.close(made.master)
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Reports without pictures, a line that is redrawn at once, an empty working directory."""
+    monkeypatch.chdir(tmp_path)
+    without_pictures(monkeypatch)
+    monkeypatch.setattr(module, "REDRAWN", 0.02)
+    monkeypatch.setattr(module, "APART", 0.0)
+
+
+def shown(told: str) -> list[str]:
+    return [line.strip() for line in told.split("\r") if line.strip()]
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_terminal_shows_what_is_done_a_bar_the_best_misfit_and_the_time_left(
+    terminal: Terminal, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "stderr", terminal.stream)
+    monkeypatch.setattr(api, "save_result", lambda *_, **__: time.sleep(0.1))
+    with pytest.raises(SystemExit) as ended:
+        main(["fit", str(RECONSTRUCTION), "--starts", "6", "--out", "r"])
+    assert ended.value.code == 0
+    told = terminal.read()
+    lines = shown(told)
+    assert "\n" not in told
+    assert all(len(line) < 80 for line in lines)
+    assert any(re.fullmatch(r"fit: loop \[#+-+\] best misfit [\d.]+ %, .+", one) for one in lines)
+    assert any(line.startswith("fit: intervals [") for line in lines)
+    assert lines[-1].startswith("fit: writing the report")
+    assert re.search(r", about \d+ s left", told)
+    found = [float(one) for one in re.findall(r"best misfit ([\d.]+) %", told)]
+    assert found == sorted(found, reverse=True)
+    assert told.endswith("\r")  # nothing is left of it
+    curves = r"stress-time ([\d.]+) %, displacement-time ([\d.]+) %"
+    said = re.search(curves, capsys.readouterr().out)
+    assert said is not None
+    ends = sorted(float(one) for one in said.groups())
+    assert 0.9 * ends[0] <= found[-1] <= 1.1 * ends[1]
+
+
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize("option", ["--quiet", "--json"])
+def test_nothing_is_shown_where_silence_is_asked_for(
+    option: str, terminal: Terminal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "stderr", terminal.stream)
+    with pytest.raises(SystemExit):
+        main(["fit", str(RECONSTRUCTION), "--starts", "2", "--out", "r", option])
+    assert terminal.read() == ""
+
+
+def test_nothing_is_shown_and_nothing_watched_without_a_terminal(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    stream = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", stream)
+    with progress_line(False, "fit") as line:
+        line.progress(0.5, "loop")
+        assert line.watch is None
+        line.tell("72 refits, about 3 s")
+    assert stream.getvalue() == "foamfit: 72 refits, about 3 s\n"
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_sentence_in_between_does_not_run_into_the_line(
+    terminal: Terminal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "stderr", terminal.stream)
+    with progress_line(False, "fit") as line:
+        line.progress(0.5, "loop")
+        time.sleep(0.05)
+        line.tell("72 refits, about 3 s")
+        line.progress(0.6, "intervals")
+        time.sleep(0.05)
+    told = terminal.read()
+    assert re.search(r"\r +\rfoamfit: 72 refits, about 3 s\r?\n", told)
+    assert shown(told)[-1].startswith("fit: intervals")
+
+
+def standing(monkeypatch: pytest.MonkeyPatch, marks: list[tuple[float, float]], **more: Any):
+    """A line that was told shares of the work at these seconds; and its clock."""
+    now = [0.0]
+    monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(module, "REDRAWN", 60.0)
+    line = ProgressLine(io.StringIO(), "fit", **more)
+    for at, share in marks:
+        now[0] = at
+        line.progress(share, "curves")
+    return line, now
+
+
+def test_the_time_left_follows_the_pace_and_counts_down(monkeypatch: pytest.MonkeyPatch) -> None:
+    steady = [(0.1 * i, 0.01 * i) for i in range(1, 51)]
+    line, now = standing(monkeypatch, steady)
+    assert line.left() == "about 5 s left"
+    now[0] += 2.0
+    assert line.left() == "about 3 s left"
+    now[0] += 60.0  # nobody knows
+    assert line.left() == "about 2 s left"
+    line.close()
+    slower = [*steady, *((5.0 + 1.0 * i, 0.5 + 0.01 * i) for i in range(1, 21))]
+    line, _ = standing(monkeypatch, slower)
+    assert line.left() == "about 30 s left"
+    line.close()
+
+
+def test_a_time_limit_bounds_the_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    for share in (0.0, 0.1):
+        line, _ = standing(monkeypatch, [(10.0, share)], limit=25.0)
+        assert line.left() == "at most 15 s left"
+        line.close()
+    line, _ = standing(monkeypatch, [(10.0, 0.8)], limit=25.0)
+    assert line.line(80).endswith("about 2 s left")
+    line.close()
+
+
+@pytest.mark.parametrize("columns", [20, 50, 80, 200])
+def test_the_line_is_never_wider_than_the_terminal(
+    columns: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    line, _ = standing(monkeypatch, [(10.0, 0.4)])
+    line.progress(0.5, "model 3 of 9: linear+microscale with relaxation and damping: refinement")
+    line.misfit = 0.0123
+    told = line.line(columns)
+    assert len(told) < columns
+    if columns >= 50:
+        assert told.endswith("best misfit 1.2 %, about 10 s left")
+    assert ("#" in told) == (columns == 200)
+    line.close()
+
+
+def test_the_best_misfit_is_that_of_all_fitted_curves_and_costs_no_evaluation() -> None:
+    _, test = synthetic_impact()
+    problem = Options().problem(test, "bistable")
+    values = problem.vector()
+    line = ProgressLine(io.StringIO(), "fit")
+    counts = problem.objective.evaluations
+    assert line.watch is not None
+    line.watch(problem, values)
+    assert problem.objective.evaluations == counts
+    best = BestPoint(problem, values)
+    assert line.misfit == pytest.approx(misfit_of(best, best.residual), rel=1e-6)
+    line.progress(0.5, "cycle 2: loop")  # of another test
+    assert line.misfit is None
+    line.close()
+
+
+def test_simulations_for_the_line_take_a_small_share_of_the_time() -> None:
+    _, test = synthetic_impact()
+    problem = Options().problem(test, "bistable")
+    line, looks = ProgressLine(io.StringIO(), "fit"), []
+    problem.objective.look = lambda values: looks.append(time.sleep(0.01))  # type: ignore[func-returns-value]
+    began = time.monotonic()
+    while time.monotonic() - began < 0.5:
+        line._watch(problem, np.zeros(8))
+        line.progress(0.1, "loop")
+    assert 1 <= len(looks) <= 3
+    line.close()
+
+
+def test_progress_rises_through_search_and_intervals() -> None:
+    _, test = synthetic_impact()
+    told: list[tuple[float, str]] = []
+    ff.fit(test, starts=4, intervals="profile", progress=lambda *one: told.append(one))
+    shares = [share for share, _ in told]
+    assert shares == sorted(shares)
+    assert (shares[0], told[-1]) == (0.0, (1.0, "done"))
+    steps = list(dict.fromkeys(what for _, what in told))
+    assert steps[:4] == ["start values", "loop", "curves", "refinement"]
+    assert len([what for _, what in told if what == "intervals"]) > 5
+
+
+def test_auto_says_which_model_of_how_many() -> None:
+    _, test = synthetic_impact()
+    told: list[str] = []
+    api.fit(test, model="auto", starts=2, progress=lambda _, what: told.append(what))
+    assert told[0].startswith("model 1 of 10: bistable without damping: ")
