@@ -88,7 +88,7 @@ def tried(monkeypatch):
 
 
 def again(**changed):
-    given = {"out": "out", "specimen": "foam.toml", "executor": Inline(), "report": False}
+    given = {"out": "out", "specimen": "foam.toml", "executor": Inline(), "figure_width": None}
     return ff.batch("tests", **(given | changed))
 
 
@@ -117,7 +117,7 @@ def stamps(out):
 def test_the_same_numbers_with_any_number_of_processes_and_anywhere(here):
     frames = {}
     for jobs in (1, 2, 4):
-        call = {"out": f"out{jobs}", "specimen": "foam.toml", "report": False, "jobs": jobs}
+        call = {"out": f"out{jobs}", "specimen": "foam.toml", "figure_width": None, "jobs": jobs}
         frames[jobs] = ff.batch("tests", **call, **QUICK)
     again(out="inline", **QUICK)
     made = numbers("out1")
