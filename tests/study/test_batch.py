@@ -143,7 +143,7 @@ def test_reports_are_there_unless_they_are_not_wanted(here, tried, monkeypatch):
     without_pictures(monkeypatch)
     again(figure_width=None)
     assert len(tried) == 3
-    again()  # the reports are missing
+    again(figure_width="two")  # the reports are missing
     assert len(tried) == 6
     assert {"report.html", "fit.png", "fit.pdf"} <= set(names("out/a"))
     assert 'href="a/report.html"' in Path("out/summary.html").read_text()
@@ -153,7 +153,7 @@ def test_reports_are_there_unless_they_are_not_wanted(here, tried, monkeypatch):
 
 def test_figures_of_another_width_are_made_again_where_there_are_any(here, tried, monkeypatch):
     without_pictures(monkeypatch)
-    again()
+    again(figure_width="two")
     assert len(tried) == 3
     again(figure_width="177.8 mm")  # two columns
     again(figure_width=None)
