@@ -163,7 +163,7 @@ def test_a_sentence_without_a_row_shows_the_headers(desk):
 
 
 def test_a_fit_is_that_of_the_command(ready):
-    worker = ready.fit("bistable", {"starts": 2, "seed": 3})
+    worker = ready.fit(["--starts", "2", "--seed", "3"])
     wait(worker)
     assert worker.ended == ""
     measurement = ff.read_test(TEST)
@@ -189,12 +189,12 @@ def test_watching_a_fit_changes_nothing():
 
 
 def test_a_fit_that_is_stopped_keeps_the_best(ready):
-    worker = ready.fit("bistable", {"starts": 100_000})
+    worker = ready.fit(["--starts", "100000"])
     wait(worker, lambda worker: worker.news.misfit)
     assert worker.news.model == "bistable"
     assert set(worker.news.values) >= {"s1_k0", "s1_eta"}
     with pytest.raises(InputError, match="A fit is running"):
-        ready.fit("bistable", {})
+        ready.fit([])
     # What it is fitted to cannot change beneath it.
     with pytest.raises(InputError, match="A fit is running"):
         ready.receive("other.csv", b"1,2\n")
@@ -206,7 +206,7 @@ def test_a_fit_that_is_stopped_keeps_the_best(ready):
 
 
 def test_a_worker_that_dies_says_so(ready):
-    worker = ready.fit("bistable", {"starts": 100_000})
+    worker = ready.fit(["--starts", "100000"])
     os.kill(worker.pid, signal.SIGKILL)
     wait(worker)
     assert ready.ending() == "The process of the fit has died by SIGKILL; start the fit again."
@@ -214,14 +214,16 @@ def test_a_worker_that_dies_says_so(ready):
 
 
 def test_a_fit_that_cannot_be_says_why(ready):
-    worker = ready.fit("bistable", {"drive": "impact", "relaxation": -1})
+    with pytest.raises(InputError, match="'--relaxation': -1 is not in the range"):
+        ready.fit(["--relaxation", "-1"])
+    worker = ready.fit(["--fix", "s1_k1=1"])
     wait(worker)
-    assert "relaxation = -1" in worker.ended
+    assert "parameter 's1_k1' is not one of the model bistable" in worker.ended
     assert "\n" not in worker.ended
 
 
 def test_a_closed_window_ends_its_fit(ready):
-    worker = ready.fit("bistable", {"starts": 100_000})
+    worker = ready.fit(["--starts", "100000"])
     wait(worker, lambda worker: worker.news.what != "starting")
     ready.close()
     wait(worker, seconds=5.0)

@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +28,12 @@ from foamfit.terminal import say, without_ctrl_c
 
 if TYPE_CHECKING:
     from foamfit.api import FitResult
+    from foamfit.one_model import Progress, Watch
     from foamfit.study.cycles import CycleFits
+    from foamfit.trust.intervals import Announce
+
+# Options of `fit` that are no keywords of `foamfit.fit`, and those that are one of them.
+OF_ONE_MODEL, WAYS = ("cycle", "model", "fix", "vary"), ("profile", "bootstrap", "mcmc")
 
 
 @main.command()
@@ -63,48 +70,72 @@ def fit(
         foamfit fit TEST.csv --drive displacement --out results/today
         foamfit fit TEST.csv --model linear+bistable --fix s1_k0=60e6
     """
-    from foamfit.data.csv_file import read_test
-    from foamfit.springs.model import Model
+    hush = quiet or as_json
+    folder = _result_folder(out, test, specimen, _model_name(model))
+    options = search | {"cycle": cycle, "model": model, "fix": fix, "vary": vary}
+    with compiling(hush, model, search["relaxation"]) as compile_rest:
+        found = fit_as_asked(
+            test, specimen, options, compile_rest, lambda: progress_bar(hush),
+            None if quiet else lambda told: say(f"foamfit: {told}", err=True),
+        )  # fmt: skip
+        from foamfit.results import Fit
 
-    search |= intervals_of(**{way: search.pop(way) for way in ("profile", "bootstrap", "mcmc")})
-    model = "auto" if model.strip() == "auto" else Model.parse(model).name
-    alone, several = cycles_of(cycle)
-    with compiling(quiet or as_json, model, search["relaxation"]) as compile_rest:
-        measurement = read_test(test, specimen, alone)
-        folder = _result_folder(out, test, specimen, model)
-        from foamfit import api
-
-        params = params_of(measurement, model, search, fix, vary)
-        compile_rest()
-        tell = None if quiet else lambda told: say(f"foamfit: {told}", err=True)
-        with progress_bar(quiet or as_json) as progress:
-            if several is not None:
-                from foamfit.study.cycles import fit_cycles
-
-                found = fit_cycles(
-                    test, specimen, cycles=several or None, model=model, progress=progress,
-                    tell=tell, **search,
-                    params=lambda one: params_of(one, model, search, fix, vary),
-                )  # fmt: skip
-            else:
-                result = api.fit(
-                    measurement, model=model, params=params, progress=progress, tell=tell, **search
-                )
-        if several is not None:
+        if not isinstance(found, Fit):
             return _tell_cycles(found, folder, as_json, quiet)
         try:
             with without_ctrl_c():
-                result.save(folder)
+                found.save(folder)
         except InputError:  # the numbers are not lost with the folder
-            _tell_result(result, as_json, quiet, verbose)
+            _tell_result(found, as_json, quiet, verbose)
             raise
-    _tell_result(result, as_json, quiet, verbose)
+    _tell_result(found, as_json, quiet, verbose)
     if not quiet and not as_json:
         say(f"\nwritten to {folder}: open {folder / 'report.html'}")
-    if result.status == "failed":
+    if found.status == "failed":
         say(f"foamfit: no acceptable fit was found; see {folder}", err=True)
         return NOT_ACCEPTABLE
     return 0
+
+
+def fit_as_asked(
+    test: Path, specimen: Path | None, options: Mapping[str, Any],
+    compile_rest: Callable[[], None], progress: Callable[[], AbstractContextManager[Progress]],
+    tell: Announce | None = None, watch: Watch | None = None,
+) -> FitResult | CycleFits:  # fmt: skip
+    """Fit a test, or cycles of a record, as the options of the command say.
+
+    `compile_rest` is called before anything is simulated, `progress` where the fit begins.
+    """
+    from foamfit.data.csv_file import read_test
+
+    search = {name: value for name, value in options.items() if name not in OF_ONE_MODEL}
+    search |= intervals_of(**{way: search.pop(way) for way in WAYS}) | {"watch": watch}
+    fix, vary = options["fix"], options["vary"]
+    model = _model_name(options["model"])
+    alone, several = cycles_of(options["cycle"])
+    measurement = read_test(test, specimen, alone)
+    from foamfit import api
+
+    params = params_of(measurement, model, search, fix, vary)
+    compile_rest()
+    with progress() as shown:
+        if several is None:
+            return api.fit(
+                measurement, model=model, params=params, progress=shown, tell=tell, **search
+            )
+        from foamfit.study.cycles import fit_cycles
+
+        return fit_cycles(
+            test, specimen, cycles=several or None, model=model, progress=shown, tell=tell,
+            params=lambda one: params_of(one, model, search, fix, vary), **search,
+        )  # fmt: skip
+
+
+def _model_name(model: str) -> str:
+    """Return a model's name without spaces; InputError if it is none."""
+    from foamfit.springs.model import Model
+
+    return "auto" if model.strip() == "auto" else Model.parse(model).name
 
 
 def _tell_cycles(found: CycleFits, folder: Path, as_json: bool, quiet: bool) -> int:

@@ -27,18 +27,18 @@ if TYPE_CHECKING:
 
 PACKAGE = Path(__file__).parent.parent
 OFTEN = 0.2  # s between two lines of a fit
+COMPILING = "compiling the solver, once after installation"
 STOPPED_EARLY = "The fit was stopped before anything was found; start it again."
 
 
 @dataclass(frozen=True)
 class Job:
-    """What is to be fitted and how: the keywords of `foamfit.fit`, and where the result goes."""
+    """What is to be fitted, where the result goes, and the arguments of `foamfit fit`."""
 
     csv: str
     toml: str
     folder: str
-    model: str
-    options: dict[str, Any] = field(default_factory=dict)
+    arguments: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -50,6 +50,7 @@ class News:
     model: str = ""
     relaxation: int = 0
     drive: str = ""
+    cycle: int = 1
     values: dict[str, float] = field(default_factory=dict)
     misfit: dict[str, float | None] = field(default_factory=dict)
 
@@ -61,6 +62,7 @@ class Worker:
         self.job, self.news = job, News()
         self.began = time.monotonic()
         self.stopping = False
+        self.told = ""  # what the command prints of several cycles
         self._done: str | None = None  # the sentence with which it ended, "" where all is well
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  (closed when the process ends)
         paths = f"{PACKAGE.parent}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
@@ -109,7 +111,7 @@ class Worker:
             except ValueError:  # what some library has printed, or half a line of one that died
                 continue
             if "ended" in told:
-                done = told["ended"]
+                done, self.told = told["ended"], told.get("told", "")
             else:
                 self.news = News(**told)
         code = self._process.wait()
@@ -150,9 +152,13 @@ class _Teller:
         self._best = problem, values
         self._tell()
 
-    def finish(self, what: str) -> None:
+    def compiling(self) -> None:
+        """Tell that the solver is compiled first."""
+        self.finish(COMPILING, 0.0)
+
+    def finish(self, what: str, fraction: float = 1.0) -> None:
         """Tell the last of what was found, and what comes after it."""
-        self.told |= {"fraction": 1.0, "what": what}
+        self.told |= {"fraction": fraction, "what": what}
         self._last = 0.0
         self._tell()
 
@@ -181,6 +187,7 @@ def _standing(problem: Problem, values: Array) -> dict[str, Any]:
         "model": problem.model.name,
         "relaxation": problem.model.relaxation,
         "drive": own.drive,
+        "cycle": problem.measurement.cycle,
         "values": dict(zip(problem.names, values.tolist(), strict=True)),
         "misfit": misfit,
     }
@@ -190,39 +197,51 @@ def _say(told: dict[str, Any]) -> None:
     print(json.dumps(told), flush=True)
 
 
-def _run(job: Job) -> str:
-    """Fit and write the result; returns "" or why there is none."""
+def parsed(arguments: list[str]) -> dict[str, Any]:
+    """Read arguments as `foamfit fit` does; InputError says which one is wrong."""
+    import click
+
+    from foamfit.cli.fit import fit as command
+
     try:
-        from foamfit import api
-        from foamfit.data.csv_file import read_test
+        context = command.make_context("fit", ["TEST.csv", *arguments])
+    except click.ClickException as error:
+        raise InputError(error.format_message()) from None
+    others = {"test", "specimen", "out", "as_json", "quiet", "verbose"}
+    return {name: value for name, value in context.params.items() if name not in others}
+
+
+def _run(job: Job) -> tuple[str, str]:
+    """Fit and write the result; returns "" or why there is none, and what is told of cycles."""
+    try:
+        from foamfit.cli.fit import fit_as_asked
+        from foamfit.report.studies.cycles import cycles_text
+        from foamfit.results import Fit
         from foamfit.solve.precompile import at_first_use
         from foamfit.terminal import without_ctrl_c
 
-        teller = _Teller()
-        relaxation = int(job.options.get("relaxation", 0))
-        with at_first_use(
-            job.model, relaxation, lambda: teller.progress(0.0, "compiling, once")
-        ) as compile_rest:
-            measurement = read_test(job.csv, job.toml)
-            compile_rest()
-            result = api.fit(
-                measurement, model=job.model, progress=teller.progress, watch=teller.watch,
-                **job.options,
+        teller, asked = _Teller(), parsed(job.arguments)
+        with at_first_use(asked["model"], asked["relaxation"], teller.compiling) as compile_rest:
+            found = fit_as_asked(
+                Path(job.csv), Path(job.toml), asked, compile_rest,
+                lambda: contextlib.nullcontext(teller.progress), watch=teller.watch,
             )  # fmt: skip
         with without_ctrl_c():
             teller.finish("writing the report")
-            result.save(job.folder)
+            found.save(job.folder)
+            told = "" if isinstance(found, Fit) else cycles_text(found)
     except (InputError, SimulationError) as error:
-        return str(error)
+        return str(error), ""
     except KeyboardInterrupt:
-        return STOPPED_EARLY
-    return ""
+        return STOPPED_EARLY, ""
+    return "", told
 
 
 def main() -> None:
     """Do the job that stands on stdin."""
     job = Job(**json.loads(sys.stdin.readline()))
-    _say({"ended": _run(job)})
+    ended, told = _run(job)
+    _say({"ended": ended, "told": told})
 
 
 if __name__ == "__main__":

@@ -60,7 +60,14 @@ export function render({ model, el }) {
         move(row.name, value);
       });
       inputs[row.name] = { row, slider, number };
-      line.append(label, slider, number, unit);
+      // Whether a fit holds it where it stands.
+      const held = document.createElement("label"), box = document.createElement("input");
+      held.className = "held";
+      Object.assign(box, { type: "checkbox", checked: row.held });
+      box.setAttribute("aria-label", `${row.name} fixed in the fit`);
+      box.addEventListener("change", () => model.send_msg({ held: { [row.name]: box.checked } }));
+      held.append(box, "fixed");
+      line.append(label, slider, number, unit, held);
       list.append(line);
     }
     show(Object.fromEntries(model.rows.map((row) => [row.name, row.value])));
@@ -69,7 +76,11 @@ export function render({ model, el }) {
     told.textContent = model.told;
     told.className = model.wrong ? "told error" : "told";
   }
+  function tick() {
+    list.className = model.ticks ? "list ticks" : "list";
+  }
   model.on("rows", build);
+  model.on("ticks", tick);
   model.on(["told", "wrong"], tell);
   model.on("msg:custom", (told) => {
     if (told.values) show(told.values);
@@ -77,4 +88,5 @@ export function render({ model, el }) {
   });
   build();
   tell();
+  tick();
 }
