@@ -4,12 +4,14 @@ import os
 import signal
 import time
 import tomllib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import foamfit as ff
-from conftest import EXPERIMENTS
+from conftest import EXPERIMENTS, synthetic_impact, synthetic_loop
+from foamfit.data.measurement import Measurement, Specimen
 from foamfit.errors import InputError
 from foamfit.page import desk as desk_module
 from foamfit.page import turning as turning_module
@@ -17,6 +19,7 @@ from foamfit.page.desk import Desk, excerpt_of, join_toml, safe_name, split_toml
 from foamfit.page.turning import Turning
 
 TEST = EXPERIMENTS / "foam-1" / "model-2-2.0mps-reconstruction.csv"
+NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
 GOOD = {
     "[specimen] height": "1.19 mm", "[specimen] diameter": "5 mm",
     "[striker] mass": "7 g", "[striker] velocity": "2 m/s",
@@ -284,3 +287,57 @@ def test_a_long_record_is_thinned_to_be_drawn(monkeypatch):
     turning = Turning(measurement, "bistable")
     assert turning.samples == (measurement.rows.used, 200)
     assert len(turning.turn({}).curves["stress_strain"][0]) == 200
+
+
+@pytest.mark.parametrize("make", [synthetic_impact, synthetic_loop])
+def test_sliders_begin_near_the_loop_but_at_no_fit(make):
+    _, measurement = make()
+    off = Turning(measurement, "bistable").turn({}).misfit["stress_strain"]
+    assert 0.01 < off < 0.30  # the noise leaves 0.005
+
+
+def test_points_lie_on_the_branches_they_join():
+    spring = ff.published["foam-1/model-1"].bistable
+    values = {f"s1_{name}": getattr(spring, name) for name in NAMES}
+    found = Turning(synthetic_loop()[1], "bistable", values).turn({}).points
+    assert set(found) == {"A1", "C1", "C2", "A2"}
+    hat_c = found["C1"][0]
+    along = spring.stress([found["A1"][0], hat_c, hat_c + 1e-9, found["C2"][0], found["A2"][0]])
+    expected = [found[name][1] for name in ("A1", "C1", "C2", "A2")]
+    np.testing.assert_allclose(along[[0, 1, 3, 4]], expected, rtol=1e-6, atol=1.0)
+
+
+def test_points_leave_out_a2_where_the_branches_do_not_meet():
+    spring = ff.BistableSpring(1e6, 50e6, -5e4, 0.3, 0.6, 2e6, 1e9)
+    assert spring.eps_hat_a is None
+    values = {f"s1_{name}": getattr(spring, name) for name in NAMES}
+    found = Turning(synthetic_loop()[1], "bistable", values).turn({}).points
+    assert set(found) == {"A1", "C1", "C2"}
+
+
+def test_a_test_without_stress_and_motion_is_refused():
+    bare = Measurement("bare", None, "", None, np.zeros(3), None, Specimen(1e-3, 1e-5))
+    with pytest.raises(InputError, match="bare"):
+        Turning(bare, "bistable")
+
+
+# ------------------------------------------------------------------- what is fixed and varied
+
+
+def test_ticks_say_what_a_fit_holds_and_varies():
+    pytest.importorskip("panel", reason='the page needs Panel: pip install "foamfit[page]"')
+    from foamfit.page.curves import Curves
+
+    curves = Curves(Turning(ff.read_test(TEST), "bistable"))
+    assert curves.chosen() == ({}, [])
+    moves = {"s1_k0": 5.0, "site_eta": 7.0}  # MPa, Pa s
+    curves._moved(SimpleNamespace(data={"moves": moves}))
+    assert curves.chosen() == ({"site_eta": 7.0}, [])  # held by itself, not at this value
+    curves._moved(SimpleNamespace(data={"held": {"s1_k0": True, "s1_eta": True, "no_one": True}}))
+    held, varied = curves.chosen()
+    assert (held["s1_k0"], set(held), varied) == (5e6, {"s1_k0", "s1_eta", "site_eta"}, [])
+    curves._moved(SimpleNamespace(data={"held": {"s1_k0": False, "site_eta": False}}))
+    assert (set(curves.chosen()[0]), curves.chosen()[1]) == ({"s1_eta"}, ["site_eta"])
+    # A chain holds its dashpots and varies the striker's by itself: the ticks say nothing else.
+    curves.show(Turning(ff.read_test(TEST), "linear+bistable"))
+    assert curves.chosen() == ({}, [])

@@ -124,9 +124,10 @@ class Worker:
         """Say how a process ended that has not said it itself."""
         self._errors.seek(0)
         lines = self._errors.read().decode(errors="replace").strip().splitlines()
-        if self.stopping:
+        last = lines[-1].strip() if lines else ""
+        if self.stopping and (code == -signal.SIGINT or last == "KeyboardInterrupt"):
             return STOPPED_EARLY
-        last = f" ({lines[-1].strip()})" if lines else ""
+        last = f" ({last})" if last else ""
         how = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
         return f"The process of the fit has died {how}{last}; start the fit again."
 

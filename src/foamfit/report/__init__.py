@@ -1,5 +1,4 @@
 """What a person reads: the page, figures, comparisons, and the look ahead at a test.
 
 `page` makes the report, `plots` its figures, `comparison` sets results beside published ones.
-A newcomer may skip `explore`, which draws for the sliders of a notebook.
 """

@@ -53,6 +53,13 @@ export function render({ model, el }) {
         slider.setAttribute("aria-valuetext", `${digits(value)} ${row.unit}`);
         move(row.name, value);
       });
+      // As it is typed, for JupyterLab keeps Enter to itself; put right once it has been.
+      number.addEventListener("input", () => {
+        const value = number.valueAsNumber;
+        if (!(value >= row.least && value <= row.most)) return;
+        slider.value = place(row, value);
+        move(row.name, value);
+      });
       number.addEventListener("change", () => {
         const value = Math.min(Math.max(number.valueAsNumber, row.least), row.most);
         if (!Number.isFinite(value)) return;
