@@ -1,22 +1,30 @@
 """What a window of the page works on, without a browser: files, sentences, fits, curves."""
 
+import io
+import json
 import os
 import signal
 import time
 import tomllib
+import zipfile
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 import foamfit as ff
-from conftest import EXPERIMENTS, synthetic_impact, synthetic_loop
+from conftest import EXPERIMENTS, synthetic_impact, synthetic_loop, without_pictures
+from cycled import write_record
+from foamfit.cli import main
 from foamfit.data.measurement import Measurement, Specimen
 from foamfit.errors import InputError
 from foamfit.page import desk as desk_module
 from foamfit.page import turning as turning_module
 from foamfit.page.desk import Desk, excerpt_of, join_toml, safe_name, split_toml
 from foamfit.page.turning import Turning
+from foamfit.report.folder import load_result
+from foamfit.report.studies import cycles as cycles_report
 
 TEST = EXPERIMENTS / "foam-1" / "model-2-2.0mps-reconstruction.csv"
 NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
@@ -178,6 +186,34 @@ def test_a_fit_is_that_of_the_command(ready):
     assert "report.html" in {path.name for path in ready.result.iterdir()}
     assert ready.zipped().startswith(b"PK")
     assert "foam-1/model-2" in ready.compared("foam-1/model-2")
+
+
+def test_cycles_and_what_is_held_are_those_of_the_command(desk, tmp_path, monkeypatch):
+    record = write_record(tmp_path)
+    desk.take(record)
+    assert not desk.check(*desk.dropped_toml(), "3,1,9").error
+    assert (desk.measurement.cycle, desk.measurement.cycles) == (3, (1, 2, 3))
+    asked = ["--cycle", "3,1,9", "--fix=s1_kh_minus=2200000.0", "--vary=s1_eta", "--starts", "1"]
+    wait(desk.fit(asked))
+    assert desk.ending() == ""
+    assert "2 of 3 cycles fitted" in desk.told
+    assert "cycle 9" in desk.told
+    without_pictures(monkeypatch)
+    monkeypatch.setattr(cycles_report, "image", lambda *_: b"")
+    monkeypatch.setattr(cycles_report, "plot_cycles", lambda _: None)
+    told = CliRunner().invoke(main, ["fit", str(record), *asked, "--json", f"--out={tmp_path}/r"])
+    command = json.loads(told.stdout)["cycles"]
+    assert list(desk.fits) == [1, 3]
+    for number, folder in desk.fits.items():
+        page = load_result(folder)
+        assert page["parameters"] == command[str(number)]["parameters"]
+        assert page["statistics"] == command[str(number)]["statistics"]
+        assert page["parameters"]["s1_kh_minus"]["value"] == 2.2e6
+        assert page["parameters"]["s1_eta"]["vary"]
+        assert desk.measured(number).cycle == number
+    assert "foam-1/model-2" in desk.compared("foam-1/model-2", 3)
+    with zipfile.ZipFile(io.BytesIO(desk.zipped())) as archive:
+        assert {"cycles.csv", "cycles.png", "cycle-3/fit.json"} <= {*archive.namelist()}
 
 
 def test_watching_a_fit_changes_nothing():
