@@ -21,12 +21,12 @@ from foamfit.errors import InputError, SimulationError
 from foamfit.page.curves import Curves, grid, misfits_text
 from foamfit.page.desk import BUSY, LARGEST, QUANTITIES, Checked, Desk, Excerpt
 from foamfit.page.fields import RELAXATIONS, Field
+from foamfit.page.first_use import FirstUse
 from foamfit.page.turning import Turning
 from foamfit.page.widgets import TEMPLATES, Upload, message
 from foamfit.page.worker import News, parsed
 from foamfit.report.folder import load_result
 from foamfit.results import law_in_words
-from foamfit.solve.precompile import at_first_use
 from foamfit.springs.published import published
 
 # Where a checkout of the repository may be: the working directory, or around an editable package.
@@ -37,8 +37,14 @@ MODELS = ("auto", "bistable", "linear+bistable", "bistable+bistable", "microscal
 FOLDED = ("starts", "max_time", "seed", "loss", "interior_mass", "time_shift", "profile",
           "bootstrap", "mcmc")  # fmt: skip
 POLL = 200  # ms
-# One thing at a time, for all windows.
-BESIDE = ThreadPoolExecutor(1, thread_name_prefix="foamfit-page")
+# For all windows one test is read at a time, and the curves of one are prepared.
+READING, PREPARING = (
+    ThreadPoolExecutor(1, thread_name_prefix=f"foamfit-{name}") for name in ("reading", "preparing")
+)
+COMPILING = (
+    "The solver is being compiled, once after installation, in half a minute or, where the "
+    "machine is busy, a whole one. Meanwhile a test can be dropped and its specimen filled in."
+)
 TEXT = """
   :host { font: 1rem/1.5 system-ui, sans-serif; color: #1d2327; }
   p { margin: .3rem 0; overflow-wrap: anywhere; } pre { margin: 0; overflow-x: auto;
@@ -80,12 +86,14 @@ class Window:
     """The page in one window of a browser; it shares nothing with another one."""
 
     def __init__(
-        self, desk: Desk, address: str, test: Path | None, gone: Callable[[], None]
-    ) -> None:
+        self, desk: Desk, address: str, test: Path | None, first_use: FirstUse,
+        gone: Callable[[], None],
+    ) -> None:  # fmt: skip
         self.desk = desk
         self.curves = Curves()
         self._shown: object = None
-        self._filling, self._asked = False, 0
+        self._filling = False
+        self._asked = {READING: 0, PREPARING: 0}
         self._inputs(address)
         self._outputs()
         self._react()
@@ -98,13 +106,16 @@ class Window:
                                  if name not in FOLDED), **wide),
             "more": pn.Column(*(self.options[name].widget for name in FOLDED), **wide),
             "run": pn.Column(self.run, self.stop, self.progress, **wide),
-            "curves": pn.Column(self.misfit, self.curves.view, self.back, **wide),
+            "curves": pn.Column(self.compiling, self.misfit, self.curves.view, self.back, **wide),
             "understood": pn.Column(self.understood, **wide),
             "result": pn.Column(self.ending, self.saves, self.report_of, self.beside,
                                 self.comparison, self.report, **wide),
         }  # fmt: skip
         for name, part in parts.items():
             self.template.add_panel(name, part)
+        self.first_use = first_use
+        self._allow()
+        self._await()
         self._poll = pn.state.add_periodic_callback(self._follow, POLL, start=False)
         pn.state.on_session_destroyed(lambda _: gone())
         if test is not None:
@@ -169,7 +180,7 @@ class Window:
         return (self.desk.fits[self.report_of.value] / "report.html").read_text(encoding="utf-8")
 
     def _outputs(self) -> None:
-        self.problem, self.progress = text_pane(), text_pane()
+        self.problem, self.progress, self.compiling = text_pane(), text_pane(), text_pane()
         self.understood, self.ending = text_pane(), text_pane()
         self.misfit, self.comparison, self.report = text_pane(), text_pane(), text_pane()
         self.understood.object = paragraph("There is no test yet.", "soft")
@@ -191,20 +202,36 @@ class Window:
 
     # ------------------------------------------------------------------------------- beside
 
-    def _beside(self, work: Callable[[], Any], then: Callable[[Any], None]) -> None:
+    def _await(self) -> None:
+        """Draw and allow again what waits for the solver to be compiled, when a part of it is."""
+        document = pn.state.curdoc
+        for part in self.first_use.parts:
+            if not part.done():
+                part.add_done_callback(lambda _: document.add_next_tick_callback(self._allow))
+
+    def _allow(self) -> None:
+        """Let a fit be begun where there is something to fit, and none is running."""
+        compiled = self.first_use.needed(self.model.value, self.relaxation.value).done()
+        self.compiling.object = "" if compiled else busy(COMPILING)
+        ready = self.desk.measurement is not None and compiled
+        self.run.disabled = not ready or self.desk.running
+
+    def _beside(
+        self, pool: ThreadPoolExecutor, work: Callable[[], Any], then: Callable[[Any], None]
+    ) -> None:
         """Do what takes a while beside the server, then show it; what is asked for later wins.
 
         What is shown changes in a turn of the document only: threads know no lock of it.
         """
-        self._asked += 1
-        asked, document = self._asked, pn.state.curdoc
+        self._asked[pool] += 1
+        asked, document = self._asked[pool], pn.state.curdoc
 
         def done(found: Any) -> None:
-            if asked == self._asked:
+            if asked == self._asked[pool]:
                 then(found)
 
         def run() -> None:
-            if asked != self._asked:
+            if asked != self._asked[pool]:
                 return
             try:
                 found = work()
@@ -212,7 +239,7 @@ class Window:
                 found = error
             document.add_next_tick_callback(partial(done, found))
 
-        BESIDE.submit(run)
+        pool.submit(run)
 
     # ------------------------------------------------------------------------------- the test
 
@@ -263,7 +290,8 @@ class Window:
         given = {name: field.value or "" for name, field in self.quantities.items()}
         rest, cycle = self.rest.value or "", self.cycle.value or ""
         self.run.disabled = True
-        self._beside(lambda: self.desk.check(given, rest, cycle), self._show_checked)
+        self._asked[PREPARING] += 1  # what is being prepared is of the test as it was
+        self._beside(READING, lambda: self.desk.check(given, rest, cycle), self._show_checked)
 
     def _show_checked(self, checked: Checked | Exception) -> None:
         if isinstance(checked, Exception):
@@ -278,7 +306,7 @@ class Window:
             self.understood.object = shown + excerpt_html(checked.excerpt)
         else:
             self.understood.object = f'<pre tabindex="0">{html.escape(checked.text)}</pre>'
-        self.run.disabled = bool(checked.error) or self.desk.running
+        self._allow()
         if self.desk.measurement is not None:
             there = len(self.desk.measurement.cycles)
             self.cycle.visible = there > 1
@@ -290,6 +318,7 @@ class Window:
     def _model_chosen(self, event: Any = None) -> None:
         """Put the model's parameters over the test, read off its loop."""
         auto = self.model.value == "auto"
+        self._allow()
         self.relaxation.disabled, self.curves.sliders.ticks = auto, not auto
         if self.desk.measurement is None:
             self._hide_curves()
@@ -311,18 +340,17 @@ class Window:
         """Put other sliders under the curves; they begin at these values, or read off the loop."""
 
         def make() -> Turning:
-            with at_first_use(model, options["relaxation"], lambda: None) as compile_rest:
-                compile_rest()
+            self.first_use.needed(model, options["relaxation"]).result()
             made = Turning(self.desk.measured(cycle), model, values, **options)
             made.turn({})  # loads what is compiled
             return made
 
+        what = f"Preparing the curves of {law_in_words(model, options['relaxation'])} …"
         if self.curves.turning is None:
-            self.misfit.object = paragraph(
-                "Preparing the curves; right after installation the solver is compiled, once.",
-                "soft",
-            )
-        self._beside(make, self._show_turning)
+            self.misfit.object = busy(what)
+        else:
+            self.curves.sliders.tell(what)
+        self._beside(PREPARING, make, self._show_turning)
 
     def _show_turning(self, made: Turning | Exception) -> None:
         if isinstance(made, Exception):
@@ -421,7 +449,8 @@ class Window:
 
     def _ended(self) -> None:
         """Show the result of the fit, or why there is none."""
-        self.run.disabled, self.stop.visible = self.desk.measurement is None, False
+        self._allow()
+        self.stop.visible = False
         self.progress.object = ""
         self._hold(False)
         if self.desk.result is None:
@@ -472,6 +501,11 @@ class Window:
 def keywords(asked: Mapping[str, Any]) -> dict[str, Any]:
     """Take from options of the command those on which the curves of a model hang."""
     return {one: asked[one] for one in ("drive", "relaxation", "interior_mass", "time_shift")}
+
+
+def busy(text: str) -> str:
+    """Write what is being done, under a bar that moves."""
+    return f'<progress aria-label="busy"></progress>{paragraph(text, "soft")}'
 
 
 def defect(error: Exception) -> str:

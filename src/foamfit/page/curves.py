@@ -21,6 +21,7 @@ from foamfit.report.summary import CURVES
 from foamfit.text import percent
 
 MOST_DRAWN, MOST_MARKERS = 400, 150  # points of a curve, of a measured one
+ASIDE = {"C1": -22}  # px from a point to its name, which is at the right edge
 NOTHING = np.empty(0), np.empty(0)
 AXES = {  # of each panel: x and y, with the SI units of both
     "stress_time": (("time", "s"), ("stress", "Pa")),
@@ -53,7 +54,7 @@ class Curves:
         self._measured = {name: ColumnDataSource({"x": [], "y": []}) for name in PANELS}
         # One source for all panels: one message for a move.
         self._turned = ColumnDataSource({f"{name}_{axis}": [] for name in PANELS for axis in "xy"})
-        self._points = ColumnDataSource({"x": [], "y": [], "name": []})
+        self._points = ColumnDataSource({"x": [], "y": [], "name": [], "aside": []})
         self._figures = {name: self._figure(name) for name in PANELS}
         self.sliders = Sliders(sizing_mode="stretch_width", margin=(6, 0))
         self.sliders.on_msg(self._moved)
@@ -116,11 +117,10 @@ class Curves:
             legend_label="springs",
         )  # fmt: skip
         made.legend.background_fill_alpha = 0.7
-        made.legend.location = "center" if name == "displacement_time" else "top_right"
         if name == "stress_strain":
             made.legend.location = "top_left"
             made.scatter("x", "y", source=self._points, size=7, color="black")
-            made.text("x", "y", "name", source=self._points, x_offset=6, y_offset=15,
+            made.text("x", "y", "name", source=self._points, x_offset="aside", y_offset=15,
                       text_font_size="9pt")  # fmt: skip
         made.legend.padding = made.legend.margin = 3
         made.legend.label_text_font_size = "8.5pt"
@@ -151,6 +151,9 @@ class Curves:
                     start=float(values.min()) - more, end=float(values.max()) + more,
                     reset_start=float(values.min()) - more, reset_end=float(values.max()) + more,
                 )  # fmt: skip
+        shown = [made for made in self._figures.values() if made.visible]
+        for made in shown:
+            made.legend.visible = made is shown[0]  # the colours are the same in all
         self._panels.visible = True
 
     def _moved(self, event: Any) -> None:
@@ -196,7 +199,9 @@ class Curves:
         fx, fy = self._scales.get("stress_strain", (1.0, 1.0))
         x, y = np.array([*drawn.points.values()]).reshape(-1, 2).T
         if len(x) or len(self._points.data["x"]):
-            self._points.data = {"x": x / fx, "y": y / fy, "name": [*drawn.points]}
+            names = [*drawn.points]
+            aside = [ASIDE.get(name, 6) for name in names]
+            self._points.data = {"x": x / fx, "y": y / fy, "name": names, "aside": aside}
 
 
 def misfits_text(misfit: Mapping[str, float | None]) -> str:

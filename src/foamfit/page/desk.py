@@ -178,7 +178,7 @@ class Desk:
             quantity = next((q.name for q in QUANTITIES if f"{q.name} " in told), "")
             if "[specimen] needs a diameter" in told:
                 quantity = "[specimen] diameter"
-            excerpt = None if quantity else excerpt_of(self.csv, told)
+            excerpt = excerpt_of(self.csv, told)
             return Checked(error=told, quantity=quantity, excerpt=excerpt)
         self.measurement = measurement
         return Checked(text)

@@ -26,6 +26,7 @@ from panel.io.server import get_server
 from foamfit.errors import InputError
 from foamfit.page.app import Window
 from foamfit.page.desk import LARGEST, Desk, too_large
+from foamfit.page.first_use import FirstUse
 from foamfit.terminal import TerminatedError, say
 
 HOST = "127.0.0.1"
@@ -132,6 +133,7 @@ class Page:
         self.folder = Path(tempfile.mkdtemp(prefix="foamfit-page-"))  # for this user alone
         self.desks: dict[str, Desk] = {}
         self.test = test
+        self.first_use = FirstUse()
         self.server = get_server(
             {"/": self._window}, port=self.port, address=HOST, show=False, start=False,
             title={"/": "foamfit"}, prefix=f"/{self.token}",
@@ -154,6 +156,7 @@ class Page:
         """End the server and all fits, and remove all files."""
         with suppress(RuntimeError, AssertionError):
             self.server.stop()
+        self.first_use.close()
         for desk in list(self.desks.values()):
             desk.close()
         shutil.rmtree(self.folder, ignore_errors=True)
@@ -167,7 +170,8 @@ class Page:
             self.desks.pop(name, None)
             desk.close()
 
-        return Window(desk, f"/{self.token}/receive/{name}", self.test, gone).template
+        address = f"/{self.token}/receive/{name}"
+        return Window(desk, address, self.test, self.first_use, gone).template
 
 
 def serve(test: Path | None, port: int, browser: bool) -> None:

@@ -55,6 +55,20 @@ class News:
     misfit: dict[str, float | None] = field(default_factory=dict)
 
 
+def with_package() -> dict[str, str]:
+    """The environment of a process that is to find this very package."""
+    paths = f"{PACKAGE.parent}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
+    return os.environ | {"PYTHONPATH": paths.rstrip(os.pathsep)}
+
+
+def end_all(process: subprocess.Popen[Any]) -> None:
+    """End a process that leads a session at once, and what it has begun to compile in."""
+    if process.poll() is None:
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+
+
 class Worker:
     """A running fit, as the page sees it: the last news, and how it ended."""
 
@@ -65,11 +79,10 @@ class Worker:
         self.told = ""  # what the command prints of several cycles
         self._done: str | None = None  # the sentence with which it ended, "" where all is well
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  (closed when the process ends)
-        paths = f"{PACKAGE.parent}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
         self._process = subprocess.Popen(
             [sys.executable, "-m", "foamfit.page.worker"],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors, text=True,
-            encoding="utf-8", env=os.environ | {"PYTHONPATH": paths.rstrip(os.pathsep)},
+            encoding="utf-8", env=with_package(),
             start_new_session=True,  # Ctrl-C in the terminal of the page is not for this one
         )  # fmt: skip
         assert self._process.stdin is not None
@@ -96,10 +109,7 @@ class Worker:
 
     def kill(self) -> None:
         """End the process at once."""
-        if self._process.poll() is None:
-            with contextlib.suppress(ProcessLookupError, PermissionError):
-                os.killpg(self._process.pid, signal.SIGKILL)  # what it compiles in, too
-        self._process.wait()
+        end_all(self._process)
 
     def _listen(self) -> None:
         """Read what the process tells until it ends."""
