@@ -36,6 +36,7 @@ MODELS = ("auto", "bistable", "linear+bistable", "bistable+bistable", "microscal
 # Options of the command that are folded away; fixed and varied parameters have ticks.
 FOLDED = ("starts", "max_time", "seed", "loss", "interior_mass", "time_shift", "profile",
           "bootstrap", "mcmc")  # fmt: skip
+ENDED = '<p role="status">The fit has ended: see <a href="#h-result">its result</a>.</p>'
 POLL = 200  # ms
 # For all windows one test is read at a time, and the curves of one are prepared.
 READING, PREPARING = (
@@ -51,7 +52,7 @@ TEXT = """
     font: .8rem/1.45 ui-monospace, Menlo, Consolas, monospace; white-space: pre; }
   .error { border-left: 4px solid #b3261e; background: #fdeeed; padding: .5rem .8rem; }
   .soft { color: #4f5960; } iframe { width: 100%; height: 85vh; border: 1px solid #dfe3e6; }
-  .wide { overflow-x: auto; }
+  .wide { overflow-x: auto; } img { max-width: 100%; height: auto; }
   table { border-collapse: collapse; font-size: .84rem; margin: .6rem 0; }
   th, td { border: 1px solid #aab2b8; padding: .1rem .5rem; text-align: left; white-space: pre; }
   th { background: #f5f7f8; } td.wrong { background: #f9dbd3; outline: 2px solid #85280a; }
@@ -108,7 +109,7 @@ class Window:
             "run": pn.Column(self.run, self.stop, self.progress, **wide),
             "curves": pn.Column(self.compiling, self.misfit, self.curves.view, self.back, **wide),
             "understood": pn.Column(self.understood, **wide),
-            "result": pn.Column(self.ending, self.saves, self.report_of, self.beside,
+            "result": pn.Column(self.saves, self.ending, self.report_of, self.beside,
                                 self.comparison, self.report, **wide),
         }  # fmt: skip
         for name, part in parts.items():
@@ -346,7 +347,7 @@ class Window:
             return made
 
         what = f"Preparing the curves of {law_in_words(model, options['relaxation'])} …"
-        if self.curves.turning is None:
+        if self.curves.turning is None and not self.compiling.object:
             self.misfit.object = busy(what)
         else:
             self.curves.sliders.tell(what)
@@ -451,7 +452,7 @@ class Window:
         """Show the result of the fit, or why there is none."""
         self._allow()
         self.stop.visible = False
-        self.progress.object = ""
+        self.progress.object = ENDED
         self._hold(False)
         if self.desk.result is None:
             self.ending.object = paragraph(self.desk.ending(), "error")

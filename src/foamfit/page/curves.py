@@ -112,16 +112,18 @@ class Curves:
         )  # fmt: skip
         made.scatter("x", "y", source=self._measured[name], size=5, fill_color="white",
                      line_color=GREY, legend_label="measured")  # fmt: skip
+        # What moves lies on a canvas of its own: axes and measured curves are not drawn again.
         made.line(
             f"{name}_x", f"{name}_y", source=self._turned, color=VERMILION, width=2,
-            legend_label="springs",
+            legend_label="springs", level="overlay",
         )  # fmt: skip
         made.legend.background_fill_alpha = 0.7
         if name == "stress_strain":
             made.legend.location = "top_left"
-            made.scatter("x", "y", source=self._points, size=7, color="black")
+            made.scatter("x", "y", source=self._points, size=7, color="black",
+                         level="overlay")  # fmt: skip
             made.text("x", "y", "name", source=self._points, x_offset="aside", y_offset=15,
-                      text_font_size="9pt")  # fmt: skip
+                      text_font_size="9pt", level="overlay")  # fmt: skip
         made.legend.padding = made.legend.margin = 3
         made.legend.label_text_font_size = "8.5pt"
         made.toolbar.logo = None
@@ -141,7 +143,7 @@ class Curves:
             self._scales[name] = fx, fy
             made.xaxis.axis_label = f"{x_name} ({x_unit})" if x_unit else x_name
             made.yaxis.axis_label = f"{y_name} ({y_unit})"
-            some = slice(None, None, max(len(there[0]) // MOST_MARKERS, 1))
+            some = slice(None, None, -(-len(there[0]) // MOST_MARKERS))
             x, y = there[0] / fx, there[1] / fy
             self._measured[name].data = {"x": x[some], "y": y[some]}
             # They stay while parameters are turned: what moves is the curve alone.
@@ -181,16 +183,18 @@ class Curves:
         for name in PANELS:
             x, y = drawn.curves.get(name, NOTHING)
             fx, fy = self._scales.get(name, (1.0, 1.0))
-            some = slice(None, None, max(len(x) // MOST_DRAWN, 1))
+            some = slice(None, None, -(-len(x) // MOST_DRAWN) or 1)
             data |= {f"{name}_x": x[some] / fx, f"{name}_y": y[some] / fy}
-        longest = max(map(len, data.values()), default=0)
-        self._turned.data = {
-            name: np.pad(one, (0, longest - len(one)), constant_values=np.nan)
-            for name, one in data.items()
-        }
+        # Of one length, as a source has it, and no finer than pixels are.
+        sent = {name: np.full(max(map(len, data.values())), np.nan, np.float32) for name in data}
+        for name, values in data.items():
+            sent[name][: len(values)] = values
+        self._turned.data = sent
         self._draw_points(drawn)
-        told = f"{self.turning.law}, {self.turning.drive} drive: "
-        told += f"misfit {misfits_text(drawn.misfit)}"
+        test = self.turning.problem.measurement
+        told = f"{self.turning.law}, {self.turning.drive} drive"
+        told += f", cycle {test.cycle}" if len(test.cycles) > 1 else ""
+        told += f": misfit {misfits_text(drawn.misfit)}"
         used, shown = self.turning.samples
         told += f"; {shown} of {used} samples are drawn" if shown < used else ""
         self.sliders.tell(drawn.error or told, wrong=bool(drawn.error))
