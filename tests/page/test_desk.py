@@ -196,6 +196,7 @@ def test_cycles_and_what_is_held_are_those_of_the_command(desk, tmp_path, monkey
     asked = ["--cycle", "3,1,9", "--fix=s1_kh_minus=2200000.0", "--vary=s1_eta", "--starts", "1"]
     wait(desk.fit(asked))
     assert desk.ending() == ""
+    assert desk.command == f"foamfit fit synthetic.csv {' '.join(asked)}"
     assert "2 of 3 cycles fitted" in desk.told
     assert "cycle 9" in desk.told
     without_pictures(monkeypatch)

@@ -458,7 +458,8 @@ class Window:
             self.ending.object = paragraph(self.desk.ending(), "error")
             return
         told, picture = self.desk.told, self.desk.result / "cycles.png"
-        self.ending.object = f'<pre tabindex="0">{html.escape(told)}</pre>' if told else ""
+        self.ending.object = paragraph(f"In a terminal: {self.desk.command}", "soft")
+        self.ending.object += f'<pre tabindex="0">{html.escape(told)}</pre>' if told else ""
         if told and picture.is_file():
             content = base64.b64encode(picture.read_bytes()).decode()
             self.ending.object += (

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 import panel as pn
-from bokeh.models import ColumnDataSource, Range1d
+from bokeh.core.properties import value
+from bokeh.models import Band, ColumnDataSource, LabelSet, Range1d
 from bokeh.plotting import figure
 
 from foamfit.page.turning import PANELS, Drawn, Row, Turning
@@ -21,6 +22,12 @@ from foamfit.report.summary import CURVES
 from foamfit.text import percent
 
 MOST_DRAWN, MOST_MARKERS = 400, 150  # points of a curve, of a measured one
+LEGEND = (
+    '<p style="margin: 0; font: .9rem system-ui, sans-serif; color: #1d2327">'
+    f'<svg width="12" height="12" aria-hidden="true"><circle cx="6" cy="6" r="3" fill="white" '
+    f'stroke="{GREY}"/></svg> measured &ensp; <svg width="22" height="12" aria-hidden="true">'
+    f'<path d="M1 6H21" stroke="{VERMILION}" stroke-width="2"/></svg> springs</p>'
+)
 ASIDE = {"C1": -22}  # px from a point to its name, which is at the right edge
 NOTHING = np.empty(0), np.empty(0)
 AXES = {  # of each panel: x and y, with the SI units of both
@@ -58,10 +65,12 @@ class Curves:
         self._figures = {name: self._figure(name) for name in PANELS}
         self.sliders = Sliders(sizing_mode="stretch_width", margin=(6, 0))
         self.sliders.on_msg(self._moved)
+        legend = pn.pane.HTML(LEGEND, sizing_mode="stretch_width", margin=0)
         self._panels = grid(
             [pn.pane.Bokeh(one, sizing_mode="stretch_width") for one in self._figures.values()],
             14.5,
         )
+        self._panels.insert(0, legend)  # of all panels: one of a figure's own is drawn each time
         self.view = pn.Column(self._panels, self.sliders, sizing_mode="stretch_width", margin=0)
         if turning is not None:
             self.show(turning)
@@ -111,21 +120,22 @@ class Curves:
             x_range=Range1d(0.0, 1.0), y_range=Range1d(0.0, 1.0),
         )  # fmt: skip
         made.scatter("x", "y", source=self._measured[name], size=5, fill_color="white",
-                     line_color=GREY, legend_label="measured")  # fmt: skip
+                     line_color=GREY)  # fmt: skip
         # What moves lies on a canvas of its own: axes and measured curves are not drawn again.
-        made.line(
-            f"{name}_x", f"{name}_y", source=self._turned, color=VERMILION, width=2,
-            legend_label="springs", level="overlay",
-        )  # fmt: skip
-        made.legend.background_fill_alpha = 0.7
+        # Annotations are cut off there at the frame, glyphs are not; a band of no width is a line.
+        line = f"{name}_y"
+        made.add_layout(Band(
+            base=f"{name}_x", lower=line, upper=line, source=self._turned, level="overlay",
+            line_color=VERMILION, line_width=2, line_alpha=1.0, fill_alpha=0.0,
+        ))  # fmt: skip
         if name == "stress_strain":
-            made.legend.location = "top_left"
-            made.scatter("x", "y", source=self._points, size=7, color="black",
-                         level="overlay")  # fmt: skip
-            made.text("x", "y", "name", source=self._points, x_offset="aside", y_offset=15,
-                      text_font_size="9pt", level="overlay")  # fmt: skip
-        made.legend.padding = made.legend.margin = 3
-        made.legend.label_text_font_size = "8.5pt"
+            at: dict[str, Any] = {"x": "x", "y": "y", "source": self._points, "level": "overlay"}
+            made.add_layout(LabelSet(
+                text=value("\u25cf"), text_align="center", text_baseline="middle", **at
+            ))  # fmt: skip
+            made.add_layout(LabelSet(
+                text="name", x_offset="aside", y_offset=-15, text_font_size="9pt", **at
+            ))  # fmt: skip
         made.toolbar.logo = None
         made.toolbar.autohide = True
         return made
@@ -153,9 +163,6 @@ class Curves:
                     start=float(values.min()) - more, end=float(values.max()) + more,
                     reset_start=float(values.min()) - more, reset_end=float(values.max()) + more,
                 )  # fmt: skip
-        shown = [made for made in self._figures.values() if made.visible]
-        for made in shown:
-            made.legend.visible = made is shown[0]  # the colours are the same in all
         self._panels.visible = True
 
     def _moved(self, event: Any) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import re
+import shlex
 import shutil
 import tomllib
 import unicodedata
@@ -243,6 +244,13 @@ class Desk:
         """Say how the last fit ended, "" where it has a result."""
         assert self.worker is not None
         return self._plain(self.worker.ended or "")
+
+    @property
+    def command(self) -> str:
+        """What asks for the last fit in a terminal, where the TOML lies beside the file."""
+        assert self.csv is not None
+        assert self.worker is not None
+        return shlex.join(["foamfit", "fit", self.csv.name, *self.worker.job.arguments])
 
     @property
     def told(self) -> str:

@@ -75,7 +75,7 @@ class Guard(routing.Router):
         given = request.path.split("/")[1] if "/" in request.path else ""
         if own and secrets.compare_digest(given.encode(), self.token.encode()):
             # A curve is several small messages: none waits until the one before is acknowledged.
-            request.connection.stream.set_nodelay(True)  # type: ignore[union-attr]
+            request.connection.stream.set_nodelay(True)
             return self.behind.find_handler(request, **kwargs)
         assert request.connection is not None
         return Refusal(request.connection)
