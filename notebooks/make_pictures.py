@@ -89,6 +89,7 @@ def photograph_page() -> None:
             window.get_by_label("reconstruction").select_option(test)
             window.get_by_role("button", name="Fit", exact=True).click(timeout=60_000)
             window.get_by_role("button", name="Back to the fit").wait_for(timeout=120_000)
+            window.evaluate("scrollTo(0, 0)")
             window.wait_for_timeout(1000)  # the curves of the fit are drawn
             window.screenshot(path=PICTURES / "page.png")
             tell("page")

@@ -202,7 +202,9 @@ def test_load_drop_fit_stop_turn_and_save(window, tmp_path):
     page.get_by_role("button", name="Stop").click()
     report = page.frame_locator("iframe")
     api.expect(report.get_by_text("stopped by Ctrl-C").first).to_be_visible(timeout=LATER)
-    # One to its end, beside a published set.
+    # One to its end with a parameter that is held, beside a published set.
+    page.get_by_label("s1_eta as a number").fill("3")
+    page.get_by_label("s1_eta fixed in the fit").check()
     page.get_by_label("Starts:").fill("2")
     page.get_by_role("button", name="Fit", exact=True).click()
     api.expect(page.get_by_text("A fit is running.")).to_be_visible()
@@ -219,6 +221,7 @@ def test_load_drop_fit_stop_turn_and_save(window, tmp_path):
     fit = json.loads(archive.read("fit.json"))
     k0 = float(page.get_by_label("s1_k0 as a number").input_value())
     assert k0 == pytest.approx(fit["parameters"]["s1_k0"]["value"] / 1e6, rel=1e-4)
+    assert (fit["parameters"]["s1_eta"]["value"], fit["parameters"]["s1_eta"]["vary"]) == (3, False)
     archive.close()
 
 

@@ -20,9 +20,11 @@ from foamfit.cli import main
 from foamfit.data.measurement import Measurement, Specimen
 from foamfit.errors import InputError
 from foamfit.page import desk as desk_module
+from foamfit.page import first_use as first_use_module
 from foamfit.page import turning as turning_module
 from foamfit.page.desk import Desk, excerpt_of, join_toml, safe_name, split_toml
 from foamfit.page.turning import Turning
+from foamfit.page.worker import Worker
 from foamfit.report.folder import load_result
 from foamfit.report.studies import cycles as cycles_report
 
@@ -52,7 +54,7 @@ def ready(desk):
 def wait(worker, until=lambda worker: worker.ended is not None, seconds=60.0):
     end = time.monotonic() + seconds
     while not until(worker):
-        assert time.monotonic() < end, worker.news
+        assert time.monotonic() < end, vars(worker)
         time.sleep(0.02)
 
 
@@ -148,6 +150,7 @@ def test_a_wrong_quantity_is_named(desk, quantity, value, told):
     checked = desk.check(GOOD | {quantity: value}, "")
     assert told in checked.error
     assert checked.quantity == quantity
+    assert checked.excerpt.cells[0] == ["time (ms)", "force (N)", "displacement (mm)"]
     assert str(desk.folder) not in checked.error
 
 
@@ -191,20 +194,20 @@ def test_a_fit_is_that_of_the_command(ready):
 def test_cycles_and_what_is_held_are_those_of_the_command(desk, tmp_path, monkeypatch):
     record = write_record(tmp_path)
     desk.take(record)
-    assert not desk.check(*desk.dropped_toml(), "3,1,9").error
+    assert not desk.check(*desk.dropped_toml(), "3,9").error
     assert (desk.measurement.cycle, desk.measurement.cycles) == (3, (1, 2, 3))
-    asked = ["--cycle", "3,1,9", "--fix=s1_kh_minus=2200000.0", "--vary=s1_eta", "--starts", "1"]
+    asked = ["--cycle", "3,9", "--fix=s1_kh_minus=2200000.0", "--vary=s1_eta", "--starts", "1"]
     wait(desk.fit(asked))
     assert desk.ending() == ""
     assert desk.command == f"foamfit fit synthetic.csv {' '.join(asked)}"
-    assert "2 of 3 cycles fitted" in desk.told
+    assert "1 of 3 cycles fitted" in desk.told
     assert "cycle 9" in desk.told
     without_pictures(monkeypatch)
     monkeypatch.setattr(cycles_report, "image", lambda *_: b"")
     monkeypatch.setattr(cycles_report, "plot_cycles", lambda _: None)
     told = CliRunner().invoke(main, ["fit", str(record), *asked, "--json", f"--out={tmp_path}/r"])
     command = json.loads(told.stdout)["cycles"]
-    assert list(desk.fits) == [1, 3]
+    assert list(desk.fits) == [3]
     for number, folder in desk.fits.items():
         page = load_result(folder)
         assert page["parameters"] == command[str(number)]["parameters"]
@@ -251,6 +254,35 @@ def test_a_worker_that_dies_says_so(ready):
     wait(worker)
     assert ready.ending() == "The process of the fit has died by SIGKILL; start the fit again."
     assert ready.result is None
+
+
+@pytest.mark.parametrize(
+    ("code", "errors", "told"),
+    [
+        (-signal.SIGINT, "", "stopped before anything was found"),
+        (1, "Traceback …\nKeyboardInterrupt", "stopped before anything was found"),
+        (1, "Traceback …\nMemoryError", "has died with exit code 1 (MemoryError)"),
+        (-signal.SIGKILL, "", "has died by SIGKILL"),
+    ],
+)
+def test_a_worker_that_dies_while_it_is_stopped_says_what_it_was(code, errors, told):
+    worker = Worker.__new__(Worker)
+    worker.stopping, worker._errors = True, io.BytesIO(errors.encode())
+    assert told in worker._why(code)
+
+
+def test_what_compiles_at_first_use_is_waited_for_and_ends_with_the_page(monkeypatch):
+    monkeypatch.setattr(first_use_module.cache, "compiled", lambda _: False)
+    monkeypatch.setattr(first_use_module, "COMPILE", "import time; time.sleep(60)  # {} {}")
+    first_use = first_use_module.FirstUse()
+    integrator, memory = first_use.parts
+    assert first_use.needed("linear+bistable", 0) is integrator
+    needing = [("auto", 0), ("microscale", 0), ("bistable", 1)]
+    assert {first_use.needed(*one) for one in needing} == {memory}
+    wait(first_use, lambda one: one._process is not None)
+    assert not integrator.done()
+    first_use.close()
+    assert integrator.result(timeout=5.0) is memory.result(timeout=5.0) is None
 
 
 def test_a_fit_that_cannot_be_says_why(ready):
