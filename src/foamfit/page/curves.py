@@ -6,6 +6,7 @@ The page and the notebook `turn_the_parameters` show the same ones.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -64,7 +65,8 @@ class Curves:
         self._points = ColumnDataSource({"x": [], "y": [], "name": [], "aside": []})
         self._figures = {name: self._figure(name) for name in PANELS}
         self.sliders = Sliders(sizing_mode="stretch_width", margin=(6, 0))
-        self.sliders.on_msg(self._moved)
+        # With the lock of the document, which a message does not always come with.
+        self.sliders.on_msg(lambda event: pn.state.execute(partial(self._moved, event), True))
         legend = pn.pane.HTML(LEGEND, sizing_mode="stretch_width", margin=0)
         self._panels = grid(
             [pn.pane.Bokeh(one, sizing_mode="stretch_width") for one in self._figures.values()],

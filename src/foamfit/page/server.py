@@ -8,6 +8,7 @@ and its path begins with a random token.
 from __future__ import annotations
 
 import asyncio
+import logging
 import secrets
 import shutil
 import signal
@@ -22,6 +23,8 @@ import tornado.httputil as httputil
 import tornado.routing as routing
 import tornado.web as web
 from panel.io.server import get_server
+from tornado.iostream import StreamClosedError
+from tornado.websocket import WebSocketClosedError
 
 from foamfit.errors import InputError
 from foamfit.page.app import Window
@@ -184,6 +187,8 @@ def serve(test: Path | None, port: int, browser: bool) -> None:
         try:
             ending = asyncio.Event()
             loop = asyncio.get_running_loop()
+            loop.set_exception_handler(_pass_over_closed_windows)
+            logging.getLogger("bokeh.server.views.ws").setLevel(logging.ERROR)
             for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
                 loop.add_signal_handler(number, ending.set)
             say(page.address)
@@ -196,6 +201,12 @@ def serve(test: Path | None, port: int, browser: bool) -> None:
 
     with suppress(KeyboardInterrupt, TerminatedError):
         asyncio.run(run())
+
+
+def _pass_over_closed_windows(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Report what went wrong in a task, but that a window was closed while a curve was sent."""
+    if not isinstance(context.get("exception"), StreamClosedError | WebSocketClosedError):
+        loop.default_exception_handler(context)
 
 
 def _free_port(wanted: int) -> int:
