@@ -250,8 +250,11 @@ def _run(job: Job) -> tuple[str, str]:
 
 def main() -> None:
     """Do the job that stands on stdin."""
+    from foamfit.terminal import ending_cleanly
+
     job = Job(**json.loads(sys.stdin.readline()))
-    ended, told = _run(job)
+    with ending_cleanly():
+        ended, told = _run(job)
     _say({"ended": ended, "told": told})
 
 
