@@ -296,4 +296,4 @@ def test_everyone_can_use_it_at_once(window):
     assert {"Specimen height", "Check the test", "Fit", "s1_k0", "s1_eta"} <= reached
     window.bring_to_front()
     took = sorted(window.evaluate(REDRAWS))
-    assert took[len(took) // 4] < 100.0, took  # a machine that does other things delays most
+    assert took[len(took) // 2] < 100.0, took
