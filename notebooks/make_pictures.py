@@ -1,12 +1,16 @@
-"""Make the main figure of each notebook as a picture: notebooks/pictures/*.png.
+"""Make the pictures of the page and of each notebook: notebooks/pictures/*.png.
 
     python notebooks/make_pictures.py
 
-The tests are reconstructions, simulated from published parameters, not measurements.
+Those of the page and of its sliders are made by a browser, where one is installed. The tests are
+reconstructions, simulated from published parameters, not measurements.
 """
 
 from __future__ import annotations
 
+import os
+import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -14,7 +18,6 @@ import foamfit as ff
 from foamfit.api import FitResult
 from foamfit.report.comparison import compare
 from foamfit.report.comparison_plot import plot_comparison
-from foamfit.report.explore import plot_loop, rough_guess
 from foamfit.report.plots import plot_fit
 
 HERE = Path(__file__).parent
@@ -22,6 +25,9 @@ PICTURES = HERE / "pictures"
 TESTS = HERE.parent / "experiments" / "foam-1"
 CASES = {"model-2": "bistable", "model-3": "linear+bistable"}
 DPI = 160
+CHROMIUM = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+# Width and height of a window of which the upper part is seen.
+WINDOW = {"width": 1200, "height": 760}
 
 
 def read(case: str) -> ff.Measurement:
@@ -40,19 +46,60 @@ def fit_with_site_damper(case: str) -> FitResult:
 
 
 def main() -> None:
-    """Make the three pictures."""
+    """Make the pictures."""
     PICTURES.mkdir(exist_ok=True)
     test = read("model-2")
     comparison = compare([fit_with_site_damper(case) for case in CASES])
-    picture = plot_loop(test, rough_guess(test))
     for name, figure in (
         ("fit_a_new_test", plot_fit(ff.fit(test, seed=0))),
         ("fitted_against_published", plot_comparison(comparison)),
-        ("turn_the_parameters", picture),
     ):
-        path = PICTURES / f"{name}.png"
-        figure.savefig(path, dpi=DPI)
-        print(f"{path.relative_to(HERE.parent)}  {path.stat().st_size / 1000:.0f} kB")
+        figure.savefig(PICTURES / f"{name}.png", dpi=DPI)
+        tell(name)
+    photograph_page()
+
+
+def tell(name: str) -> None:
+    """Say that a picture is made."""
+    path = PICTURES / f"{name}.png"
+    print(f"{path.relative_to(HERE.parent)}  {path.stat().st_size / 1000:.0f} kB")
+
+
+def photograph_page() -> None:
+    """Fit a reconstruction on the page and take pictures of it, or say why there are none."""
+    try:
+        from playwright.sync_api import Error, sync_playwright
+    except ImportError as error:
+        print(f'no picture of the page is made ({error}); pip install ".[test]"')
+        return
+    chromium = next((path for path in map(shutil.which, CHROMIUM) if path), None)
+    root = hasattr(os, "geteuid") and os.geteuid() == 0
+    command = [sys.executable, "-m", "foamfit", "page", "--no-browser"]
+    with (
+        subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=HERE.parent) as served,
+        sync_playwright() as playwright,
+    ):
+        try:
+            options = ["--no-sandbox"] if root else []
+            browser = playwright.chromium.launch(executable_path=chromium, args=options)
+            window = browser.new_page(viewport=WINDOW)
+            assert served.stdout is not None
+            window.goto(served.stdout.readline().strip())
+            test = "foam-1: model-2-2.0mps-reconstruction"
+            window.get_by_label("reconstruction").select_option(test)
+            window.get_by_role("button", name="Fit", exact=True).click(timeout=60_000)
+            window.get_by_role("button", name="Back to the fit").wait_for(timeout=120_000)
+            window.evaluate("scrollTo(0, 0)")
+            window.wait_for_timeout(1000)  # the curves of the fit are drawn
+            window.screenshot(path=PICTURES / "page.png")
+            tell("page")
+            curves = window.locator("section").filter(has=window.locator("#h-curves"))
+            curves.screenshot(path=PICTURES / "turn_the_parameters.png")
+            tell("turn_the_parameters")
+        except Error as error:
+            print(f"no picture of the page is made: {error.message.splitlines()[0]}")
+        finally:
+            served.terminate()
 
 
 if __name__ == "__main__":

@@ -29,5 +29,5 @@ def served(tmp_path_factory):
     process.send_signal(signal.SIGTERM)
     _, errors = process.communicate(timeout=20)
     assert process.returncode == 0, errors
-    assert "Traceback" not in errors
+    assert "Traceback" not in errors, errors
     assert list(files.iterdir()) == []  # nothing stays behind

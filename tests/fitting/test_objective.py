@@ -19,6 +19,7 @@ from foamfit.fitting.curves import (
     smoothed,
 )
 from foamfit.fitting.objective import MODEL_ERROR, PENALTY, Objective
+from foamfit.one_model import Options
 from foamfit.springs.model import Model
 
 BISTABLE = Model.parse("bistable")
@@ -321,3 +322,17 @@ def test_unknown_and_negative_weights_are_refused():
 def test_an_unknown_spring_in_a_model_is_refused():
     with pytest.raises(ff.InputError, match="'elastic' is not a spring"):
         Model.parse("linear+elastic")
+
+
+@pytest.mark.parametrize("lost", [KeyboardInterrupt(), None, ValueError("a bug")])
+def test_ctrl_c_in_a_compiled_loop_is_ctrl_c(monkeypatch, lost):
+    """Where it comes as a loop hands over its result, Python makes a SystemError of it."""
+
+    def interrupted(*_):
+        raise SystemError("returned a result with an exception set") from lost
+
+    problem = Options().problem(synthetic_impact()[1], "bistable")
+    monkeypatch.setattr(type(problem.objective), "_springs", interrupted)
+    expected = KeyboardInterrupt if isinstance(lost, KeyboardInterrupt) else SystemError
+    with pytest.raises(expected):
+        problem.objective.simulate(problem.vector())

@@ -4,7 +4,9 @@ import json
 import os
 import re
 import shutil
+import time
 import zipfile
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -18,7 +20,8 @@ api = pytest.importorskip(
 pytest.importorskip("panel", reason='the page needs Panel: pip install "foamfit[page]"')
 __all__ = ["served"]
 
-NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+CHROMIUM = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+FIREFOX = ("firefox", "firefox-esr")
 TEST = EXPERIMENTS / "foam-1" / "model-2-2.0mps-reconstruction.csv"
 HEAD = "time (ms),force (N),displacement (mm)"
 SOON, LATER = 20_000, 90_000  # ms
@@ -46,6 +49,21 @@ REDRAWS = """async () => {
   }
   return took;
 }"""
+# What lies beneath the pointer gets the events of a drag from outside, with the files.
+DROP = """([files, x, y]) => {
+  const carried = new DataTransfer();
+  for (const [name, text] of files)
+    carried.items.add(new File([Uint8Array.from(text, (c) => c.charCodeAt(0))], name));
+  const beneath = document.elementFromPoint(x, y);
+  return ['dragenter', 'dragover', 'drop'].map((kind) => {
+    const event = new DragEvent(kind, {
+      dataTransfer: carried, bubbles: true, cancelable: true, composed: true,
+      clientX: x, clientY: y,
+    });
+    beneath.dispatchEvent(event);
+    return event.defaultPrevented;
+  });
+}"""
 FOCUSED = """() => {
   let at = document.activeElement;
   while (at.shadowRoot?.activeElement) at = at.shadowRoot.activeElement;
@@ -71,22 +89,23 @@ BAD = {
 
 
 @pytest.fixture(scope="module")
-def browser():
-    found = next((path for path in map(shutil.which, NAMES) if path), None)
+def playwright():
     with api.sync_playwright() as playwright:
-        own = playwright.chromium.executable_path
-        if found is None and not Path(own).exists():
-            pytest.skip(
-                f"no browser is installed here: neither {', '.join(NAMES)} nor playwright's"
-            )
-        options = [] if not hasattr(os, "geteuid") or os.geteuid() else ["--no-sandbox"]
-        browser = playwright.chromium.launch(executable_path=found, args=options)
-        yield browser
-        browser.close()
+        yield playwright
 
 
-@pytest.fixture(scope="module")
-def window(browser, served):
+def launch(driver, names, **options):
+    """Start a browser that is installed under one of these names, or that Playwright brings."""
+    found = next((path for path in map(shutil.which, names) if path), None)
+    if found is None and not Path(driver.executable_path).exists():
+        pytest.skip(f"no {driver.name} is here: neither {', '.join(names)} nor playwright's own")
+    if found is None:
+        options.pop("channel", None)  # its own needs none
+    return driver.launch(executable_path=found, **options)
+
+
+@contextmanager
+def opened(browser, served):
     """An open window; that no error is on its console is tested at its end."""
     context = browser.new_context(viewport={"width": 1280, "height": 900}, accept_downloads=True)
     page, wrong, hosts = context.new_page(), [], set()
@@ -105,8 +124,25 @@ def window(browser, served):
     context.close()
 
 
+@pytest.fixture(scope="module")
+def window(playwright, served):
+    options = [] if not hasattr(os, "geteuid") or os.geteuid() else ["--no-sandbox"]
+    browser = launch(playwright.chromium, CHROMIUM, args=options)
+    with opened(browser, served) as page:
+        yield page
+    browser.close()
+
+
 def drop(page, *files):
-    """Put files into the page as a hand does that drops them."""
+    """Drop files onto the page, beside the zone that is drawn for them, as a file manager does."""
+    at = page.get_by_role("heading", name="Curves").bounding_box()
+    given = [[name, text.encode("latin-1").decode("latin-1")] for name, text in files]
+    taken = page.evaluate(DROP, [given, at["x"] + 5, at["y"] + 5])
+    assert taken == [True, True, True]  # else the browser would leave the page for the file
+
+
+def choose(page, *files):
+    """Choose files in the dialog of the browser."""
     given = [
         {"name": name, "mimeType": "text/csv", "buffer": text.encode("latin-1")}
         for name, text in files
@@ -115,7 +151,7 @@ def drop(page, *files):
 
 
 def load(page):
-    drop(page, (TEST.name, TEST.read_text()), ("any.toml", TEST.with_suffix(".toml").read_text()))
+    choose(page, (TEST.name, TEST.read_text()), ("any.toml", TEST.with_suffix(".toml").read_text()))
     page.get_by_label("s1_k0", exact=True).wait_for()
     api.expect(page.get_by_role("button", name="Fit", exact=True)).to_be_enabled()
 
@@ -158,15 +194,18 @@ def test_load_drop_fit_stop_turn_and_save(window, tmp_path):
     page.get_by_label("s1_eps_c as a number").press("Enter")
     api.expect(page.get_by_text("is not admissible").first).to_be_visible()
     # A fit that is stopped keeps the best.
-    page.get_by_label("Starts of the search").fill("100000")
+    page.get_by_text("More options").click()
+    page.get_by_label("Starts:").fill("100000")
     page.get_by_role("button", name="Fit", exact=True).click()
     api.expect(page.get_by_text("best misfit").first).to_be_visible(timeout=LATER)
     api.expect(height).to_be_disabled()
     page.get_by_role("button", name="Stop").click()
     report = page.frame_locator("iframe")
     api.expect(report.get_by_text("stopped by Ctrl-C").first).to_be_visible(timeout=LATER)
-    # One to its end, beside a published set.
-    page.get_by_label("Starts of the search").fill("2")
+    # One to its end with a parameter that is held, beside a published set.
+    page.get_by_label("s1_eta as a number").fill("3")
+    page.get_by_label("s1_eta fixed in the fit").check()
+    page.get_by_label("Starts:").fill("2")
     page.get_by_role("button", name="Fit", exact=True).click()
     api.expect(page.get_by_text("A fit is running.")).to_be_visible()
     api.expect(report.get_by_text("s1_kc").first).to_be_visible(timeout=LATER)
@@ -182,7 +221,42 @@ def test_load_drop_fit_stop_turn_and_save(window, tmp_path):
     fit = json.loads(archive.read("fit.json"))
     k0 = float(page.get_by_label("s1_k0 as a number").input_value())
     assert k0 == pytest.approx(fit["parameters"]["s1_k0"]["value"] / 1e6, rel=1e-4)
+    assert (fit["parameters"]["s1_eta"]["value"], fit["parameters"]["s1_eta"]["vary"]) == (3, False)
     archive.close()
+
+
+def test_firefox_drops_fits_turns_and_saves(playwright, served, tmp_path):
+    options = {"channel": "moz-firefox", "downloads_path": tmp_path}
+    browser = launch(playwright.firefox, FIREFOX, **options)
+    try:
+        browser.new_context().close()
+    except api.Error as error:
+        why = error.message.splitlines()[0]
+        browser.close()
+        pytest.skip(f"playwright cannot drive this Firefox ({why})")
+    with opened(browser, served) as page:
+        toml = TEST.with_suffix(".toml").read_text()
+        drop(page, ("word.csv", BAD["word.csv"][0]), ("t.toml", toml))
+        api.expect(page.get_by_text("row 11").first).to_be_visible()
+        drop(page, (TEST.name, TEST.read_text()), ("t.toml", toml))
+        slider = page.get_by_label("s1_k0", exact=True)
+        slider.wait_for()
+        before = page.evaluate(CURVE)
+        slider.focus()
+        page.keyboard.press("ArrowRight")
+        page.wait_for_function(f"({CURVE})().join() !== {json.dumps(','.join(map(str, before)))}")
+        page.get_by_text("More options").click()
+        page.get_by_label("Starts:").fill("2")
+        page.get_by_role("button", name="Fit", exact=True).click()
+        report = page.frame_locator("iframe")
+        api.expect(report.get_by_text("s1_kc").first).to_be_visible(timeout=LATER)
+        page.get_by_text("Save the report").click()
+        saved, end = tmp_path / "report.html", time.monotonic() + 20.0
+        while not saved.is_file() or "</html>" not in saved.read_text():  # no event tells it
+            assert time.monotonic() < end
+            page.wait_for_timeout(100)
+        assert "s1_kc" in saved.read_text()
+    browser.close()
 
 
 def test_two_windows_do_not_mix(window, served):
@@ -196,6 +270,10 @@ def test_two_windows_do_not_mix(window, served):
     api.expect(other.get_by_text("VACNT foam-1/model-1").first).to_be_visible()
     api.expect(window.get_by_text("VACNT foam-1/model-2").first).to_be_visible()
     api.expect(window.get_by_text("VACNT foam-1/model-1")).to_have_count(0)
+    # One that is closed while its curves are on the way leaves no traceback: see `served`.
+    other.get_by_label("s1_k0", exact=True).focus()
+    for _ in range(8):
+        other.keyboard.press("ArrowRight")
     other.close()  # a window behind another one is drawn once a second only
 
 
@@ -212,10 +290,10 @@ def test_everyone_can_use_it_at_once(window):
         assert {"label", "color-contrast", "button-name"} <= {one["id"] for one in found["passes"]}
     reached = set()
     window.get_by_label("Drop a CSV").focus()
-    for _ in range(45):
+    for _ in range(75):
         window.keyboard.press("Tab")
         reached.add(window.evaluate(FOCUSED))
     assert {"Specimen height", "Check the test", "Fit", "s1_k0", "s1_eta"} <= reached
     window.bring_to_front()
     took = sorted(window.evaluate(REDRAWS))
-    assert took[len(took) // 4] < 100.0, took  # a machine that does other things delays most
+    assert took[len(took) // 2] < 100.0, took

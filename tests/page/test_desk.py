@@ -1,22 +1,35 @@
 """What a window of the page works on, without a browser: files, sentences, fits, curves."""
 
+import io
+import json
 import os
 import signal
 import time
 import tomllib
+import zipfile
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 import foamfit as ff
-from conftest import EXPERIMENTS
+from conftest import EXPERIMENTS, synthetic_impact, synthetic_loop, without_pictures
+from cycled import write_record
+from foamfit.cli import main
+from foamfit.data.measurement import Measurement, Specimen
 from foamfit.errors import InputError
 from foamfit.page import desk as desk_module
+from foamfit.page import first_use as first_use_module
 from foamfit.page import turning as turning_module
 from foamfit.page.desk import Desk, excerpt_of, join_toml, safe_name, split_toml
 from foamfit.page.turning import Turning
+from foamfit.page.worker import Worker
+from foamfit.report.folder import load_result
+from foamfit.report.studies import cycles as cycles_report
 
 TEST = EXPERIMENTS / "foam-1" / "model-2-2.0mps-reconstruction.csv"
+NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
 GOOD = {
     "[specimen] height": "1.19 mm", "[specimen] diameter": "5 mm",
     "[striker] mass": "7 g", "[striker] velocity": "2 m/s",
@@ -41,7 +54,7 @@ def ready(desk):
 def wait(worker, until=lambda worker: worker.ended is not None, seconds=60.0):
     end = time.monotonic() + seconds
     while not until(worker):
-        assert time.monotonic() < end, worker.news
+        assert time.monotonic() < end, vars(worker)
         time.sleep(0.02)
 
 
@@ -137,6 +150,7 @@ def test_a_wrong_quantity_is_named(desk, quantity, value, told):
     checked = desk.check(GOOD | {quantity: value}, "")
     assert told in checked.error
     assert checked.quantity == quantity
+    assert checked.excerpt.cells[0] == ["time (ms)", "force (N)", "displacement (mm)"]
     assert str(desk.folder) not in checked.error
 
 
@@ -163,7 +177,7 @@ def test_a_sentence_without_a_row_shows_the_headers(desk):
 
 
 def test_a_fit_is_that_of_the_command(ready):
-    worker = ready.fit("bistable", {"starts": 2, "seed": 3})
+    worker = ready.fit(["--starts", "2", "--seed", "3"])
     wait(worker)
     assert worker.ended == ""
     measurement = ff.read_test(TEST)
@@ -175,6 +189,35 @@ def test_a_fit_is_that_of_the_command(ready):
     assert "report.html" in {path.name for path in ready.result.iterdir()}
     assert ready.zipped().startswith(b"PK")
     assert "foam-1/model-2" in ready.compared("foam-1/model-2")
+
+
+def test_cycles_and_what_is_held_are_those_of_the_command(desk, tmp_path, monkeypatch):
+    record = write_record(tmp_path)
+    desk.take(record)
+    assert not desk.check(*desk.dropped_toml(), "3,9").error
+    assert (desk.measurement.cycle, desk.measurement.cycles) == (3, (1, 2, 3))
+    asked = ["--cycle", "3,9", "--fix=s1_kh_minus=2200000.0", "--vary=s1_eta", "--starts", "1"]
+    wait(desk.fit(asked))
+    assert desk.ending() == ""
+    assert desk.command == f"foamfit fit synthetic.csv {' '.join(asked)}"
+    assert "1 of 3 cycles fitted" in desk.told
+    assert "cycle 9" in desk.told
+    without_pictures(monkeypatch)
+    monkeypatch.setattr(cycles_report, "image", lambda *_: b"")
+    monkeypatch.setattr(cycles_report, "plot_cycles", lambda _: None)
+    told = CliRunner().invoke(main, ["fit", str(record), *asked, "--json", f"--out={tmp_path}/r"])
+    command = json.loads(told.stdout)["cycles"]
+    assert list(desk.fits) == [3]
+    for number, folder in desk.fits.items():
+        page = load_result(folder)
+        assert page["parameters"] == command[str(number)]["parameters"]
+        assert page["statistics"] == command[str(number)]["statistics"]
+        assert page["parameters"]["s1_kh_minus"]["value"] == 2.2e6
+        assert page["parameters"]["s1_eta"]["vary"]
+        assert desk.measured(number).cycle == number
+    assert "foam-1/model-2" in desk.compared("foam-1/model-2", 3)
+    with zipfile.ZipFile(io.BytesIO(desk.zipped())) as archive:
+        assert {"cycles.csv", "cycles.png", "cycle-3/fit.json"} <= {*archive.namelist()}
 
 
 def test_watching_a_fit_changes_nothing():
@@ -189,12 +232,12 @@ def test_watching_a_fit_changes_nothing():
 
 
 def test_a_fit_that_is_stopped_keeps_the_best(ready):
-    worker = ready.fit("bistable", {"starts": 100_000})
+    worker = ready.fit(["--starts", "100000"])
     wait(worker, lambda worker: worker.news.misfit)
     assert worker.news.model == "bistable"
     assert set(worker.news.values) >= {"s1_k0", "s1_eta"}
     with pytest.raises(InputError, match="A fit is running"):
-        ready.fit("bistable", {})
+        ready.fit([])
     # What it is fitted to cannot change beneath it.
     with pytest.raises(InputError, match="A fit is running"):
         ready.receive("other.csv", b"1,2\n")
@@ -206,22 +249,53 @@ def test_a_fit_that_is_stopped_keeps_the_best(ready):
 
 
 def test_a_worker_that_dies_says_so(ready):
-    worker = ready.fit("bistable", {"starts": 100_000})
+    worker = ready.fit(["--starts", "100000"])
     os.kill(worker.pid, signal.SIGKILL)
     wait(worker)
     assert ready.ending() == "The process of the fit has died by SIGKILL; start the fit again."
     assert ready.result is None
 
 
+@pytest.mark.parametrize(
+    ("code", "errors", "told"),
+    [
+        (-signal.SIGINT, "", "stopped before anything was found"),
+        (1, "Traceback …\nKeyboardInterrupt", "stopped before anything was found"),
+        (1, "Traceback …\nMemoryError", "has died with exit code 1 (MemoryError)"),
+        (-signal.SIGKILL, "", "has died by SIGKILL"),
+    ],
+)
+def test_a_worker_that_dies_while_it_is_stopped_says_what_it_was(code, errors, told):
+    worker = Worker.__new__(Worker)
+    worker.stopping, worker._errors = True, io.BytesIO(errors.encode())
+    assert told in worker._why(code)
+
+
+def test_what_compiles_at_first_use_is_waited_for_and_ends_with_the_page(monkeypatch):
+    monkeypatch.setattr(first_use_module.cache, "compiled", lambda _: False)
+    monkeypatch.setattr(first_use_module, "COMPILE", "import time; time.sleep(60)  # {} {}")
+    first_use = first_use_module.FirstUse()
+    integrator, memory = first_use.parts
+    assert first_use.needed("linear+bistable", 0) is integrator
+    needing = [("auto", 0), ("microscale", 0), ("bistable", 1)]
+    assert {first_use.needed(*one) for one in needing} == {memory}
+    wait(first_use, lambda one: one._process is not None)
+    assert not integrator.done()
+    first_use.close()
+    assert integrator.result(timeout=5.0) is memory.result(timeout=5.0) is None
+
+
 def test_a_fit_that_cannot_be_says_why(ready):
-    worker = ready.fit("bistable", {"drive": "impact", "relaxation": -1})
+    with pytest.raises(InputError, match="'--relaxation': -1 is not in the range"):
+        ready.fit(["--relaxation", "-1"])
+    worker = ready.fit(["--fix", "s1_k1=1"])
     wait(worker)
-    assert "relaxation = -1" in worker.ended
+    assert "parameter 's1_k1' is not one of the model bistable" in worker.ended
     assert "\n" not in worker.ended
 
 
 def test_a_closed_window_ends_its_fit(ready):
-    worker = ready.fit("bistable", {"starts": 100_000})
+    worker = ready.fit(["--starts", "100000"])
     wait(worker, lambda worker: worker.news.what != "starting")
     ready.close()
     wait(worker, seconds=5.0)
@@ -282,3 +356,57 @@ def test_a_long_record_is_thinned_to_be_drawn(monkeypatch):
     turning = Turning(measurement, "bistable")
     assert turning.samples == (measurement.rows.used, 200)
     assert len(turning.turn({}).curves["stress_strain"][0]) == 200
+
+
+@pytest.mark.parametrize("make", [synthetic_impact, synthetic_loop])
+def test_sliders_begin_near_the_loop_but_at_no_fit(make):
+    _, measurement = make()
+    off = Turning(measurement, "bistable").turn({}).misfit["stress_strain"]
+    assert 0.01 < off < 0.30  # the noise leaves 0.005
+
+
+def test_points_lie_on_the_branches_they_join():
+    spring = ff.published["foam-1/model-1"].bistable
+    values = {f"s1_{name}": getattr(spring, name) for name in NAMES}
+    found = Turning(synthetic_loop()[1], "bistable", values).turn({}).points
+    assert set(found) == {"A1", "C1", "C2", "A2"}
+    hat_c = found["C1"][0]
+    along = spring.stress([found["A1"][0], hat_c, hat_c + 1e-9, found["C2"][0], found["A2"][0]])
+    expected = [found[name][1] for name in ("A1", "C1", "C2", "A2")]
+    np.testing.assert_allclose(along[[0, 1, 3, 4]], expected, rtol=1e-6, atol=1.0)
+
+
+def test_points_leave_out_a2_where_the_branches_do_not_meet():
+    spring = ff.BistableSpring(1e6, 50e6, -5e4, 0.3, 0.6, 2e6, 1e9)
+    assert spring.eps_hat_a is None
+    values = {f"s1_{name}": getattr(spring, name) for name in NAMES}
+    found = Turning(synthetic_loop()[1], "bistable", values).turn({}).points
+    assert set(found) == {"A1", "C1", "C2"}
+
+
+def test_a_test_without_stress_and_motion_is_refused():
+    bare = Measurement("bare", None, "", None, np.zeros(3), None, Specimen(1e-3, 1e-5))
+    with pytest.raises(InputError, match="bare"):
+        Turning(bare, "bistable")
+
+
+# ------------------------------------------------------------------- what is fixed and varied
+
+
+def test_ticks_say_what_a_fit_holds_and_varies():
+    pytest.importorskip("panel", reason='the page needs Panel: pip install "foamfit[page]"')
+    from foamfit.page.curves import Curves
+
+    curves = Curves(Turning(ff.read_test(TEST), "bistable"))
+    assert curves.chosen() == ({}, [])
+    moves = {"s1_k0": 5.0, "site_eta": 7.0}  # MPa, Pa s
+    curves._moved(SimpleNamespace(data={"moves": moves}))
+    assert curves.chosen() == ({"site_eta": 7.0}, [])  # held by itself, not at this value
+    curves._moved(SimpleNamespace(data={"held": {"s1_k0": True, "s1_eta": True, "no_one": True}}))
+    held, varied = curves.chosen()
+    assert (held["s1_k0"], set(held), varied) == (5e6, {"s1_k0", "s1_eta", "site_eta"}, [])
+    curves._moved(SimpleNamespace(data={"held": {"s1_k0": False, "site_eta": False}}))
+    assert (set(curves.chosen()[0]), curves.chosen()[1]) == ({"s1_eta"}, ["site_eta"])
+    # A chain holds its dashpots and varies the striker's by itself: the ticks say nothing else.
+    curves.show(Turning(ff.read_test(TEST), "linear+bistable"))
+    assert curves.chosen() == ({}, [])

@@ -11,16 +11,10 @@ from click.testing import CliRunner
 
 import foamfit as ff
 from conftest import DATA, needs_data, without_pictures
+from cycled import FRESH, ONSETS, SETS, write_record
 from foamfit.cli import main
 from foamfit.report.plotted import plotted
 from foamfit.report.studies import cycles as cycles_report
-
-HEIGHT, AREA = 10e-3, 1e-4
-FRESH = ff.BistableSpring(
-    k0=5.5e6, kc=20e6, dsigma=-0.3e6, eps_a=0.14, eps_c=0.27, kh_plus=2e6, kh_minus=2.2e6
-)
-# What changes from cycle to cycle, and nothing else: where snapping starts, and the start strain.
-ONSETS, SETS = (0.14, 0.11, 0.10), (0.0, 0.02, 0.03)
 
 
 def springs():
@@ -29,27 +23,7 @@ def springs():
 
 @pytest.fixture(scope="module")
 def record(tmp_path_factory) -> Path:
-    """A synthetic record of three cycles on a foam whose snapping starts earlier each time."""
-    strain, stress = [], []
-    for spring, gone in zip(springs(), SETS, strict=True):
-        up = np.linspace(0.0, 0.38, 150)
-        one = np.concatenate([up, up[::-1][1:-1]])
-        strain.append(one)
-        along = np.maximum(one - gone, 0.0)
-        pressed = spring.stress(along)
-        stress.append(np.where(one > gone, np.maximum(pressed, 0.0), 0.0))
-    strain, stress = (np.concatenate([*parts, [0.0]]) for parts in (strain, stress))
-    stress = stress + 500.0 * np.random.default_rng(0).standard_normal(stress.size)
-    path = tmp_path_factory.mktemp("record") / "synthetic.csv"
-    lines = ["time (s),stress (MPa),displacement (mm)"]
-    lines += [
-        f"{0.01 * i:.2f},{1e-6 * s:.6f},{1e3 * HEIGHT * e:.6f}"
-        for i, (e, s) in enumerate(zip(strain, stress, strict=True))
-    ]
-    path.write_text("\n".join(lines) + "\n")
-    toml = f'[specimen]\nheight = "{1e3 * HEIGHT} mm"\narea = "{1e6 * AREA} mm^2"\n'
-    path.with_suffix(".toml").write_text(toml)
-    return path
+    return write_record(tmp_path_factory.mktemp("record"))
 
 
 @pytest.fixture(scope="module")

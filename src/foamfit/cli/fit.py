@@ -4,8 +4,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, ExitStack
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +21,7 @@ from foamfit.cli.options import (
     SPECIMEN,
     TEST,
     WIDTH,
+    Drawers,
     check_open,
     compiling,
     cycles_of,
@@ -28,13 +29,16 @@ from foamfit.cli.options import (
     open_if_asked,
     spare,
 )
-from foamfit.cli.progress import progress_line
+from foamfit.cli.progress import Progress, progress_line
 from foamfit.errors import InputError
 from foamfit.terminal import say, without_ctrl_c
 
 if TYPE_CHECKING:
     from foamfit.api import FitResult
     from foamfit.study.cycles import CycleFits
+
+# Options of `fit` that are no keywords of `foamfit.fit`, and those that are one of them.
+OF_ONE_MODEL, WAYS = ("cycle", "model", "fix", "vary"), ("profile", "bootstrap", "mcmc")
 
 
 @main.command()
@@ -73,71 +77,100 @@ def fit(
         foamfit fit TEST.csv --drive displacement --out results/today --figure-width one
         foamfit fit TEST.csv --model linear+bistable --fix s1_k0=60e6
     """
-    from foamfit.data.csv_file import read_test
-    from foamfit.springs.model import Model
-
     check_open(as_json)
-    search |= intervals_of(**{way: search.pop(way) for way in ("profile", "bootstrap", "mcmc")})
-    model = "auto" if model.strip() == "auto" else Model.parse(model).name
-    alone, several = cycles_of(cycle)
+    hush = quiet or as_json
+    folder = _result_folder(out, test, specimen, _model_name(model))
+    options = search | {"cycle": cycle, "model": model, "fix": fix, "vary": vary}
     with ExitStack() as beside:
-        compile_rest = beside.enter_context(
-            compiling(quiet or as_json, model, search["relaxation"])
-        )
-        measurement = read_test(test, specimen, alone)
-        folder = _result_folder(out, test, specimen, model)
-        from foamfit import api
-        from foamfit.report.folder import save_result
+        compile_rest = beside.enter_context(compiling(hush, model, search["relaxation"]))
+        drawers = beside.enter_context(drawing_beside())
 
-        params = params_of(measurement, model, search, fix, vary)
-        compile_rest()
-        mapped = beside.enter_context(drawing_beside())
-        limit = search["max_time"] if several is None else None  # it is that of each cycle
-        with progress_line(quiet or as_json, "fit", limit) as shown:
-            told: dict[str, Any] = {"progress": shown.progress, "watch": shown.watch}
-            told["tell"] = None if quiet else shown.tell
-            if several is not None:
-                from foamfit.study.cycles import fit_cycles
+        def begin(limit: float | None) -> AbstractContextManager[Progress]:
+            compile_rest()
+            drawers.begin()
+            return progress_line(hush, "fit", limit, says=not quiet)
 
-                found = fit_cycles(
-                    test, specimen, cycles=several or None, model=model, **told, **search,
-                    params=lambda one: params_of(one, model, search, fix, vary),
-                )  # fmt: skip
-            else:
-                result = api.fit(measurement, model=model, params=params, **told, **search)
-        save: Callable[[], Path]
-        if several is not None:
-            from foamfit.report.studies.cycles import save_cycles
+        found = fit_as_asked(test, specimen, options, begin)
+        save = partial(_save, found, folder, figure_width, drawers, hush)
+        from foamfit.results import Fit
 
-            save = partial(save_cycles, found, folder, width=figure_width, mapped=mapped)
-            code = _tell_cycles(found, folder, save, as_json, quiet)
-            open_if_asked(folder / "cycles.png")
-            return code
+        if not isinstance(found, Fit):
+            return _tell_cycles(found, folder, save, as_json, quiet)
         try:
-            save = partial(save_result, result, folder, width=figure_width, mapped=mapped)
-            _save(save, quiet or as_json)
+            save()
         except InputError:  # the numbers are not lost with the folder
-            _tell_result(result, as_json, quiet, verbose)
+            _tell_result(found, as_json, quiet, verbose)
             raise
-    _tell_result(result, as_json, quiet, verbose)
+    _tell_result(found, as_json, quiet, verbose)
     if not quiet and not as_json:
         say(f"\nwritten to {folder}: open {folder / 'report.html'}")
     open_if_asked(folder / "report.html")
-    if result.status == "failed":
+    if found.status == "failed":
         say(f"foamfit: no acceptable fit was found; see {folder}", err=True)
         return NOT_ACCEPTABLE
     return 0
 
 
-def _save(save: Callable[[], Path], silent: bool) -> None:
+def fit_as_asked(
+    test: Path,
+    specimen: Path | None,
+    options: Mapping[str, Any],
+    begin: Callable[[float | None], AbstractContextManager[Progress]],
+) -> FitResult | CycleFits:
+    """Fit a test, or cycles of a record, as the options of the command say.
+
+    `begin` is called when all is read, before anything is simulated, with the seconds after which
+    the fit ends in any case; what it gives is told how the fit goes.
+    """
+    from foamfit.data.csv_file import read_test
+
+    search = {name: value for name, value in options.items() if name not in OF_ONE_MODEL}
+    search |= intervals_of(**{way: search.pop(way) for way in WAYS})
+    fix, vary = options["fix"], options["vary"]
+    model = _model_name(options["model"])
+    alone, several = cycles_of(options["cycle"])
+    measurement = read_test(test, specimen, alone)
+    from foamfit import api
+
+    params = params_of(measurement, model, search, fix, vary)
+    # With several cycles the limit is that of each.
+    with begin(search["max_time"] if several is None else None) as news:
+        search |= {"progress": news.progress, "watch": news.watch, "tell": news.tell}
+        if several is None:
+            return api.fit(measurement, model=model, params=params, **search)
+        from foamfit.study.cycles import fit_cycles
+
+        return fit_cycles(
+            test, specimen, cycles=several or None, model=model,
+            params=lambda one: params_of(one, model, search, fix, vary), **search,
+        )  # fmt: skip
+
+
+def _model_name(model: str) -> str:
+    """Return a model's name without spaces; InputError if it is none."""
+    from foamfit.springs.model import Model
+
+    return "auto" if model.strip() == "auto" else Model.parse(model).name
+
+
+def _save(
+    found: FitResult | CycleFits, folder: Path, width: str, drawers: Drawers, silent: bool
+) -> None:
     """Write the folder; the line on the terminal says so."""
+    from foamfit.report.folder import save_result
+    from foamfit.report.studies.cycles import save_cycles
+    from foamfit.results import Fit
+
     with progress_line(silent, "fit") as shown, without_ctrl_c():
         shown.progress(1.0, "writing the report")
-        save()
+        if isinstance(found, Fit):
+            save_result(found, folder, width=width, mapped=drawers.map)
+        else:
+            save_cycles(found, folder, width=width, mapped=drawers.map)
 
 
 def _tell_cycles(
-    found: CycleFits, folder: Path, save: Callable[[], Path], as_json: bool, quiet: bool
+    found: CycleFits, folder: Path, save: Callable[[], None], as_json: bool, quiet: bool
 ) -> int:
     """Write and print the fits of several cycles; returns the exit code."""
     import json
@@ -148,12 +181,13 @@ def _tell_cycles(
     content["cycles"] = {n: one.to_json_dict() for n, one in sorted(found.results.items())}
     shown = json.dumps(content, allow_nan=False) if as_json else cycles_text(found)
     try:
-        _save(save, quiet or as_json)
+        save()
     finally:  # the numbers are not lost with the folder
         if as_json or not quiet:
             say(shown)
     if not quiet and not as_json:
         say(f"\nwritten to {folder}: open {folder / 'cycles.png'}")
+    open_if_asked(folder / "cycles.png")
     good = [n for n, one in found.results.items() if one.status != "failed"]
     if not good:
         say(f"foamfit: no acceptable fit of any cycle was found; see {folder}", err=True)

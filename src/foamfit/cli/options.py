@@ -14,7 +14,9 @@ from foamfit.files import check_file
 from foamfit.terminal import say
 
 if TYPE_CHECKING:
-    from foamfit.report.result_figures import Mapped
+    from concurrent.futures import Future
+
+    from foamfit.study.processes import Processes
 
 FILE = click.Path(path_type=Path)
 TEST = click.argument("test", metavar="TEST.csv", type=FILE)
@@ -98,36 +100,54 @@ def compiling(
         yield finish
 
 
-@contextmanager
-def drawing_beside() -> Iterator[Mapped]:
-    """Give a `map` over figures that has them drawn in two processes, where there are two cores.
+class Drawers:
+    """Two processes that draw figures, once they have begun and where there are two cores.
 
-    These import what they need beside the body, which then need not. Where they cannot be had, or
-    end before they are done, this process draws.
+    They import what they need beside the process that begins them, which then need not. Where they
+    cannot be had, or end before they are done, that process draws.
     """
-    from foamfit.study import processes
 
-    if processes.cores() < 2:
-        yield map
-        return
-    pool = processes.Processes(2, processes.DRAWING)
+    def __init__(self) -> None:
+        self._pool: Processes | None = None
 
-    def mapped(draw: Callable[[str], Any], names: Iterable[str]) -> Iterator[Any]:
-        begun = [(name, pool.submit(draw, name)) for name in names]
+    def begin(self) -> None:
+        """Start the processes."""
+        from foamfit.study import processes
 
-        def drawn() -> Iterator[Any]:
-            for name, one in begun:
-                try:
-                    yield one.result()
-                except (processes.EndedError, OSError):
-                    yield draw(name)
+        if processes.cores() > 1:
+            self._pool = processes.Processes(2, processes.DRAWING)
 
-        return drawn()
+    def map(self, draw: Callable[[str], Any], names: Iterable[str]) -> Iterable[Any]:
+        """Begin to draw; what is given is waited for when it is asked for."""
+        if self._pool is None:
+            return map(draw, names)
+        begun = [(name, self._pool.submit(draw, name)) for name in names]
+        return (_drawn(one, draw, name) for name, one in begun)
+
+    def stop(self) -> None:
+        """End the processes."""
+        if self._pool is not None:
+            self._pool.stop()
+
+
+def _drawn(begun: Future[Any], draw: Callable[[str], Any], name: str) -> Any:
+    """What a process has drawn, or else this one draws."""
+    from foamfit.study.processes import EndedError
 
     try:
-        yield mapped
+        return begun.result()
+    except (EndedError, OSError):
+        return draw(name)
+
+
+@contextmanager
+def drawing_beside() -> Iterator[Drawers]:
+    """Give drawers, which are stopped at the end."""
+    drawers = Drawers()
+    try:
+        yield drawers
     finally:
-        pool.stop()
+        drawers.stop()
 
 
 def check_open(as_json: bool) -> None:

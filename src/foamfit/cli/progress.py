@@ -32,12 +32,16 @@ class Progress:
 
     watch: Callable[[Problem, Array], None] | None = None
 
+    def __init__(self, says: bool = True) -> None:
+        self.says = says
+
     def progress(self, fraction: float, what: str) -> None:
         """Take how far the command is."""
 
     def tell(self, told: str) -> None:
-        """Print a sentence on stderr."""
-        say(f"foamfit: {told}", err=True)
+        """Print a sentence on stderr, unless nothing is to be said."""
+        if self.says:
+            say(f"foamfit: {told}", err=True)
 
 
 class ProgressLine(Progress):
@@ -48,6 +52,7 @@ class ProgressLine(Progress):
     """
 
     def __init__(self, stream: TextIO, name: str, limit: float | None = None) -> None:
+        super().__init__()
         self.stream, self.name, self.limit = stream, name, limit
         self.began = time.monotonic()
         self.fraction, self.what, self.scope = 0.0, "", ""
@@ -169,10 +174,15 @@ def duration(seconds: float) -> str:
 
 
 @contextmanager
-def progress_line(quiet: bool, name: str, limit: float | None = None) -> Iterator[Progress]:
-    """Give a line on stderr that shows progress; nothing is shown where that is no terminal."""
+def progress_line(
+    quiet: bool, name: str, limit: float | None = None, *, says: bool = True
+) -> Iterator[Progress]:
+    """Give a line on stderr that shows progress; nothing is shown where that is no terminal.
+
+    `says` is whether sentences are printed where there is no line.
+    """
     if quiet or sys.stderr is None or not sys.stderr.isatty():
-        yield Progress()
+        yield Progress(says)
         return
     line = ProgressLine(sys.stderr, name, limit)
     try:

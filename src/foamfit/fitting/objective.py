@@ -228,6 +228,11 @@ class Objective:
         except SimulationError:
             self.failures += 1
             raise
+        except SystemError as error:
+            # A signal that comes while a compiled loop hands over its result: Ctrl-C, not a defect.
+            if error.__cause__ is None or isinstance(error.__cause__, Exception):
+                raise
+            raise error.__cause__ from None
         if not self.time_shift:
             return springs
         return self.shifted(springs, float(values[count]), places == count)

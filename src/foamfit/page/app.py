@@ -6,62 +6,62 @@ for and shown. All that comes from a file is shown as text.
 
 from __future__ import annotations
 
+import base64
 import html
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import panel as pn
-from bokeh.models import ColumnDataSource, Range1d
-from bokeh.plotting import figure
 
 from foamfit.errors import InputError, SimulationError
-from foamfit.one_model import Options
+from foamfit.page.curves import Curves, grid, misfits_text
 from foamfit.page.desk import BUSY, LARGEST, QUANTITIES, Checked, Desk, Excerpt
-from foamfit.page.turning import PANELS, Row, Turning
-from foamfit.page.widgets import TEMPLATES, Sliders, Upload, message
-from foamfit.report.figures import GREY, VERMILION
+from foamfit.page.fields import RELAXATIONS, Field
+from foamfit.page.first_use import FirstUse
+from foamfit.page.turning import Turning
+from foamfit.page.widgets import TEMPLATES, Upload, message
+from foamfit.page.worker import News, parsed
 from foamfit.report.folder import load_result
-from foamfit.report.readable import readable_unit
-from foamfit.report.summary import CURVES
 from foamfit.results import law_in_words
-from foamfit.solve.precompile import at_first_use
 from foamfit.springs.published import published
-from foamfit.text import percent
 
 # Where a checkout of the repository may be: the working directory, or around an editable package.
 CHECKOUTS = (Path(), Path(__file__).parents[3])
 MODELS = ("auto", "bistable", "linear+bistable", "bistable+bistable", "microscale",
           "linear+microscale", "unilateral+bistable")  # fmt: skip
-OWN = "as the test allows"  # drive
+# Options of the command that are folded away; fixed and varied parameters have ticks.
+FOLDED = ("starts", "max_time", "seed", "loss", "interior_mass", "time_shift", "profile",
+          "bootstrap", "mcmc")  # fmt: skip
+ENDED = '<p role="status">The fit has ended: see <a href="#h-result">its result</a>.</p>'
 POLL = 200  # ms
-MOST_DRAWN, MOST_MARKERS = 400, 150  # points of a curve, of a measured one
-# One thing at a time, for all windows.
-BESIDE = ThreadPoolExecutor(1, thread_name_prefix="foamfit-page")
-NOTHING = np.empty(0), np.empty(0)
-AXES = {  # of each panel: x and y, with the SI units of both
-    "stress_time": (("time", "s"), ("stress", "Pa")),
-    "displacement_time": (("time", "s"), ("displacement", "m")),
-    "stress_strain": (("strain", ""), ("stress", "Pa")),
-}
+# For all windows one test is read at a time, and the curves of one are prepared.
+READING, PREPARING = (
+    ThreadPoolExecutor(1, thread_name_prefix=f"foamfit-{name}") for name in ("reading", "preparing")
+)
+COMPILING = (
+    "The solver is being compiled, once after installation, in half a minute or, where the "
+    "machine is busy, a whole one. Meanwhile a test can be dropped and its specimen filled in."
+)
 TEXT = """
   :host { font: 1rem/1.5 system-ui, sans-serif; color: #1d2327; }
   p { margin: .3rem 0; overflow-wrap: anywhere; } pre { margin: 0; overflow-x: auto;
     font: .8rem/1.45 ui-monospace, Menlo, Consolas, monospace; white-space: pre; }
   .error { border-left: 4px solid #b3261e; background: #fdeeed; padding: .5rem .8rem; }
   .soft { color: #4f5960; } iframe { width: 100%; height: 85vh; border: 1px solid #dfe3e6; }
-  .wide { overflow-x: auto; }
+  .wide { overflow-x: auto; } img { max-width: 100%; height: auto; }
   table { border-collapse: collapse; font-size: .84rem; margin: .6rem 0; }
   th, td { border: 1px solid #aab2b8; padding: .1rem .5rem; text-align: left; white-space: pre; }
   th { background: #f5f7f8; } td.wrong { background: #f9dbd3; outline: 2px solid #85280a; }
   progress { width: 100%; height: .8rem; accent-color: #0072B2; }
 """
 FIELD = """
-  :host { width: 100%; color: #1d2327; } label { color: #1d2327; font-size: .9rem; }
+  :host { width: 100%; color: #1d2327; font-size: .9rem; --font-size: .9rem; }
+  label { color: #1d2327; font-size: .9rem; white-space: normal; line-height: 1.3; }
   .bk-input { color: #1d2327; border: 1px solid #6f7a81; font-size: .95rem; }
   .bk-input::placeholder { color: #667078; }
   .bk-input:focus-visible, .bk-btn:focus-visible { outline: 3px solid #0072B2;
@@ -78,19 +78,6 @@ def text_pane() -> pn.pane.HTML:
     return pn.pane.HTML("", stylesheets=[TEXT], sizing_mode="stretch_width", margin=(4, 0))
 
 
-def grid(parts: list[Any], width: float) -> pn.Column:
-    """Put parts side by side, none narrower than so many rem; hidden at first.
-
-    What is hidden is the column around it: a part that says itself how it is laid out stays.
-    """
-    style = (
-        ":host { display: grid; gap: .4rem; "
-        f"grid-template-columns: repeat(auto-fit, minmax(min(100%, {width}rem), 1fr)); }}"
-    )
-    wide: dict[str, Any] = {"sizing_mode": "stretch_width", "margin": 0}
-    return pn.Column(pn.Column(*parts, stylesheets=[style], **wide), visible=False, **wide)
-
-
 def paragraph(text: str, kind: str = "") -> str:
     """Write a text, whatever is in it, as a paragraph."""
     role = ' role="alert"' if kind == "error" else ""
@@ -101,13 +88,14 @@ class Window:
     """The page in one window of a browser; it shares nothing with another one."""
 
     def __init__(
-        self, desk: Desk, address: str, test: Path | None, gone: Callable[[], None]
-    ) -> None:
+        self, desk: Desk, address: str, test: Path | None, first_use: FirstUse,
+        gone: Callable[[], None],
+    ) -> None:  # fmt: skip
         self.desk = desk
-        self.turning: Turning | None = None
-        self.rows: dict[str, Row] = {}
+        self.curves = Curves()
         self._shown: object = None
-        self._filling, self._asked = False, 0
+        self._filling = False
+        self._asked = {READING: 0, PREPARING: 0}
         self._inputs(address)
         self._outputs()
         self._react()
@@ -116,17 +104,23 @@ class Window:
         parts = {
             "test": pn.Column(self.upload, self.chosen, *self.quantities.values(), self.rest,
                               self.check, self.problem, **wide),
-            "model": pn.Column(self.model, self.drive, self.relaxation, self.starts, self.max_time,
-                               self.seed, self.run, self.stop, self.progress, **wide),
-            "curves": pn.Column(self.panels, self.misfit, self.sliders, self.back, **wide),
+            "model": pn.Column(*(self.options[name].widget for name in self.options
+                                 if name not in FOLDED), **wide),
+            "more": pn.Column(*(self.options[name].widget for name in FOLDED), **wide),
+            "run": pn.Column(self.run, self.stop, self.progress, **wide),
+            "curves": pn.Column(self.compiling, self.misfit, self.curves.view, self.back, **wide),
             "understood": pn.Column(self.understood, **wide),
-            "result": pn.Column(self.ending, self.saves, self.beside, self.comparison,
-                                self.report, **wide),
+            "result": pn.Column(self.saves, self.ending, self.report_of, self.beside,
+                                self.comparison, self.report, **wide),
         }  # fmt: skip
         for name, part in parts.items():
             self.template.add_panel(name, part)
+        self.first_use = first_use
+        self._allow()
+        self._await()
         self._poll = pn.state.add_periodic_callback(self._follow, POLL, start=False)
         pn.state.on_session_destroyed(lambda _: gone())
+        pn.state.onload(send_at_once)
         if test is not None:
             pn.state.onload(partial(self._take, test))
 
@@ -153,25 +147,26 @@ class Window:
             placeholder='[columns]\nforce = { column = "Load", unit = "kN" }', **style,
         )  # fmt: skip
         self.check = button(name="Check the test", **style)
-        self.model = select(name="Model, springs from the base up", options=[*MODELS],
-                            value="bistable", **style)  # fmt: skip
-        self.drive = select(name="Drive", options=[OWN, "impact", "stress", "displacement"],
-                            **style)  # fmt: skip
-        self.relaxation = select(name="Relaxation terms", options=[0, 1, 2, 3], **style)
-        self.starts = text(name="Starts of the search", placeholder="16 for each spring", **style)
-        self.max_time = text(name="Longest time, s", placeholder="no limit", **style)
-        self.seed = text(name="Seed", value="0", **style)
+        lists = {"model": [*MODELS], "relaxation": [*range(RELAXATIONS)]}
+        self.options = {
+            name: Field(name, lists.get(name), **style)
+            for name in ("model", "drive", "relaxation", "cycle", *FOLDED)
+        }
+        self.model, self.relaxation = (self.options[n].widget for n in ("model", "relaxation"))
+        self.cycle = self.options["cycle"].widget
+        self.cycle.visible = False
         self.run = button(name="Fit", button_type="primary", disabled=True, **style)
         self.stop = button(name="Stop, and keep the best", button_type="danger", visible=False,
                            **style)  # fmt: skip
-        self.sliders = Sliders(sizing_mode="stretch_width", margin=(6, 0))
         self.back = button(name="Back to the fit", visible=False, **style)
+        self.report_of = select(name="Report and curves of cycle", options=[0], visible=False,
+                                **style)  # fmt: skip
         self.beside = select(name="Compare with a published set", options=["", *published],
                              visible=False, **style)  # fmt: skip
         self.saves = grid(
             [
                 self._save("Save the result folder", "result.zip", lambda: self.desk.zipped()),
-                self._save("Save the report", "report.html", partial(self._file, "report.html")),
+                self._save("Save the report", "report.html", lambda: self._report().encode()),
                 self._save("Save the TOML", "test.toml", lambda: self.desk.toml),
             ],
             11.0,
@@ -183,77 +178,63 @@ class Window:
             auto=True, stylesheets=[FIELD], margin=(3, 0), sizing_mode="stretch_width",
         )  # fmt: skip
 
-    def _file(self, name: str) -> bytes:
-        assert self.desk.result is not None  # what saves it is hidden until then
-        return (self.desk.result / name).read_bytes()
+    def _report(self) -> str:
+        """The report of the fit, or of the cycle that is chosen."""
+        return (self.desk.fits[self.report_of.value] / "report.html").read_text(encoding="utf-8")
 
     def _outputs(self) -> None:
-        self.problem, self.progress = text_pane(), text_pane()
+        self.problem, self.progress, self.compiling = text_pane(), text_pane(), text_pane()
         self.understood, self.ending = text_pane(), text_pane()
         self.misfit, self.comparison, self.report = text_pane(), text_pane(), text_pane()
         self.understood.object = paragraph("There is no test yet.", "soft")
         self.ending.object = paragraph("There is no fit yet.", "soft")
-        self.measured = {name: ColumnDataSource({"x": [], "y": []}) for name in PANELS}
-        # One source for all panels: one message for a move.
-        self.turned = ColumnDataSource({f"{name}_{axis}": [] for name in PANELS for axis in "xy"})
-        self.scales: dict[str, tuple[float, float]] = {}
-        self.figures = {name: self._figure(name) for name in PANELS}
-        self.panels = grid(
-            [pn.pane.Bokeh(one, sizing_mode="stretch_width") for one in self.figures.values()], 14.5
-        )
-
-    def _figure(self, name: str) -> Any:
-        made = figure(
-            height=270, sizing_mode="stretch_width", title=CURVES[name], output_backend="canvas",
-            tools="pan,box_zoom,reset", toolbar_location="right",
-            x_range=Range1d(0.0, 1.0), y_range=Range1d(0.0, 1.0),
-        )  # fmt: skip
-        made.scatter("x", "y", source=self.measured[name], size=5, fill_color="white",
-                     line_color=GREY, legend_label="measured")  # fmt: skip
-        made.line(
-            f"{name}_x", f"{name}_y", source=self.turned, color=VERMILION, width=2,
-            legend_label="springs",
-        )  # fmt: skip
-        made.legend.background_fill_alpha = 0.7
-        made.legend.location = "center" if name == "displacement_time" else "top_right"
-        if name == "stress_strain":
-            made.legend.location = "top_left"
-        made.legend.padding = made.legend.margin = 3
-        made.legend.label_text_font_size = "8.5pt"
-        made.toolbar.logo = None
-        made.toolbar.autohide = True
-        return made
 
     def _react(self) -> None:
         self.upload.on_msg(self._received)
-        self.sliders.on_msg(self._moved)
         self.chosen.param.watch(self._choose, "value")
         self.check.on_click(self._check)
         self.run.on_click(self._run)
         self.stop.on_click(self._stop)
         self.back.on_click(self._back)
         self.beside.param.watch(self._compare, "value")
-        for field in (*self.quantities.values(), self.rest):
+        self.report_of.param.watch(self._back, "value")
+        for field in (*self.quantities.values(), self.rest, self.cycle):
             field.param.watch(self._edited, "value")
-        for field in (self.model, self.drive, self.relaxation):
-            field.param.watch(self._model_chosen, "value")
+        for name in ("model", "drive", "relaxation", "interior_mass", "time_shift"):
+            self.options[name].widget.param.watch(self._model_chosen, "value")
 
     # ------------------------------------------------------------------------------- beside
 
-    def _beside(self, work: Callable[[], Any], then: Callable[[Any], None]) -> None:
+    def _await(self) -> None:
+        """Draw and allow again what waits for the solver to be compiled, when a part of it is."""
+        document = pn.state.curdoc
+        for part in self.first_use.parts:
+            if not part.done():
+                part.add_done_callback(lambda _: document.add_next_tick_callback(self._allow))
+
+    def _allow(self) -> None:
+        """Let a fit be begun where there is something to fit, and none is running."""
+        compiled = self.first_use.needed(self.model.value, self.relaxation.value).done()
+        self.compiling.object = "" if compiled else busy(COMPILING)
+        ready = self.desk.measurement is not None and compiled
+        self.run.disabled = not ready or self.desk.running
+
+    def _beside(
+        self, pool: ThreadPoolExecutor, work: Callable[[], Any], then: Callable[[Any], None]
+    ) -> None:
         """Do what takes a while beside the server, then show it; what is asked for later wins.
 
         What is shown changes in a turn of the document only: threads know no lock of it.
         """
-        self._asked += 1
-        asked, document = self._asked, pn.state.curdoc
+        self._asked[pool] += 1
+        asked, document = self._asked[pool], pn.state.curdoc
 
         def done(found: Any) -> None:
-            if asked == self._asked:
+            if asked == self._asked[pool]:
                 then(found)
 
         def run() -> None:
-            if asked != self._asked:
+            if asked != self._asked[pool]:
                 return
             try:
                 found = work()
@@ -261,7 +242,7 @@ class Window:
                 found = error
             document.add_next_tick_callback(partial(done, found))
 
-        BESIDE.submit(run)
+        pool.submit(run)
 
     # ------------------------------------------------------------------------------- the test
 
@@ -291,15 +272,16 @@ class Window:
         except InputError as error:
             self.problem.object = paragraph(str(error), "error")
             return
+        self._filling = True  # one check after all of them
         if self.desk.worker is None:  # what is shown of a fit is of another test
             self._hide_result("There is no fit yet.")
+            self.curves.held, self.cycle.value = {}, ""
         if found is not None:
             quantities, rest = found
-            self._filling = True  # one check after all of them
             for name, field in self.quantities.items():
                 field.value = quantities.get(name, "")
             self.rest.value = rest
-            self._filling = False
+        self._filling = False
         self._check()
 
     def _edited(self, event: Any) -> None:
@@ -309,9 +291,10 @@ class Window:
     def _check(self, event: Any = None) -> None:
         """Check the test as it is filled in, and show what is understood or wrong."""
         given = {name: field.value or "" for name, field in self.quantities.items()}
-        rest = self.rest.value or ""
+        rest, cycle = self.rest.value or "", self.cycle.value or ""
         self.run.disabled = True
-        self._beside(lambda: self.desk.check(given, rest), self._show_checked)
+        self._asked[PREPARING] += 1  # what is being prepared is of the test as it was
+        self._beside(READING, lambda: self.desk.check(given, rest, cycle), self._show_checked)
 
     def _show_checked(self, checked: Checked | Exception) -> None:
         if isinstance(checked, Exception):
@@ -326,144 +309,80 @@ class Window:
             self.understood.object = shown + excerpt_html(checked.excerpt)
         else:
             self.understood.object = f'<pre tabindex="0">{html.escape(checked.text)}</pre>'
-        self.run.disabled = bool(checked.error) or self.desk.running
+        self._allow()
+        if self.desk.measurement is not None:
+            there = len(self.desk.measurement.cycles)
+            self.cycle.visible = there > 1
+            self.cycle.name = f"{self.options['cycle'].label} This record has {there}."
         self._model_chosen()
 
     # ------------------------------------------------------------------------------- the curves
 
     def _model_chosen(self, event: Any = None) -> None:
         """Put the model's parameters over the test, read off its loop."""
+        auto = self.model.value == "auto"
+        self._allow()
+        self.relaxation.disabled, self.curves.sliders.ticks = auto, not auto
         if self.desk.measurement is None:
             self._hide_curves()
             return
-        model = "bistable" if self.model.value == "auto" else self.model.value
-        self._turn_model(model, self.relaxation.value, self._drive())
-
-    def _drive(self) -> str | None:
-        return None if self.drive.value == OWN else str(self.drive.value)
+        try:
+            asked = parsed(self._arguments(ticked=False))
+        except InputError:  # said when it is fitted
+            asked = parsed([])
+        model = "bistable" if auto else self.model.value
+        self._turn_model(model, self.desk.measurement.cycle, **keywords(asked))
 
     def _hide_curves(self, why: str = "") -> None:
-        self.sliders.tell("")
-        self.turning, self.rows, self.sliders.rows = None, {}, []
-        self.panels.visible = False
+        self.curves.hide()
         self.misfit.object = paragraph(why, "error") if why else ""
 
     def _turn_model(
-        self, model: str, relaxation: int, drive: str | None,
-        values: Mapping[str, float] | None = None,
-    ) -> None:  # fmt: skip
+        self, model: str, cycle: int, values: Mapping[str, float] | None = None, **options: Any
+    ) -> None:
         """Put other sliders under the curves; they begin at these values, or read off the loop."""
-        measurement = self.desk.measurement
-        assert measurement is not None
 
         def make() -> Turning:
-            with at_first_use(model, relaxation, lambda: None) as compile_rest:
-                compile_rest()
-            made = Turning(measurement, model, relaxation, drive, values)
+            self.first_use.needed(model, options["relaxation"]).result()
+            made = Turning(self.desk.measured(cycle), model, values, **options)
             made.turn({})  # loads what is compiled
             return made
 
-        if self.turning is None:
-            self.misfit.object = paragraph(
-                "Preparing the curves; right after installation the solver is compiled, once.",
-                "soft",
-            )
-        self._beside(make, self._show_turning)
+        what = f"Preparing the curves of {law_in_words(model, options['relaxation'])} …"
+        if self.curves.turning is None and not self.compiling.object:
+            self.misfit.object = busy(what)
+        else:
+            self.curves.sliders.tell(what)
+        self._beside(PREPARING, make, self._show_turning)
 
     def _show_turning(self, made: Turning | Exception) -> None:
         if isinstance(made, Exception):
             known = isinstance(made, InputError | SimulationError)
             self._hide_curves(str(made) if known else defect(made))
             return
-        self.turning = made
-        self.rows = {row.name: row for row in made.rows}
-        self._show_measured()
         self.misfit.object = ""
-        self.sliders.rows = [vars(row) for row in made.rows]
-        self._draw({})
-
-    def _show_measured(self) -> None:
-        assert self.turning is not None
-        for name, made in self.figures.items():
-            there = self.turning.measured.get(name)
-            made.visible = there is not None
-            if there is None:
-                continue
-            (x_name, x_si), (y_name, y_si) = AXES[name]
-            fx, x_unit = readable_unit(float(abs(there[0]).max()), x_si)
-            fy, y_unit = readable_unit(float(abs(there[1]).max()), y_si)
-            self.scales[name] = fx, fy
-            made.xaxis.axis_label = f"{x_name} ({x_unit})" if x_unit else x_name
-            made.yaxis.axis_label = f"{y_name} ({y_unit})"
-            some = slice(None, None, max(len(there[0]) // MOST_MARKERS, 1))
-            x, y = there[0] / fx, there[1] / fy
-            self.measured[name].data = {"x": x[some], "y": y[some]}
-            # They stay while parameters are turned: what moves is the curve alone.
-            for limits, values, beyond in ((made.x_range, x, 0.04), (made.y_range, y, 0.15)):
-                more = beyond * float(np.ptp(values))
-                limits.update(
-                    start=float(values.min()) - more, end=float(values.max()) + more,
-                    reset_start=float(values.min()) - more, reset_end=float(values.max()) + more,
-                )  # fmt: skip
-        self.panels.visible = True
-
-    def _moved(self, event: Any) -> None:
-        """Draw the curves of the parameters that were moved."""
-        moves = message(event).get("moves")
-        moves = moves if isinstance(moves, dict) else {}
-        wanted = {
-            name: float(value) * self.rows[name].factor
-            for name, value in moves.items()
-            if name in self.rows and isinstance(value, int | float)
-        }
-        if self.turning is not None and wanted:
-            self._draw(wanted)
-        self.sliders.drawn()
-
-    def _draw(self, moves: Mapping[str, float]) -> None:
-        """Send the arrays of the curves alone; the figures stay as they are."""
-        assert self.turning is not None
-        drawn = self.turning.turn(moves)
-        data = dict[str, Any]()
-        for name in PANELS:
-            x, y = drawn.curves.get(name, NOTHING)
-            fx, fy = self.scales.get(name, (1.0, 1.0))
-            some = slice(None, None, max(len(x) // MOST_DRAWN, 1))
-            data |= {f"{name}_x": x[some] / fx, f"{name}_y": y[some] / fy}
-        longest = max(map(len, data.values()), default=0)
-        self.turned.data = {
-            name: np.pad(one, (0, longest - len(one)), constant_values=np.nan)
-            for name, one in data.items()
-        }
-        told = f"{self.turning.law}, {self.turning.drive} drive: "
-        told += f"misfit {misfits_text(drawn.misfit)}"
-        used, shown = self.turning.samples
-        told += f"; {shown} of {used} samples are drawn" if shown < used else ""
-        self.sliders.tell(drawn.error or told, wrong=bool(drawn.error))
+        self.curves.show(made)
 
     # ------------------------------------------------------------------------------- the fit
 
-    def _options(self) -> dict[str, Any]:
-        """Return the keywords of `foamfit.fit` that are filled in; InputError names a wrong one."""
-        given: dict[str, Any] = {"drive": self._drive()}
-        for field, key, kind in (
-            (self.seed, "seed", int), (self.starts, "starts", int),
-            (self.max_time, "max_time", float),
-        ):  # fmt: skip
-            text = (field.value or "").strip()
-            try:
-                given |= {key: kind(text)} if text else {}
-            except ValueError:
-                wanted = "a whole number" if kind is int else "a number of seconds"
-                raise InputError(f"{field.name} = {text!r} must be {wanted}.") from None
-        if self.model.value != "auto":
-            given["relaxation"] = self.relaxation.value
-        Options(**given)
-        return given
+    def _arguments(self, ticked: bool = True) -> list[str]:
+        """Return the arguments of `foamfit fit` that ask for what is filled in."""
+        auto = self.model.value == "auto"
+        hidden = {"relaxation": auto, "cycle": not self.cycle.visible}
+        given = [
+            argument for name, field in self.options.items() if not hidden.get(name)
+            for argument in field.arguments()
+        ]  # fmt: skip
+        if auto or not ticked:
+            return given
+        held, varied = self.curves.chosen()
+        given += [f"--fix={name}={value!r}" for name, value in held.items()]
+        return given + [f"--vary={name}" for name in varied]
 
     def _run(self, event: Any = None) -> None:
         try:
-            self.desk.fit(self.model.value, self._options())
+            arguments = self._arguments()
+            self.desk.fit(arguments)
         except InputError as error:
             self.progress.object = paragraph(str(error), "error")
             return
@@ -474,11 +393,12 @@ class Window:
 
     def _hold(self, held: bool) -> None:
         """Let nothing of the test be changed while it is fitted."""
-        for field in (*self.quantities.values(), self.rest, self.chosen, self.check):
+        for field in (*self.quantities.values(), self.rest, self.chosen, self.check, self.cycle):
             field.disabled = held
 
     def _hide_result(self, why: str) -> None:
         self.saves.visible = self.beside.visible = self.back.visible = False
+        self.report_of.visible = False
         self.report.object = self.comparison.object = ""
         self.ending.object = paragraph(why, "soft")
 
@@ -507,69 +427,104 @@ class Window:
             told += f"; best misfit {misfits_text(news.misfit)}"
         bar = f'<progress max="100" value="{share}" aria-label="progress of the fit"></progress>'
         self.progress.object = bar + paragraph(told)
-        self._show_best(news.model, news.relaxation, news.drive, news.values)
+        self._show_best(news)
 
-    def _show_best(
-        self, model: str, relaxation: int, drive: str, values: Mapping[str, float]
+    def _show_best(self, news: News) -> None:
+        """Draw the curves of the best so far, and put the sliders there."""
+        if not news.values or self.desk.measurement is None:
+            return
+        now = self.curves.turning
+        there = None if now is None else (now.law, now.drive, now.problem.measurement.cycle)
+        if there != (law_in_words(news.model, news.relaxation), news.drive, news.cycle):
+            self._turn_fitted(news.model, news.relaxation, news.drive, news.cycle, news.values)
+            return
+        self.curves.put(news.values)
+
+    def _turn_fitted(
+        self, model: str, relaxation: int, drive: str, cycle: int, values: Mapping[str, float]
     ) -> None:
-        """Draw the curves of a model at some parameters, and put the sliders there."""
-        if not values or self.desk.measurement is None:
-            return
-        now = self.turning
-        if now is None or (now.law, now.drive) != (law_in_words(model, relaxation), drive):
-            self._turn_model(model, relaxation, drive, values)
-            return
-        self._draw(values)
-        self.sliders.show(
-            {name: v / self.rows[name].factor for name, v in values.items() if name in self.rows}
-        )
+        """Put the curves of the fit there that was begun last, at these values."""
+        assert self.desk.worker is not None
+        assert self.desk.measurement is not None
+        options = keywords(parsed(self.desk.worker.job.arguments))
+        options |= {"relaxation": relaxation, "drive": drive}
+        self._turn_model(model, cycle or self.desk.measurement.cycle, values, **options)
 
     def _ended(self) -> None:
         """Show the result of the fit, or why there is none."""
-        self.run.disabled, self.stop.visible = self.desk.measurement is None, False
-        self.progress.object = ""
+        self._allow()
+        self.stop.visible = False
+        self.progress.object = ENDED
         self._hold(False)
         if self.desk.result is None:
             self.ending.object = paragraph(self.desk.ending(), "error")
             return
-        self.ending.object = ""
-        report = self._file("report.html").decode()
-        self.report.object = (
-            '<iframe sandbox="" title="Report of the fit: figures, parameters with their states, '
-            f'notes" srcdoc="{html.escape(report)}"></iframe>'
-        )
-        self.saves.visible = self.beside.visible = self.back.visible = True
-        self.beside.value = ""
+        told, picture = self.desk.told, self.desk.result / "cycles.png"
+        self.ending.object = paragraph(f"In a terminal: {self.desk.command}", "soft")
+        self.ending.object += f'<pre tabindex="0">{html.escape(told)}</pre>' if told else ""
+        if told and picture.is_file():
+            content = base64.b64encode(picture.read_bytes()).decode()
+            self.ending.object += (
+                '<img alt="Loops of the cycles, and their parameters by cycle" '
+                f'src="data:image/png;base64,{content}">'
+            )
+        fits = [*self.desk.fits]
+        self.saves.visible = True
+        self.beside.visible = self.back.visible = bool(fits)
+        self.report_of.visible, self.beside.value = len(fits) > 1, ""
+        if not fits:
+            return
+        self.report_of.param.update(options=fits, value=fits[0])
         self._back()
 
     def _back(self, event: Any = None) -> None:
-        """Put the sliders back to the fit."""
-        if self.desk.result is None:
+        """Show the report of the fit, and put the sliders back to it."""
+        if self.report_of.value not in self.desk.fits:
             return
-        fit = load_result(self.desk.result)
+        self.report.object = (
+            '<iframe sandbox="" title="Report of the fit: figures, parameters with their states, '
+            f'notes" srcdoc="{html.escape(self._report())}"></iframe>'
+        )
+        fit = load_result(self.desk.fits[self.report_of.value])
         values = {name: one["value"] for name, one in fit["parameters"].items()}
-        self._turn_model(fit["model"], fit["relaxation"], fit["drive"], values)
+        self._turn_fitted(
+            fit["model"], fit["relaxation"], fit["drive"], self.report_of.value, values
+        )
 
     def _compare(self, event: Any) -> None:
         if not event.new:
             self.comparison.object = ""
             return
         try:
-            text = self.desk.compared(event.new)
+            text = self.desk.compared(event.new, self.report_of.value)
             self.comparison.object = f'<pre tabindex="0">{html.escape(text)}</pre>'
         except InputError as error:
             self.comparison.object = paragraph(str(error), "error")
 
 
+def keywords(asked: Mapping[str, Any]) -> dict[str, Any]:
+    """Take from options of the command those on which the curves of a model hang."""
+    return {one: asked[one] for one in ("drive", "relaxation", "interior_mass", "time_shift")}
+
+
+def busy(text: str) -> str:
+    """Write what is being done, under a bar that moves."""
+    return f'<progress aria-label="busy"></progress>{paragraph(text, "soft")}'
+
+
+def send_at_once() -> None:
+    """Let no message of this window wait until the one before is acknowledged, 40 ms later.
+
+    A curve is several small ones. Bokeh has no public way to its sockets; without it they are late.
+    """
+    with suppress(AttributeError):
+        for connection in pn.state.curdoc.session_context.session._subscribed_connections:
+            connection._socket.set_nodelay(True)
+
+
 def defect(error: Exception) -> str:
     """Say that what happened should not."""
     return f"This is a defect of foamfit, please report it ({type(error).__name__}: {error})."
-
-
-def misfits_text(misfit: Mapping[str, float | None]) -> str:
-    """Name the misfits of the three panels that are there."""
-    shown = {CURVES[name]: misfit.get(name) for name in PANELS}
-    return ", ".join(f"{name} {percent(off)}" for name, off in shown.items() if off is not None)
 
 
 def excerpt_html(excerpt: Excerpt | None) -> str:

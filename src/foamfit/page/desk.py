@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import re
+import shlex
 import shutil
 import tomllib
 import unicodedata
@@ -17,13 +18,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from foamfit.cli.options import cycles_of
 from foamfit.data.csv_file import read_test
 from foamfit.data.csv_table import find_table, read_text
 from foamfit.data.describe import describe
 from foamfit.data.energy import audit
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError
-from foamfit.page.worker import Job, Worker
+from foamfit.page.worker import Job, Worker, parsed
 from foamfit.report.comparison import compare
 from foamfit.report.comparison_text import comparison_text
 from foamfit.text import listed
@@ -155,8 +157,11 @@ class Desk:
 
     # ------------------------------------------------------------------------------- the test
 
-    def check(self, quantities: Mapping[str, str], rest: str) -> Checked:
-        """Read the test as `foamfit check` does, and say what was understood or what is wrong."""
+    def check(self, quantities: Mapping[str, str], rest: str, cycle: str = "") -> Checked:
+        """Read the test as `foamfit check` does, and say what was understood or what is wrong.
+
+        `cycle` is as the command takes it; of several the first is read.
+        """
         if self.running:
             return Checked(error=BUSY)
         self.measurement = None
@@ -165,7 +170,8 @@ class Desk:
         toml = self.csv.with_suffix(".toml")
         try:
             toml.write_text(join_toml(quantities, rest), encoding="utf-8")
-            measurement = read_test(self.csv, toml)
+            alone, several = cycles_of(cycle.strip() or None)
+            measurement = read_test(self.csv, toml, several[0] if several else alone)
             # By its own name: the folder of the window means nothing to who reads it.
             text = describe(replace(measurement, path=Path(self.csv.name)), audit(measurement))
         except InputError as error:
@@ -173,10 +179,18 @@ class Desk:
             quantity = next((q.name for q in QUANTITIES if f"{q.name} " in told), "")
             if "[specimen] needs a diameter" in told:
                 quantity = "[specimen] diameter"
-            excerpt = None if quantity else excerpt_of(self.csv, told)
+            excerpt = excerpt_of(self.csv, told)
             return Checked(error=told, quantity=quantity, excerpt=excerpt)
         self.measurement = measurement
         return Checked(text)
+
+    def measured(self, cycle: int) -> Measurement:
+        """Return a cycle of the test that was checked last, or that its fit has read."""
+        assert self.csv is not None
+        assert self.measurement is not None
+        if cycle == self.measurement.cycle:
+            return self.measurement
+        return read_test(self.csv, self.csv.with_suffix(".toml"), cycle)
 
     @property
     def toml(self) -> bytes:
@@ -191,17 +205,18 @@ class Desk:
 
     # ------------------------------------------------------------------------------- the fit
 
-    def fit(self, model: str, options: dict[str, Any]) -> Worker:
-        """Begin a fit of the test as it was checked last."""
+    def fit(self, arguments: list[str]) -> Worker:
+        """Begin a fit of the test as it was checked last, with arguments of `foamfit fit`."""
         if self.csv is None or self.measurement is None:
             raise InputError("There is no test that can be read yet; see what is wrong with it.")
         if self.running:
             raise InputError(BUSY)
+        parsed(arguments)
         self._fits += 1
         folder = self.folder / f"fit-{self._fits}"
         toml = folder.with_suffix(".toml")  # as it is now, whatever is filled in later
         toml.write_bytes(self.toml)
-        job = Job(str(self.csv), str(toml), str(folder), model, options)
+        job = Job(str(self.csv), str(toml), str(folder), arguments)
         self.worker = Worker(job)
         return self.worker
 
@@ -217,26 +232,46 @@ class Desk:
             return None
         return Path(self.worker.job.folder)
 
+    @property
+    def fits(self) -> dict[int, Path]:
+        """The folders with a fit of the last result by the number of their cycle; 0 = the one."""
+        if self.result is None:
+            return {}
+        cycles = {int(one.name.split("-")[1]): one for one in self.result.glob("cycle-*")}
+        return dict(sorted(cycles.items())) or {0: self.result}
+
     def ending(self) -> str:
         """Say how the last fit ended, "" where it has a result."""
         assert self.worker is not None
         return self._plain(self.worker.ended or "")
+
+    @property
+    def command(self) -> str:
+        """What asks for the last fit in a terminal, where the TOML lies beside the file."""
+        assert self.csv is not None
+        assert self.worker is not None
+        return shlex.join(["foamfit", "fit", self.csv.name, *self.worker.job.arguments])
+
+    @property
+    def told(self) -> str:
+        """What the command prints of several cycles, "" of one fit."""
+        return "" if self.worker is None else self.worker.told
 
     def zipped(self) -> bytes:
         """The result folder as a ZIP, with the TOML of the test."""
         assert self.result is not None
         content = io.BytesIO()
         with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
-            for path in sorted(self.result.iterdir()):
-                archive.write(path, path.name)
+            for path in sorted(self.result.rglob("*")):
+                archive.write(path, path.relative_to(self.result))
             archive.write(self.result.with_suffix(".toml"), "test.toml")
         return content.getvalue()
 
-    def compared(self, published: str) -> str:
-        """The result beside a published set, as `foamfit compare` prints it."""
-        if self.result is None:
+    def compared(self, published: str, cycle: int = 0) -> str:
+        """A fit of the result beside a published set, as `foamfit compare` prints it."""
+        if cycle not in self.fits:
             raise InputError("There is no fit yet; run one to compare it.")
-        return self._plain(comparison_text(compare([self.result], published)))
+        return self._plain(comparison_text(compare([self.fits[cycle]], published)))
 
 
 def too_large(name: str) -> str:

@@ -8,6 +8,7 @@ and its path begins with a random token.
 from __future__ import annotations
 
 import asyncio
+import logging
 import secrets
 import shutil
 import signal
@@ -22,10 +23,13 @@ import tornado.httputil as httputil
 import tornado.routing as routing
 import tornado.web as web
 from panel.io.server import get_server
+from tornado.iostream import StreamClosedError
+from tornado.websocket import WebSocketClosedError
 
 from foamfit.errors import InputError
 from foamfit.page.app import Window
 from foamfit.page.desk import LARGEST, Desk, too_large
+from foamfit.page.first_use import FirstUse
 from foamfit.terminal import TerminatedError, say
 
 HOST = "127.0.0.1"
@@ -132,6 +136,7 @@ class Page:
         self.folder = Path(tempfile.mkdtemp(prefix="foamfit-page-"))  # for this user alone
         self.desks: dict[str, Desk] = {}
         self.test = test
+        self.first_use = FirstUse()
         self.server = get_server(
             {"/": self._window}, port=self.port, address=HOST, show=False, start=False,
             title={"/": "foamfit"}, prefix=f"/{self.token}",
@@ -154,6 +159,7 @@ class Page:
         """End the server and all fits, and remove all files."""
         with suppress(RuntimeError, AssertionError):
             self.server.stop()
+        self.first_use.close()
         for desk in list(self.desks.values()):
             desk.close()
         shutil.rmtree(self.folder, ignore_errors=True)
@@ -167,7 +173,8 @@ class Page:
             self.desks.pop(name, None)
             desk.close()
 
-        return Window(desk, f"/{self.token}/receive/{name}", self.test, gone).template
+        address = f"/{self.token}/receive/{name}"
+        return Window(desk, address, self.test, self.first_use, gone).template
 
 
 def serve(test: Path | None, port: int, browser: bool) -> None:
@@ -178,6 +185,8 @@ def serve(test: Path | None, port: int, browser: bool) -> None:
         try:
             ending = asyncio.Event()
             loop = asyncio.get_running_loop()
+            loop.set_exception_handler(_pass_over_closed_windows)
+            logging.getLogger("bokeh.server.views.ws").setLevel(logging.ERROR)
             for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
                 loop.add_signal_handler(number, ending.set)
             say(page.address)
@@ -190,6 +199,12 @@ def serve(test: Path | None, port: int, browser: bool) -> None:
 
     with suppress(KeyboardInterrupt, TerminatedError):
         asyncio.run(run())
+
+
+def _pass_over_closed_windows(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Report what went wrong in a task, but that a window was closed while a curve was sent."""
+    if not isinstance(context.get("exception"), StreamClosedError | WebSocketClosedError):
+        loop.default_exception_handler(context)
 
 
 def _free_port(wanted: int) -> int:

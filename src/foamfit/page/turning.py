@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Unpack
 
 import numpy as np
 
@@ -14,10 +15,11 @@ from foamfit.data.measurement import Measurement
 from foamfit.errors import SimulationError
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import Tracker, curve_starts, rank, smooth_loop
-from foamfit.one_model import Options
+from foamfit.one_model import Keywords, Options
 from foamfit.report.readable import readable_unit
 from foamfit.results import law_in_words
 from foamfit.springs.parameters import split_name, unit_of
+from foamfit.springs.spring import BistableSpring
 
 MOST_SAMPLES = 1500  # of a curve that is drawn again at every move
 WIDE = 4.0  # times its value that a slider reaches
@@ -40,6 +42,7 @@ class Row:
     high: float
     least: float
     most: float
+    held: bool = False  # a fit does not vary it unless it is told to
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,7 @@ class Drawn:
     curves: dict[str, tuple[Array, Array]]
     misfit: dict[str, float | None]
     values: dict[str, float]
+    points: dict[str, tuple[float, float]] = field(default_factory=dict)  # strain, stress
     error: str = ""
 
 
@@ -56,15 +60,15 @@ class Turning:
     """A model over a test: its parameters, and its curves wherever they are turned to."""
 
     def __init__(
-        self, measurement: Measurement, model: str, relaxation: int = 0, drive: str | None = None,
-        values: Mapping[str, float] | None = None,
+        self, measurement: Measurement, model: str, values: Mapping[str, float] | None = None,
+        **options: Unpack[Keywords],
     ) -> None:  # fmt: skip
-        """Begin at these values (SI), or else at those read off the loop."""
+        """Begin at these values (SI), or else at those read off the loop; options as of a fit."""
         thin = thinned(measurement)
         self.samples = thin.rows.used, _size(thin)
-        self.problem: Problem = Options(drive=drive, relaxation=relaxation).problem(thin, model)
+        self.problem: Problem = Options(**options).problem(thin, model)
         self.values = self._guess() if not values else self._at(self.problem.vector(), values)
-        self.rows = [self._row(name) for name in self.problem.free()]
+        self.rows = [self._row(name) for name in self.problem.names if self._own(name)]
 
     @property
     def drive(self) -> str:
@@ -75,6 +79,18 @@ class Turning:
     def law(self) -> str:
         """The model and its relaxation in words."""
         return law_in_words(self.problem.model.name, self.problem.model.relaxation)
+
+    @property
+    def named(self) -> dict[str, float]:
+        """The values (SI) by their names."""
+        return dict(zip(self.problem.names, self.values.tolist(), strict=True))
+
+    def _own(self, name: str) -> bool:
+        """Whether a parameter can be turned: it does not follow from others or the specimen."""
+        given = self.problem.measurement.specimen.heights is not None
+        if given and split_name(name)[1] == "height":
+            return False
+        return self.problem.params[name].expr is None
 
     def _at(self, values: Array, moves: Mapping[str, float]) -> Array:
         """Put some values into a vector; what hangs on them by expressions follows."""
@@ -89,12 +105,27 @@ class Turning:
         """Turn some parameters (SI) and return the curves that follow."""
         problem = self.problem
         self.values = values = self._at(self.values, moves)
-        named = dict(zip(problem.names, values.tolist(), strict=True))
+        named = self.named
         try:
             simulated = problem.objective.simulate(values, everything=True)
         except SimulationError as error:
-            return Drawn({}, {}, named, self._why(error))
-        return Drawn(self._curves(simulated.curves), problem.objective.misfit(simulated), named)
+            return Drawn({}, {}, named, error=self._why(error))
+        curves, misfit = self._curves(simulated.curves), problem.objective.misfit(simulated)
+        return Drawn(curves, misfit, named, self._points())
+
+    def _points(self) -> dict[str, tuple[float, float]]:
+        """Where the branches of a single bistable spring meet, by the names of the paper."""
+        model = self.problem.model
+        if model.kinds != ("bistable",) or model.relaxation:
+            return {}
+        spring = model.springs(self.values[: len(model.names)])[0]
+        assert isinstance(spring, BistableSpring)
+        ends = {
+            "A1": (spring.eps_a, spring.sigma_a), "C1": (spring.eps_hat_c, spring.sigma_hat_c),
+            "C2": (spring.eps_c, spring.sigma_c), "A2": (spring.eps_hat_a, spring.sigma_hat_a),
+        }  # fmt: skip
+        # A2 is missing where the branches e and a do not meet.
+        return {n: (x, y) for n, (x, y) in ends.items() if x is not None and y is not None}
 
     @cached_property
     def measured(self) -> dict[str, tuple[Array, Array]]:
@@ -163,7 +194,7 @@ class Turning:
         low, high = max(low, parameter.min), min(high, parameter.max)
         return Row(
             name, shown, factor, value / factor, low / factor, high / factor,
-            parameter.min / factor, parameter.max / factor,
+            parameter.min / factor, parameter.max / factor, held=not parameter.vary,
         )  # fmt: skip
 
 

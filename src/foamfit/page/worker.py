@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from foamfit.cli.progress import Progress
 from foamfit.errors import InputError, SimulationError
 
 if TYPE_CHECKING:
@@ -27,18 +28,18 @@ if TYPE_CHECKING:
 
 PACKAGE = Path(__file__).parent.parent
 OFTEN = 0.2  # s between two lines of a fit
+COMPILING = "compiling the solver, once after installation"
 STOPPED_EARLY = "The fit was stopped before anything was found; start it again."
 
 
 @dataclass(frozen=True)
 class Job:
-    """What is to be fitted and how: the keywords of `foamfit.fit`, and where the result goes."""
+    """What is to be fitted, where the result goes, and the arguments of `foamfit fit`."""
 
     csv: str
     toml: str
     folder: str
-    model: str
-    options: dict[str, Any] = field(default_factory=dict)
+    arguments: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -50,8 +51,23 @@ class News:
     model: str = ""
     relaxation: int = 0
     drive: str = ""
+    cycle: int = 1
     values: dict[str, float] = field(default_factory=dict)
     misfit: dict[str, float | None] = field(default_factory=dict)
+
+
+def with_package() -> dict[str, str]:
+    """The environment of a process that is to find this very package."""
+    paths = f"{PACKAGE.parent}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
+    return os.environ | {"PYTHONPATH": paths.rstrip(os.pathsep)}
+
+
+def end_all(process: subprocess.Popen[Any]) -> None:
+    """End a process that leads a session at once, and what it has begun to compile in."""
+    if process.poll() is None:
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
 
 
 class Worker:
@@ -61,13 +77,13 @@ class Worker:
         self.job, self.news = job, News()
         self.began = time.monotonic()
         self.stopping = False
+        self.told = ""  # what the command prints of several cycles
         self._done: str | None = None  # the sentence with which it ended, "" where all is well
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  (closed when the process ends)
-        paths = f"{PACKAGE.parent}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
         self._process = subprocess.Popen(
             [sys.executable, "-m", "foamfit.page.worker"],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors, text=True,
-            encoding="utf-8", env=os.environ | {"PYTHONPATH": paths.rstrip(os.pathsep)},
+            encoding="utf-8", env=with_package(),
             start_new_session=True,  # Ctrl-C in the terminal of the page is not for this one
         )  # fmt: skip
         assert self._process.stdin is not None
@@ -94,10 +110,7 @@ class Worker:
 
     def kill(self) -> None:
         """End the process at once."""
-        if self._process.poll() is None:
-            with contextlib.suppress(ProcessLookupError, PermissionError):
-                os.killpg(self._process.pid, signal.SIGKILL)  # what it compiles in, too
-        self._process.wait()
+        end_all(self._process)
 
     def _listen(self) -> None:
         """Read what the process tells until it ends."""
@@ -109,7 +122,7 @@ class Worker:
             except ValueError:  # what some library has printed, or half a line of one that died
                 continue
             if "ended" in told:
-                done = told["ended"]
+                done, self.told = told["ended"], told.get("told", "")
             else:
                 self.news = News(**told)
         code = self._process.wait()
@@ -122,9 +135,10 @@ class Worker:
         """Say how a process ended that has not said it itself."""
         self._errors.seek(0)
         lines = self._errors.read().decode(errors="replace").strip().splitlines()
-        if self.stopping:
+        last = lines[-1].strip() if lines else ""
+        if self.stopping and (code == -signal.SIGINT or last == "KeyboardInterrupt"):
             return STOPPED_EARLY
-        last = f" ({lines[-1].strip()})" if lines else ""
+        last = f" ({last})" if last else ""
         how = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
         return f"The process of the fit has died {how}{last}; start the fit again."
 
@@ -132,10 +146,12 @@ class Worker:
 # --------------------------------------------------------------------- in the process of the fit
 
 
-class _Teller:
+class _Teller(Progress):
     """What the page is told of a fit, a few times a second."""
 
     def __init__(self) -> None:
+        super().__init__(says=False)
+        self.watch = self._watch
         self.told: dict[str, Any] = {}
         self._best: tuple[Problem, Array] | None = None
         self._last = 0.0
@@ -145,14 +161,18 @@ class _Teller:
         self.told |= {"fraction": fraction, "what": what}
         self._tell()
 
-    def watch(self, problem: Problem, values: Array) -> None:
+    def _watch(self, problem: Problem, values: Array) -> None:
         """Take the best point so far."""
         self._best = problem, values
         self._tell()
 
-    def finish(self, what: str) -> None:
+    def compiling(self) -> None:
+        """Tell that the solver is compiled first."""
+        self.finish(COMPILING, 0.0)
+
+    def finish(self, what: str, fraction: float = 1.0) -> None:
         """Tell the last of what was found, and what comes after it."""
-        self.told |= {"fraction": 1.0, "what": what}
+        self.told |= {"fraction": fraction, "what": what}
         self._last = 0.0
         self._tell()
 
@@ -176,6 +196,7 @@ def _standing(problem: Problem, values: Array) -> dict[str, Any]:
         "model": problem.model.name,
         "relaxation": problem.model.relaxation,
         "drive": problem.objective.drive,
+        "cycle": problem.measurement.cycle,
         "values": dict(zip(problem.names, values.tolist(), strict=True)),
         "misfit": misfit,
     }
@@ -185,39 +206,57 @@ def _say(told: dict[str, Any]) -> None:
     print(json.dumps(told), flush=True)
 
 
-def _run(job: Job) -> str:
-    """Fit and write the result; returns "" or why there is none."""
+def parsed(arguments: list[str]) -> dict[str, Any]:
+    """Read arguments as `foamfit fit` does; InputError says which one is wrong."""
+    import click
+
+    from foamfit.cli.fit import fit as command
+
     try:
-        from foamfit import api
-        from foamfit.data.csv_file import read_test
+        context = command.make_context("fit", ["TEST.csv", *arguments])
+    except click.ClickException as error:
+        raise InputError(error.format_message()) from None
+    others = {"test", "specimen", "out", "as_json", "quiet", "verbose"}
+    return {name: value for name, value in context.params.items() if name not in others}
+
+
+def _run(job: Job) -> tuple[str, str]:
+    """Fit and write the result; returns "" or why there is none, and what is told of cycles."""
+    try:
+        from foamfit.cli.fit import fit_as_asked
+        from foamfit.report.studies.cycles import cycles_text
+        from foamfit.results import Fit
         from foamfit.solve.precompile import at_first_use
         from foamfit.terminal import without_ctrl_c
 
-        teller = _Teller()
-        relaxation = int(job.options.get("relaxation", 0))
-        with at_first_use(
-            job.model, relaxation, lambda: teller.progress(0.0, "compiling, once")
-        ) as compile_rest:
-            measurement = read_test(job.csv, job.toml)
-            compile_rest()
-            result = api.fit(
-                measurement, model=job.model, progress=teller.progress, watch=teller.watch,
-                **job.options,
-            )  # fmt: skip
+        teller, asked = _Teller(), parsed(job.arguments)
+        width = asked.pop("figure_width")
+        with at_first_use(asked["model"], asked["relaxation"], teller.compiling) as compile_rest:
+
+            def begin(_: float | None) -> contextlib.AbstractContextManager[Progress]:
+                compile_rest()
+                return contextlib.nullcontext(teller)
+
+            found = fit_as_asked(Path(job.csv), Path(job.toml), asked, begin)
         with without_ctrl_c():
             teller.finish("writing the report")
-            result.save(job.folder)
+            found.save(job.folder, figure_width=width)
+            told = "" if isinstance(found, Fit) else cycles_text(found)
     except (InputError, SimulationError) as error:
-        return str(error)
+        return str(error), ""
     except KeyboardInterrupt:
-        return STOPPED_EARLY
-    return ""
+        return STOPPED_EARLY, ""
+    return "", told
 
 
 def main() -> None:
     """Do the job that stands on stdin."""
+    from foamfit.terminal import ending_cleanly
+
     job = Job(**json.loads(sys.stdin.readline()))
-    _say({"ended": _run(job)})
+    with ending_cleanly():
+        ended, told = _run(job)
+    _say({"ended": ended, "told": told})
 
 
 if __name__ == "__main__":

@@ -53,6 +53,13 @@ export function render({ model, el }) {
         slider.setAttribute("aria-valuetext", `${digits(value)} ${row.unit}`);
         move(row.name, value);
       });
+      // As it is typed, for JupyterLab keeps Enter to itself; put right once it has been.
+      number.addEventListener("input", () => {
+        const value = number.valueAsNumber;
+        if (!(value >= row.least && value <= row.most)) return;
+        slider.value = place(row, value);
+        move(row.name, value);
+      });
       number.addEventListener("change", () => {
         const value = Math.min(Math.max(number.valueAsNumber, row.least), row.most);
         if (!Number.isFinite(value)) return;
@@ -60,7 +67,14 @@ export function render({ model, el }) {
         move(row.name, value);
       });
       inputs[row.name] = { row, slider, number };
-      line.append(label, slider, number, unit);
+      // Whether a fit holds it where it stands.
+      const held = document.createElement("label"), box = document.createElement("input");
+      held.className = "held";
+      Object.assign(box, { type: "checkbox", checked: row.held });
+      box.setAttribute("aria-label", `${row.name} fixed in the fit`);
+      box.addEventListener("change", () => model.send_msg({ held: { [row.name]: box.checked } }));
+      held.append(box, "fixed");
+      line.append(label, slider, number, unit, held);
       list.append(line);
     }
     show(Object.fromEntries(model.rows.map((row) => [row.name, row.value])));
@@ -69,7 +83,11 @@ export function render({ model, el }) {
     told.textContent = model.told;
     told.className = model.wrong ? "told error" : "told";
   }
+  function tick() {
+    list.className = model.ticks ? "list ticks" : "list";
+  }
   model.on("rows", build);
+  model.on("ticks", tick);
   model.on(["told", "wrong"], tell);
   model.on("msg:custom", (told) => {
     if (told.values) show(told.values);
@@ -77,4 +95,5 @@ export function render({ model, el }) {
   });
   build();
   tell();
+  tick();
 }

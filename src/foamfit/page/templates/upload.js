@@ -40,10 +40,19 @@ export function render({ model, el }) {
     if (received) model.send_msg({ received });
   }
   input.addEventListener("change", () => send(input.files));
+  // Anywhere on the page: beside the zone the browser would leave the page for the file.
+  const files = (e) => e.dataTransfer?.types.includes("Files");
   for (const kind of ["dragenter", "dragover"])
-    zone.addEventListener(kind, (e) => { e.preventDefault(); zone.classList.add("over"); });
-  zone.addEventListener("dragleave", () => zone.classList.remove("over"));
-  zone.addEventListener("drop", (e) => {
+    document.addEventListener(kind, (e) => {
+      if (!files(e)) return;
+      e.preventDefault();
+      zone.classList.add("over");
+    });
+  document.addEventListener("dragleave", (e) => {
+    if (!e.relatedTarget) zone.classList.remove("over");
+  });
+  document.addEventListener("drop", (e) => {
+    if (!files(e)) return;
     e.preventDefault();
     zone.classList.remove("over");
     send(e.dataTransfer.files);

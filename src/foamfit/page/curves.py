@@ -1,0 +1,223 @@
+"""The measured curves, those of springs over them, and a slider for each parameter.
+
+The page and the notebook `turn_the_parameters` show the same ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+import panel as pn
+from bokeh.core.properties import value
+from bokeh.models import Band, ColumnDataSource, LabelSet, Range1d
+from bokeh.plotting import figure
+
+from foamfit.page.turning import PANELS, Drawn, Row, Turning
+from foamfit.page.widgets import Sliders, message
+from foamfit.report.figures import GREY, VERMILION
+from foamfit.report.readable import readable_unit
+from foamfit.report.summary import CURVES
+from foamfit.text import percent
+
+MOST_DRAWN, MOST_MARKERS = 400, 150  # points of a curve, of a measured one
+LEGEND = (
+    '<p style="margin: 0; font: .9rem system-ui, sans-serif; color: #1d2327">'
+    f'<svg width="12" height="12" aria-hidden="true"><circle cx="6" cy="6" r="3" fill="white" '
+    f'stroke="{GREY}"/></svg> measured &ensp; <svg width="22" height="12" aria-hidden="true">'
+    f'<path d="M1 6H21" stroke="{VERMILION}" stroke-width="2"/></svg> springs</p>'
+)
+ASIDE = {"C1": -22}  # px from a point to its name, which is at the right edge
+NOTHING = np.empty(0), np.empty(0)
+AXES = {  # of each panel: x and y, with the SI units of both
+    "stress_time": (("time", "s"), ("stress", "Pa")),
+    "displacement_time": (("time", "s"), ("displacement", "m")),
+    "stress_strain": (("strain", ""), ("stress", "Pa")),
+}
+
+
+def grid(parts: list[Any], width: float) -> pn.Column:
+    """Put parts side by side, none narrower than so many rem; hidden at first.
+
+    What is hidden is the column around it: a part that says itself how it is laid out stays.
+    """
+    style = (
+        ":host { display: grid; gap: .4rem; "
+        f"grid-template-columns: repeat(auto-fit, minmax(min(100%, {width}rem), 1fr)); }}"
+    )
+    wide: dict[str, Any] = {"sizing_mode": "stretch_width", "margin": 0}
+    return pn.Column(pn.Column(*parts, stylesheets=[style], **wide), visible=False, **wide)
+
+
+class Curves:
+    """Panels and sliders of one test; `view` is what is shown of them."""
+
+    def __init__(self, turning: Turning | None = None) -> None:
+        self.turning: Turning | None = None
+        self.held: dict[str, bool] = {}  # what was ticked by hand: whether a fit holds it
+        self._rows: dict[str, Row] = {}
+        self._scales: dict[str, tuple[float, float]] = {}
+        self._measured = {name: ColumnDataSource({"x": [], "y": []}) for name in PANELS}
+        # One source for all panels: one message for a move.
+        self._turned = ColumnDataSource({f"{name}_{axis}": [] for name in PANELS for axis in "xy"})
+        self._points = ColumnDataSource({"x": [], "y": [], "name": [], "aside": []})
+        self._figures = {name: self._figure(name) for name in PANELS}
+        self.sliders = Sliders(sizing_mode="stretch_width", margin=(6, 0))
+        # With the lock of the document, which a message does not always come with.
+        self.sliders.on_msg(lambda event: pn.state.execute(partial(self._moved, event), True))
+        legend = pn.pane.HTML(LEGEND, sizing_mode="stretch_width", margin=0)
+        self._panels = grid(
+            [pn.pane.Bokeh(one, sizing_mode="stretch_width") for one in self._figures.values()],
+            14.5,
+        )
+        self._panels.insert(0, legend)  # of all panels: one of a figure's own is drawn each time
+        self.view = pn.Column(self._panels, self.sliders, sizing_mode="stretch_width", margin=0)
+        if turning is not None:
+            self.show(turning)
+
+    def show(self, turning: Turning) -> None:
+        """Put another model or test there, with sliders of its own."""
+        self.turning = turning
+        self._rows = {row.name: row for row in turning.rows}
+        self._show_measured()
+        self.sliders.rows = [
+            vars(row) | {"held": self.held.get(row.name, row.held)} for row in turning.rows
+        ]
+        self._draw({})
+
+    def put(self, values: Mapping[str, float]) -> None:
+        """Draw the springs at other values (SI), and move the sliders there."""
+        self._draw(values)
+        rows = self._rows
+        self.sliders.show({n: v / rows[n].factor for n, v in values.items() if n in rows})
+
+    def hide(self) -> None:
+        """Take everything away."""
+        self.sliders.tell("")
+        self.turning, self._rows, self.sliders.rows = None, {}, []
+        self._panels.visible = False
+
+    def chosen(self) -> tuple[dict[str, float], list[str]]:
+        """Return what a fit is to hold, with its values (SI), and what it is to vary.
+
+        Left out is what it holds at this value, or varies, by itself.
+        """
+        held, varied = dict[str, float](), list[str]()
+        if self.turning is None:
+            return held, varied
+        now, usual = self.turning.named, self.turning.problem.params
+        for name, row in self._rows.items():
+            if not self.held.get(name, row.held):
+                varied += [name] if row.held else []
+            elif not row.held or now[name] != usual[name].value:
+                held[name] = now[name]
+        return held, varied
+
+    def _figure(self, name: str) -> Any:
+        made = figure(
+            height=270, sizing_mode="stretch_width", title=CURVES[name], output_backend="canvas",
+            tools="pan,box_zoom,reset", toolbar_location="right",
+            x_range=Range1d(0.0, 1.0), y_range=Range1d(0.0, 1.0),
+        )  # fmt: skip
+        made.scatter("x", "y", source=self._measured[name], size=5, fill_color="white",
+                     line_color=GREY)  # fmt: skip
+        # What moves lies on a canvas of its own: axes and measured curves are not drawn again.
+        # Annotations are cut off there at the frame, glyphs are not; a band of no width is a line.
+        line = f"{name}_y"
+        made.add_layout(Band(
+            base=f"{name}_x", lower=line, upper=line, source=self._turned, level="overlay",
+            line_color=VERMILION, line_width=2, line_alpha=1.0, fill_alpha=0.0,
+        ))  # fmt: skip
+        if name == "stress_strain":
+            at: dict[str, Any] = {"x": "x", "y": "y", "source": self._points, "level": "overlay"}
+            made.add_layout(LabelSet(
+                text=value("\u25cf"), text_align="center", text_baseline="middle", **at
+            ))  # fmt: skip
+            made.add_layout(LabelSet(
+                text="name", x_offset="aside", y_offset=-15, text_font_size="9pt", **at
+            ))  # fmt: skip
+        made.toolbar.logo = None
+        made.toolbar.autohide = True
+        return made
+
+    def _show_measured(self) -> None:
+        assert self.turning is not None
+        for name, made in self._figures.items():
+            there = self.turning.measured.get(name)
+            made.visible = there is not None
+            if there is None:
+                continue
+            (x_name, x_si), (y_name, y_si) = AXES[name]
+            fx, x_unit = readable_unit(float(abs(there[0]).max()), x_si)
+            fy, y_unit = readable_unit(float(abs(there[1]).max()), y_si)
+            self._scales[name] = fx, fy
+            made.xaxis.axis_label = f"{x_name} ({x_unit})" if x_unit else x_name
+            made.yaxis.axis_label = f"{y_name} ({y_unit})"
+            some = slice(None, None, -(-len(there[0]) // MOST_MARKERS))
+            x, y = there[0] / fx, there[1] / fy
+            self._measured[name].data = {"x": x[some], "y": y[some]}
+            # They stay while parameters are turned: what moves is the curve alone.
+            for limits, values, beyond in ((made.x_range, x, 0.04), (made.y_range, y, 0.15)):
+                more = beyond * float(np.ptp(values))
+                limits.update(
+                    start=float(values.min()) - more, end=float(values.max()) + more,
+                    reset_start=float(values.min()) - more, reset_end=float(values.max()) + more,
+                )  # fmt: skip
+        self._panels.visible = True
+
+    def _moved(self, event: Any) -> None:
+        """Draw the curves of the parameters that were moved; note what was ticked."""
+        told = message(event)
+        moves, held = (
+            one if isinstance(one, dict) else {} for one in (told.get("moves"), told.get("held"))
+        )
+        self.held |= {name: bool(value) for name, value in held.items() if name in self._rows}
+        wanted = {
+            name: float(value) * self._rows[name].factor
+            for name, value in moves.items()
+            if name in self._rows and isinstance(value, int | float)
+        }
+        if self.turning is not None and wanted:
+            self._draw(wanted)
+        if moves:
+            self.sliders.drawn()
+
+    def _draw(self, moves: Mapping[str, float]) -> None:
+        """Send the arrays of the curves alone; the figures stay as they are."""
+        assert self.turning is not None
+        drawn = self.turning.turn(moves)
+        data = dict[str, Any]()
+        for name in PANELS:
+            x, y = drawn.curves.get(name, NOTHING)
+            fx, fy = self._scales.get(name, (1.0, 1.0))
+            some = slice(None, None, -(-len(x) // MOST_DRAWN) or 1)
+            data |= {f"{name}_x": x[some] / fx, f"{name}_y": y[some] / fy}
+        # Of one length, as a source has it, and no finer than pixels are.
+        sent = {name: np.full(max(map(len, data.values())), np.nan, np.float32) for name in data}
+        for name, values in data.items():
+            sent[name][: len(values)] = values
+        self._turned.data = sent
+        self._draw_points(drawn)
+        test = self.turning.problem.measurement
+        told = f"{self.turning.law}, {self.turning.drive} drive"
+        told += f", cycle {test.cycle}" if len(test.cycles) > 1 else ""
+        told += f": misfit {misfits_text(drawn.misfit)}"
+        used, shown = self.turning.samples
+        told += f"; {shown} of {used} samples are drawn" if shown < used else ""
+        self.sliders.tell(drawn.error or told, wrong=bool(drawn.error))
+
+    def _draw_points(self, drawn: Drawn) -> None:
+        fx, fy = self._scales.get("stress_strain", (1.0, 1.0))
+        x, y = np.array([*drawn.points.values()]).reshape(-1, 2).T
+        if len(x) or len(self._points.data["x"]):
+            names = [*drawn.points]
+            aside = [ASIDE.get(name, 6) for name in names]
+            self._points.data = {"x": x / fx, "y": y / fy, "name": names, "aside": aside}
+
+
+def misfits_text(misfit: Mapping[str, float | None]) -> str:
+    """Name the misfits of the three panels that are there."""
+    shown = {CURVES[name]: misfit.get(name) for name in PANELS}
+    return ", ".join(f"{name} {percent(off)}" for name, off in shown.items() if off is not None)

@@ -1,0 +1,40 @@
+"""A synthetic record of several cycles."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+import foamfit as ff
+
+HEIGHT, AREA = 10e-3, 1e-4
+FRESH = ff.BistableSpring(
+    k0=5.5e6, kc=20e6, dsigma=-0.3e6, eps_a=0.14, eps_c=0.27, kh_plus=2e6, kh_minus=2.2e6
+)
+# What changes from cycle to cycle, and nothing else: where snapping starts, and the start strain.
+ONSETS, SETS = (0.14, 0.11, 0.10), (0.0, 0.02, 0.03)
+
+
+def write_record(folder: Path) -> Path:
+    """Write a record of three cycles on a foam whose snapping starts earlier each time."""
+    springs = [replace(FRESH, eps_a=onset) for onset in ONSETS]
+    strain, stress = [], []
+    for spring, gone in zip(springs, SETS, strict=True):
+        up = np.linspace(0.0, 0.38, 150)
+        one = np.concatenate([up, up[::-1][1:-1]])
+        strain.append(one)
+        along = np.maximum(one - gone, 0.0)
+        pressed = spring.stress(along)
+        stress.append(np.where(one > gone, np.maximum(pressed, 0.0), 0.0))
+    strain, stress = (np.concatenate([*parts, [0.0]]) for parts in (strain, stress))
+    stress = stress + 500.0 * np.random.default_rng(0).standard_normal(stress.size)
+    path = folder / "synthetic.csv"
+    lines = ["time (s),stress (MPa),displacement (mm)"]
+    lines += [
+        f"{0.01 * i:.2f},{1e-6 * s:.6f},{1e3 * HEIGHT * e:.6f}"
+        for i, (e, s) in enumerate(zip(strain, stress, strict=True))
+    ]
+    path.write_text("\n".join(lines) + "\n")
+    toml = f'[specimen]\nheight = "{1e3 * HEIGHT} mm"\narea = "{1e6 * AREA} mm^2"\n'
+    path.with_suffix(".toml").write_text(toml)
+    return path
