@@ -1,4 +1,9 @@
-"""Errors raised by foamfit."""
+"""Errors raised by foamfit, and Ctrl-C as what it is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 
 class InputError(ValueError):
@@ -10,3 +15,17 @@ class InputError(ValueError):
 
 class SimulationError(RuntimeError):
     """A simulation cannot go on; the message says why. A simulation never returns NaN instead."""
+
+
+@contextmanager
+def as_signalled() -> Iterator[None]:
+    """Raise Ctrl-C, or the end by a signal, as itself.
+
+    Where it comes while a compiled loop hands over its result Python makes a SystemError of it.
+    """
+    try:
+        yield
+    except SystemError as error:
+        if error.__cause__ is None or isinstance(error.__cause__, Exception):
+            raise
+        raise error.__cause__ from None

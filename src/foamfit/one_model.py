@@ -16,7 +16,7 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
-from foamfit.errors import InputError, SimulationError
+from foamfit.errors import InputError, SimulationError, as_signalled
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.search import (
     REFINED,
@@ -180,11 +180,12 @@ def judge(
 ) -> tuple[Fit, BestPoint]:
     """Make the intervals (and ranges) that were chosen, and the result of the best point."""
     try:
-        best, record, intervals = found.best(), found.record, Intervals()
-        if record.stopped is None:
-            found.tracker.pulse = _pulse(found, best, choice, progress)
-            best, record, intervals = _assess(found, best, choice, announce)
-        return _finish(found, best, record, intervals)
+        with as_signalled():
+            best, record, intervals = found.best(), found.record, Intervals()
+            if record.stopped is None:
+                found.tracker.pulse = _pulse(found, best, choice, progress)
+                best, record, intervals = _assess(found, best, choice, announce)
+            return _finish(found, best, record, intervals)
     except KeyboardInterrupt:  # what was found is not given up for a late Ctrl-C
         record = replace(found.record, stopped="Ctrl-C")
         return _finish(found, found.best(), record, Intervals())

@@ -26,8 +26,9 @@ def drawn_here() -> dict[str, Images | None]:
 
 
 def test_other_processes_draw_the_same(drawn_here: dict[str, Images | None]) -> None:
-    with drawing_beside() as mapped:
-        assert dict(draw_all(fabricated.result(), mapped=mapped)) == drawn_here
+    with drawing_beside() as drawers:
+        drawers.begin()
+        assert dict(draw_all(fabricated.result(), mapped=drawers.map)) == drawn_here
     fit = drawn_here["fit"]
     assert fit is not None
     assert fit.png.startswith(b"\x89PNG")
@@ -44,14 +45,17 @@ def test_where_processes_end_this_one_draws(
 
     monkeypatch.setattr(foamfit.study.processes.Processes, "submit", ended)
     monkeypatch.setattr(foamfit.study.processes, "cores", lambda: 2)
-    with drawing_beside() as mapped:
-        assert dict(draw_all(fabricated.result(), mapped=mapped)) == drawn_here
+    with drawing_beside() as drawers:
+        drawers.begin()
+        assert dict(draw_all(fabricated.result(), mapped=drawers.map)) == drawn_here
 
 
 def test_one_core_draws_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(foamfit.study.processes, "cores", lambda: 1)
-    with drawing_beside() as mapped:
-        assert mapped is map
+    monkeypatch.delattr(foamfit.study.processes, "Processes")
+    with drawing_beside() as drawers:
+        drawers.begin()
+        assert list(drawers.map(str.upper, ["fit", "residuals"])) == ["FIT", "RESIDUALS"]
 
 
 def modules_after(code: str, *arguments: str) -> Iterator[str]:

@@ -95,7 +95,9 @@ def fit(
         from foamfit.results import Fit
 
         if not isinstance(found, Fit):
-            return _tell_cycles(found, folder, save, as_json, quiet)
+            code = _tell_cycles(found, folder, save, as_json, quiet)
+            open_if_asked(folder / "cycles.png")
+            return code
         try:
             save()
         except InputError:  # the numbers are not lost with the folder
@@ -187,7 +189,6 @@ def _tell_cycles(
             say(shown)
     if not quiet and not as_json:
         say(f"\nwritten to {folder}: open {folder / 'cycles.png'}")
-    open_if_asked(folder / "cycles.png")
     good = [n for n, one in found.results.items() if one.status != "failed"]
     if not good:
         say(f"foamfit: no acceptable fit of any cycle was found; see {folder}", err=True)

@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 
 import click
 
-from foamfit.errors import InputError, SimulationError
+from foamfit.errors import InputError, SimulationError, as_signalled
 from foamfit.terminal import TerminatedError, ending_cleanly, say, show_all
 
 # Exit codes: the input or the call is wrong; no acceptable fit; a defect (EX_SOFTWARE of
@@ -30,7 +30,7 @@ class _Group(click.Group):
         _spare_the_collector()
         show_all()
         try:
-            with ending_cleanly():
+            with ending_cleanly(), as_signalled():
                 code = super().main(*args, **kwargs)
                 say("", newline=False)  # what click has printed
         except click.ClickException as error:

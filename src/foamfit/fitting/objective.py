@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from foamfit.arrays import Array
 from foamfit.data.measurement import INTEGRATED, Measurement, NoiseLevel
 from foamfit.data.noise import with_noise
-from foamfit.errors import InputError, SimulationError
+from foamfit.errors import InputError, SimulationError, as_signalled
 from foamfit.fitting.curves import (
     CURVES,
     MOTION_CURVES,
@@ -224,15 +224,11 @@ class Objective:
         count = len(self.model.names)
         self.evaluations += 1
         try:
-            springs = self._springs(values[:count], everything, places[places < count])
+            with as_signalled():
+                springs = self._springs(values[:count], everything, places[places < count])
         except SimulationError:
             self.failures += 1
             raise
-        except SystemError as error:
-            # A signal that comes while a compiled loop hands over its result: Ctrl-C, not a defect.
-            if error.__cause__ is None or isinstance(error.__cause__, Exception):
-                raise
-            raise error.__cause__ from None
         if not self.time_shift:
             return springs
         return self.shifted(springs, float(values[count]), places == count)

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from foamfit.cli.progress import Progress
-from foamfit.errors import InputError, SimulationError
+from foamfit.errors import InputError, SimulationError, as_signalled
 
 if TYPE_CHECKING:
     from foamfit.arrays import Array
@@ -237,7 +237,8 @@ def _run(job: Job) -> tuple[str, str]:
                 compile_rest()
                 return contextlib.nullcontext(teller)
 
-            found = fit_as_asked(Path(job.csv), Path(job.toml), asked, begin)
+            with as_signalled():
+                found = fit_as_asked(Path(job.csv), Path(job.toml), asked, begin)
         with without_ctrl_c():
             teller.finish("writing the report")
             found.save(job.folder, figure_width=width)
