@@ -533,7 +533,11 @@ def test_the_pictures_show_every_parameter_and_curve() -> None:
     names, curves = result.insight.names, result.insight.curves
     above, below = plot_insight(result.insight, result.correlation.matrix).subfigs
     for panel, curve in zip(above.axes, curves, strict=True):
-        traces = [line.get_ydata() for line in panel.lines if len(line.get_xdata()) > 2]
+        lines = [line for line in panel.lines if len(line.get_xdata()) > 2]
+        # Where the numbers of a row stand in the panel.
+        places = [line.get_transform() - panel.transData for line in lines]
+        pairs = zip(places, lines, strict=True)
+        traces = [at.transform(line.get_xydata())[:, 1] for at, line in pairs]
         assert len(traces) == len(names)
         for i, (name, trace) in enumerate(zip(names, traces, strict=True)):
             shown, true = i - np.asarray(trace), result.insight.along(name, curve)
