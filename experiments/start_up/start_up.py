@@ -51,11 +51,13 @@ try:
     from foamfit.cli.options import drawing_beside
 except ImportError:  # earlier versions draw in their own process
     drawing_beside = None
-with contextlib.nullcontext() if drawing_beside is None else drawing_beside() as mapped:
+with contextlib.nullcontext() if drawing_beside is None else drawing_beside() as drawers:
+    if drawers is not None:
+        drawers.begin()
     marks.append(time.perf_counter())
     result = api.fit(test)
     marks.append(time.perf_counter())
-    save_result(result, sys.argv[2], *(() if mapped is None else (mapped,)))
+    save_result(result, sys.argv[2], **({} if drawers is None else {"mapped": drawers.map}))
     marks.append(time.perf_counter())
 print(*(after - before for before, after in zip(marks, marks[1:])))
 """
@@ -73,13 +75,15 @@ def environment(source: Path | None, cache: Path | None) -> dict[str, str]:
 
 def fitted(test: Path, variables: dict[str, str]) -> tuple[float, float]:
     """Wall time and processor time of one fit by the command, s."""
-    before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     command = [sys.executable, "-m", "foamfit", "fit", str(test), "--quiet"]
-    subprocess.run(
-        [*command, "--out", str(test.parent / "result")], check=True, env=variables,
-        stderr=subprocess.DEVNULL,
-    )  # fmt: skip
-    wall = time.perf_counter() - began
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    with tempfile.TemporaryDirectory() as folder:
+        began = time.perf_counter()
+        subprocess.run(
+            [*command, "--out", f"{folder}/result"], check=True, env=variables,
+            stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        wall = time.perf_counter() - began
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     return wall, used
@@ -87,12 +91,13 @@ def fitted(test: Path, variables: dict[str, str]) -> tuple[float, float]:
 
 def parts(test: Path, variables: dict[str, str]) -> list[float]:
     """Wall time of each of `PARTS`, s."""
-    began = time.perf_counter()
-    done = subprocess.run(
-        [sys.executable, "-c", PROBE, str(test), str(test.parent / "parts")], check=True,
-        env=variables, capture_output=True, text=True,
-    )  # fmt: skip
-    wall = time.perf_counter() - began
+    with tempfile.TemporaryDirectory() as folder:
+        began = time.perf_counter()
+        done = subprocess.run(
+            [sys.executable, "-c", PROBE, str(test), f"{folder}/result"], check=True,
+            env=variables, capture_output=True, text=True,
+        )  # fmt: skip
+        wall = time.perf_counter() - began
     measured = [float(part) for part in done.stdout.split()]
     return [wall - sum(measured[1:]), *measured[1:]]
 
