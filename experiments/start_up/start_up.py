@@ -38,7 +38,8 @@ PARTS = (
     "figures, report, result folder",
 )
 PROBE = """
-import contextlib, sys, time
+import contextlib, gc, sys, time
+gc.set_threshold(100_000, 20, 10)  # as the command
 marks = [time.perf_counter()]
 import foamfit.cli
 marks.append(time.perf_counter())
@@ -60,6 +61,7 @@ with contextlib.nullcontext() if drawing_beside is None else drawing_beside() as
     save_result(result, sys.argv[2], **({} if drawers is None else {"mapped": drawers.map}))
     marks.append(time.perf_counter())
 print(*(after - before for before, after in zip(marks, marks[1:])))
+gc.freeze()  # as the command: what is left goes with the process
 """
 
 

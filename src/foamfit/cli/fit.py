@@ -79,10 +79,10 @@ def fit(
     """
     check_open(as_json)
     hush = quiet or as_json
-    folder = _result_folder(out, test, specimen, _model_name(model))
     options = search | {"cycle": cycle, "model": model, "fix": fix, "vary": vary}
     with ExitStack() as beside:
         compile_rest = beside.enter_context(compiling(hush, model, search["relaxation"]))
+        folder = _result_folder(out, test, specimen, _model_name(model))
         drawers = beside.enter_context(drawing_beside())
 
         def begin(limit: float | None) -> AbstractContextManager[Progress]:
