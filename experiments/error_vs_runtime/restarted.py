@@ -294,6 +294,9 @@ class System:
         self.output(states, self.rows, self.branches, self.heights, out_w, out_s)
 
 
+MOST_SWITCHES = 100_000  # of 1000 springs every one goes through four
+
+
 class Impact(Protocol):
     """What `impact` wants of a system: `System`, or that of springs with memory."""
 
@@ -320,7 +323,7 @@ def impact(
     """
     out_w, out_s = np.zeros(t.size), np.zeros(t.size)
     now, done = float(t[0]), 0
-    for _ in range(1000 + 20 * system.y.size):
+    for _ in range(MOST_SWITCHES):
         with np.errstate(all="ignore"):  # a stage past a pole: the step is rejected
             now, done, who, side = _phase(system, now, t, done, method, rtol, looks, out_w, out_s)
         if who is None:
