@@ -35,12 +35,15 @@ def test_other_processes_draw_the_same(drawn_here: dict[str, Images | None]) -> 
     assert fit.pdf is not None
 
 
+@pytest.mark.parametrize(
+    "error", [EndedError("its process ended 2 times"), ImportError("no functioning sem_open")]
+)
 def test_where_processes_end_this_one_draws(
-    drawn_here: dict[str, Images | None], monkeypatch: pytest.MonkeyPatch
+    drawn_here: dict[str, Images | None], monkeypatch: pytest.MonkeyPatch, error: Exception
 ) -> None:
     def ended(*_: Any) -> Future[Any]:
         told: Future[Any] = Future()
-        told.set_exception(EndedError("its process ended 2 times before it was done"))
+        told.set_exception(error)
         return told
 
     monkeypatch.setattr(foamfit.study.processes.Processes, "submit", ended)
@@ -48,6 +51,17 @@ def test_where_processes_end_this_one_draws(
     with drawing_beside() as drawers:
         drawers.begin()
         assert dict(draw_all(fabricated.result(), mapped=drawers.map)) == drawn_here
+
+
+def test_where_no_process_can_be_had_this_one_draws(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*_: object) -> None:
+        raise BlockingIOError("Resource temporarily unavailable")
+
+    monkeypatch.setattr(foamfit.study.processes, "Processes", refused)
+    monkeypatch.setattr(foamfit.study.processes, "cores", lambda: 2)
+    with drawing_beside() as drawers:
+        drawers.begin()
+        assert list(drawers.map(str.upper, ["fit"])) == ["FIT"]
 
 
 def test_one_core_draws_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -115,7 +115,8 @@ class Drawers:
         from foamfit.study import processes
 
         if processes.cores() > 1:
-            self._pool = processes.Processes(2, processes.DRAWING)
+            with suppress(OSError):  # the machine gives no more processes
+                self._pool = processes.Processes(2, processes.DRAWING)
 
     def map(self, draw: Callable[[str], Any], names: Iterable[str]) -> Iterable[Any]:
         """Begin to draw; what is given is waited for when it is asked for."""
@@ -131,12 +132,10 @@ class Drawers:
 
 
 def _drawn(begun: Future[Any], draw: Callable[[str], Any], name: str) -> Any:
-    """What a process has drawn, or else this one draws."""
-    from foamfit.study.processes import EndedError
-
+    """What a process has drawn, or else this one draws, and says what is wrong with the figure."""
     try:
         return begun.result()
-    except (EndedError, OSError):
+    except Exception:
         return draw(name)
 
 
