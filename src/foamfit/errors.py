@@ -26,6 +26,9 @@ def as_signalled() -> Iterator[None]:
     try:
         yield
     except SystemError as error:
-        if error.__cause__ is None or isinstance(error.__cause__, Exception):
+        first: BaseException | None = error
+        while isinstance(first, SystemError):  # one for each compiled loop that called the next
+            first = first.__cause__ or first.__context__
+        if first is None or isinstance(first, Exception):
             raise
-        raise error.__cause__ from None
+        raise first from None
