@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -79,11 +79,13 @@ def fit(
     """
     check_open(as_json)
     hush = quiet or as_json
+    model = _model_name(model)
     options = search | {"cycle": cycle, "model": model, "fix": fix, "vary": vary}
-    with ExitStack() as beside:
-        compile_rest = beside.enter_context(compiling(hush, model, search["relaxation"]))
-        folder = _result_folder(out, test, specimen, _model_name(model))
-        drawers = beside.enter_context(drawing_beside())
+    with (
+        compiling(hush, model, search["relaxation"]) as compile_rest,
+        drawing_beside() as drawers,
+    ):
+        folder = _result_folder(out, test, specimen, model)
 
         def begin(limit: float | None) -> AbstractContextManager[Progress]:
             compile_rest()
