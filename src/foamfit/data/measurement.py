@@ -176,6 +176,7 @@ class Record:
     cycle: Array | None = None
     numbers: NDArray[np.int64] | None = None
     dropped: tuple[Dropped, ...] = ()
+    sampled: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         """Count the samples."""
@@ -272,6 +273,20 @@ class Measurement:
     start_strain : float
         Strain of a later cycle, counted from the first contact, at which its own contact starts:
         what the foam had not recovered. It is taken off.
+    sampled : dict of str to (n,) bool array
+        Of a channel of which some samples do not count as measured: True at those that do.
+    zeros : dict of str to float
+        Standard error of the zero of a channel ("stress", Pa, "acceleration", m/s², and
+        "displacement", m), where samples before contact show the zero.
+    origins : dict of str to float
+        What was taken off, in SI: "contact_time", s, "stress_zero", Pa, "acceleration_zero", m/s²,
+        and "displacement_zero", m.
+    acceleration : (n,) array or None
+        Deceleration of the striker, m/s², where an impact has it and no displacement.
+    derived : tuple of str
+        Channels that were computed from others and are no measurement of their own.
+    block : int
+        Rows of the file that are averaged in each sample.
     """
 
     name: str
@@ -292,6 +307,12 @@ class Measurement:
     cycle: int = 1
     cycles: tuple[int, ...] = (1,)
     start_strain: float = 0.0
+    sampled: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
+    zeros: dict[str, float] = field(default_factory=dict)
+    origins: dict[str, float] = field(default_factory=dict)
+    acceleration: Array | None = None
+    derived: tuple[str, ...] = ()
+    block: int = 1
 
     @property
     def rows(self) -> RowCount:

@@ -7,6 +7,7 @@ thing that it changed or left out.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -122,6 +123,8 @@ def condition(
         cycle=chosen.number if chosen else 1,
         cycles=tuple(cycle.number for cycle in cycles) or (1,),
         start_strain=start_strain,
+        sampled=record.sampled,
+        block=block,
     )
 
 
@@ -260,8 +263,10 @@ def thin(record: Record) -> tuple[Record, list[str]]:
     counts = np.diff(np.append(edges, n))
     time = None if record.time is None else np.add.reduceat(record.time, edges) / counts
     thinned = Record(time, record.stress, None)
-    for name, values in record.curves().items():
+    for name, values in record.curves("acceleration").items():
         thinned = thinned.changed(name, np.add.reduceat(values, edges) / counts)
+    kept = {name: np.logical_and.reduceat(k, edges) for name, k in record.sampled.items()}
+    thinned = replace(thinned, sampled=kept)
     return thinned, [f"{n} samples are averaged in {len(edges)} blocks of {size}."]
 
 
