@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
@@ -49,6 +49,17 @@ class ParameterEstimate:
     why: str
     ci95_method: str | None = None
     range: tuple[float, float] | None = None
+
+    def counted_from(self, zero: float) -> ParameterEstimate:
+        """Count value, interval and range from another zero."""
+
+        def moved(ends: tuple[float, float] | None) -> tuple[float, float] | None:
+            return None if ends is None else (ends[0] - zero, ends[1] - zero)
+
+        if zero == 0.0:
+            return self
+        ci95, span = moved(self.ci95), moved(self.range)
+        return replace(self, value=self.value - zero, ci95=ci95, range=span)
 
 
 @dataclass(frozen=True, eq=False)

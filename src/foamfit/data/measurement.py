@@ -80,7 +80,7 @@ class Noise:
     def of(self, channel: str) -> NoiseLevel | None:
         """Return the noise of a channel, stated or else estimated; None where neither is known."""
         given = self.displacement if channel.startswith("displacement") else self.stress
-        if given is not None:
+        if given is not None and channel != "acceleration":
             return NoiseLevel(given, True, "given")
         return self.estimated.get(channel)
 
@@ -287,6 +287,10 @@ class Measurement:
         Channels that were computed from others and are no measurement of their own.
     block : int
         Rows of the file that are averaged in each sample.
+    uncertainties : dict of str to float
+        Each ± of the TOML, one standard deviation: "height", m, "area", m², "striker_mass", kg,
+        "velocity", m/s, "specimen_mass", kg, "delay", s, and, relative, "stress_scale",
+        "displacement_scale", "acceleration_scale", "velocity_scale".
     """
 
     name: str
@@ -313,6 +317,7 @@ class Measurement:
     acceleration: Array | None = None
     derived: tuple[str, ...] = ()
     block: int = 1
+    uncertainties: dict[str, float] = field(default_factory=dict)
 
     @property
     def rows(self) -> RowCount:
@@ -321,7 +326,8 @@ class Measurement:
         return self.count or RowCount(n, n)
 
     def channels(self) -> dict[str, Array]:
-        """Stress, displacement and displacements of masses inside, as far as they are there."""
+        """Stress, displacement, acceleration and displacements inside, as far as they are there."""
         found = {"stress": self.stress, "displacement": self.displacement}
+        found["acceleration"] = self.acceleration
         found |= {interior_channel(node): values for node, values in self.interior.items()}
         return {name: values for name, values in found.items() if values is not None}

@@ -2,7 +2,7 @@
 
 Logarithms of the stiffnesses, of ε_a, of snap stresses, spreads and relaxation times; the drop
 Δσ/σ_a; the places of ε_c between ε_a and one and of ε_* between its least and one; slopes, damping
-and shares of relaxation over the scales of the test, a time shift over the largest one.
+and shares of relaxation over the scales of the test; nuisance parameters between their limits.
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
+from foamfit.fitting import nuisance
 from foamfit.springs.law import least_eps_star
 from foamfit.springs.model import Model
-from foamfit.springs.parameters import split_name
+from foamfit.springs.parameters import NUISANCE, split_name
 
 LAST_STRAIN = 0.999
 # Parameters whose coordinate is a logarithm, besides the relaxation times.
@@ -89,13 +90,24 @@ class Scales:
         """Time under load, s; 1 where time is unknown."""
         return 2.0 * self.strain / self.rate if self.rate > 0.0 else 1.0
 
+    @property
+    def _hundredth(self) -> dict[str, float]:
+        """A hundredth of the time under load, and of the largest value of each channel."""
+        times = dict.fromkeys((nuisance.CONTACT_TIME, nuisance.TIME_SHIFT), 0.01 * self.duration)
+        moved, acceleration = self.strain * self.height, self.height / self.duration**2
+        return times | {
+            "stress_zero": 0.01 * self.stress,
+            "displacement_zero": 0.01 * moved,
+            "acceleration_zero": 0.01 * acceleration,
+        }
+
     def of_parameter(self, name: str, values: dict[str, float]) -> float:
         """Scale of a parameter, in its unit: a change by so much is a relative change of 1."""
         spring, short = split_name(name)
         if short == "eta":
             return max(abs(values[name]), 0.1 * self.eta)
-        if short == "time_shift":
-            return 0.01 * self.duration
+        if spring < 0 and short in NUISANCE:
+            return abs(values[name]) if name in nuisance.STRIKER else self._hundredth[short]
         if short in ("kh_plus", "kh_minus"):
             return max(abs(values[name]), 0.1 * self.slope)
         if short == "dsigma":
@@ -113,6 +125,10 @@ def scale_in_words(name: str, value: float, scale: float) -> str:
     return {
         "eta": "a tenth of the damping that would carry the whole stress",
         "time_shift": "a hundredth of the time under load",
+        "contact_time": "a hundredth of the time under load",
+        "stress_zero": "a hundredth of the largest stress",
+        "displacement_zero": "a hundredth of the largest displacement",
+        "acceleration_zero": "a hundredth of the height over the squared time under load",
         "kh_plus": "a tenth of the largest stress over strain",
         "kh_minus": "a tenth of the largest stress over strain",
         "dsigma": "σ_a",
@@ -139,10 +155,7 @@ BOX = {
     "tau": (np.log(1e-4), np.log(30.0)),
     "eta": (0.0, 10.0),
     "height": (0.02, 0.98),
-    "time_shift": (-1.0, 1.0),
-}
-# Largest time shift between force and motion, over the time under load.
-LARGEST_SHIFT = 0.1
+} | dict.fromkeys(NUISANCE, (-1.0, 1.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,6 +163,7 @@ class Space:
     """The box in which the search moves, and the way between it and the vector of parameters."""
 
     model: Model  # The springs
+    names: tuple[str, ...]  # Of all parameters: those of the springs, then the nuisance
     scales: Scales  # Of the test
     values: Array  # (n,): Values of the parameters that do not vary (SI); the others are ignored
     free: tuple[str, ...]  # Names of the parameters that vary
@@ -166,8 +180,7 @@ class Space:
         for name in sorted(self.free, key=lambda name: shorts.index(family(split_name(name)[1]))):
             spring, short = split_name(name)
             first = self.model.index[f"s{spring + 1}_k0"] if spring >= 0 else -1
-            # The nuisance stands last.
-            out.append((self.model.index.get(name, len(self.model.names)), short, first))
+            out.append((self.names.index(name), short, first))
         return out
 
     @cached_property
@@ -182,8 +195,11 @@ class Space:
         units = {"height": scales.height, "eta": scales.eta, "tau": scales.duration}
         units |= dict.fromkeys(("k0", "kc", "sigma_plus", "sigma_minus"), scales.stress)
         units |= dict.fromkeys(("kh_plus", "kh_minus"), scales.slope)
-        units["time_shift"] = LARGEST_SHIFT * scales.duration
         return units.get(family(short), 1.0)
+
+    def _middle(self, i: int) -> tuple[float, float]:
+        """Middle between the limits of a nuisance parameter, and half of their distance."""
+        return 0.5 * (self.low[i] + self.high[i]), 0.5 * (self.high[i] - self.low[i])
 
     def encode(self, values: Array) -> Array:
         """Coordinates of a vector of parameters, moved into the box."""
@@ -198,6 +214,9 @@ class Space:
                 out[j] = (values[i] - least) / (LAST_STRAIN - least)
             elif short == "dsigma":
                 out[j] = -values[i] / _stress_at_a1(values, first)
+            elif short in NUISANCE:
+                middle, half = self._middle(i)
+                out[j] = (values[i] - middle) / half
             else:
                 out[j] = values[i] / self._unit(short)
         low, high = self.box
@@ -208,7 +227,7 @@ class Space:
         """Vector of parameters (SI) at a point of the box."""
         values = self.values.copy()
         for u, (i, short, first) in zip(point, self.coordinates, strict=True):
-            value = self._value(u, short, first, values)
+            value = self._value(u, i, short, first, values)
             values[i] = min(max(value, self.low[i]), self.high[i])
         return self.complete(values)
 
@@ -216,7 +235,7 @@ class Space:
         """Complete a vector by what hangs on others."""
         return values if self.tied is None else self.tied(values)
 
-    def _value(self, u: float, short: str, first: int, values: Array) -> float:
+    def _value(self, u: float, i: int, short: str, first: int, values: Array) -> float:
         """Parameter of a coordinate, whatever its limits; what it needs of `values` is there."""
         if is_logarithmic(short):
             return float(np.exp(u)) * self._unit(short)
@@ -224,6 +243,9 @@ class Space:
             least = least_eps_star(values[first], values[first + 1])
             least = least if short == "eps_star" else float(values[first + 3])
             return least + u * (LAST_STRAIN - least)
+        if short in NUISANCE:
+            middle, half = self._middle(i)
+            return middle + u * half
         return -u * _stress_at_a1(values, first) if short == "dsigma" else u * self._unit(short)
 
     def slopes(self, point: Array, values: Array) -> Array:
@@ -251,9 +273,11 @@ class Space:
                 rise += values[first] / (1.0 - eps_a) ** 2 * moves[first + 3]
                 moves[i] = -point[j] * rise
                 moves[i, j] = -_stress_at_a1(values, first)
+            elif short in NUISANCE:
+                moves[i, j] = self._middle(i)[1]
             else:
                 moves[i, j] = self._unit(short)
-            if not self.low[i] <= self._value(point[j], short, first, values) <= self.high[i]:
+            if not self.low[i] <= self._value(point[j], i, short, first, values) <= self.high[i]:
                 moves[i] = 0.0
         return self.follow(values, moves, np.full(point.size, 1e-5))
 

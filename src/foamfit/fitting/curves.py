@@ -13,6 +13,8 @@ from foamfit.springs.model import Model
 
 # Of every objective; to them come displacement_1_time … where masses inside were followed.
 CURVES = ("stress_time", "displacement_time", "stress_strain")
+# Of an impact whose striker carries an accelerometer and whose displacement was not measured.
+ACCELERATION = "acceleration_time"
 # Those that need a motion.
 MOTION_CURVES = ("displacement_time", "stress_strain")
 DRIVES = ("impact", "stress", "displacement")
@@ -94,9 +96,11 @@ def default_weights(measurement: Measurement, drive: str, springs: int = 1) -> d
     weights = dict.fromkeys(CURVES, 0.0)
     weights |= dict.fromkeys(interior_curves(measurement, springs), 1.0)
     if drive == "impact":
-        weights["stress_time"] = 1.0
-        if measurement.displacement is not None and measurement.motion != INTEGRATED:
-            weights["displacement_time"] = 1.0
+        weights["stress_time"] = float("stress" not in measurement.derived)
+        moved = measurement.displacement is not None and measurement.motion != INTEGRATED
+        weights["displacement_time"] = float(moved and "displacement" not in measurement.derived)
+        if measurement.acceleration is not None:
+            weights[ACCELERATION] = 1.0
     elif drive == "stress":
         weights["displacement_time"] = 1.0
     else:

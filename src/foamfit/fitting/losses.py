@@ -12,8 +12,10 @@ from foamfit.arrays import Array
 LOSSES = {"linear": np.inf, "soft_l1": 1.345, "huber": 1.345, "cauchy": 2.385}
 
 
-def soften(residual: Array, loss: str) -> Array:
+def soften(residual: Array, loss: str, data: int | None = None) -> Array:
     """Residuals whose squares sum to the loss: sign(r) c √ρ((r/c)²), shape (n,).
+
+    Those behind the first `data`, if that is given, are of priors and stay as they are.
 
     A search that lowers a sum of squares so lowers Σ c² ρ((r/c)²); ρ(z) is z (linear),
     2 (√(1+z) - 1) (soft_l1), z up to 1 and 2√z - 1 beyond (huber), ln(1+z) (cauchy), as in
@@ -21,6 +23,8 @@ def soften(residual: Array, loss: str) -> Array:
     """
     if loss == "linear":
         return residual
+    if data is not None and data < residual.size:
+        return np.append(soften(residual[:data], loss), residual[data:])
     width = LOSSES[loss]
     z = (residual / width) ** 2
     if loss == "soft_l1":
@@ -45,8 +49,9 @@ def influence(residual: Array, loss: str) -> tuple[Array, Array]:
     return residual / (1.0 + z), (1.0 - z) / (1.0 + z) ** 2
 
 
-def softness(residual: Array, loss: str) -> Array:
+def softness(residual: Array, loss: str, data: int | None = None) -> Array:
     """Derivative of `soften` by the residual, (n,): ψ over the softened residual, 1 at zero."""
     soft = soften(residual, loss)
     near = np.abs(soft) < 1e-8
+    near[residual.size if data is None else data :] = True
     return np.where(near, 1.0, influence(residual, loss)[0] / np.where(near, 1.0, soft))

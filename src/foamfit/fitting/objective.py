@@ -18,7 +18,9 @@ from foamfit.arrays import Array
 from foamfit.data.measurement import INTEGRATED, Measurement, NoiseLevel
 from foamfit.data.noise import with_noise
 from foamfit.errors import InputError, SimulationError, as_signalled
+from foamfit.fitting import nuisance as nuisances
 from foamfit.fitting.curves import (
+    ACCELERATION,
     CURVES,
     MOTION_CURVES,
     check_drive,
@@ -45,6 +47,10 @@ MODEL_ERROR = 0.005
 _ANY_SPRING: dict[str, Spring] = {"microscale": MicroscaleSpring(1.0, 1.0, 0.0, 1.0, 1.0, 1.0, 1.0)}
 # A trial that needs more steps than this is too stiff to be worth waiting for.
 MAX_STEPS = 20_000
+# Most instants that are simulated for each sample that averages rows of the file.
+FINEST = 8
+# Steps of differences: of the velocity and the mass, relative, and of times over the instants' gap.
+RELATIVE_STEP, STEP_OF_TIME = 1e-3, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +84,8 @@ class Objective:
     interior_mass: bool = False
     # Whether the vector of parameters ends with how late the motion channel is, s.
     time_shift: bool = False
+    # Names of the nuisance parameters that end the vector; by default those of the drive.
+    nuisance: tuple[str, ...] = ()
     loss: str = "linear"  # One of `LOSSES`
     evaluations: int = field(default=0, init=False)  # Sets of parameters that were simulated
     failures: int = field(default=0, init=False)  # Those of them that could not be
@@ -91,15 +99,19 @@ class Objective:
             raise InputError(
                 f"loss '{self.loss}' is unknown; it must be one of {', '.join(LOSSES)}"
             )
+        self.nuisance = self.nuisance or nuisances.names_of(self.drive, time_shift=self.time_shift)
         self.measurement = with_noise(self.measurement)
         self.interior = interior_curves(self.measurement, len(self.model.kinds))
-        self.curves = (*CURVES, *self.interior)
+        self.accelerated = self.drive == "impact" and self.measurement.acceleration is not None
+        self.curves = (*CURVES, *((ACCELERATION,) if self.accelerated else ()), *self.interior)
         self._check_weights()
         self._dashpots = np.array([name.endswith("eta") for name in self.model.names])
         self._dashpots[-1] = False  # the onsite damper is none of a spring
         time = self.measurement.time
         # Of the samples, s; their number where the test has no time.
         self.time = np.arange(self._stress.size, dtype=float) if time is None else time
+        self._fine = min(self.measurement.block, FINEST) if self.drive == "impact" else 1
+        self._clock = _instants(self.time, self._fine)
         self._absent = {"stress": ["stress_time"], "displacement": ["displacement_time"]}.get(
             self.drive, []
         ) + (["stress_time"] if time is None else [])
@@ -107,7 +119,8 @@ class Objective:
         self._plans = {damped: self._scene(loading, damped=damped) for damped in (False, True)}
         self._along: dict[bool, Plan] = {}
         if self.measurement.displacement is not None:
-            along = DisplacementDrive(self.measurement.displacement)
+            moved = np.interp(self._clock, self.time, self.measurement.displacement)
+            along = DisplacementDrive(moved)
             self._along = {damped: self._scene(along, damped=damped) for damped in (False, True)}
         self.measured = self._measured()
         self.counted = tuple(name for name in self.measured if self.weights[name] > 0)
@@ -123,6 +136,28 @@ class Objective:
         self.n_data = sum(self.sizes)
         # Worse per sample than any curve that stays within ten ranges.
         self.penalty = max(PENALTY * self.span(name) for name in self.counted)
+        self._set_nuisance()
+
+    def _set_nuisance(self) -> None:
+        """Which zero each curve has, the steps of differences, and the priors."""
+        channels = {channel: zero for zero, channel in nuisances.ZEROS.items()}
+        self._zero_of = {
+            curve: zero
+            for curve in self.curves
+            if (zero := channels.get(self.channel(curve))) in self.nuisance
+        }
+        gap = float(np.median(np.diff(self._clock)))
+        self.usual = nuisances.values_of(self.measurement)
+        self._steps = {
+            name: RELATIVE_STEP * self.usual[name]
+            if name in (nuisances.VELOCITY, nuisances.STRIKER_MASS)
+            else STEP_OF_TIME * gap
+            for name in self.nuisance
+        }
+        known = nuisances.priors_of(self.measurement)
+        self.priors = tuple(known[name] for name in self.nuisance if name in known)
+        count, places = len(self.model.names), {n: i for i, n in enumerate(self.nuisance)}
+        self._prior_places = np.array([count + places[one.name] for one in self.priors], np.int64)
 
     def _check_weights(self) -> None:
         for name, weight in self.weights.items():
@@ -170,7 +205,7 @@ class Objective:
             masses = [specimen.mass / (count - 1)] * (count - 1) + [0.0]
         chain = Chain(springs, heights, specimen.area, masses)
         return make_plan(
-            chain, loading, self.time, dashpots=damped, relaxing=self.model.relaxation > 0,
+            chain, loading, self._clock, dashpots=damped, relaxing=self.model.relaxation > 0,
             max_steps=MAX_STEPS,
         )  # fmt: skip
 
@@ -182,16 +217,15 @@ class Objective:
             measured["stress_strain"] = self._stress
         inside = self.measurement.interior
         measured |= {name: inside[node] for name, node in self.interior.items()}
+        if self.accelerated:
+            assert self.measurement.acceleration is not None
+            measured[ACCELERATION] = self.measurement.acceleration
         return {name: curve for name, curve in measured.items() if name not in self._absent}
-
-    @property
-    def nuisance(self) -> tuple[str, ...]:
-        """Names of the parameters that the objective adds to those of the model."""
-        return ("time_shift",) if self.time_shift else ()
 
     def channel(self, name: str) -> str:
         """Channel of the test that a curve is compared with."""
-        return name.removesuffix("_time") if name.startswith("displacement") else "stress"
+        own = name.startswith("displacement") or name == ACCELERATION
+        return name.removesuffix("_time") if own else "stress"
 
     def noise(self, name: str) -> NoiseLevel:
         """Noise of a curve, stated or estimated."""
@@ -206,9 +240,12 @@ class Objective:
         return level.sigma if level.given else max(level.sigma, least)
 
     def _fitted(self, name: str) -> slice | NDArray[np.bool_]:
-        """Samples of a curve that count: all but the outliers of its channel."""
+        """Samples of a curve that count: those that were measured, but for outliers."""
         outliers = self.measurement.outliers.get(self.channel(name))
-        return slice(None) if outliers is None else ~outliers.left_out
+        sampled = self.measurement.sampled.get(self.channel(name))
+        if outliers is None:
+            return slice(None) if sampled is None else sampled
+        return ~outliers.left_out if sampled is None else sampled & ~outliers.left_out
 
     # ------------------------------------------------------------------ simulation and residual
 
@@ -225,21 +262,62 @@ class Objective:
         self.evaluations += 1
         try:
             with as_signalled():
-                springs = self._springs(values[:count], everything, places[places < count])
+                return self._seen(values[:count], values[count:], everything, places)
         except SimulationError:
             self.failures += 1
             raise
-        if not self.time_shift:
-            return springs
-        return self.shifted(springs, float(values[count]), places == count)
 
     def add_counts(self, other: Objective) -> None:
         """Count the evaluations and failures of another objective as one's own."""
         self.evaluations += other.evaluations
         self.failures += other.failures
 
-    def _springs(self, values: Array, everything: bool, places: NDArray[np.int64]) -> Simulated:
-        """Simulate the parameters of the model, without a time shift; see `simulate`."""
+    def _seen(
+        self, values: Array, nuisance: Array, everything: bool, places: NDArray[np.int64]
+    ) -> Simulated:
+        """Curves of springs as the channels show them, and their derivatives; see `simulate`."""
+        own = places < values.size
+        curves = self._curves(values, nuisance, everything, places[own])
+        if own.all():
+            return curves
+        slopes = {}
+        given = curves.slopes or {name: np.empty((0, self.time.size)) for name in curves.curves}
+        by_nuisance = {
+            int(place): self._nuisance_slope(values, nuisance, int(place) - values.size)
+            for place in places[~own]
+        }
+        for name, carried in given.items():
+            slopes[name] = out = np.empty((places.size, self.time.size))
+            out[own] = carried
+            out[~own] = np.reshape(
+                [by_nuisance[int(place)][name] for place in places[~own]], (-1, self.time.size)
+            )
+        return replace(curves, slopes=slopes)
+
+    def _nuisance_slope(self, values: Array, nuisance: Array, at: int) -> dict[str, Array]:
+        """Derivative of the curves by one nuisance parameter.
+
+        The zero of a channel adds to it; the others by a central difference of two simulations,
+        whose error is far below that of their steps.
+        """
+        name, n = self.nuisance[at], self.time.size
+        if name in nuisances.ZEROS:
+            own = {curve: self._zero_of.get(curve) == name for curve in self.curves}
+            return {curve: np.full(n, float(shifted)) for curve, shifted in own.items()}
+        if self.drive != "impact" and name != nuisances.TIME_SHIFT:
+            return {curve: np.zeros(n) for curve in self.curves}
+        step = self._steps[name]
+        sides = []
+        for side in (-0.5, 0.5):
+            there = nuisance.copy()
+            there[at] += side * step
+            sides.append(self._curves(values, there, False, NOWHERE).curves)
+        return {curve: (sides[1][curve] - sides[0][curve]) / step for curve in sides[0]}
+
+    def _curves(
+        self, values: Array, nuisance: Array, everything: bool, places: NDArray[np.int64]
+    ) -> Simulated:
+        """Curves of springs with derivatives by their own parameters alone; see `simulate`."""
         height = self.measurement.specimen.height
         rows = self.model.rows(values)
         heights = np.ascontiguousarray(self.model.heights(values, height))
@@ -250,107 +328,186 @@ class Objective:
         drag = float(values[-1]) / height
         everywhere = everything or self._inside
         wanted = self.model.directions[places]
-        run = self._plans[damped].run(
-            rows, heights, self.rtol, drag=drag, everything=everywhere, directions=wanted
-        )
-        inside = self.interior if everywhere else {}
-        along = run if self.drive == "displacement" else None
+        at = dict(zip(self.nuisance, nuisance.tolist(), strict=True))
+        plan = self._placed(self._plans[damped], at)
+
+        def run(plan: Plan, everything: bool) -> Motion:
+            return plan.run(
+                rows, heights, self.rtol, drag=drag, everything=everything, directions=wanted
+            )
+
+        motion = run(plan, everywhere)
+        late = at.get(nuisances.TIME_SHIFT, 0.0)
+        moved = motion
+        if late != 0.0 and self.drive == "impact":
+            moved = run(plan._replace(time=plan.time - late), everywhere)
+        along = motion if self._driven else None
         if along is None and self._along and (everything or "stress_strain" in self.counted):
-            plan = self._along[damped]
-            along = plan.run(rows, heights, self.rtol, everything=False, directions=wanted)
-        curves = {"stress_time": run.base_stress, "displacement_time": run.displacement[-1]}
-        curves |= {name: run.displacement[node - 1] for name, node in inside.items()}
+            along = run(self._followed(self._along[damped], at), False)
+        parts = self._parts(motion, moved, along, everywhere, (values, at))
+        curves = {name: self._sampled(curve) for name, (curve, _) in parts.items()}
+        seen = self._averaged(motion, at.get(nuisances.CONTACT_TIME, 0.0))
+        for name in curves:
+            zero = self._zero_of.get(name)
+            if zero is not None:
+                curves[name] = curves[name] + at[zero]
+            curves[name] = self._late(name, curves[name], late)
+        if not places.size:
+            return Simulated(curves, seen)
+        slopes = {}
+        for name, (_, slope) in parts.items():
+            if slope is None:
+                continue
+            by_site = places == values.size - 1
+            slopes[name] = self._sampled(slope)
+            slopes[name][by_site] /= height  # site_eta acts through η_site/H
+            if name == "acceleration_time":
+                slopes[name][by_site] += self._sampled(self._push_of_site(moved, at)) / height
+            slopes[name] = self._late(name, slopes[name], late)
+        return Simulated(curves, seen, slopes)
+
+    def _parts(
+        self, motion: Motion, moved: Motion, along: Motion | None, everywhere: bool,
+        point: tuple[Array, dict[str, float]],
+    ) -> dict[str, tuple[Array, Array | None]]:  # fmt: skip
+        """Each curve and its derivatives at the instants that are simulated."""
+
+        def of(run: Motion, node: int) -> tuple[Array, Array | None]:
+            return run.displacement[node], run.slopes and run.slopes.displacement[:, node]
+
+        parts: dict[str, tuple[Array, Array | None]] = {
+            "stress_time": (motion.base_stress, motion.slopes and motion.slopes.base_stress),
+            "displacement_time": of(moved, -1),
+        }
+        if everywhere:
+            parts |= {name: of(moved, node - 1) for name, node in self.interior.items()}
         if along is not None:
-            curves["stress_strain"] = along.base_stress
-        curves = {name: curve for name, curve in curves.items() if name not in self._absent}
-        if run.slopes is None or (along is not None and along.slopes is None):
-            return Simulated(curves, run)
-        moved, pressed = run.slopes
-        slopes = {"stress_time": pressed, "displacement_time": moved[:, -1]}
-        slopes |= {name: moved[:, node - 1] for name, node in inside.items()}
-        if along is not None and along.slopes is not None:
-            slopes["stress_strain"] = along.slopes.base_stress
-        for slope in slopes.values():
-            slope[places == values.size - 1] /= height  # site_eta acts through η_site/H
-        return Simulated(curves, run, slopes)
+            parts["stress_strain"] = along.base_stress, along.slopes and along.slopes.base_stress
+        if self.accelerated:
+            parts["acceleration_time"] = self._acceleration(moved, *point)
+        return {name: part for name, part in parts.items() if name not in self._absent}
 
-    def shifted(
-        self, curves: Simulated, late: float, by_shift: NDArray[np.bool_] = NOWHERE == 0
-    ) -> Simulated:
-        """Curves as channels show them of which the motion is late by so many seconds.
+    # ------------------------------------------------------------------ where and when
 
-        Slopes are shifted with their curves. Where `by_shift` (n_places,) marks one by the shift
-        itself, that is a difference over one sample: no simulation is in it.
+    @property
+    def _driven(self) -> bool:
+        """Whether the measured motion drives the springs."""
+        return self.drive == "displacement"
+
+    def _placed(self, plan: Plan, at: dict[str, float]) -> Plan:
+        """Plan of an impact with its contact, and its striker, where the nuisance has them."""
+        if self.drive != "impact":
+            return plan
+        mass = plan.mass.copy()
+        mass[-1] = at[nuisances.STRIKER_MASS] / self.measurement.specimen.area
+        time = self._clock - at[nuisances.CONTACT_TIME]
+        return plan._replace(time=time, speed=at[nuisances.VELOCITY], mass=mass)
+
+    def _followed(self, plan: Plan, at: dict[str, float]) -> Plan:
+        """Plan of the measured motion of an impact: its zero taken off, none before contact."""
+        if self.drive != "impact":
+            return plan
+        values = plan.values - at["displacement_zero"]
+        before = self._clock < at[nuisances.CONTACT_TIME]
+        return plan._replace(values=np.where(before, 0.0, values))
+
+    def _sampled(self, values: Array) -> Array:
+        """Mean over the instants that each sample averages, along the last axis."""
+        if self._fine == 1:
+            return values
+        return np.asarray(values.reshape(*values.shape[:-1], -1, self._fine).mean(axis=-1))
+
+    def _averaged(self, motion: Motion, contact: float) -> Motion:
+        """A run on the clock of the samples."""
+        if self._fine > 1:
+            motion = motion._replace(
+                displacement=self._sampled(motion.displacement),
+                base_stress=self._sampled(motion.base_stress),
+            )
+        if contact == 0.0:
+            return motion
+        switches = motion.switches.copy()
+        switches[:, 0] += contact
+        return motion._replace(switches=switches, contact_end=motion.contact_end + contact)
+
+    def _late(self, name: str, curves: Array, late: float) -> Array:
+        """Stress along a motion that is late by so many seconds, seen on its clock: earlier."""
+        if late == 0.0 or self.drive == "impact" and name != "stress_strain":
+            return curves
+        if self.drive == "stress":
+            return _later(self.time, curves, late) if name.startswith("displacement") else curves
+        if name.startswith("displacement"):
+            return curves
+        when = self.time + late
+        rows = [np.interp(when, self.time, row) for row in np.atleast_2d(curves)]
+        return np.reshape(rows, curves.shape)
+
+    def _push_of_site(self, motion: Motion, at: dict[str, float]) -> Array:
+        """Deceleration of the striker by an onsite damper of η_site/H = 1 Pa·s/m, m/s²."""
+        per_mass = self.measurement.specimen.area / at[nuisances.STRIKER_MASS]
+        clock = self._clock - at[nuisances.CONTACT_TIME]
+        speed = np.gradient(motion.displacement[-1], self._clock)
+        return np.where(clock < 0.0, 0.0, per_mass * speed)
+
+    def _acceleration(
+        self, motion: Motion, values: Array, at: dict[str, float]
+    ) -> tuple[Array, Array | None]:
+        """Deceleration of the striker, m/s², and its derivatives: eq. of motion of the top mass.
+
+        A (Σ_N + η_site/H dw/dt)/m; with masses inside the second derivative of the motion itself.
         """
-        there, slopes = curves.curves, curves.slopes
-        if by_shift.size:
-            step = float(np.median(np.diff(self.time)))
-            own = slopes or {name: np.empty((0, self.time.size)) for name in there}
-            slopes = {}
-            for name in there.keys() & own.keys():
-                out = np.empty((by_shift.size, self.time.size))
-                rows = [self._shift(name, row, late, 0.0) for row in own[name]]
-                out[~by_shift] = np.reshape(rows, (-1, self.time.size))
-                sides = [self._shift(name, there[name], late + side * step) for side in (-0.5, 0.5)]
-                out[by_shift] = (sides[1] - sides[0]) / step
-                slopes[name] = out
-        if late != 0.0:
-            there = {name: self._shift(name, curve, late) for name, curve in there.items()}
-        return replace(curves, curves=there, slopes=slopes)
+        drag = float(values[-1]) / self.measurement.specimen.height
+        per_mass = self.measurement.specimen.area / at[nuisances.STRIKER_MASS]
 
-    def _shift(self, name: str, curve: Array, late: float, speed: float | None = None) -> Array:
-        """One curve, or its derivative, seen by channels of which the motion is late (s).
+        def of(stress: Array, top: Array) -> Array:
+            speed = np.gradient(top, self._clock, axis=-1)
+            if self.interior_mass:
+                return -np.gradient(speed, self._clock, axis=-1)
+            flying = self._clock < at[nuisances.CONTACT_TIME]
+            return np.asarray(per_mass * (stress + np.where(flying, 0.0, drag * speed)))
 
-        Where time is that of the force the motion is seen later; where it is that of the motion
-        (time zero is read off it, or it drives) the force is seen earlier. Before contact the
-        striker comes at its velocity, or at `speed` (m/s), and no stress acts; a displacement that
-        was set to zero where the stress starts is so here.
-        """
-        impact, contact = self.drive == "impact", self.measurement.contact
-        by_motion = self.drive == "displacement" or (impact and contact == "motion")
-        if not name.startswith("displacement"):
-            if not by_motion and name != "stress_strain":
-                return curve
-            when = self.time + late
-            earlier = np.interp(when, self.time, curve)
-            return np.where(when < 0.0, 0.0, earlier) if late < 0.0 else earlier
-        if by_motion:
-            return curve
-        before: float | None = None
-        if impact:
-            assert self.measurement.striker is not None  # checked by check_drive
-            before = self.measurement.striker.velocity if speed is None else speed
-        moved = _later(self.time, curve, late, before)
-        if impact and contact == "stress":
-            moved = moved - _later(self.time, curve, late, before, at=0.0)
-        return moved
+        push = of(motion.base_stress, motion.displacement[-1])
+        if motion.slopes is None:
+            return push, None
+        return push, of(motion.slopes.base_stress, motion.slopes.displacement[:, -1])
+
+    # ------------------------------------------------------------------ residual
 
     def residual(self, values: Array, shift: Array | float = 0.0) -> Array:
-        """Weighted residuals of all counted curves, shape (n_data,), dimensionless.
+        """Weighted residuals of all counted curves and of the priors, dimensionless.
 
-        Simulated minus measured over the curve's scale, times the root of its weight, softened by
-        the loss; outliers are left out. Parameters that cannot be simulated cost a finite penalty
-        and are counted in `failures`. `shift` (n_data,) is taken off before the loss: data that
-        differ by so much from those that were measured.
+        The first `n_data` are those of the curves: simulated minus measured over the curve's scale,
+        times the root of its weight, softened by the loss; outliers are left out. Behind them
+        stands a residual for each of the `priors`, over its standard deviation. Parameters that
+        cannot be simulated cost a finite penalty and are counted in `failures`. `shift` is taken
+        off before the loss: data that differ by so much from those that were measured.
         """
-        return soften(self.differences(values) - shift, self.loss)
+        return soften(self.differences(values) - shift, self.loss, self.n_data)
 
     def differences(self, values: Array) -> Array:
-        """Residuals before the loss gives way to large ones, shape (n_data,)."""
+        """Residuals before the loss gives way to large ones; see `residual`."""
         try:
             curves = self.simulate(values)
         except SimulationError:
-            return np.full(self.n_data, self.penalty)
-        return self.compare(curves)
+            return np.append(np.full(self.n_data, self.penalty), self.off_priors(values))
+        return self.compare(curves, values)
 
-    def compare(self, curves: Simulated) -> Array:
-        """Residuals of simulated curves before the loss gives way to large ones, (n_data,)."""
+    def off_priors(self, values: Array) -> Array:
+        """How far nuisance parameters are off their priors, in standard deviations."""
+        there = values[self._prior_places]
+        return np.array(
+            [(v - one.mean) / one.sigma for v, one in zip(there, self.priors, strict=True)]
+        )
+
+    def compare(self, curves: Simulated, values: Array) -> Array:
+        """Residuals of simulated curves before the loss gives way to large ones; see `residual`."""
         parts = [
             (curves.curves[name] - self.measured[name])[self._kept[name]] * self.factor(name)
             for name in self.counted
         ]
         # A stress near the pole of branch c is as bad as none.
-        return np.asarray(np.clip(np.concatenate(parts), -self.penalty, self.penalty))
+        bounded = np.clip(np.concatenate(parts), -self.penalty, self.penalty)
+        return np.append(bounded, self.off_priors(values)) if self.priors else bounded
 
     def factor(self, name: str) -> float:
         """Residual of a curve that is off by one SI unit."""
@@ -361,23 +518,28 @@ class Objective:
         return float(np.ptp(self.measured[name])) * self.factor(name)
 
     def jacobian(self, values: Array, places: NDArray[np.int64]) -> Array:
-        """Derivative of the residual by the parameters at `places`, (n_data, n_places), SI.
+        """Derivative of the residual by the parameters at `places`, (n, n_places), SI.
 
         Carried along with the simulation; zeros where the parameters cannot be simulated.
         """
+        by_priors = np.zeros((len(self.priors), places.size))
+        for row, (one, place) in enumerate(zip(self.priors, self._prior_places, strict=True)):
+            by_priors[row, places == place] = 1.0 / one.sigma
         try:
             curves = self.simulate(values, places=places)
         except SimulationError:
-            return np.zeros((self.n_data, places.size))
+            return np.concatenate([np.zeros((self.n_data, places.size)), by_priors])
         if curves.slopes is None:  # none were asked for
-            return np.zeros((self.n_data, 0))
+            return np.zeros((self.n_data + len(self.priors), 0))
         parts = [
             curves.slopes[name][:, self._kept[name]] * self.factor(name) for name in self.counted
         ]
         slopes = np.concatenate(parts, axis=1).T
-        residual = self.compare(curves)
+        residual = self.compare(curves, values)[: self.n_data]
         slopes[np.abs(residual) >= self.penalty] = 0.0
-        return slopes if self.loss == "linear" else slopes * softness(residual, self.loss)[:, None]
+        if self.loss != "linear":
+            slopes *= softness(residual, self.loss)[:, None]
+        return np.concatenate([slopes, by_priors]) if self.priors else slopes
 
     def jacobian_along(self, values: Array, moves: Array) -> Array:
         """Derivative of the residual along moves (n_values, m) of the parameters, (n_data, m)."""
@@ -390,7 +552,7 @@ class Objective:
 
     def rms(self, residual: Array) -> dict[str, float]:
         """RMS of each counted curve in its unit, from residuals before the loss."""
-        parts = np.split(residual, np.cumsum(self.sizes)[:-1])
+        parts = np.split(residual[: self.n_data], np.cumsum(self.sizes)[:-1])
         return {
             name: float(np.sqrt(np.mean(part**2))) / self.factor(name)
             for name, part in zip(self.counted, parts, strict=True)
@@ -405,6 +567,16 @@ class Objective:
         derived = MOTION_CURVES if self.measurement.motion == INTEGRATED else ()
         there = [name for name in self.curves if name in self.counted or name not in derived]
         return {name: self.off(curves, name) if name in there else None for name in self.curves}
+
+    def shifted(self, curves: Simulated, late: float) -> dict[str, Array]:
+        """Curves as channels show them of which the motion is late by so many seconds."""
+        impact, there = self.drive == "impact", curves.curves
+        return {
+            name: _later(self.time, curve, late)
+            if impact and name.startswith("displacement")
+            else self._late(name, curve, late)
+            for name, curve in there.items()
+        }
 
     def look(self, values: Array, *, everything: bool = False) -> dict[str, float | None] | None:
         """Misfits of a point, see `misfit`, which is counted as no step of a fit.
@@ -428,16 +600,22 @@ class Objective:
         return float(np.sqrt(np.mean(miss**2)) / np.ptp(measured))
 
 
-def _later(
-    time: Array, curve: Array, late: float, before: float | None, *, at: float | None = None
-) -> Array:
-    """Motion (m) seen `late` seconds later, at the samples or at one time; straight past its ends.
-
-    `before` is the velocity (m/s) ahead of the first sample, by default that of its first step.
-    """
-    when = (time if at is None else np.array([at])) - late
-    first = (curve[1] - curve[0]) / (time[1] - time[0]) if before is None else before
-    last = (curve[-1] - curve[-2]) / (time[-1] - time[-2])
-    inside = np.interp(when, time, curve)
+def _later(time: Array, curves: Array, late: float) -> Array:
+    """Curves (…, n) seen `late` seconds later, at the samples; straight past their ends."""
+    when = time - late
     ahead, after = np.minimum(when - time[0], 0.0), np.maximum(when - time[-1], 0.0)
-    return np.asarray(inside + first * ahead + last * after)
+    first = (curves[..., 1] - curves[..., 0]) / (time[1] - time[0])
+    last = (curves[..., -1] - curves[..., -2]) / (time[-1] - time[-2])
+    rows = [np.interp(when, time, row) for row in np.atleast_2d(curves)]
+    inside = np.reshape(rows, curves.shape)
+    return np.asarray(inside + first[..., None] * ahead + last[..., None] * after)
+
+
+def _instants(time: Array, fine: int) -> Array:
+    """Instants that each sample averages: so many, evenly spread over its share of the clock."""
+    if fine == 1:
+        return time
+    gaps = np.diff(time)
+    widths = np.minimum(np.append(gaps, gaps[-1]), np.append(gaps[0], gaps))
+    offsets = (np.arange(fine) + 0.5) / fine - 0.5
+    return np.asarray((time[:, None] + widths[:, None] * offsets).ravel())

@@ -13,11 +13,12 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError
-from foamfit.fitting.box import LARGEST_SHIFT, LAST_STRAIN, Scales, Space, family, is_share
+from foamfit.fitting import nuisance
+from foamfit.fitting.box import LAST_STRAIN, Scales, Space, family, is_share
 from foamfit.fitting.curves import check_interior, choose_drive, default_weights
 from foamfit.fitting.objective import Objective
 from foamfit.springs.model import Model
-from foamfit.springs.parameters import split_name
+from foamfit.springs.parameters import NUISANCE, split_name
 
 
 def make_params(
@@ -87,9 +88,7 @@ def make_params(
         vary = short != "eta" or (drive == "impact" and (spring >= 0) == (count == 1))
         params.add(name, value=value, min=low, max=high, vary=vary)
     _add_heights(params, measurement, model)
-    if time_shift:
-        most = LARGEST_SHIFT * scales.duration
-        params.add("time_shift", value=0.0, min=-most, max=most)
+    _add_nuisance(params, measurement, scales, nuisance.names_of(drive, time_shift=time_shift))
     for own in (name.removesuffix("dsigma") for name in model.names if name.endswith("_dsigma")):
         eps_a = params[own + "eps_a"].value
         params[own + "dsigma"].value = -0.2 * params[own + "k0"].value * eps_a / (1.0 - eps_a)
@@ -144,6 +143,36 @@ def _add_heights(params: lmfit.Parameters, measurement: Measurement, model: Mode
         params.add(f"s{i}_height", value=height, vary=False)
 
 
+def _add_nuisance(
+    params: lmfit.Parameters, measurement: Measurement, scales: Scales, names: tuple[str, ...]
+) -> None:
+    """What the record does not say exactly, in the numbers of its file."""
+    weights = default_weights(measurement, "impact")
+    counted = {
+        "displacement": weights["displacement_time"] > 0.0,
+        "stress": weights["stress_time"] > 0.0,
+        "acceleration": measurement.acceleration is not None,
+    }
+    ranges = {name: float(np.ptp(values)) for name, values in measurement.channels().items()}
+    free = nuisance.open_in(measurement, counted) | {nuisance.TIME_SHIFT}
+    usual = nuisance.values_of(measurement)
+    for name in names:
+        low, high = nuisance.limits_of(name, measurement, scales.duration, ranges)
+        origin = measurement.origins.get(name, 0.0)
+        vary = name in free and low < high
+        limits = {"min": low + origin, "max": high + origin} if vary else {}
+        params.add(name, value=usual[name] + origin, vary=vary, **limits)
+
+
+def _counted_from(params: lmfit.Parameters, origins: Mapping[str, float], sign: float) -> None:
+    """Count nuisance parameters from what was taken off the record, or in its own numbers."""
+    for name, origin in origins.items():
+        if name in params and origin != 0.0:
+            one = params[name]
+            by = sign * origin
+            one.set(value=one.value + by, min=one.min + by, max=one.max + by)
+
+
 def _rest_of_height(measurement: Measurement, model: Model) -> str:
     """Expression of the last spring's height: what the others leave of the specimen."""
     others = [f"s{i}_height" for i in range(1, len(model.kinds))]
@@ -182,6 +211,12 @@ class Problem:
         """Flat vector of these parameters, or of the problem's own."""
         values = (self.params if params is None else params).valuesdict()
         return np.array([values[name] for name in self.names])
+
+    def told(self) -> lmfit.Parameters:
+        """Parameters for the user: nuisance parameters in the numbers of the file."""
+        params = self.params.copy()
+        _counted_from(params, self.measurement.origins, 1.0)
+        return params
 
     def put(self, values: Array) -> None:
         """Write a flat vector into the parameters that vary."""
@@ -234,7 +269,10 @@ class Problem:
         """The box in which the search moves."""
         params = [self.params[name] for name in self.names]
         low, high = np.array([one.min for one in params]), np.array([one.max for one in params])
-        return Space(self.model, self.scales, self.vector(), self.free(), low, high, self.tied())
+        vector = self.vector()
+        return Space(
+            self.model, self.names, self.scales, vector, self.free(), low, high, self.tied()
+        )
 
     def sizes(self, names: tuple[str, ...], values: Array) -> Array:
         """Scales of some parameters at a point."""
@@ -269,8 +307,9 @@ def _check_held(params: lmfit.Parameters) -> None:
             "kh_plus": ("zero or positive", value >= 0.0),
             "kh_minus": ("zero or positive", value >= 0.0),
             "eta": ("zero or positive", value >= 0.0),
-            "time_shift": ("finite", bool(np.isfinite(value))),
         }.get(short, ("positive", value > 0.0))
+        if name in NUISANCE and name not in nuisance.STRIKER:
+            wanted, fine = "finite", bool(np.isfinite(value))
         if is_share(short):
             wanted, fine = "zero or positive", value >= 0.0
         if not fine:
@@ -317,6 +356,7 @@ def make_problem(
         )
     for name in params:
         wanted[name] = params[name]
+    _counted_from(wanted, measurement.origins, -1.0)
     _check_held(wanted)
     if not any(parameter.vary for parameter in wanted.values()):
         raise InputError("no parameter varies; let at least one vary")

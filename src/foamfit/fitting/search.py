@@ -21,7 +21,7 @@ from foamfit.fitting.box import BOX, LAST_STRAIN, Scales, Space, family
 from foamfit.fitting.curves import smoothed
 from foamfit.fitting.objective import Objective
 from foamfit.springs.law import least_eps_star
-from foamfit.springs.parameters import HYSTERETIC
+from foamfit.springs.parameters import HYSTERETIC, NUISANCE
 
 Progress = Callable[[float, str], None]
 
@@ -116,11 +116,14 @@ def smooth_loop(measurement: Measurement) -> Measurement:
     assert stress is not None
     window = max(motion.size // 60, 1) * 2 + 1
     motion = smoothed(motion, window) if window > 3 else motion
-    keep = np.unique(np.linspace(0, motion.size - 1, min(motion.size, LOOP_SAMPLES)).astype(int))
+    first = 0 if time is None else int(np.searchsorted(time, 0.0))  # what precedes contact is none
+    count = min(motion.size - first, LOOP_SAMPLES)
+    keep = np.unique(np.linspace(first, motion.size - 1, count).astype(int))
     thinned = None if time is None else time[keep]
     return replace(
         measurement, displacement=motion[keep], stress=stress[keep], time=thinned,
-        outliers={},  # bridged, and smoothed over
+        outliers={}, sampled={}, interior={},  # bridged, and smoothed over
+        acceleration=None, block=1,
     )  # fmt: skip
 
 
@@ -263,7 +266,8 @@ def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> l
 def box_starts(space: Space, rng: np.random.Generator, count: int) -> list[Array]:
     """Latin hypercube over the inner part of the box, whatever the curve looks like."""
     inner = {"kh_plus": (0.0, 4.0), "kh_minus": (0.0, 4.0), "eta": (0.0, 0.3), "g": (0.0, 1.0)}
-    inner |= {"time_shift": (-0.3, 0.3), "tau": tuple(np.log([0.002, 1.0]))}
+    inner |= dict.fromkeys(NUISANCE, (-0.05, 0.05)) | {"time_shift": (-0.3, 0.3)}
+    inner |= {"tau": tuple(np.log([0.002, 1.0]))}
     inner |= dict.fromkeys(("k0", "kc"), tuple(np.log([0.3, 300.0])))
     inner |= dict.fromkeys(("sigma_plus", "sigma_minus"), tuple(np.log([0.02, 1.0])))
     inner |= dict.fromkeys(("spread_plus", "spread_minus"), tuple(np.log([0.05, 2.0])))
@@ -383,7 +387,7 @@ def _search_loop(
     loop = smooth_loop(objective.measurement)
     along = Objective(
         loop, objective.model, "displacement", {"stress_strain": 1.0},
-        time_shift=objective.time_shift, loss=objective.loss,
+        time_shift=objective.time_shift, nuisance=objective.nuisance, loss=objective.loss,
     )  # fmt: skip
     inner = Tracker(along, tracker.deadline, tracker.better)
     try:

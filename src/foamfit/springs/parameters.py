@@ -30,9 +30,18 @@ UNITS = {
 } | {
     "eta": "Pa s",
     "height": "m",
-    "time_shift": "s",
     "g": "",
     "tau": "s",
+}
+# What a record does not say exactly of an impact, and its unit: unknowns beside the springs.
+NUISANCE = {
+    "contact_time": "s",
+    "displacement_zero": "m",
+    "stress_zero": "Pa",
+    "acceleration_zero": "m/s^2",
+    "velocity": "m/s",
+    "striker_mass": "kg",
+    "time_shift": "s",
 }
 # By kind of spring, the branches of which a test must have reached one for the parameter to leave a
 # trace in it.
@@ -72,15 +81,17 @@ def names_of(kind: str, relaxation: int = 0) -> tuple[str, ...]:
 
 
 def split_name(name: str) -> tuple[int, str]:
-    """Split "s2_kh_plus" into (1, "kh_plus"); (-1, "eta") for "site_eta", (-1, "time_shift")."""
-    if name in ("site_eta", "time_shift"):
-        return -1, name.removeprefix("site_")
-    prefix, short = name.split("_", 1)
-    return int(prefix[1:]) - 1, short
+    """Split "s2_kh_plus" into (1, "kh_plus"); (-1, "eta") for "site_eta", (-1, "velocity")."""
+    prefix, _, short = name.partition("_")
+    if prefix.startswith("s") and prefix[1:].isdigit():
+        return int(prefix[1:]) - 1, short
+    return -1, name.removeprefix("site_")
 
 
 def unit_of(name: str) -> str:
     """Unit of a parameter, SI; "" for a pure number."""
+    if name in NUISANCE:
+        return NUISANCE[name]
     short = split_name(name)[1]
     return UNITS[short if short in UNITS else short.rstrip("0123456789")]
 

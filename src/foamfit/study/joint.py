@@ -430,7 +430,8 @@ def _alone(tests: Sequence[_Test], vectors: Sequence[Array], n_eff: int) -> Alon
         for one, values in zip(objectives, vectors, strict=True)
     ]
     cost = sum(
-        float(np.sum(one.compare(run) ** 2)) for one, run in zip(objectives, runs, strict=True)
+        float(np.sum(one.compare(run, values) ** 2))
+        for one, run, values in zip(objectives, runs, vectors, strict=True)
     )
     n_vary = sum(len(test.problem.free()) for test in tests)
     score = bic(cost, sum(one.n_data for one in objectives), n_vary, n_eff)

@@ -61,7 +61,7 @@ def effective_samples(problem: Problem, values: Array) -> int:
     What the own fit leaves is mostly an error of the law, which is no noise: one stretch on one
     side, whatever its samples, says one thing. Counted over `BLOCKS` means of each curve.
     """
-    residual, count = problem.objective.residual(values), 0
+    residual, count = problem.objective.residual(values)[: problem.objective.n_data], 0
     for part in np.split(residual, np.cumsum(problem.objective.sizes)[:-1]):
         blocks = np.array_split(part, min(BLOCKS, part.size))
         signs = np.sign([float(np.mean(block)) for block in blocks])

@@ -28,10 +28,11 @@ def m_estimate(residual: Array, sizes: tuple[int, ...], loss: str) -> tuple[Arra
     With the mean m of ψ'(r) over each curve (so many samples in `sizes`): √m and ψ(r)/√m. The
     normal matrix of the slopes so weighted is half the curvature of the cost, and the covariance of
     their least squares that of an M-estimate (Huber 1981, Robust Statistics, section 7.6). Under
-    the linear loss they are one and the residuals.
+    the linear loss they are one and the residuals, as those of priors behind the curves always are.
     """
     psi, slope = influence(residual, loss)
-    weights = np.empty(residual.size)
+    weights, data = np.ones(residual.size), sum(sizes)
+    psi = np.append(psi[:data], residual[data:])
     for part in parts(sizes):
         weights[part] = max(float(slope[part].mean()), 0.05) ** 0.5
     return weights, psi / weights
@@ -56,8 +57,8 @@ class BestPoint:
 
     @cached_property
     def residual(self) -> Array:
-        """Residual before its loss gives way to large ones, (n_data,)."""
-        return self.problem.objective.compare(self.simulated)
+        """Residual of curves and priors before its loss gives way to large ones."""
+        return self.problem.objective.compare(self.simulated, self.values)
 
     @cached_property
     def unreached(self) -> dict[str, str]:
@@ -139,6 +140,7 @@ class BestPoint:
         pull = jacobian.T @ residual
         noise = zip(spread.noise, parts(self.problem.objective.sizes), strict=True)
         sure = np.sum([process.forms(jacobian[part]) for process, part in noise], axis=0)
+        sure += np.sum(jacobian[self.problem.objective.n_data :] ** 2, axis=0)
         limits = np.array([self.limits(name) for name in self.names])
         there = self.values[[self.index[name] for name in self.names]]
         near = np.abs(limits.T - there) <= covariance.AT_LIMIT * self.sizes
@@ -147,8 +149,9 @@ class BestPoint:
 
     @cached_property
     def soft(self) -> Array:
-        """Residual, softened by the loss, (n_data,)."""
-        return soften(self.residual, self.problem.objective.loss)
+        """Residual of curves and priors, softened by the loss."""
+        objective = self.problem.objective
+        return soften(self.residual, objective.loss, objective.n_data)
 
     @cached_property
     def cost(self) -> float:

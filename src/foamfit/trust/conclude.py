@@ -16,6 +16,7 @@ from foamfit.data.describe import noise_sentences
 from foamfit.data.energy import audit
 from foamfit.data.measurement import INTEGRATED, interior_channel
 from foamfit.errors import SimulationError
+from foamfit.fitting import nuisance
 from foamfit.fitting.box import scale_in_words
 from foamfit.fitting.branches import visited
 from foamfit.fitting.curves import MOTION_CURVES
@@ -55,7 +56,7 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         status=status_of(checklist),
         warnings=warnings_of(checklist),
         chain=problem.model.chain(springs, specimen.height, specimen.area),
-        params=problem.params,
+        params=problem.told(),
         parameters=estimates,
         visited=visited(problem, simulated),
         misfit=misfit,
@@ -221,7 +222,10 @@ def _estimates(
 ) -> dict[str, ParameterEstimate]:
     """Value, uncertainty and state of every parameter; also put into lmfit's parameters."""
     out = {}
+    usual = nuisance.values_of(best.problem.measurement)
     for i, name in enumerate(best.problem.names):
+        if not best.problem.params[name].vary and best.values[i] == usual.get(name):
+            continue  # the record leaves it no freedom
         value, parameter, unit = float(best.values[i]), best.problem.params[name], unit_of(name)
         if name in best.names:
             assert insight is not None
@@ -234,7 +238,8 @@ def _estimates(
             why = "held fixed" if parameter.expr is None else f"tied by {parameter.expr}"
             out[name] = ParameterEstimate(value, None, None, unit, False, "fixed", why)
         parameter.stderr = out[name].stderr
-    return out
+    origins = best.problem.measurement.origins
+    return {name: one.counted_from(-origins.get(name, 0.0)) for name, one in out.items()}
 
 
 def _left_over(best: BestPoint) -> dict[str, float]:
@@ -326,7 +331,7 @@ def state_of(
 def _statistics(best: BestPoint, record: SearchRecord) -> dict[str, float | int | None]:
     """Statistics as lmfit defines them (chi-square, AIC, BIC), and what the search cost."""
     objective, chisqr = best.problem.objective, best.cost
-    n, n_vary = best.residual.size, len(best.names)  # determined or not, they follow the data
+    n, n_vary = objective.n_data, len(best.names)  # determined or not, they follow the data
     log_likelihood = n * math.log(max(chisqr, 1e-300) / n)
     aic, freedom = log_likelihood + 2 * n_vary, n - n_vary - 1
     return {

@@ -93,7 +93,7 @@ def covariance(
     """Covariance H⁻¹ JᵀΣJ H⁻¹ with Σ the noise of each curve (by default `noise_processes`).
 
     `residual` (n,) and `jacobian` (n, k) are those of the best point, so many samples of each curve
-    as in `sizes`; `sizes_of` (k,) are the scales of the parameters, so that directions compare. H
+    as in `sizes` and behind them priors of unit variance; `sizes_of` (k,) are the scales of the parameters, so that directions compare. H
     is JᵀJ, or with `gradient` the derivative of Jᵀr, which a residual that is no noise changes
     (White 1982, Econometrica 50, 1): `gradient` gives Jᵀr (k,) at a step (k,), both scaled, off the
     best point; it is asked one standard error to either side along the principal axes.
@@ -105,6 +105,8 @@ def covariance(
     left, root = left[:, seen], vt[seen].T / singular[seen]
     curves = list(zip(noise, parts(sizes), strict=True))
     inner = np.sum([left[part].T @ process.times(left[part]) for process, part in curves], axis=0)
+    rest = left[sum(sizes) :]  # priors, of unit variance
+    inner = inner + rest.T @ rest
     power, axes = np.linalg.eigh(0.5 * (inner + inner.T))
     least = 1e-12 * power.max(initial=0.0)  # no variance is negative
     axes = axes * np.sqrt(np.maximum(power, least))
@@ -119,6 +121,7 @@ def covariance(
     effective = sum(n / process.tau for n, process in zip(sizes, noise, strict=True))
     errors = left @ bread @ root.T  # of the estimates, by the noise of each sample
     variance = np.sum([process.forms(errors[part]) for process, part in curves], axis=0)
+    variance = variance + np.sum(errors[sum(sizes) :] ** 2, axis=0)
     doubt = np.sum([process.doubt(errors[part]) for process, part in curves], axis=0)
     known = 2.0 * variance**2 / np.maximum(doubt, 1e-300)
     return Covariance(

@@ -68,7 +68,8 @@ class Tried:
     @cached_property
     def residual(self) -> Array:
         """At the best point, curve after curve, (n_data,)."""
-        return soften(self.best.residual, self.best.problem.objective.loss)
+        objective = self.best.problem.objective
+        return soften(self.best.residual[: objective.n_data], objective.loss)
 
     @cached_property
     def spans(self) -> tuple[float, ...]:
@@ -85,10 +86,10 @@ class Tried:
     @cached_property
     def grams(self) -> Array:
         """JᵀJ of each curve, J the derivative by relative changes, (n_curves, k, k)."""
-        loss = self.best.problem.objective.loss
+        objective = self.best.problem.objective
         jacobian = self.best.jacobian * self.best.sizes
-        jacobian = jacobian * softness(self.best.residual, loss)[:, None]
-        parts = np.split(jacobian, np.cumsum(self.sizes)[:-1])
+        jacobian = jacobian * softness(self.best.residual, objective.loss)[:, None]
+        parts = np.split(jacobian[: objective.n_data], np.cumsum(self.sizes)[:-1])
         return np.array([part.T @ part for part in parts])
 
     @property

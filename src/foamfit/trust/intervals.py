@@ -124,8 +124,11 @@ def _with_minima(
     for point in minima:
         residual = tracker.consider(point)
         apart = (residual - here)[:, None]
-        noise = zip(best.spread.noise, parts(best.problem.objective.sizes), strict=True)
-        chance = 2.0 * math.sqrt(sum(float(process.forms(apart[p])[0]) for process, p in noise))
+        objective = best.problem.objective
+        noise = zip(best.spread.noise, parts(objective.sizes), strict=True)
+        spread = sum(float(process.forms(apart[p])[0]) for process, p in noise)
+        spread += float(np.sum(apart[objective.n_data :] ** 2))
+        chance = 2.0 * math.sqrt(spread)
         if float(residual @ residual) - best.cost > 1.96 * chance:
             continue
         for name in best.known:

@@ -114,7 +114,8 @@ class _Block:
     def times(self, columns: Array) -> Array:
         """Covariance of the noise times columns (n, m)."""
         pairs = zip(self.noise, self.parts, strict=True)
-        return np.concatenate([process.times(columns[part]) for process, part in pairs])
+        priors = columns[self.best.problem.objective.n_data :]  # of unit variance
+        return np.concatenate([*(process.times(columns[p]) for process, p in pairs), priors])
 
     def doubt(self, columns: Array) -> Array:
         """Variance of the variance that the noise makes of each column, (m,)."""

@@ -50,7 +50,8 @@ def predicted_misfit(best: BestPoint, deadline: float | None = None) -> float:
     space, tracker = problem.space(), Tracker(objective, deadline)
     block = np.arange(objective.time.size) * BLOCKS // objective.time.size
     of_sample = np.concatenate([block[objective.kept(name)] for name in objective.counted])
-    start, predicted = space.encode(best.values), np.empty(objective.n_data)
+    of_sample = np.append(of_sample, np.full(len(objective.priors), BLOCKS))  # none of a block
+    start, predicted = space.encode(best.values), np.empty(of_sample.size)
     for held in range(BLOCKS):
         rest = of_sample != held
 
@@ -65,4 +66,4 @@ def predicted_misfit(best: BestPoint, deadline: float | None = None) -> float:
         end = levenberg.descend(residual, jacobian, start, space.box, STEPS, enough=ENOUGH)
         there = objective.residual(space.decode(end.point))
         predicted[~rest] = there[~rest]
-    return misfit_of(best, predicted)
+    return misfit_of(best, predicted[: objective.n_data])

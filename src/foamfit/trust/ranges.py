@@ -119,7 +119,8 @@ def _weights(best: BestPoint) -> Iterator[Array]:
     heavy += [number * WINDOWS // stress.size != window for window in range(WINDOWS)]
     for samples in heavy:
         kept = [samples[objective.kept(name)] for name in objective.counted]
-        yield np.where(np.concatenate(kept), HEAVIER, 1.0)
+        priors = np.zeros(len(objective.priors), dtype=bool)
+        yield np.where(np.concatenate([*kept, priors]), HEAVIER, 1.0)
 
 
 def _towards(best: BestPoint, refit: Refit, weights: Array, rise: float) -> list[Array]:

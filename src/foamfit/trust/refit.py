@@ -26,8 +26,8 @@ class Refit:
 
     best: BestPoint
     tracker: Tracker  # Simulates, counts and ends all at its deadline
-    # (n_data,): Taken off the residual, before the loss: data that differ from those that were
-    # fitted.
+    # Taken off the residual, before the loss: data (and means of priors) that differ from those
+    # that were fitted.
     shift: Array | float = 0.0
 
     def __post_init__(self) -> None:
@@ -50,12 +50,14 @@ class Refit:
     def start(self) -> Iterate:
         """The best point itself."""
         differences = self.best.residual - self.shift
-        soft = soften(differences, self.best.problem.objective.loss)
+        objective = self.best.problem.objective
+        soft = soften(differences, objective.loss, objective.n_data)
         return Iterate(self.best.values, soft, self._jacobian(differences, self.best.jacobian))
 
     def _jacobian(self, differences: Array, slopes: Array) -> Array:
         """Derivative of the softened residual by the scaled parameters."""
-        soft = softness(differences, self.best.problem.objective.loss)
+        objective = self.best.problem.objective
+        soft = softness(differences, objective.loss, objective.n_data)
         return np.asarray(soft[:, None] * slopes * self.best.sizes)
 
     def residual(self, point: Array) -> Array | None:

@@ -67,7 +67,7 @@ def _misfits(best: BestPoint) -> Array:
     """Residuals of the curves that hold an error of the law, zero for the others, (n_data,)."""
     pairs = zip(best.problem.objective.sizes, best.errors, strict=True)
     found = np.concatenate([np.full(size, error.found) for size, error in pairs])
-    return np.where(found, best.residual, 0.0)
+    return np.where(found, best.residual[: found.size], 0.0)
 
 
 def bootstrap(best: BestPoint, draws: int, seed: int, tracker: Tracker | None = None) -> Refits:
@@ -82,12 +82,13 @@ def bootstrap(best: BestPoint, draws: int, seed: int, tracker: Tracker | None = 
     objective = best.problem.objective
     tracker = Tracker(objective) if tracker is None else tracker
     rng = np.random.default_rng([seed, 1])
-    ends = np.cumsum(objective.sizes)[:-1]
+    ends = np.cumsum(objective.sizes)
+    priors = len(objective.priors)
     _, pseudo = m_estimate(best.residual, objective.sizes, objective.loss)
     sources = []
     for n, part, like, process in zip(
-        objective.sizes, np.split(best.residual, ends), np.split(pseudo, ends), best.spread.noise,
-        strict=True,
+        objective.sizes, np.split(best.residual, ends)[:-1], np.split(pseudo, ends)[:-1],
+        best.spread.noise, strict=True,
     ):  # fmt: skip
         length = block_length(process, n)
         sources.append((_scaled_residual(part, process, like, length), length))
@@ -102,7 +103,8 @@ def bootstrap(best: BestPoint, draws: int, seed: int, tracker: Tracker | None = 
                     sources, best.errors, best.spread.noise, strict=True
                 )
             ]
-            refit = Refit(best, tracker, best.residual - kept - np.concatenate(drawn))
+            left = best.residual[: objective.n_data] - kept - np.concatenate(drawn)
+            refit = Refit(best, tracker, np.append(left, rng.standard_normal(priors)))
             end = refit.run(best.values)
             assert end is not None  # the best point can be simulated
             out.append(end.point[refit.places])
@@ -168,6 +170,7 @@ def mcmc(best: BestPoint, steps: int, seed: int, tracker: Tracker | None = None)
     start = refit.start()
     variances = [process.variance * process.tau for process in best.spread.noise]
     weights = np.repeat(1.0 / np.array(variances), best.problem.objective.sizes)
+    weights = np.append(weights, np.ones(len(best.problem.objective.priors)))
 
     def log_probability(scaled: Array) -> float:
         point = start.point.copy()

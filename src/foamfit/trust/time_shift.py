@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from foamfit.fitting.problem import Problem
@@ -24,10 +26,12 @@ def shift_hint(best: BestPoint, determined: list[str]) -> float | None:
 def _shift_of_residuals(best: BestPoint, determined: list[str]) -> float | None:
     """Time by which the motion is late (s), if one linear step plainly finds it."""
     problem, objective, residual = best.problem, best.problem.objective, best.residual
+    there = best.simulated
     assert problem.measurement.time is not None
     step = float(np.median(np.diff(problem.measurement.time)))
     sides = [
-        objective.compare(objective.shifted(best.simulated, side * step)) for side in (-0.5, 0.5)
+        objective.compare(replace(there, curves=objective.shifted(there, side * step)), best.values)
+        for side in (-0.5, 0.5)
     ]
     columns = [best.names.index(name) for name in determined]
     own = best.jacobian[:, columns] if columns else np.empty((residual.size, 0))

@@ -165,7 +165,8 @@ def noise_processes(
         pairs = list(zip(processes, curves, strict=True))
         images = [process.times(basis[part]) for process, part in pairs]
         squares = [basis[part].T @ image for image, part in zip(images, curves, strict=True)]
-        middle = np.sum(squares, axis=0)
+        rest = basis[sum(sizes) :]  # priors, of unit variance
+        middle = np.sum(squares, axis=0) + rest.T @ rest
         processes = [
             _corrected(process, seen, basis[part], image, middle)
             for process, seen, part, image in zip(processes, sums, curves, images, strict=True)
