@@ -54,6 +54,8 @@ MOVED = 0.999
 # Evaluations over those of the search that ranges and profiles take, as measured: where the law has
 # an error, and where none.
 JUDGED, JUDGED_NOISE = 2.0, 0.15
+# How often the covariance by a driving motion is made.
+WEIGHED = 2
 # Share of its time that a fit has searched, where the law has an error or none.
 SEARCHED = 0.5
 
@@ -260,6 +262,7 @@ def _search(
         record = replace(record, costs=tuple(costs))
         progress(REFINED, "refinement")
         _refine(problem, tracker)
+        _weigh_motion(problem, tracker)
     except STOPPING as error:
         ensure_feasible(tracker, problem.space(), np.random.default_rng(record.seed))
         return replace(record, stopped=what_stopped(error))
@@ -300,6 +303,25 @@ def _refine(problem: Problem, tracker: Tracker) -> None:
             residual, params, method="least_squares", jac=jacobian, x_scale=best.sizes,
             ftol=1e-10, xtol=1e-10, gtol=1e-12, max_nfev=60,
         )  # fmt: skip
+
+
+def _weigh_motion(problem: Problem, tracker: Tracker) -> None:
+    """Count the residual in the covariance that the motion's own uncertainty gives it, and refine.
+
+    That covariance is the one at the best point, so it is made anew there once more.
+    """
+    for _ in range(WEIGHED):
+        if tracker.best_values is None:
+            return
+        try:
+            uncertain = problem.objective.by_motion(tracker.best_values)
+        except SimulationError:  # along a motion a little off: the residual stays as it is
+            return
+        if uncertain is None:
+            return
+        problem.objective.weigh(uncertain)
+        tracker.restart()
+        _refine(problem, tracker)
 
 
 def _on_limits(best: BestPoint, cost: float) -> BestPoint:

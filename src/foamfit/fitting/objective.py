@@ -8,7 +8,9 @@ silently.
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from numbers import Real
 
 import numpy as np
@@ -16,6 +18,7 @@ from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import INTEGRATED, Measurement, NoiseLevel
+from foamfit.data.motion import SmoothMotion, follow
 from foamfit.data.noise import with_noise
 from foamfit.errors import InputError, SimulationError, as_signalled
 from foamfit.fitting import nuisance as nuisances
@@ -47,6 +50,8 @@ MODEL_ERROR = 0.005
 _ANY_SPRING: dict[str, Spring] = {"microscale": MicroscaleSpring(1.0, 1.0, 0.0, 1.0, 1.0, 1.0, 1.0)}
 # A trial that needs more steps than this is too stiff to be worth waiting for.
 MAX_STEPS = 20_000
+# Noise of a motion, over its range, that counts as none.
+EXACT = 1e-6
 # Most instants that are simulated for each sample that averages rows of the file.
 FINEST = 8
 # Steps of differences: of the velocity and the mass, relative, and of times over the instants' gap.
@@ -86,6 +91,9 @@ class Objective:
     time_shift: bool = False
     # Names of the nuisance parameters that end the vector; by default those of the drive.
     nuisance: tuple[str, ...] = ()
+    # (n_data, m): what one standard deviation along each mode of a driving motion does to the
+    # residual; the residual is counted in its full covariance, see `weigh`.
+    uncertain: Array | None = None
     loss: str = "linear"  # One of `LOSSES`
     evaluations: int = field(default=0, init=False)  # Sets of parameters that were simulated
     failures: int = field(default=0, init=False)  # Those of them that could not be
@@ -110,18 +118,17 @@ class Objective:
         time = self.measurement.time
         # Of the samples, s; their number where the test has no time.
         self.time = np.arange(self._stress.size, dtype=float) if time is None else time
-        self._fine = min(self.measurement.block, FINEST) if self.drive == "impact" else 1
-        self._clock = _instants(self.time, self._fine)
+        self._fine = min(self.measurement.block, FINEST) if self.drive != "stress" else 1
+        self._clock, self._own = _instants(self.time, self._fine), None
+        if self._driven and self.motion is not None and self.motion.turns.size:
+            # A motion turns between samples: how far it goes there is what the springs remember.
+            own, self._clock = self._clock, np.union1d(self._clock, self.motion.turns)
+            self._own = np.searchsorted(self._clock, own)
         self._absent = {"stress": ["stress_time"], "displacement": ["displacement_time"]}.get(
             self.drive, []
         ) + (["stress_time"] if time is None else [])
         loading = self._loading()
         self._plans = {damped: self._scene(loading, damped=damped) for damped in (False, True)}
-        self._along: dict[bool, Plan] = {}
-        if self.measurement.displacement is not None:
-            moved = np.interp(self._clock, self.time, self.measurement.displacement)
-            along = DisplacementDrive(moved)
-            self._along = {damped: self._scene(along, damped=damped) for damped in (False, True)}
         self.measured = self._measured()
         self.counted = tuple(name for name in self.measured if self.weights[name] > 0)
         self._inside = any(name in self.interior for name in self.counted)
@@ -137,6 +144,84 @@ class Objective:
         # Worse per sample than any curve that stays within ten ranges.
         self.penalty = max(PENALTY * self.span(name) for name in self.counted)
         self._set_nuisance()
+        self.weigh(self.uncertain)
+
+    @cached_property
+    def motion(self) -> SmoothMotion | None:
+        """The measured motion without its noise; None where it is exact, or is not there."""
+        values = self.measurement.displacement
+        level = self.measurement.noise.of("displacement")
+        if values is None or level is None or level.sigma <= EXACT * float(np.ptp(values)):
+            return None
+        return follow(self.time, values, level, self.measurement.sampled.get("displacement"))
+
+    @cached_property
+    def _moved(self) -> Array:
+        """The measured motion at the instants that are simulated, m."""
+        values = self.measurement.displacement
+        assert values is not None
+        if self.motion is not None:
+            return self.motion.at(self._clock)
+        return np.interp(self._clock, self.time, values)
+
+    @cached_property
+    def _along(self) -> dict[bool, Plan]:
+        """Scenes of the springs along the measured motion; none where there is no motion."""
+        if self.measurement.displacement is None:
+            return {}
+        along = DisplacementDrive(self._moved)
+        return {damped: self._scene(along, damped=damped) for damped in (False, True)}
+
+    def weigh(self, uncertain: Array | None) -> None:
+        """Count residuals in the covariance v + SSᵀ of noise v and of a motion that drives.
+
+        The columns of S (n_data, m) are those of `uncertain`. The residual r becomes
+        √v (1 + S'S'ᵀ)^(-1/2) r/√v with S' = S/√v, whose covariance is v again.
+        """
+        self.uncertain = uncertain
+        if uncertain is None:
+            return
+        levels = [
+            np.full(size, self.noise(name).sigma * self.factor(name))
+            for name, size in zip(self.counted, self.sizes, strict=True)
+        ]
+        self._root = np.maximum(np.concatenate(levels), 1e-9)
+        left, size, _ = np.linalg.svd(uncertain / self._root[:, None], full_matrices=False)
+        self._lean, self._less = left, 1.0 - 1.0 / np.sqrt(1.0 + size**2)
+
+    def _weighed(self, rows: Array) -> Array:
+        """Residuals, or columns of their derivatives, in the covariance of `weigh`."""
+        if self.uncertain is None:
+            return rows
+        root = self._root if rows.ndim == 1 else self._root[:, None]
+        less = self._less if rows.ndim == 1 else self._less[:, None]
+        plain = rows / root
+        return np.asarray(rows - root * (self._lean @ (less * (self._lean.T @ plain))))
+
+    def by_motion(self, values: Array) -> Array | None:
+        """Change of the residual by each mode of the motion that drives, (n_data, m), or None.
+
+        Raises SimulationError if the springs cannot be simulated along one of them.
+        """
+        if not self._driven or self.motion is None:
+            return None
+        modes = self.motion.modes(self._clock)
+        out = np.empty((self.n_data, modes.shape[1]))
+        for column, mode in zip(out.T, modes.T, strict=True):
+            sides = [self._moved_by(side * mode).simulate(values) for side in (-0.5, 0.5)]
+            ends = [self.compare(side, values)[: self.n_data] for side in sides]
+            column[:] = ends[1] - ends[0]
+        self.evaluations += 2 * modes.shape[1]
+        return out
+
+    def _moved_by(self, change: Array) -> Objective:
+        """The same objective with another driving motion."""
+        other = copy(self)
+        other._plans = {
+            damped: plan._replace(values=plan.values + change)
+            for damped, plan in self._plans.items()
+        }
+        return other
 
     def _set_nuisance(self) -> None:
         """Which zero each curve has, the steps of differences, and the priors."""
@@ -183,8 +268,7 @@ class Objective:
             return Impact(striker.mass, striker.velocity)
         if self.drive == "stress":
             return StressDrive(driving_stress(self._stress, self.model))
-        assert self.measurement.displacement is not None
-        return DisplacementDrive(self.measurement.displacement)
+        return DisplacementDrive(self._moved)
 
     def _scene(self, loading: Drive, *, damped: bool) -> Plan:
         """Make a scene ready; only which springs have a dashpot matters here, not their values.
@@ -342,7 +426,8 @@ class Objective:
         if late != 0.0 and self.drive == "impact":
             moved = run(plan._replace(time=plan.time - late), everywhere)
         along = motion if self._driven else None
-        if along is None and self._along and (everything or "stress_strain" in self.counted):
+        wanted_along = everything or "stress_strain" in self.counted
+        if along is None and wanted_along and self._along:
             along = run(self._followed(self._along[damped], at), False)
         parts = self._parts(motion, moved, along, everywhere, (values, at))
         curves = {name: self._sampled(curve) for name, (curve, _) in parts.items()}
@@ -413,13 +498,14 @@ class Objective:
 
     def _sampled(self, values: Array) -> Array:
         """Mean over the instants that each sample averages, along the last axis."""
+        values = values if self._own is None else values[..., self._own]
         if self._fine == 1:
             return values
         return np.asarray(values.reshape(*values.shape[:-1], -1, self._fine).mean(axis=-1))
 
     def _averaged(self, motion: Motion, contact: float) -> Motion:
         """A run on the clock of the samples."""
-        if self._fine > 1:
+        if self._fine > 1 or self._own is not None:
             motion = motion._replace(
                 displacement=self._sampled(motion.displacement),
                 base_stress=self._sampled(motion.base_stress),
@@ -432,7 +518,7 @@ class Objective:
 
     def _late(self, name: str, curves: Array, late: float) -> Array:
         """Stress along a motion that is late by so many seconds, seen on its clock: earlier."""
-        if late == 0.0 or self.drive == "impact" and name != "stress_strain":
+        if late == 0.0 or (self.drive == "impact" and name != "stress_strain"):
             return curves
         if self.drive == "stress":
             return _later(self.time, curves, late) if name.startswith("displacement") else curves
@@ -507,6 +593,7 @@ class Objective:
         ]
         # A stress near the pole of branch c is as bad as none.
         bounded = np.clip(np.concatenate(parts), -self.penalty, self.penalty)
+        bounded = self._weighed(bounded)
         return np.append(bounded, self.off_priors(values)) if self.priors else bounded
 
     def factor(self, name: str) -> float:
@@ -537,6 +624,7 @@ class Objective:
         slopes = np.concatenate(parts, axis=1).T
         residual = self.compare(curves, values)[: self.n_data]
         slopes[np.abs(residual) >= self.penalty] = 0.0
+        slopes = self._weighed(slopes)
         if self.loss != "linear":
             slopes *= softness(residual, self.loss)[:, None]
         return np.concatenate([slopes, by_priors]) if self.priors else slopes

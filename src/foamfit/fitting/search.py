@@ -92,6 +92,12 @@ class Tracker:
             raise SearchStoppedError
         return residual
 
+    def restart(self) -> None:
+        """Go on from the best point with an objective that has changed."""
+        best, self.best_values, self.best_cost = self.best_values, None, np.inf
+        if best is not None:
+            self.consider(best)
+
     def consider(self, values: Array, shift: Array | float = 0.0) -> Array:
         """Residual of the objective, whatever the time; with a shift, that of other data."""
         failures = self.objective.failures
@@ -109,13 +115,19 @@ class Tracker:
 # ---------------------------------------------------------------- starts
 
 
-def smooth_loop(measurement: Measurement) -> Measurement:
-    """Smooth and thin the measured loop, for the first descent only."""
+def smooth_loop(measurement: Measurement, followed: Array | None = None) -> Measurement:
+    """Smooth and thin the measured loop, for the first descent only.
+
+    `followed` is the motion without its noise, m, where it is known better.
+    """
     motion, stress, time = measurement.displacement, measurement.stress, measurement.time
     assert motion is not None
     assert stress is not None
-    window = max(motion.size // 60, 1) * 2 + 1
-    motion = smoothed(motion, window) if window > 3 else motion
+    if followed is not None:
+        motion = followed
+    else:
+        window = max(motion.size // 60, 1) * 2 + 1
+        motion = smoothed(motion, window) if window > 3 else motion
     first = 0 if time is None else int(np.searchsorted(time, 0.0))  # what precedes contact is none
     count = min(motion.size - first, LOOP_SAMPLES)
     keep = np.unique(np.linspace(first, motion.size - 1, count).astype(int))
@@ -384,7 +396,9 @@ def _search_loop(
     However this ends, the best point of the loop is handed to the tracker.
     """
     objective = tracker.objective
-    loop = smooth_loop(objective.measurement)
+    driven = objective.drive == "displacement" and objective.motion is not None
+    followed = objective.motion.at(objective.time) if driven and objective.motion else None
+    loop = smooth_loop(objective.measurement, followed)
     along = Objective(
         loop, objective.model, "displacement", {"stress_strain": 1.0},
         time_shift=objective.time_shift, nuisance=objective.nuisance, loss=objective.loss,

@@ -18,7 +18,7 @@ from foamfit.fitting.curves import check_time_shift
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.search import SearchRecord
 from foamfit.results import Check, Intervals, ParameterEstimate
-from foamfit.springs.parameters import BRANCHES, split_name
+from foamfit.springs.parameters import BRANCHES, NUISANCE, split_name
 from foamfit.text import engineering, listed, percent
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import AT_LIMIT, WEAK
@@ -199,17 +199,21 @@ def _structure(e: Findings) -> _Answer:
 
 
 def _determined(e: Findings) -> _Answer:
-    """Ask for the states; a parameter with a small upper bound is known well enough."""
-    warnings, vanishing = [], [name for name in e.estimates if _vanishes(e, name)]
+    """Ask for the states of the springs; a small upper bound of a parameter is enough.
+
+    A nuisance parameter that is not determined shows in the intervals of those that are wanted.
+    """
+    own = {name: item for name, item in e.estimates.items() if name not in NUISANCE}
+    warnings, vanishing = [], [name for name in own if _vanishes(e, name)]
     for state in ("not determined", "weak"):
         of = [
             (name, item.why)
-            for name, item in e.estimates.items()
+            for name, item in own.items()
             if item.state == state and name not in vanishing
         ]
         if of:
             warnings.append(f"{state.capitalize()}: {_by_reason(of)}.")
-    varied = [item.state for item in e.estimates.values() if item.state != "fixed"]
+    varied = [item.state for item in own.values() if item.state != "fixed"]
     found = f"{varied.count('determined')} of {len(varied)} are"
     if vanishing:
         found += f"; consistent with zero, with a small upper bound: {', '.join(vanishing)}"
@@ -274,7 +278,7 @@ def _bounds(e: Findings) -> _Answer:
     stuck, natural = [], []
     for name, size in zip(varied, sizes, strict=True):
         for bound in (params[name].min, params[name].max):
-            off = abs(e.estimates[name].value - bound)
+            off = abs(e.best.values[e.best.index[name]] - bound)
             if off > AT_LIMIT * size or e.estimates[name].stderr is None:
                 continue
             if bound == 0.0 and split_name(name)[1] in MAY_VANISH:

@@ -93,7 +93,8 @@ def covariance(
     """Covariance H⁻¹ JᵀΣJ H⁻¹ with Σ the noise of each curve (by default `noise_processes`).
 
     `residual` (n,) and `jacobian` (n, k) are those of the best point, so many samples of each curve
-    as in `sizes` and behind them priors of unit variance; `sizes_of` (k,) are the scales of the parameters, so that directions compare. H
+    as in `sizes` and behind them priors of unit variance;
+    `sizes_of` (k,) are the scales of the parameters, so that directions compare. H
     is JᵀJ, or with `gradient` the derivative of Jᵀr, which a residual that is no noise changes
     (White 1982, Econometrica 50, 1): `gradient` gives Jᵀr (k,) at a step (k,), both scaled, off the
     best point; it is asked one standard error to either side along the principal axes.
