@@ -217,12 +217,14 @@ def cut_to_reload(record: Record, cycle: Cycle, at: Reload, zero: float, height:
     return cut.without(slice(0, cycle.first), f"before cycle {number}"), notes
 
 
-def find_turns(values: Array) -> NDArray[np.int64]:
+def find_turns(values: Array, back: float | None = None) -> NDArray[np.int64]:
     """Samples at which a motion turns round: peaks and valleys by turns, the first a peak.
 
-    Only what goes back by more than a twentieth of the range, and by more than the noise, turns.
+    Only what goes back by more than `back`, by default a twentieth of the range and more than the
+    noise, turns.
     """
-    back = max(_TURN * float(np.ptp(values)), 8.0 * noise_level(values))
+    if back is None:
+        back = max(_TURN * float(np.ptp(values)), 8.0 * noise_level(values))
     # The extremes of short blocks are all that counts.
     block = max(1, len(values) // 20_000)
     parts = values[: len(values) // block * block].reshape(-1, block)

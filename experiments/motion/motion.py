@@ -1,0 +1,263 @@
+"""How well the motion is found behind a noisy displacement, and how well its errors are known.
+
+Synthetic motions of known turns are sampled with white noise; `foamfit.data.motion.follow` gives
+the motion, its turns and its modes, which are compared with the truth.
+
+    python experiments/motion/motion.py                # 225 draws a class, two minutes
+    python experiments/motion/motion.py --draws 4
+"""
+
+from __future__ import annotations
+
+import argparse
+import platform
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+import foamfit as ff
+from foamfit.data.measurement import NoiseLevel
+from foamfit.data.motion import follow
+
+HERE = Path(__file__).parent
+ROWS, NOISE = (300, 1000, 5000), (0.0005, 0.001, 0.003)
+NEAR = 0.01  # of the duration, on both sides of a turn
+Z95 = 1.959964
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A motion over the times 0 to 1, its turns in order, and holds at which it stands."""
+
+    at: Callable[[np.ndarray], np.ndarray]
+    turns: np.ndarray
+    holds: tuple[tuple[float, float], ...] = ()
+
+
+def straight(places: list[float], heights: list[float]) -> Motion:
+    """Return straight lines; a turn at a hold lies in its middle."""
+    places, heights = np.array(places), np.array(heights)
+    moves = np.flatnonzero(np.diff(heights))
+    up = np.sign(np.diff(heights)[moves])
+    turns = [
+        0.5 * (places[a + 1] + places[b])
+        for a, b, same in zip(moves[:-1], moves[1:], up[:-1] == up[1:], strict=True)
+        if not same
+    ]
+    flat = np.flatnonzero(np.diff(heights) == 0.0)
+    holds = tuple((float(places[i]), float(places[i + 1])) for i in flat)
+    return Motion(lambda t: np.interp(t, places, heights), np.array(turns), holds)
+
+
+def smooth(function: Callable[[np.ndarray], np.ndarray]) -> Motion:
+    fine = np.linspace(0.0, 1.0, 200_001)
+    values = function(fine)
+    low, size = values.min(), np.ptp(values)
+    speed = np.diff(values)
+    turns = fine[1:-1][speed[:-1] * speed[1:] < 0.0]
+    return Motion(lambda t: (function(t) - low) / size, turns)
+
+
+def triangle(rng: np.random.Generator) -> Motion:
+    return straight([0.0, rng.uniform(0.4, 0.6), 1.0], [0.0, 1.0, rng.uniform(0.0, 0.1)])
+
+
+def asymmetric(rng: np.random.Generator) -> Motion:
+    return straight([0.0, rng.choice([rng.uniform(0.08, 0.4), rng.uniform(0.6, 0.92)]), 1.0], [0.0, 1.0, 0.0])
+
+
+def sine(rng: np.random.Generator) -> Motion:
+    end = rng.uniform(0.8, 1.0)
+    return smooth(lambda t: np.sin(np.pi * end * t))
+
+
+def haversine(rng: np.random.Generator) -> Motion:
+    turn = rng.uniform(0.45, 0.55)
+    return smooth(lambda t: 0.5 - 0.5 * np.cos(np.pi * t / turn))
+
+
+def trapezoid(rng: np.random.Generator) -> Motion:
+    start, hold = rng.uniform(0.35, 0.45), rng.uniform(0.02, 0.2)
+    return straight([0.0, start, start + hold, 1.0], [0.0, 1.0, 1.0, 0.0])
+
+
+def slow_start(rng: np.random.Generator) -> Motion:
+    ramp, turn = rng.uniform(0.01, 0.1), rng.uniform(0.4, 0.6)
+
+    def up(t: np.ndarray) -> np.ndarray:
+        return np.where(t < ramp, t**2 / (2.0 * ramp), t - 0.5 * ramp)
+
+    high = float(up(np.array(turn)))
+    return Motion(
+        lambda t: np.where(t < turn, up(t), high * (1.0 - t) / (1.0 - turn)) / high, np.array([turn])
+    )
+
+
+def inner_loop(rng: np.random.Generator) -> Motion:
+    """A triangle that goes back by 0.5 to 20 % of its range on its way up or down."""
+    size, level = float(np.exp(rng.uniform(np.log(0.005), np.log(0.2)))), rng.uniform(0.3, 0.75)
+    heights = [0.0, level, level - size, 1.0, 0.0]
+    if rng.random() < 0.5:
+        heights = [0.0, 1.0, level - size, level, 0.0]
+    way = np.append(0.0, np.cumsum(np.abs(np.diff(heights))))
+    return straight(list(way / way[-1]), heights)
+
+
+def random_smooth(rng: np.random.Generator) -> Motion:
+    """A half sine on a clock that runs unevenly, with waves that may turn it."""
+    phase, size = rng.uniform(0.0, 2.0 * np.pi, 4), rng.normal(0.0, 1.0, 4)
+    wave, number = rng.uniform(0.0, 0.08), rng.integers(2, 6)
+
+    def at(t: np.ndarray) -> np.ndarray:
+        late = sum(
+            s / (k + 1) ** 2 * (np.sin(np.pi * (k + 1) * t + p) - np.sin(p))
+            for k, (s, p) in enumerate(zip(size, phase, strict=True))
+        )
+        clock = t + 0.05 * late
+        return np.sin(0.95 * np.pi * clock) + wave * np.sin(2.0 * np.pi * number * t + phase[0])
+
+    return smooth(at)
+
+
+CLASSES = {
+    "triangle": triangle,
+    "unequal speeds": asymmetric,
+    "half sine": sine,
+    "haversine": haversine,
+    "trapezoid": trapezoid,
+    "slow start": slow_start,
+    "inner loop": inner_loop,
+    "random smooth": random_smooth,
+}
+
+
+def sampled(rng: np.random.Generator, rows: int) -> np.ndarray:
+    """Times of samples: even, or uneven by up to a third of a step."""
+    t = np.linspace(0.0, 1.0, rows)
+    if rng.random() < 0.3:
+        t[1:-1] += rng.uniform(-0.33, 0.33, rows - 2) / rows
+    return t
+
+
+def matched(motion: Motion, turns: np.ndarray, t: np.ndarray) -> list[tuple[int, int]]:
+    """Pairs of true and found turns of the same kind, none further off than the next true turn."""
+    ends = np.concatenate([[0.0], motion.turns, [1.0]])
+    pairs, taken = [], set()
+    for i, true in enumerate(motion.turns):
+        left, right = 0.5 * (ends[i] + true), 0.5 * (true + ends[i + 2])
+        inside = [j for j in np.flatnonzero((turns > left) & (turns < right)) if j not in taken]
+        if inside:
+            j = min(inside, key=lambda k: abs(turns[k] - true))
+            pairs.append((i, int(j)))
+            taken.add(j)
+    return pairs
+
+
+def one(name: str, rows: int, noise: float, rng: np.random.Generator, given: bool) -> Iterator[dict]:
+    """Follow one noisy motion; a row for it and one for each true turn."""
+    motion = CLASSES[name](rng)
+    t = sampled(rng, rows)
+    true = motion.at(t)
+    noisy = true + noise * rng.standard_normal(rows)
+    level = NoiseLevel(noise * (1.0 if given else rng.uniform(0.85, 1.15)), given, "")
+    begin = time.process_time()
+    found = follow(t, noisy, level)
+    seconds = time.process_time() - begin
+    off = found.at(t) - true
+    stderr = np.linalg.norm(found.modes(t), axis=1)
+    held = np.abs(off) < Z95 * stderr
+    near = np.any(np.abs(t[:, None] - motion.turns) < NEAR, axis=1)
+    for a, b in motion.holds:
+        near |= (t > a - NEAR) & (t < b + NEAR)
+    pairs = matched(motion, found.turns, t)
+    fine = np.linspace(0.0, 1.0, 7 * rows)
+    steps = np.diff(found.at(np.union1d(fine, found.turns)))
+    stretch = np.searchsorted(found.turns, np.union1d(fine, found.turns)[:-1], side="right")
+    back = max(
+        float(min(np.maximum(-part, 0.0).max(), np.maximum(part, 0.0).max()))
+        for part in (steps[stretch == k] for k in np.unique(stretch))
+    )
+    row = {"class": name, "rows": rows, "noise": noise, "ms": 1e3 * seconds}
+    yield row | {
+        "what": "motion", "rms": off / noise @ off / noise / rows, "dof": found.dof,
+        "near": float(np.mean((off[near] / noise) ** 2)) if near.any() else np.nan,
+        "held": held.mean(), "held_near": held[near].mean() if near.any() else np.nan,
+        "worst": np.abs(off).max() / noise, "sigma": found.sigma / noise,
+        "turns": len(motion.turns), "invented": len(found.turns) - len(pairs), "back": back,
+        "kinks": found._modes.kinks.shape[1], "modes": found.modes(t[:1]).shape[1],
+    }  # fmt: skip
+    sizes = np.abs(np.diff(motion.at(np.concatenate([[0.0], motion.turns, [1.0]]))))
+    for i, at in enumerate(motion.turns):
+        j = dict(pairs).get(i)
+        size = min(sizes[i], sizes[i + 1])
+        turn = row | {"what": "turn", "size": size / noise, "found": j is not None}
+        ends = np.concatenate([[0.0], motion.turns, [1.0]])
+        turn |= {"samples": rows * min(np.diff(ends)[i : i + 2])}
+        if j is not None:
+            here = found.turns[j : j + 1]
+            sign = 1.0 if motion.at(np.array(at)) > motion.at(np.array(ends[i])) else -1.0
+            error = float(found.at(here)[0] - motion.at(np.array(at)))
+            turn |= {"height": sign * error / noise,
+                     "height_z": sign * error / np.linalg.norm(found.modes(here))}  # fmt: skip
+            if not motion.holds:
+                late = float(here[0] - at)
+                turn |= {"late": late * rows, "late_z": late / found.turns_stderr[j]}
+        yield turn
+
+
+def table(data: pd.DataFrame, by: list[str]) -> pd.DataFrame:
+    """Means over draws."""
+    motions, turns = data[data.what == "motion"], data[data.what == "turn"]
+    m, found = motions.groupby(by), turns[turns.found == True].groupby(by)  # noqa: E712
+    return pd.DataFrame(
+        {
+            "draws": m.size(),
+            "RMS": m.rms.mean() ** 0.5,
+            "near": m.near.mean() ** 0.5,
+            "worst": m.worst.max(),
+            "held": 100.0 * m.held.mean(),
+            "held near": 100.0 * m.held_near.mean(),
+            "height bias": found.height.mean(),
+            "height RMS": found.height.apply(lambda v: np.sqrt(np.mean(v**2))),
+            "height held": 100.0 * found.height_z.apply(lambda v: np.mean(np.abs(v) < Z95)),
+            "instant RMS": found.late.apply(lambda v: np.sqrt(np.mean(v**2))),
+            "instant held": 100.0 * found.late_z.apply(lambda v: np.mean(np.abs(v[v.notna()]) < Z95)),
+            "missed": 100.0 * (1.0 - turns.groupby(by).found.mean()),
+            "invented": 100.0 * m.invented.apply(lambda v: np.mean(v > 0)),
+            "dof": m.dof.mean(),
+            "kinks": m.kinks.mean(),
+            "back": m.back.max(),
+            "ms": m.ms.median(),
+        }
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--draws", type=int, default=25, help="of each class, rows and noise")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", default="")
+    parser.add_argument("--estimated", action="store_true", help="the noise is not given")
+    options = parser.parse_args()
+    rows = [
+        row
+        for k, name in enumerate(CLASSES)
+        if options.only in name
+        for n in ROWS
+        for i, noise in enumerate(NOISE)
+        for draw in range(options.draws)
+        for row in one(name, n, noise, np.random.default_rng([options.seed, k, n, i, draw]), not options.estimated)
+    ]
+    data = pd.DataFrame(rows)
+    pd.set_option("display.width", 250, "display.max_columns", 30)
+    print(table(data, ["class"]).round(2).to_string())
+    print(table(data, ["rows", "noise"]).round(2).to_string())
+    data.to_pickle("/tmp/motion.pkl")
+
+
+if __name__ == "__main__":
+    main()
