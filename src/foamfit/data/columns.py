@@ -12,9 +12,12 @@ from foamfit.data.measurement import Striker, interior_channel, interior_node
 from foamfit.data.toml_file import Column, Settings
 from foamfit.data.units import is_unit
 from foamfit.errors import InputError
+from foamfit.text import percent
 
 _NONE = Column("")
 _MOTIONS = "displacement", "strain"
+# What stress and displacement are read from, the first that there is.
+_SOURCES = {"stress": ("stress", "force", "acceleration"), "displacement": _MOTIONS}
 
 
 def assign_columns(table: Table, given: dict[str, Column], toml: Path | None) -> dict[str, int]:
@@ -147,6 +150,16 @@ def needed_columns(table: Table, columns: dict[str, int], settings: Settings) ->
     return {c: k for c, k in columns.items() if c in has}
 
 
+def scale_spreads(columns: dict[str, int], given: dict[str, Column]) -> dict[str, float]:
+    """Standard deviations of the scales of the channels that are read, each over its scale."""
+    sources = _SOURCES | {c: (c,) for c in ("velocity", "acceleration")}
+    used = {channel: next((c for c in cs if c in columns), "") for channel, cs in sources.items()}
+    if used["stress"] == "acceleration":  # then it is no channel of its own
+        del used["acceleration"]
+    spreads = {f"{channel}_scale": given.get(c, _NONE).spread for channel, c in used.items()}
+    return {name: spread for name, spread in spreads.items() if spread}
+
+
 def read_note(table: Table, needed: dict[str, int], settings: Settings) -> str:
     """Say what is read from which column, and which columns are not used."""
     parts = []
@@ -155,6 +168,7 @@ def read_note(table: Table, needed: dict[str, int], settings: Settings) -> str:
         by = f"{given.scale:.6g} {given.scale_unit}".strip()
         own = (given.unit or header.unit or "").casefold()
         part = f"{channel} from {header.text!r}" + (f" in {given.unit}" if given.unit else "")
+        by += f" ± {percent(given.spread)}" if given.spread else ""
         part += f" times {by}" if by != "1" else ""
         part += ", counting down" if given.counts_down else ""
         if channel == "force" and own in WEIGHTS:
@@ -167,8 +181,7 @@ def read_note(table: Table, needed: dict[str, int], settings: Settings) -> str:
 
 def sign_advice(table: Table, columns: dict[str, int], settings: Settings, channel: str) -> str:
     """Say what makes a channel positive that is negative in compression; see `check_signs`."""
-    sources = {"stress": ("stress", "force", "acceleration"), "displacement": _MOTIONS}
-    channel = next(c for c in sources.get(channel, (channel,)) if c in columns)
+    channel = next(c for c in _SOURCES.get(channel, (channel,)) if c in columns)
     given, motion = settings.columns.get(channel, _NONE), channel.startswith("displacement")
     entry = f'{channel} = {{ column = "{table.headers[columns[channel]].text}"'
     by = f'"{-given.scale:g} {given.scale_unit}"' if given.scale_unit else f"{-given.scale:g}"

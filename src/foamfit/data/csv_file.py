@@ -15,7 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.arrays import Array
-from foamfit.data.columns import assign_columns, needed_columns, read_note, si_factor, sign_advice
+from foamfit.data.columns import (
+    assign_columns,
+    needed_columns,
+    read_note,
+    scale_spreads,
+    si_factor,
+    sign_advice,
+)
 from foamfit.data.csv_table import Table, find_table, read_numbers, read_text
 from foamfit.data.headers import CHANNELS, example
 from foamfit.data.measurement import MIN_ROWS, Dropped, Measurement, Record, Striker, interior_node
@@ -73,7 +80,10 @@ def read_test(
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     _check_noise(toml, settings, test)
-    test = replace(test, name=settings.name, path=path, data_sha256=text.sha256)
+    spreads = settings.uncertainties | scale_spreads(columns, settings.columns)
+    test = replace(
+        test, name=settings.name, path=path, data_sha256=text.sha256, uncertainties=spreads
+    )
     noise = replace(settings.noise, estimated=test.noise.estimated)
     return with_noise(replace(test, noise=noise, notes=(*notes, *test.notes)))
 

@@ -272,6 +272,12 @@ class Measurement:
     start_strain : float
         Strain of a later cycle, counted from the first contact, at which its own contact starts:
         what the foam had not recovered. It is taken off.
+    uncertainties : dict of str to float
+        What the TOML says is uncertain, one standard deviation each: "height" and those of the
+        springs of a chain, "height_1", … (m), "area" (m²), "specimen_mass" and "striker_mass" (kg),
+        "velocity" (m/s), and as a share of the scale of a channel "stress_scale",
+        "displacement_scale", "acceleration_scale", "velocity_scale". What it does not say is not
+        there.
     """
 
     name: str
@@ -292,6 +298,7 @@ class Measurement:
     cycle: int = 1
     cycles: tuple[int, ...] = (1,)
     start_strain: float = 0.0
+    uncertainties: dict[str, float] = field(default_factory=dict)
 
     @property
     def rows(self) -> RowCount:

@@ -3,7 +3,8 @@
 [columns] names the column of a channel where its header does not: ``column``, ``unit``, ``scale``
 (a number, or a quantity such as "4444.4 N/V"; negative turns a sign round) and, for displacements,
 ``counts_down = true`` (a gap or a position that gets smaller in compression). [data] ``duplicates``
-is "average" (neighbouring rows with one time stamp make one sample) or "refuse".
+is "average" (neighbouring rows with one time stamp make one sample) or "refuse". A quantity may
+have a standard deviation, "1.75 ± 0.01 m/s"; `Measurement.uncertainties` says of which it is used.
 """
 
 from __future__ import annotations
@@ -15,10 +16,16 @@ import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from foamfit.data.measurement import Noise, Specimen, Striker, Window, interior_node
-from foamfit.data.units import is_unit, parse_quantity, split_quantity
+from foamfit.data.units import (
+    is_unit,
+    parse_quantity,
+    parse_uncertain,
+    split_quantity,
+    split_uncertain,
+)
 from foamfit.errors import InputError
 from foamfit.terminal import printable
 
@@ -26,36 +33,60 @@ _LARGEST = 1_000_000  # characters of a TOML
 LONGEST = 200  # characters of a name
 # Many keys that are joined by dots.
 _DOTTED = re.compile(r"""(?<![\w"'-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){32}""")
-# Section, key: SI unit and an example.
-_SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
+
+
+class _Quantity(NamedTuple):
+    """SI unit, an example, and the name of its ± in `Settings.uncertainties` (none: no ±)."""
+
+    si: str
+    example: str
+    spread: str = ""
+
+
+_SECTIONS = {
     "specimen": {
-        "height": ("m", "1.19 mm"),
-        "diameter": ("m", "5 mm"),
-        "area": ("m**2", "19.6 mm^2"),
-        "mass": ("kg", "5.56 mg"),
-        "heights": ("m", "0.7 mm"),
+        "height": _Quantity("m", "1.19 mm", "height"),
+        "diameter": _Quantity("m", "5 mm", "diameter"),
+        "area": _Quantity("m**2", "19.6 mm^2", "area"),
+        "mass": _Quantity("kg", "5.56 mg", "specimen_mass"),
+        "heights": _Quantity("m", "0.7 mm", "height"),
     },
-    "striker": {"mass": ("kg", "7 g"), "velocity": ("m/s", "1.75 m/s")},
-    "noise": {"stress": ("Pa", "20 kPa"), "displacement": ("m", "2 um")},
-    "window": {"start": ("s", "0.5 ms"), "end": ("s", "2 ms"), "cycle": ("", "1")},
-    "data": {"duplicates": ("", "average")},
+    "striker": {
+        "mass": _Quantity("kg", "7 g", "striker_mass"),
+        "velocity": _Quantity("m/s", "1.75 m/s", "velocity"),
+    },
+    "noise": {"stress": _Quantity("Pa", "20 kPa"), "displacement": _Quantity("m", "2 um")},
+    "window": {
+        "start": _Quantity("s", "0.5 ms"),
+        "end": _Quantity("s", "2 ms"),
+        "cycle": _Quantity("", "1"),
+    },
+    "data": {"duplicates": _Quantity("", "average")},
 }
+_SCALE = "4444.4 N/V"
 
 
 @dataclass(frozen=True)
 class Column:
-    """What [columns] says of one channel; one that `counts_down` gets smaller in compression."""
+    """What [columns] says of one channel; one that `counts_down` gets smaller in compression.
+
+    `spread` is the standard deviation of the scale over the scale, 0 for an exact one.
+    """
 
     column: str
     unit: str | None = None
     scale: float = 1.0
     scale_unit: str = ""
     counts_down: bool = False
+    spread: float = 0.0
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What the TOML says, in SI; `duplicates` says what becomes of rows with one time stamp."""
+    """What the TOML says, in SI; `duplicates` says what becomes of rows with one time stamp.
+
+    `uncertainties` are those of `Measurement`, without the scales, which their `columns` have.
+    """
 
     name: str
     specimen: Specimen
@@ -64,6 +95,7 @@ class Settings:
     window: Window
     columns: dict[str, Column] = field(default_factory=dict)
     duplicates: str = "average"
+    uncertainties: dict[str, float] = field(default_factory=dict)
 
 
 def read_bytes(path: Path, otherwise: str, most: int = -1) -> bytes:
@@ -115,19 +147,21 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
     document = load_toml(path, f"{test.name} needs a TOML with [specimen] height and diameter")
     check_keys(f"{path}:", document, ["name", "columns", *_SECTIONS])
     values: dict[str, dict[str, Any]] = {}
+    spreads: dict[str, float] = {}
     for section, keys in _SECTIONS.items():
         table = document.get(section, {})
         if not isinstance(table, dict):
             raise InputError(f"{path}: {section} must be a table, [{section}].")
         check_keys(f"{path}: [{section}]", table, keys)
-        values[section] = {k: _value(path, section, k, v) for k, v in table.items()}
+        values[section] = {k: _value(path, section, k, v, spreads) for k, v in table.items()}
     return Settings(
         name=_name(path, document["name"]) if "name" in document else printable(test.stem),
-        specimen=_specimen(path, values["specimen"]),
+        specimen=_specimen(path, values["specimen"], spreads),
         striker=Striker(**values["striker"]) if values["striker"] else None,
         noise=Noise(**values["noise"]),
         window=Window(**values["window"]),
         columns=_columns(path, document.get("columns", {}), channels),
+        uncertainties=spreads,
         **values["data"],
     )
 
@@ -143,8 +177,9 @@ def _name(path: Path, name: Any) -> str:
     return name
 
 
-def _value(path: Path, section: str, key: str, value: Any) -> Any:
-    si, example = _SECTIONS[section][key]
+def _value(path: Path, section: str, key: str, value: Any, spreads: dict[str, float]) -> Any:
+    """Check and return what a key says, in SI, and put its ± into `spreads`."""
+    si, example, spread = _SECTIONS[section][key]
     where = f"{path}: [{section}] {key}"
     if key == "cycle" and (type(value) is not int or value < 1):
         raise InputError(f"{where} = {value!r} must be a whole number from 1 up.")
@@ -155,23 +190,32 @@ def _value(path: Path, section: str, key: str, value: Any) -> Any:
     if key in ("cycle", "duplicates"):
         return value
     given = value if key == "heights" else [value]
-    numbers = tuple(parse_quantity(v, si, where, example) for v in given)
-    for number, v in zip(numbers, given, strict=True):
+    numbers = []
+    for i, v in enumerate(given, 1):
+        if spread:
+            number, sigma = parse_uncertain(v, si, where, example)
+            if sigma:
+                spreads[f"{spread}_{i}" if key == "heights" else spread] = sigma
+        else:
+            number = parse_quantity(v, si, where, example)
         if section != "window" and not 0.0 < number < math.inf:
             raise InputError(f'{where} = "{v}" must be positive.')
-    return numbers if key == "heights" else numbers[0]
+        numbers.append(number)
+    return tuple(numbers) if key == "heights" else numbers[0]
 
 
-def _specimen(path: Path, values: dict[str, Any]) -> Specimen:
+def _specimen(path: Path, values: dict[str, Any], spreads: dict[str, float]) -> Specimen:
     if "height" not in values:
         raise InputError(f'{path}: [specimen] height is missing; give it like height = "1.19 mm".')
-    diameter = values.pop("diameter", None)
+    diameter, spread = values.pop("diameter", None), spreads.pop("diameter", 0.0)
     if diameter is None and "area" not in values:
         raise InputError(f'{path}: [specimen] needs a diameter = "5 mm" or an area = "19.6 mm^2".')
     if diameter is not None:
         area = math.pi * diameter**2 / 4
         if not math.isclose(values.setdefault("area", area), area, rel_tol=0.02):
             raise InputError(f"{path}: [specimen] area and diameter disagree; give one of them.")
+        if spread:
+            spreads.setdefault("area", 2.0 * values["area"] * spread / diameter)
     heights = values.get("heights")
     if heights and not math.isclose(sum(heights), values["height"], rel_tol=0.02):
         raise InputError(f"{path}: [specimen] heights must add up to height.")
@@ -197,8 +241,14 @@ def _columns(path: Path, table: Any, channels: Iterable[str]) -> dict[str, Colum
         if unit is not None and (not isinstance(unit, str) or not is_unit(unit)):
             raise InputError(f'{where}: unit = {unit!r} is unknown; give it like unit = "mm".')
         scale = spec.get("scale", 1)
-        parts = split_quantity(str(scale))
+        parts = split_quantity(split_uncertain(str(scale))[0])
         if parts is None or parts[0] in (0.0, math.inf, -math.inf) or not is_unit(parts[1]):
-            raise InputError(f'{where}: scale = {scale!r} must be like -1 or "4444.4 N/V".')
-        columns[channel] = Column(spec["column"], unit, *parts, down)
+            raise InputError(f'{where}: scale = {scale!r} must be like -1 or "{_SCALE}".')
+        _, sigma = parse_uncertain(str(scale), parts[1], f"{where}: scale", _SCALE)
+        if sigma is not None and (channel in ("time", "cycle") or interior_node(channel)):
+            raise InputError(
+                f"{where}: scale = {scale!r} has a ±, which has no meaning there; give it without."
+            )
+        spread = (sigma or 0.0) / abs(parts[0])
+        columns[channel] = Column(spec["column"], unit, *parts, down, spread)
     return columns

@@ -170,6 +170,7 @@ def planned_test(settings_file: Path) -> Measurement:
         striker=striker,
         noise=settings.noise,
         motion="measured",
+        uncertainties=settings.uncertainties,
         notes=("Nothing is measured yet: the curves are simulated.",),
     )
 
