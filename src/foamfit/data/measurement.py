@@ -163,6 +163,7 @@ class Record:
     has outliers. `clipped` marks the samples at which the force is clipped. `cycle` is the number
     of the cycle, where a column counts them. `numbers` holds the row number in the file of each
     sample (None: they count from 1), and `dropped` the rows of the file that were left out so far.
+    `sampled` is that of `Measurement`.
     """
 
     time: Array | None
@@ -176,6 +177,7 @@ class Record:
     cycle: Array | None = None
     numbers: NDArray[np.int64] | None = None
     dropped: tuple[Dropped, ...] = ()
+    sampled: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         """Count the samples."""
@@ -272,12 +274,16 @@ class Measurement:
     start_strain : float
         Strain of a later cycle, counted from the first contact, at which its own contact starts:
         what the foam had not recovered. It is taken off.
+    sampled : dict of str to (n,) bool array
+        Of a channel of which some samples do not count as measured: True at those that do, which
+        are those at which its own instrument took a value. Elsewhere it is interpolated.
     uncertainties : dict of str to float
         What the TOML says is uncertain, one standard deviation each: "height" and those of the
         springs of a chain, "height_1", … (m), "area" (m²), "specimen_mass" and "striker_mass" (kg),
         "velocity" (m/s), and as a share of the scale of a channel "stress_scale",
-        "displacement_scale", "acceleration_scale", "velocity_scale". What it does not say is not
-        there.
+        "displacement_scale", "acceleration_scale", "velocity_scale"; and "delay" (s) of a
+        motion with its own clock: time of the force = time of the motion + delay. What it does not
+        say is not there.
     """
 
     name: str
@@ -298,6 +304,7 @@ class Measurement:
     cycle: int = 1
     cycles: tuple[int, ...] = (1,)
     start_strain: float = 0.0
+    sampled: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
     uncertainties: dict[str, float] = field(default_factory=dict)
 
     @property

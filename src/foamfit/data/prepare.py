@@ -20,6 +20,7 @@ from foamfit.data.cycles import (
     find_reload,
     inner_reversals,
 )
+from foamfit.data.frames import frames_of_blocks, noise_of_blocks
 from foamfit.data.measurement import (
     INTEGRATED,
     MEASURED,
@@ -35,7 +36,7 @@ from foamfit.data.measurement import (
     Window,
     interior_channel,
 )
-from foamfit.data.noise import averaged, estimated_noise, noise_before_contact, noise_level
+from foamfit.data.noise import estimated_noise, noise_before_contact, noise_level
 from foamfit.data.outliers import (
     bridge_outliers,
     fill_staircase,
@@ -105,7 +106,8 @@ def condition(
     block = -(-len(whole) // len(record))
     before = {name: values[:resting] for name, values in first.curves().items()}
     noise = noise_before_contact(before, record.curves(), block)
-    noise |= {name: averaged(level, block) for name, level in held.items()}
+    taken = whole.sampled
+    noise |= {c: noise_of_blocks(level, block, taken.get(c)) for c, level in held.items()}
     outliers = outliers_of_blocks(whole, block)
     for name, n in spoilt.items():
         notes.append(outlier_note(name, n, outliers.get(name), record.time is not None))
@@ -122,6 +124,7 @@ def condition(
         cycle=chosen.number if chosen else 1,
         cycles=tuple(cycle.number for cycle in cycles) or (1,),
         start_strain=start_strain,
+        sampled=record.sampled,
     )
 
 
@@ -262,6 +265,7 @@ def thin(record: Record) -> tuple[Record, list[str]]:
     thinned = Record(time, record.stress, None)
     for name, values in record.curves().items():
         thinned = thinned.changed(name, np.add.reduceat(values, edges) / counts)
+    thinned = frames_of_blocks(record, thinned, edges)
     return thinned, [f"{n} samples are averaged in {len(edges)} blocks of {size}."]
 
 

@@ -5,6 +5,8 @@
 ``counts_down = true`` (a gap or a position that gets smaller in compression). [data] ``duplicates``
 is "average" (neighbouring rows with one time stamp make one sample) or "refuse". A quantity may
 have a standard deviation, "1.75 ± 0.01 m/s"; `Measurement.uncertainties` says of which it is used.
+[motion] names a ``file`` that has the motion by a clock of its own, relative to the TOML, the
+``delay`` of that clock, and in [motion.columns] its columns.
 """
 
 from __future__ import annotations
@@ -64,6 +66,8 @@ _SECTIONS = {
     "data": {"duplicates": _Quantity("", "average")},
 }
 _SCALE = "4444.4 N/V"
+# What is read from the file of [motion], beside displacements of masses inside.
+MOTION_CHANNELS = "time", "displacement", "strain", "velocity"
 
 
 @dataclass(frozen=True)
@@ -82,6 +86,18 @@ class Column:
 
 
 @dataclass(frozen=True)
+class Motion:
+    """What [motion] says: the file of a motion with its own clock, its columns, and its delay.
+
+    Time of the force = time of the motion + `delay`, s.
+    """
+
+    file: Path
+    columns: dict[str, Column]
+    delay: float = 0.0
+
+
+@dataclass(frozen=True)
 class Settings:
     """What the TOML says, in SI; `duplicates` says what becomes of rows with one time stamp.
 
@@ -96,6 +112,7 @@ class Settings:
     columns: dict[str, Column] = field(default_factory=dict)
     duplicates: str = "average"
     uncertainties: dict[str, float] = field(default_factory=dict)
+    motion: Motion | None = None
 
 
 def read_bytes(path: Path, otherwise: str, most: int = -1) -> bytes:
@@ -145,7 +162,7 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
     the key that is wrong or missing.
     """
     document = load_toml(path, f"{test.name} needs a TOML with [specimen] height and diameter")
-    check_keys(f"{path}:", document, ["name", "columns", *_SECTIONS])
+    check_keys(f"{path}:", document, ["name", "columns", "motion", *_SECTIONS])
     values: dict[str, dict[str, Any]] = {}
     spreads: dict[str, float] = {}
     for section, keys in _SECTIONS.items():
@@ -162,6 +179,7 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
         window=Window(**values["window"]),
         columns=_columns(path, document.get("columns", {}), channels),
         uncertainties=spreads,
+        motion=_motion(path, document["motion"], spreads) if "motion" in document else None,
         **values["data"],
     )
 
@@ -222,14 +240,46 @@ def _specimen(path: Path, values: dict[str, Any], spreads: dict[str, float]) -> 
     return Specimen(**values)
 
 
-def _columns(path: Path, table: Any, channels: Iterable[str]) -> dict[str, Column]:
+def motion_file(toml: Path) -> Path | None:
+    """Return the file that [motion] of a TOML names; None if it names none or cannot be read."""
+    try:
+        return _file(toml, load_toml(toml, "").get("motion"))
+    except InputError:  # who reads the test says it
+        return None
+
+
+def _file(toml: Path, table: Any) -> Path | None:
+    """Path of the file that a table [motion] names, which is relative to its TOML."""
+    name = table.get("file") if isinstance(table, dict) else None
+    if not isinstance(name, str) or not name.strip() or "\0" in name:
+        return None
+    return toml.parent / name
+
+
+def _motion(path: Path, table: Any, spreads: dict[str, float]) -> Motion:
+    file, example = _file(path, table), "0 ± 50 us"
+    if isinstance(table, dict):
+        check_keys(f"{path}: [motion]", table, ["file", "delay", "columns"])
+    if file is None:
+        raise InputError(f'{path}: [motion] must name a file, like file = "camera.csv".')
+    columns = _columns(path, table.get("columns", {}), MOTION_CHANNELS, "motion.columns")
+    given = table.get("delay", "0 s")
+    delay, sigma = parse_uncertain(given, "s", f"{path}: [motion] delay", example, zero=True)
+    if sigma:
+        spreads["delay"] = sigma
+    return Motion(file, columns, delay)
+
+
+def _columns(
+    path: Path, table: Any, channels: Iterable[str], name: str = "columns"
+) -> dict[str, Column]:
     if not isinstance(table, dict):
-        raise InputError(f"{path}: columns must be a table, [columns].")
+        raise InputError(f"{path}: {name} must be a table, [{name}].")
     inside = [key for key in table if interior_node(key)]
-    check_keys(f"{path}: [columns]", table, [*channels, *inside])
+    check_keys(f"{path}: [{name}]", table, [*channels, *inside])
     columns: dict[str, Column] = {}
     for channel, spec in table.items():
-        where = f"{path}: [columns] {channel}"
+        where = f"{path}: [{name}] {channel}"
         if not isinstance(spec, dict) or not isinstance(spec.get("column"), str):
             raise InputError(f'{where} must be like {{ column = "Load", unit = "V" }}.')
         motion = channel == "displacement" or interior_node(channel) is not None

@@ -206,9 +206,12 @@ class Objective:
         return level.sigma if level.given else max(level.sigma, least)
 
     def _fitted(self, name: str) -> slice | NDArray[np.bool_]:
-        """Samples of a curve that count: all but the outliers of its channel."""
+        """Samples of a curve that count: those that its channel measured, but no outliers."""
         outliers = self.measurement.outliers.get(self.channel(name))
-        return slice(None) if outliers is None else ~outliers.left_out
+        taken = self.measurement.sampled.get(self.channel(name))
+        if outliers is None:
+            return slice(None) if taken is None else taken
+        return ~outliers.left_out if taken is None else taken & ~outliers.left_out
 
     # ------------------------------------------------------------------ simulation and residual
 
@@ -385,8 +388,13 @@ class Objective:
         return self.jacobian(values, places) @ moves[places]
 
     def kept(self, name: str) -> NDArray[np.intp]:
-        """Samples of a curve that stand in the residual, in their order: all but outliers."""
+        """Samples of a curve that stand in the residual, in their order."""
         return np.arange(self.time.size)[self._kept[name]]
+
+    def n_measured(self, name: str) -> int:
+        """Count the samples that the channel of a curve measured, outliers included."""
+        taken = self.measurement.sampled.get(self.channel(name))
+        return self.time.size if taken is None else int(np.count_nonzero(taken))
 
     def rms(self, residual: Array) -> dict[str, float]:
         """RMS of each counted curve in its unit, from residuals before the loss."""

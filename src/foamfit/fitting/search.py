@@ -120,7 +120,7 @@ def smooth_loop(measurement: Measurement) -> Measurement:
     thinned = None if time is None else time[keep]
     return replace(
         measurement, displacement=motion[keep], stress=stress[keep], time=thinned,
-        outliers={},  # bridged, and smoothed over
+        outliers={}, sampled={},  # bridged, and smoothed over
     )  # fmt: skip
 
 
