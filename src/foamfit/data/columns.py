@@ -12,9 +12,12 @@ from foamfit.data.measurement import Striker, interior_channel, interior_node
 from foamfit.data.toml_file import Column, Settings
 from foamfit.data.units import is_unit
 from foamfit.errors import InputError
+from foamfit.text import percent
 
 _NONE = Column("")
 _MOTIONS = "displacement", "strain"
+# What stress and displacement are read from, the first that there is.
+_SOURCES = {"stress": ("stress", "force", "acceleration"), "displacement": _MOTIONS}
 
 
 def assign_columns(table: Table, given: dict[str, Column], toml: Path | None) -> dict[str, int]:
@@ -128,7 +131,9 @@ def needed_columns(table: Table, columns: dict[str, int], settings: Settings) ->
             "with a time and the [striker] mass an acceleration will do."
         )
     helping = {"velocity", "acceleration"} if forced else {"velocity"}
-    if has & set(_MOTIONS):
+    if settings.motion is not None:
+        _check_motion(table, columns, settings.motion.file)
+    if has & set(_MOTIONS) or settings.motion is not None:
         return {c: k for c, k in columns.items() if c not in helping}
     for channel in has & helping - set(settings.columns):
         try:  # these only help, so one whose unit does not say what it is can be left
@@ -147,14 +152,53 @@ def needed_columns(table: Table, columns: dict[str, int], settings: Settings) ->
     return {c: k for c, k in columns.items() if c in has}
 
 
-def read_note(table: Table, needed: dict[str, int], settings: Settings) -> str:
+def scale_spreads(columns: dict[str, int], given: dict[str, Column]) -> dict[str, float]:
+    """Standard deviations of the scales of the channels that are read, each over its scale."""
+    sources = _SOURCES | {c: (c,) for c in ("velocity", "acceleration")}
+    used = {channel: next((c for c in cs if c in columns), "") for channel, cs in sources.items()}
+    if used["stress"] == "acceleration":  # then it is no channel of its own
+        del used["acceleration"]
+    spreads = {f"{channel}_scale": given.get(c, _NONE).spread for channel, c in used.items()}
+    return {name: spread for name, spread in spreads.items() if spread}
+
+
+def _check_motion(table: Table, columns: dict[str, int], file: Path) -> None:
+    """Refuse a test with [motion] that has a displacement of its own, or no time."""
+    own = [c for c in columns if c in _MOTIONS or interior_node(c)]
+    if own:
+        raise InputError(
+            f"{table.path}: column {table.headers[columns[own[0]]].text!r} is a {own[0]}, but "
+            f"[motion] file = {file.name!r} has the motion; leave one of them out."
+        )
+    if "time" not in columns:
+        raise InputError(
+            f"{table.path}: no column is a time (there are {table.listed}); with [motion] it needs "
+            "one like 'time (ms)'."
+        )
+
+
+def motion_columns(table: Table, columns: dict[str, int]) -> dict[str, int]:
+    """Choose time and displacements of a file of [motion]; refuse one that lacks them."""
+    needed = {c: k for c, k in columns.items() if c in ("time", *_MOTIONS) or interior_node(c)}
+    for wanted, names in (("time", ["time"]), ("displacement", _MOTIONS)):
+        if not needed.keys() & set(names):
+            raise InputError(
+                f"{table.path}: no column is a {' or a '.join(names)} (there are {table.listed}); "
+                f"name one like '{example(wanted)}', or write {wanted} = "
+                f'{{ column = "…", unit = "{CHANNELS[wanted].unit}" }} in [columns].'
+            )
+    return needed
+
+
+def read_note(table: Table, needed: dict[str, int], columns: dict[str, Column]) -> str:
     """Say what is read from which column, and which columns are not used."""
     parts = []
     for channel, k in needed.items():
-        given, header = settings.columns.get(channel, _NONE), table.headers[k]
+        given, header = columns.get(channel, _NONE), table.headers[k]
         by = f"{given.scale:.6g} {given.scale_unit}".strip()
         own = (given.unit or header.unit or "").casefold()
         part = f"{channel} from {header.text!r}" + (f" in {given.unit}" if given.unit else "")
+        by += f" ± {percent(given.spread)}" if given.spread else ""
         part += f" times {by}" if by != "1" else ""
         part += ", counting down" if given.counts_down else ""
         if channel == "force" and own in WEIGHTS:
@@ -165,11 +209,12 @@ def read_note(table: Table, needed: dict[str, int], settings: Settings) -> str:
     return f"Read {', '.join(parts)}" + (f"; not used: {', '.join(rest)}." if rest else ".")
 
 
-def sign_advice(table: Table, columns: dict[str, int], settings: Settings, channel: str) -> str:
+def sign_advice(
+    table: Table, columns: dict[str, int], entries: dict[str, Column], channel: str
+) -> str:
     """Say what makes a channel positive that is negative in compression; see `check_signs`."""
-    sources = {"stress": ("stress", "force", "acceleration"), "displacement": _MOTIONS}
-    channel = next(c for c in sources.get(channel, (channel,)) if c in columns)
-    given, motion = settings.columns.get(channel, _NONE), channel.startswith("displacement")
+    channel = next(c for c in _SOURCES.get(channel, (channel,)) if c in columns)
+    given, motion = entries.get(channel, _NONE), channel.startswith("displacement")
     entry = f'{channel} = {{ column = "{table.headers[columns[channel]].text}"'
     by = f'"{-given.scale:g} {given.scale_unit}"' if given.scale_unit else f"{-given.scale:g}"
     wrong = "is negative in compression; it must be positive"

@@ -1,13 +1,17 @@
 """A test file and its TOML become a `Measurement` in SI.
 
 A file holds one table, one row per sample; the unit of a channel is in its header, in a row of
-units beneath it, or in the ``[columns]`` table of the TOML.
+units beneath it, or in the ``[columns]`` table of the TOML. The motion may stand in a second file,
+which ``[motion]`` of the TOML names.
 """
 
 from __future__ import annotations
 
+import hashlib
+import os
 import re
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -15,10 +19,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.arrays import Array
-from foamfit.data.columns import assign_columns, needed_columns, read_note, si_factor, sign_advice
+from foamfit.data.columns import (
+    assign_columns,
+    motion_columns,
+    needed_columns,
+    read_note,
+    scale_spreads,
+    si_factor,
+    sign_advice,
+)
 from foamfit.data.csv_table import Table, find_table, read_numbers, read_text
+from foamfit.data.frames import Frames, join
 from foamfit.data.headers import CHANNELS, example
-from foamfit.data.measurement import MIN_ROWS, Dropped, Measurement, Record, Striker, interior_node
+from foamfit.data.measurement import (
+    MIN_ROWS,
+    Dropped,
+    Measurement,
+    Record,
+    Striker,
+    interior_channel,
+    interior_node,
+)
 from foamfit.data.noise import with_noise
 from foamfit.data.outliers import fresh_samples
 from foamfit.data.prepare import condition
@@ -62,18 +83,26 @@ def read_test(
     table = find_table(text, {column.column for column in settings.columns.values()})
     columns = assign_columns(table, settings.columns, toml)
     record, notes = _record(table, columns, settings)
+    sha256, spreads = text.sha256, scale_spreads(columns, settings.columns)
+    advice = partial(sign_advice, table, columns, settings.columns)
+    if settings.motion is not None:
+        moved = _read_motion(path, toml, settings)
+        try:
+            record, more = join(record, moved.frames)
+        except InputError as error:
+            raise InputError(f"{toml}: {error}") from None
+        notes, spreads = (*notes, *moved.notes, *more), spreads | moved.spreads
+        sha256 = hashlib.sha256(f"{sha256} {moved.sha256}".encode()).hexdigest()
+        advice = partial(_advice_of, advice, moved.advice)
     try:
         test = condition(
-            record,
-            settings.specimen,
-            striker=settings.striker,
-            window=window,
-            advice=partial(sign_advice, table, columns, settings),
+            record, settings.specimen, striker=settings.striker, window=window, advice=advice
         )
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     _check_noise(toml, settings, test)
-    test = replace(test, name=settings.name, path=path, data_sha256=text.sha256)
+    spreads |= settings.uncertainties
+    test = replace(test, name=settings.name, path=path, data_sha256=sha256, uncertainties=spreads)
     noise = replace(settings.noise, estimated=test.noise.estimated)
     return with_noise(replace(test, noise=noise, notes=(*notes, *test.notes)))
 
@@ -97,12 +126,74 @@ def read_history(path: Path, channel: str) -> tuple[Array, Array]:
     return numbers["time"], numbers[channel]
 
 
+@dataclass(frozen=True)
+class _Moved:
+    """What the file of [motion] holds; `advice` is that of `sign_advice`."""
+
+    frames: Frames
+    notes: tuple[str, ...]
+    spreads: dict[str, float]
+    sha256: str
+    advice: Callable[[str], str]
+
+
+def _read_motion(path: Path, toml: Path, settings: Settings) -> _Moved:
+    """Read the motion from the file that [motion] names; `path` is that of the force."""
+    motion = settings.motion
+    assert motion is not None  # else there is nothing to read
+    if os.path.realpath(motion.file) == os.path.realpath(path):
+        raise InputError(
+            f"{toml}: [motion] file = {motion.file.name!r} is the file of the force; name one of "
+            "its own."
+        )
+    wanted = f"in [motion] file of {toml.name} the CSV file of the motion"
+    text = read_text(motion.file, wanted)
+    try:
+        table = find_table(text, {column.column for column in motion.columns.values()})
+        needed = motion_columns(table, assign_columns(table, motion.columns, toml))
+        numbers, _, dropped, notes = _channels(table, needed, motion.columns, settings)
+        advice = partial(sign_advice, table, needed, motion.columns)
+    except InputError as error:
+        raise InputError(_of_motion(str(error))) from None
+    notes += [f"Not used: {item}." for item in dropped]
+    top = _one_of(numbers, "displacement", "strain", 1 / settings.specimen.height, "height", notes)
+    assert top is not None  # see motion_columns
+    inside = {interior_channel(k): w for k, w in _inside(numbers, top, notes).items()}
+    spread = settings.uncertainties.get("delay")
+    name, moved = motion.file.name, {"displacement": top} | inside
+    return _Moved(
+        Frames(name, numbers["time"], moved, motion.delay, spread),
+        tuple(f"{name}: {note}" for note in notes),
+        scale_spreads(needed, motion.columns),
+        text.sha256,
+        lambda channel: _of_motion(advice(channel)),
+    )
+
+
+def _of_motion(text: str) -> str:
+    return text.replace("[columns]", "[motion.columns]")
+
+
+def _advice_of(force: Callable[[str], str], motion: Callable[[str], str], channel: str) -> str:
+    """Advice on a channel by the file that it was read from."""
+    return (motion if channel.startswith("displacement") else force)(channel)
+
+
 def _record(
     table: Table, columns: dict[str, int], settings: Settings
 ) -> tuple[Record, tuple[str, ...]]:
     """Read the channels that are needed, in SI, and say what was read from where."""
     needed = needed_columns(table, columns, settings)
-    given, headers = settings.columns, table.headers
+    numbers, rows, dropped, notes = _channels(table, needed, settings.columns, settings)
+    record = _to_record(numbers, settings, notes)
+    return replace(record, numbers=rows, dropped=tuple(dropped)), tuple(notes)
+
+
+def _channels(
+    table: Table, needed: dict[str, int], given: dict[str, Column], settings: Settings
+) -> tuple[dict[str, Array], NDArray[np.int64], list[Dropped], list[str]]:
+    """Channels of a table in SI, the numbers of their rows, the rows left out, and notes."""
+    headers = table.headers
     factors = {c: si_factor(table, c, headers[k], given.get(c)) for c, k in needed.items()}
     numbers, empty = read_numbers(table, needed)
     count = len(next(iter(numbers.values())))
@@ -113,7 +204,7 @@ def _record(
         if np.ptp(values) == 0:
             raise InputError(f"{table.path}: column {name!r} is constant; a {channel} must vary.")
         numbers[channel] = values * factors[channel]
-    notes = [read_note(table, needed, settings), *_announced(table, count)]
+    notes = [read_note(table, needed, given), *_announced(table, count)]
     rows, dropped = table.row_numbers(count), list[Dropped]()
     if empty.size:
         dropped.append(Dropped.of(empty, "no cell of it holds anything"))
@@ -121,8 +212,7 @@ def _record(
         if settings.duplicates == "average":
             numbers, rows = _averaged(numbers, rows, dropped, notes)
         _check_time(table, numbers["time"], headers[needed["time"]].text, rows)
-    record = _to_record(numbers, settings, notes)
-    return replace(record, numbers=rows, dropped=tuple(dropped)), tuple(notes)
+    return numbers, rows, dropped, notes
 
 
 def _to_record(numbers: dict[str, Array], settings: Settings, notes: list[str]) -> Record:
@@ -136,17 +226,23 @@ def _to_record(numbers: dict[str, Array], settings: Settings, notes: list[str]) 
         assert acceleration is not None
         stress, acceleration = acceleration * mass / specimen.area, None
         notes.append("The force is the striker's mass times its acceleration.")
-    inside = {}
-    for channel, values in numbers.items():
-        node, top = interior_node(channel), displacement
-        if node and top is not None and np.allclose(values, top, 0.0, 1e-9 * np.ptp(top)):
-            notes.append(f"{channel} is the displacement of the top; it is left out.")
-        elif node:
-            inside[node] = values
+    inside = _inside(numbers, displacement, notes)
     return Record(
         numbers.get("time"), stress, displacement, numbers.get("velocity"), acceleration, inside,
         cycle=numbers.get("cycle"),
     )  # fmt: skip
+
+
+def _inside(numbers: dict[str, Array], top: Array | None, notes: list[str]) -> dict[int, Array]:
+    """Displacements of masses inside; one that is that of the top is left out."""
+    inside = {}
+    for channel, values in numbers.items():
+        node = interior_node(channel)
+        if node and top is not None and np.allclose(values, top, 0.0, 1e-9 * np.ptp(top)):
+            notes.append(f"{channel} is the displacement of the top; it is left out.")
+        elif node:
+            inside[node] = values
+    return inside
 
 
 def _announced(table: Table, count: int) -> list[str]:

@@ -14,8 +14,8 @@ def describe(test: Measurement, audit: EnergyAudit) -> str:
     lines = [
         ("test", [test.name]),
         ("file", [str(test.path or "none")]),
-        ("specimen", [_specimen(test.specimen)]),
-        ("striker", [_striker(test.striker)]),
+        ("specimen", [_specimen(test.specimen, test.uncertainties)]),
+        ("striker", [_striker(test.striker, test.uncertainties)]),
         ("rows", test.rows.sentences()),
         ("samples", [_samples(test)]),
         *_peaks(test),
@@ -39,21 +39,37 @@ def noise_sentences(measurement: Measurement) -> list[str]:
     return sentences
 
 
-def _specimen(s: Specimen) -> str:
-    text = f"height {engineering(s.height, 'm')}, area {s.area * 1e6:.4g} mm²"
+def _specimen(s: Specimen, spread: dict[str, float]) -> str:
+    area = f"{s.area * 1e6:.4g}"
+    area += f" ± {spread['area'] * 1e6:.2g}" if "area" in spread else ""
+    text = f"height {_uncertain(s.height, 'm', spread.get('height'))}, area {area} mm²"
     if s.mass:
         density = s.mass / (s.area * s.height)
-        text += f", mass {engineering(s.mass * 1e3, 'g')} ({density:.4g} kg/m³)"
+        mass = _uncertain(s.mass * 1e3, "g", spread.get("specimen_mass", 0.0) * 1e3)
+        text += f", mass {mass} ({density:.4g} kg/m³)"
     if s.heights:
-        text += f", springs from the base {' + '.join(engineering(h, 'm') for h in s.heights)}"
+        springs = [
+            _uncertain(h, "m", spread.get(f"height_{i}")) for i, h in enumerate(s.heights, 1)
+        ]
+        text += f", springs from the base {' + '.join(springs)}"
     return text
 
 
-def _striker(s: Striker | None) -> str:
+def _striker(s: Striker | None, spread: dict[str, float]) -> str:
     if s is None:
         return "none given"
-    mass = engineering(s.mass * 1e3, "g") if s.mass else "mass unknown"
-    return f"{mass}, {s.velocity:.4g} m/s" if s.velocity else f"{mass}, velocity unknown"
+    mass = "mass unknown"
+    if s.mass:
+        mass = _uncertain(s.mass * 1e3, "g", spread.get("striker_mass", 0.0) * 1e3)
+    if not s.velocity:
+        return f"{mass}, velocity unknown"
+    own = f" ± {spread['velocity']:.2g}" if "velocity" in spread else ""
+    return f"{mass}, {s.velocity:.4g}{own} m/s"
+
+
+def _uncertain(value: float, unit: str, sigma: float | None) -> str:
+    """Write a quantity with its standard deviation, if it has one."""
+    return engineering(value, unit) + (f" ± {engineering(sigma, unit)}" if sigma else "")
 
 
 def _samples(test: Measurement) -> str:

@@ -163,6 +163,7 @@ class Record:
     has outliers. `clipped` marks the samples at which the force is clipped. `cycle` is the number
     of the cycle, where a column counts them. `numbers` holds the row number in the file of each
     sample (None: they count from 1), and `dropped` the rows of the file that were left out so far.
+    `sampled` is that of `Measurement`.
     """
 
     time: Array | None
@@ -274,7 +275,8 @@ class Measurement:
         Strain of a later cycle, counted from the first contact, at which its own contact starts:
         what the foam had not recovered. It is taken off.
     sampled : dict of str to (n,) bool array
-        Of a channel of which some samples do not count as measured: True at those that do.
+        Of a channel of which some samples do not count as measured: True at those that do, which
+        are those at which its own instrument took a value. Elsewhere it is interpolated.
     zeros : dict of str to float
         Standard error of the zero of a channel ("stress", Pa, "acceleration", m/s², and
         "displacement", m), where samples before contact show the zero.
@@ -288,9 +290,12 @@ class Measurement:
     block : int
         Rows of the file that are averaged in each sample.
     uncertainties : dict of str to float
-        Each ± of the TOML, one standard deviation: "height", m, "area", m², "striker_mass", kg,
-        "velocity", m/s, "specimen_mass", kg, "delay", s, and, relative, "stress_scale",
-        "displacement_scale", "acceleration_scale", "velocity_scale".
+        What the TOML says is uncertain, one standard deviation each: "height" and those of the
+        springs of a chain, "height_1", … (m), "area" (m²), "specimen_mass" and "striker_mass" (kg),
+        "velocity" (m/s), and as a share of the scale of a channel "stress_scale",
+        "displacement_scale", "acceleration_scale", "velocity_scale"; and "delay" (s) of a
+        motion with its own clock: time of the force = time of the motion + delay. What it does not
+        say is not there.
     """
 
     name: str

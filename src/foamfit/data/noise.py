@@ -157,7 +157,12 @@ def averaged(level: NoiseLevel, block: int) -> NoiseLevel:
 def with_noise(measurement: Measurement) -> Measurement:
     """Estimate the noise of the channels that have none; a test that has all stays as it is."""
     noise, curves = measurement.noise, measurement.channels()
-    missing = {c: estimated_noise(v) for c, v in curves.items() if noise.of(c) is None}
+    taken = measurement.sampled
+    missing = {
+        c: estimated_noise(v[taken.get(c, slice(None))])
+        for c, v in curves.items()
+        if noise.of(c) is None
+    }
     if not missing:
         return measurement
     return replace(measurement, noise=replace(noise, estimated=noise.estimated | missing))

@@ -167,6 +167,8 @@ def _line_to_middle(times: Array, at: list[int]) -> Array:
 def bridge_outliers(record: Record) -> Record:
     """Replace spikes and short gaps by a straight line; `excess` keeps what the file has there."""
     for name, values in record.curves("velocity", "acceleration").items():
+        if name in record.sampled:  # interpolated between frames, which have been looked through
+            continue
         wrong = find_outliers(values, record.time)
         if wrong.any():
             line = _bridged(values, wrong, record.instants)
@@ -255,9 +257,17 @@ def is_staircase(values: Array) -> bool:
 
 
 def noise_of_held(record: Record) -> dict[str, NoiseLevel]:
-    """Noise of the displacements that are held, from the samples where they are fresh."""
+    """Noise of the displacements that are held, from the samples where they are fresh.
+
+    That of a channel with a clock of its own is that of its frames.
+    """
     levels = {}
     for name, values in record.curves().items():
+        if name in record.sampled:
+            frames = values[record.sampled[name]]
+            level = estimated_noise(frames, "frames on their own clock")
+            levels[name] = replace(level, time=level.time * len(values) / len(frames))
+            continue
         fresh = values[fresh_samples(values)[0]]
         if name != "stress" and is_staircase(values) and len(fresh) >= MIN_ROWS:
             level = estimated_noise(fresh, "fresh samples")
@@ -275,7 +285,7 @@ def fill_staircase(record: Record) -> tuple[Record, list[str]]:
     for name, values in record.curves().items():
         fresh, lengths = fresh_samples(values)
         step = int(np.median(lengths))
-        if name == "stress" or len(lengths) < MIN_ROWS or step < 2:
+        if name == "stress" or name in record.sampled or len(lengths) < MIN_ROWS or step < 2:
             continue
         knots = np.union1d(fresh, (fresh + lengths - step)[lengths > 3 * step])
         record = record.changed(name, np.interp(time, time[knots], values[knots]))

@@ -21,6 +21,7 @@ from foamfit.data.cycles import (
     find_reload,
     inner_reversals,
 )
+from foamfit.data.frames import frames_of_blocks, noise_of_blocks
 from foamfit.data.measurement import (
     INTEGRATED,
     MEASURED,
@@ -36,7 +37,7 @@ from foamfit.data.measurement import (
     Window,
     interior_channel,
 )
-from foamfit.data.noise import averaged, estimated_noise, noise_before_contact, noise_level
+from foamfit.data.noise import estimated_noise, noise_before_contact, noise_level
 from foamfit.data.outliers import (
     bridge_outliers,
     fill_staircase,
@@ -106,7 +107,8 @@ def condition(
     block = -(-len(whole) // len(record))
     before = {name: values[:resting] for name, values in first.curves().items()}
     noise = noise_before_contact(before, record.curves(), block)
-    noise |= {name: averaged(level, block) for name, level in held.items()}
+    taken = whole.sampled
+    noise |= {c: noise_of_blocks(level, block, taken.get(c)) for c, level in held.items()}
     outliers = outliers_of_blocks(whole, block)
     for name, n in spoilt.items():
         notes.append(outlier_note(name, n, outliers.get(name), record.time is not None))
@@ -265,8 +267,7 @@ def thin(record: Record) -> tuple[Record, list[str]]:
     thinned = Record(time, record.stress, None)
     for name, values in record.curves("acceleration").items():
         thinned = thinned.changed(name, np.add.reduceat(values, edges) / counts)
-    kept = {name: np.logical_and.reduceat(k, edges) for name, k in record.sampled.items()}
-    thinned = replace(thinned, sampled=kept)
+    thinned = frames_of_blocks(record, thinned, edges)
     return thinned, [f"{n} samples are averaged in {len(edges)} blocks of {size}."]
 
 

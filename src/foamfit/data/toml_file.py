@@ -3,7 +3,10 @@
 [columns] names the column of a channel where its header does not: ``column``, ``unit``, ``scale``
 (a number, or a quantity such as "4444.4 N/V"; negative turns a sign round) and, for displacements,
 ``counts_down = true`` (a gap or a position that gets smaller in compression). [data] ``duplicates``
-is "average" (neighbouring rows with one time stamp make one sample) or "refuse".
+is "average" (neighbouring rows with one time stamp make one sample) or "refuse". A quantity may
+have a standard deviation, "1.75 ± 0.01 m/s"; `Measurement.uncertainties` says of which it is used.
+[motion] names a ``file`` that has the motion by a clock of its own, relative to the TOML, the
+``delay`` of that clock, and in [motion.columns] its columns.
 """
 
 from __future__ import annotations
@@ -15,10 +18,16 @@ import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from foamfit.data.measurement import Noise, Specimen, Striker, Window, interior_node
-from foamfit.data.units import is_unit, parse_quantity, split_quantity
+from foamfit.data.units import (
+    is_unit,
+    parse_quantity,
+    parse_uncertain,
+    split_quantity,
+    split_uncertain,
+)
 from foamfit.errors import InputError
 from foamfit.terminal import printable
 
@@ -26,36 +35,74 @@ _LARGEST = 1_000_000  # characters of a TOML
 LONGEST = 200  # characters of a name
 # Many keys that are joined by dots.
 _DOTTED = re.compile(r"""(?<![\w"'-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){32}""")
-# Section, key: SI unit and an example.
-_SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
+
+
+class _Quantity(NamedTuple):
+    """SI unit, an example, and the name of its ± in `Settings.uncertainties` (none: no ±)."""
+
+    si: str
+    example: str
+    spread: str = ""
+
+
+_SECTIONS = {
     "specimen": {
-        "height": ("m", "1.19 mm"),
-        "diameter": ("m", "5 mm"),
-        "area": ("m**2", "19.6 mm^2"),
-        "mass": ("kg", "5.56 mg"),
-        "heights": ("m", "0.7 mm"),
+        "height": _Quantity("m", "1.19 mm", "height"),
+        "diameter": _Quantity("m", "5 mm", "diameter"),
+        "area": _Quantity("m**2", "19.6 mm^2", "area"),
+        "mass": _Quantity("kg", "5.56 mg", "specimen_mass"),
+        "heights": _Quantity("m", "0.7 mm", "height"),
     },
-    "striker": {"mass": ("kg", "7 g"), "velocity": ("m/s", "1.75 m/s")},
-    "noise": {"stress": ("Pa", "20 kPa"), "displacement": ("m", "2 um")},
-    "window": {"start": ("s", "0.5 ms"), "end": ("s", "2 ms"), "cycle": ("", "1")},
-    "data": {"duplicates": ("", "average")},
+    "striker": {
+        "mass": _Quantity("kg", "7 g", "striker_mass"),
+        "velocity": _Quantity("m/s", "1.75 m/s", "velocity"),
+    },
+    "noise": {"stress": _Quantity("Pa", "20 kPa"), "displacement": _Quantity("m", "2 um")},
+    "window": {
+        "start": _Quantity("s", "0.5 ms"),
+        "end": _Quantity("s", "2 ms"),
+        "cycle": _Quantity("", "1"),
+    },
+    "data": {"duplicates": _Quantity("", "average")},
 }
+_SCALE = "4444.4 N/V"
+# What is read from the file of [motion], beside displacements of masses inside.
+MOTION_CHANNELS = "time", "displacement", "strain", "velocity"
 
 
 @dataclass(frozen=True)
 class Column:
-    """What [columns] says of one channel; one that `counts_down` gets smaller in compression."""
+    """What [columns] says of one channel; one that `counts_down` gets smaller in compression.
+
+    `spread` is the standard deviation of the scale over the scale, 0 for an exact one.
+    """
 
     column: str
     unit: str | None = None
     scale: float = 1.0
     scale_unit: str = ""
     counts_down: bool = False
+    spread: float = 0.0
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What [motion] says: the file of a motion with its own clock, its columns, and its delay.
+
+    Time of the force = time of the motion + `delay`, s.
+    """
+
+    file: Path
+    columns: dict[str, Column]
+    delay: float = 0.0
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What the TOML says, in SI; `duplicates` says what becomes of rows with one time stamp."""
+    """What the TOML says, in SI; `duplicates` says what becomes of rows with one time stamp.
+
+    `uncertainties` are those of `Measurement`, without the scales, which their `columns` have.
+    """
 
     name: str
     specimen: Specimen
@@ -64,6 +111,8 @@ class Settings:
     window: Window
     columns: dict[str, Column] = field(default_factory=dict)
     duplicates: str = "average"
+    uncertainties: dict[str, float] = field(default_factory=dict)
+    motion: Motion | None = None
 
 
 def read_bytes(path: Path, otherwise: str, most: int = -1) -> bytes:
@@ -113,21 +162,24 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
     the key that is wrong or missing.
     """
     document = load_toml(path, f"{test.name} needs a TOML with [specimen] height and diameter")
-    check_keys(f"{path}:", document, ["name", "columns", *_SECTIONS])
+    check_keys(f"{path}:", document, ["name", "columns", "motion", *_SECTIONS])
     values: dict[str, dict[str, Any]] = {}
+    spreads: dict[str, float] = {}
     for section, keys in _SECTIONS.items():
         table = document.get(section, {})
         if not isinstance(table, dict):
             raise InputError(f"{path}: {section} must be a table, [{section}].")
         check_keys(f"{path}: [{section}]", table, keys)
-        values[section] = {k: _value(path, section, k, v) for k, v in table.items()}
+        values[section] = {k: _value(path, section, k, v, spreads) for k, v in table.items()}
     return Settings(
         name=_name(path, document["name"]) if "name" in document else printable(test.stem),
-        specimen=_specimen(path, values["specimen"]),
+        specimen=_specimen(path, values["specimen"], spreads),
         striker=Striker(**values["striker"]) if values["striker"] else None,
         noise=Noise(**values["noise"]),
         window=Window(**values["window"]),
         columns=_columns(path, document.get("columns", {}), channels),
+        uncertainties=spreads,
+        motion=_motion(path, document["motion"], spreads) if "motion" in document else None,
         **values["data"],
     )
 
@@ -143,8 +195,9 @@ def _name(path: Path, name: Any) -> str:
     return name
 
 
-def _value(path: Path, section: str, key: str, value: Any) -> Any:
-    si, example = _SECTIONS[section][key]
+def _value(path: Path, section: str, key: str, value: Any, spreads: dict[str, float]) -> Any:
+    """Check and return what a key says, in SI, and put its ± into `spreads`."""
+    si, example, spread = _SECTIONS[section][key]
     where = f"{path}: [{section}] {key}"
     if key == "cycle" and (type(value) is not int or value < 1):
         raise InputError(f"{where} = {value!r} must be a whole number from 1 up.")
@@ -155,37 +208,78 @@ def _value(path: Path, section: str, key: str, value: Any) -> Any:
     if key in ("cycle", "duplicates"):
         return value
     given = value if key == "heights" else [value]
-    numbers = tuple(parse_quantity(v, si, where, example) for v in given)
-    for number, v in zip(numbers, given, strict=True):
+    numbers = []
+    for i, v in enumerate(given, 1):
+        if spread:
+            number, sigma = parse_uncertain(v, si, where, example)
+            if sigma:
+                spreads[f"{spread}_{i}" if key == "heights" else spread] = sigma
+        else:
+            number = parse_quantity(v, si, where, example)
         if section != "window" and not 0.0 < number < math.inf:
             raise InputError(f'{where} = "{v}" must be positive.')
-    return numbers if key == "heights" else numbers[0]
+        numbers.append(number)
+    return tuple(numbers) if key == "heights" else numbers[0]
 
 
-def _specimen(path: Path, values: dict[str, Any]) -> Specimen:
+def _specimen(path: Path, values: dict[str, Any], spreads: dict[str, float]) -> Specimen:
     if "height" not in values:
         raise InputError(f'{path}: [specimen] height is missing; give it like height = "1.19 mm".')
-    diameter = values.pop("diameter", None)
+    diameter, spread = values.pop("diameter", None), spreads.pop("diameter", 0.0)
     if diameter is None and "area" not in values:
         raise InputError(f'{path}: [specimen] needs a diameter = "5 mm" or an area = "19.6 mm^2".')
     if diameter is not None:
         area = math.pi * diameter**2 / 4
         if not math.isclose(values.setdefault("area", area), area, rel_tol=0.02):
             raise InputError(f"{path}: [specimen] area and diameter disagree; give one of them.")
+        if spread:
+            spreads.setdefault("area", 2.0 * values["area"] * spread / diameter)
     heights = values.get("heights")
     if heights and not math.isclose(sum(heights), values["height"], rel_tol=0.02):
         raise InputError(f"{path}: [specimen] heights must add up to height.")
     return Specimen(**values)
 
 
-def _columns(path: Path, table: Any, channels: Iterable[str]) -> dict[str, Column]:
+def motion_file(toml: Path) -> Path | None:
+    """Return the file that [motion] of a TOML names; None if it names none or cannot be read."""
+    try:
+        return _file(toml, load_toml(toml, "").get("motion"))
+    except InputError:  # who reads the test says it
+        return None
+
+
+def _file(toml: Path, table: Any) -> Path | None:
+    """Path of the file that a table [motion] names, which is relative to its TOML."""
+    name = table.get("file") if isinstance(table, dict) else None
+    if not isinstance(name, str) or not name.strip() or "\0" in name:
+        return None
+    return toml.parent / name
+
+
+def _motion(path: Path, table: Any, spreads: dict[str, float]) -> Motion:
+    file, example = _file(path, table), "0 ± 50 us"
+    if isinstance(table, dict):
+        check_keys(f"{path}: [motion]", table, ["file", "delay", "columns"])
+    if file is None:
+        raise InputError(f'{path}: [motion] must name a file, like file = "camera.csv".')
+    columns = _columns(path, table.get("columns", {}), MOTION_CHANNELS, "motion.columns")
+    given = table.get("delay", "0 s")
+    delay, sigma = parse_uncertain(given, "s", f"{path}: [motion] delay", example, zero=True)
+    if sigma:
+        spreads["delay"] = sigma
+    return Motion(file, columns, delay)
+
+
+def _columns(
+    path: Path, table: Any, channels: Iterable[str], name: str = "columns"
+) -> dict[str, Column]:
     if not isinstance(table, dict):
-        raise InputError(f"{path}: columns must be a table, [columns].")
+        raise InputError(f"{path}: {name} must be a table, [{name}].")
     inside = [key for key in table if interior_node(key)]
-    check_keys(f"{path}: [columns]", table, [*channels, *inside])
+    check_keys(f"{path}: [{name}]", table, [*channels, *inside])
     columns: dict[str, Column] = {}
     for channel, spec in table.items():
-        where = f"{path}: [columns] {channel}"
+        where = f"{path}: [{name}] {channel}"
         if not isinstance(spec, dict) or not isinstance(spec.get("column"), str):
             raise InputError(f'{where} must be like {{ column = "Load", unit = "V" }}.')
         motion = channel == "displacement" or interior_node(channel) is not None
@@ -197,8 +291,14 @@ def _columns(path: Path, table: Any, channels: Iterable[str]) -> dict[str, Colum
         if unit is not None and (not isinstance(unit, str) or not is_unit(unit)):
             raise InputError(f'{where}: unit = {unit!r} is unknown; give it like unit = "mm".')
         scale = spec.get("scale", 1)
-        parts = split_quantity(str(scale))
+        parts = split_quantity(split_uncertain(str(scale))[0])
         if parts is None or parts[0] in (0.0, math.inf, -math.inf) or not is_unit(parts[1]):
-            raise InputError(f'{where}: scale = {scale!r} must be like -1 or "4444.4 N/V".')
-        columns[channel] = Column(spec["column"], unit, *parts, down)
+            raise InputError(f'{where}: scale = {scale!r} must be like -1 or "{_SCALE}".')
+        _, sigma = parse_uncertain(str(scale), parts[1], f"{where}: scale", _SCALE)
+        if sigma is not None and (channel in ("time", "cycle") or interior_node(channel)):
+            raise InputError(
+                f"{where}: scale = {scale!r} has a ±, which has no meaning there; give it without."
+            )
+        spread = (sigma or 0.0) / abs(parts[0])
+        columns[channel] = Column(spec["column"], unit, *parts, down, spread)
     return columns

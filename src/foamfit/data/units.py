@@ -11,7 +11,8 @@ from foamfit.errors import InputError
 # Usual units, for headers in capitals: "MM" is millimetre as a displacement, "MPA" megapascal.
 _USUAL = ["s", "ms", "us", "m", "cm", "mm", "um", "N", "kN", "mN", "Pa", "kPa", "MPa", "GPa"]
 _USUAL += ["m/s", "mm/s", "m/s^2", "V", "mV"]
-_QUANTITY = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*)")
+_QUANTITY = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*")
+_PLUS_MINUS = re.compile(r"±|\+/[-−]")
 
 
 @functools.cache
@@ -71,18 +72,70 @@ def split_quantity(text: str) -> tuple[float, str] | None:
 
 def parse_quantity(value: object, si: str, where: str, example: str) -> float:
     """Read a quantity such as "1.19 mm" in the unit `si`; `where` and `example` are for errors."""
-    parts = split_quantity(value) if isinstance(value, str) else None
+    number, sigma = parse_uncertain(value, si, where, example)
+    if sigma is not None:
+        raise InputError(
+            f'{where} = "{value}" has a ±, which has no meaning there; give it like "{example}".'
+        )
+    return number
+
+
+def parse_uncertain(
+    value: object, si: str, where: str, example: str, *, zero: bool = False
+) -> tuple[float, float | None]:
+    """Read a quantity and its standard deviation, None where it has none, in the unit `si`.
+
+    It is written like "1.75 ± 0.01 m/s", "1.19 mm +/- 5 um" or "5 mm ± 1 %" (of the value). The
+    standard deviation must be less than the value, unless that may be `zero`. The InputError names
+    the place by `where`, and gives the `example`.
+    """
+    text, spread = split_uncertain(value)
+    number = _in_si(text, si)
+    if isinstance(number, str):
+        shown = f'"{value}"' if split_quantity(text) else repr(value)
+        raise InputError(f'{where} = {shown} {number}; give it like "{example}".')
+    if not spread:
+        return number, None
+    parts = split_quantity(spread)
+    share = parts is not None and parts[1] == "%"
+    sigma = abs(number) * parts[0] / 100.0 if parts and share else _in_si(spread, si)
+    if isinstance(sigma, str):
+        wrong = sigma
+    elif sigma < 0.0:
+        wrong = "must not be negative"
+    elif sigma >= abs(number) and (share or not zero):
+        wrong = "must be less than the value"
+    else:
+        return number, sigma
+    right = example if "±" in example else f"{example} ± 1 %"
+    raise InputError(f'{where} = "{value}": the ± {wrong}; give it like "{right}".')
+
+
+def split_uncertain(value: object) -> tuple[str, str]:
+    """Split "1.75 ± 0.01 m/s" into "1.75 m/s" and "0.01 m/s"; the second is "" without a ±."""
+    if not isinstance(value, str):
+        return "", ""
+    inside = re.sub(r"^\s*\((.*)\)", r"\1", value)  # (1.75 ± 0.01) m/s
+    nominal, *more = _PLUS_MINUS.split(inside, maxsplit=1)
+    if not more:
+        return value, ""
+    one, two = split_quantity(nominal), split_quantity(more[0])
+    if one and two and not one[1].strip() and two[1] != "%":  # one unit for both
+        nominal = f"{nominal} {two[1]}"
+    return nominal.strip(), more[0].strip() or "nothing"
+
+
+def _in_si(text: str, si: str) -> float | str:
+    """Return a quantity in the unit `si`, or what is wrong with it."""
+    parts = split_quantity(text)
     if parts is None:
-        raise InputError(f'{where} = {value!r} is no quantity; give it like "{example}".')
+        return "is no quantity"
     number, unit = parts
     if re.match(r"[_',]\d", unit):
-        raise InputError(
-            f'{where} = "{value}" must be written with a decimal point and without separators, '
-            f'like "{example}".'
-        )
+        return "must be written with a decimal point and without separators"
     one = _unit(unit)
     if one is None:
-        raise InputError(f'{where} = "{value}" has an unknown unit; give it like "{example}".')
+        return "has an unknown unit"
     if not one.check(_unit(si).dimensionality):
-        raise InputError(f'{where} = "{value}" is of another kind; give it like "{example}".')
-    return number * float(one.to(si).magnitude)
+        return "is of another kind"
+    return number * float(one.to(si or "dimensionless").magnitude)

@@ -324,12 +324,12 @@ class Objective:
         return level.sigma if level.given else max(level.sigma, least)
 
     def _fitted(self, name: str) -> slice | NDArray[np.bool_]:
-        """Samples of a curve that count: those that were measured, but for outliers."""
+        """Samples of a curve that count: those that its channel measured, but no outliers."""
         outliers = self.measurement.outliers.get(self.channel(name))
-        sampled = self.measurement.sampled.get(self.channel(name))
+        taken = self.measurement.sampled.get(self.channel(name))
         if outliers is None:
-            return slice(None) if sampled is None else sampled
-        return ~outliers.left_out if sampled is None else sampled & ~outliers.left_out
+            return slice(None) if taken is None else taken
+        return ~outliers.left_out if taken is None else taken & ~outliers.left_out
 
     # ------------------------------------------------------------------ simulation and residual
 
@@ -635,8 +635,13 @@ class Objective:
         return self.jacobian(values, places) @ moves[places]
 
     def kept(self, name: str) -> NDArray[np.intp]:
-        """Samples of a curve that stand in the residual, in their order: all but outliers."""
+        """Samples of a curve that stand in the residual, in their order."""
         return np.arange(self.time.size)[self._kept[name]]
+
+    def n_measured(self, name: str) -> int:
+        """Count the samples that the channel of a curve measured, outliers included."""
+        taken = self.measurement.sampled.get(self.channel(name))
+        return self.time.size if taken is None else int(np.count_nonzero(taken))
 
     def rms(self, residual: Array) -> dict[str, float]:
         """RMS of each counted curve in its unit, from residuals before the loss."""

@@ -216,6 +216,7 @@ def thinned(measurement: Measurement) -> Measurement:
         measurement, time=some(measurement.time), stress=some(measurement.stress),
         displacement=some(measurement.displacement), outliers=outliers,
         interior={node: values[keep] for node, values in measurement.interior.items()},
+        sampled={channel: taken[keep] for channel, taken in measurement.sampled.items()},
     )  # fmt: skip
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from foamfit.arrays import Array
-from foamfit.data.measurement import Outliers, interior_channel
+from foamfit.data.measurement import Measurement, interior_channel
 from foamfit.errors import InputError
 from foamfit.files import reason, replacing
 from foamfit.report.figures import TWO
@@ -179,7 +179,7 @@ def write_result(
     # A name that is no UTF-8 keeps its bytes as an escape of JSON.
     (folder / "fit.json").write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
     write_table(folder / "parameters.csv", _parameter_rows(result.parameters))
-    write_table(folder / "curves.csv", _curve_rows(result.curves, result.measurement.outliers))
+    write_table(folder / "curves.csv", _curve_rows(result.curves, result.measurement))
     if result.intervals is not None and result.intervals.profiles:
         write_table(folder / "profiles.csv", _profile_rows(result.intervals))
     if result.ladder is not None:
@@ -219,7 +219,7 @@ def _profile_rows(intervals: Intervals) -> Iterator[Iterable[object]]:
             yield [profile.name, value, rise, profile.cut, profile.complete]
 
 
-def _curve_rows(curves: Curves, outliers: Mapping[str, Outliers]) -> Iterator[Iterable[object]]:
+def _curve_rows(curves: Curves, measurement: Measurement) -> Iterator[Iterable[object]]:
     columns: dict[str, Array | None] = {
         "time (s)": curves.time,
         "measured stress (Pa)": curves.measured_stress,
@@ -231,8 +231,10 @@ def _curve_rows(curves: Curves, outliers: Mapping[str, Outliers]) -> Iterator[It
     for node, (measured, fitted) in curves.interior.items():
         columns[f"measured {interior_channel(node)} (m)"] = measured
         columns[f"fitted {interior_channel(node)} (m)"] = fitted
-    for channel, found in outliers.items():
+    for channel, found in measurement.outliers.items():
         columns[f"outliers of {channel} left out"] = found.left_out.astype(int)
+    for channel, taken in measurement.sampled.items():
+        columns[f"{channel} is measured"] = taken.astype(int)
     there = {name: column for name, column in columns.items() if column is not None}
     yield there.keys()
     # Python floats are written with as many digits as they have, numpy's with their type's name.

@@ -170,6 +170,7 @@ def planned_test(settings_file: Path) -> Measurement:
         striker=striker,
         noise=settings.noise,
         motion="measured",
+        uncertainties=settings.uncertainties,
         notes=("Nothing is measured yet: the curves are simulated.",),
     )
 
@@ -193,7 +194,8 @@ def simulated_test(like: Measurement, chain: Chain, drive: Impact) -> Measuremen
     inside = {node: response.displacement[node - 1] for node in like.interior}
     return replace(
         like, time=time, stress=stress, displacement=motion, interior=inside, noise=noise,
-        striker=Striker(drive.mass, drive.velocity), outliers={}, contact="file",
+        striker=Striker(drive.mass, drive.velocity), outliers={}, sampled={},
+        contact="file",
     )  # fmt: skip
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Literal, Unpack
 
+from foamfit.data.toml_file import motion_file
 from foamfit.errors import InputError
 from foamfit.files import is_left, reason, sweep
 from foamfit.one_model import Keywords, Options
@@ -342,16 +343,17 @@ class _Run:
         toml = path.with_suffix(".toml") if made.toml is None else made.toml
         folder = made.out / name
         try:
-            data, settings = path.read_bytes(), _bytes(toml)
+            data, settings, camera = path.read_bytes(), _bytes(toml), motion_file(toml)
+            motion = None if camera is None else _bytes(camera)
         except OSError:  # who reads the test says it better
-            data, settings = b"", None
-        mark = fingerprint(self.key, data, settings)
+            data, settings, motion = b"", None, None
+        mark = fingerprint(self.key, data, settings, motion)
         known = None if self.fresh else stored(folder, mark, made.recipe)
         if known is not None:
             moved = tuple(replace(row, file=str(path)) for row in known)
             self._keep(name, moved)
             return
-        content = (data, settings) if self.foreign and data else None
+        content = (data, settings, motion) if self.foreign and data else None
         task = Task(
             name,
             path,
@@ -365,7 +367,7 @@ class _Run:
             future = self.executor.submit(work, task)
         except (BrokenExecutor, RuntimeError) as error:
             raise self._ended(error) from error
-        size = len(data) if content else 0
+        size = len(data) + len(motion or b"") if content else 0
         self.ahead += size
         self.waiting[future] = (name, path, size)
         future.add_done_callback(self.ready.put)

@@ -21,6 +21,7 @@ import lmfit
 from foamfit.api import FitResult, fit
 from foamfit.data.csv_file import read_test
 from foamfit.data.measurement import Measurement
+from foamfit.data.toml_file import motion_file
 from foamfit.errors import InputError, SimulationError
 from foamfit.files import scratch
 from foamfit.fitting.curves import check_time_shift, choose_drive
@@ -71,8 +72,8 @@ class Task:
     """One test to be fitted.
 
     `out` is the folder to write; None brings the files back in the outcome. `content` holds the
-    bytes of the test and of its TOML where the paths may be those of another machine, which must
-    have the same `version` of foamfit.
+    bytes of the test, of its TOML and of its file of [motion] where the paths may be those of
+    another machine, which must have the same `version` of foamfit.
     """
 
     name: str
@@ -81,7 +82,7 @@ class Task:
     recipe: Recipe
     fingerprint: str
     out: Path | None = None
-    content: tuple[bytes, bytes | None] | None = None
+    content: tuple[bytes, bytes | None, bytes | None] | None = None
     version: str = field(default_factory=lambda: version("foamfit"))
 
 
@@ -107,9 +108,10 @@ def settings_key(recipe: Recipe) -> str:
     return json.dumps(parts, sort_keys=True)
 
 
-def fingerprint(key: str, data: bytes, toml: bytes | None) -> str:
-    """Identify what a result is made from: settings and version (`settings_key`), data, TOML."""
-    digests = (None if part is None else hashlib.sha256(part).hexdigest() for part in (data, toml))
+def fingerprint(key: str, data: bytes, toml: bytes | None, motion: bytes | None) -> str:
+    """Identify what a result is made from: settings and version (`settings_key`), and files."""
+    parts = (data, toml) if motion is None else (data, toml, motion)
+    digests = (None if part is None else hashlib.sha256(part).hexdigest() for part in parts)
     return hashlib.sha256(json.dumps([key, *digests]).encode()).hexdigest()
 
 
@@ -235,12 +237,16 @@ def _inputs(task: Task) -> Iterator[tuple[Path, Path]]:
     if task.content is None:
         yield task.path, task.toml
         return
-    data, toml = task.content
+    data, toml, motion = task.content
     with scratch() as folder:
         path, settings = folder / task.path.name, folder / task.toml.name
         path.write_bytes(data)
         if toml is not None:
             settings.write_bytes(toml)
+        moved = motion_file(settings)
+        if moved is not None and motion is not None and folder in moved.resolve().parents:
+            moved.parent.mkdir(parents=True, exist_ok=True)
+            moved.write_bytes(motion)
         try:
             yield path, settings
         except (InputError, SimulationError) as error:

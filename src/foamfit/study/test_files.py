@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import glob
+import os
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+from foamfit.data.toml_file import motion_file
 from foamfit.errors import InputError
 from foamfit.report.folder import (
     BATCH_FILES,
@@ -34,8 +36,9 @@ def find_tests(
     ----------
     patterns : str, Path or several of them
         Files, folders, globs ("**" goes into folders). Of a folder, and of what a glob matches,
-        tables are taken (`ENDINGS`) that are no list of specimens and no result of foamfit. A file
-        that is named itself is taken unless it is a TOML.
+        tables are taken (`ENDINGS`) that are no list of specimens, no motion that a TOML beside
+        them names as that of another test, and no result of foamfit. A file that is named itself
+        is taken unless it is a TOML.
     base : str or Path
         The folder that relative ones start from.
 
@@ -72,7 +75,10 @@ def _matches(pattern: str | Path, base: Path) -> list[Path]:
         # One that is not there is refused where it is read. A shell's glob also names the TOMLs.
         return [] if path.suffix.lower() == ".toml" else [path]
     hits = [Path(hit) for hit in glob.glob(str(path), recursive=True)]
-    there = [hit for hit in hits if hit.is_file() and _is_test(hit)]
+    motions = {path for folder in {hit.parent for hit in hits} for path in _motions(folder)}
+    there = [
+        hit for hit in hits if hit.is_file() and _is_test(hit) and hit.resolve() not in motions
+    ]
     there += [inner for hit in hits if hit.is_dir() for inner in _tests_in(hit)]
     if not there:
         why = "matches no file" if not hits else "matches no test"
@@ -81,7 +87,15 @@ def _matches(pattern: str | Path, base: Path) -> list[Path]:
 
 
 def _tests_in(folder: Path) -> list[Path]:
-    return [path for path in folder.iterdir() if path.is_file() and _is_test(path)]
+    files = [path for path in folder.iterdir() if path.is_file() and _is_test(path)]
+    motions = _motions(folder) if files else set()
+    return [path for path in files if path.resolve() not in motions]
+
+
+def _motions(folder: Path) -> set[Path]:
+    """Files that TOMLs in a folder name as the motion of a test."""
+    found = map(motion_file, folder.glob("*.toml"))
+    return {Path(os.path.realpath(path)) for path in found if path is not None}
 
 
 def _is_test(path: Path) -> bool:

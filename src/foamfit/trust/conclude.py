@@ -337,7 +337,7 @@ def _statistics(best: BestPoint, record: SearchRecord) -> dict[str, float | int 
     return {
         "n_data": n,
         "n_effective": best.spread.effective if best.names else None,
-        "n_left_out": len(objective.counted) * objective.time.size - n,
+        "n_left_out": sum(map(objective.n_measured, objective.counted)) - n,
         "n_vary": n_vary,
         "chisqr": chisqr,
         "redchi": chisqr / max(n - n_vary, 1),

@@ -33,7 +33,7 @@ class PredictedCurve:
     lo: Array
     hi: Array
     parts: dict[str, Array]
-    kept: NDArray[np.bool_]  # Samples that count: all but the outliers of the channel
+    kept: NDArray[np.bool_]  # Samples that count: those that the channel measured, but no outliers
 
     @property
     def range(self) -> float:
@@ -184,8 +184,11 @@ class PredictedTest:
                 columns[f"{channel} half width, {part.replace('_', ' ')} ({unit})"] = curve.parts[
                     part
                 ]
-            if not curve.kept.all():
-                columns[f"outliers of {channel} left out"] = (~curve.kept).astype(int)
+            found, taken = m.outliers.get(channel), m.sampled.get(channel)
+            if found is not None and found.left_out.any():
+                columns[f"outliers of {channel} left out"] = found.left_out.astype(int)
+            if taken is not None:
+                columns[f"{channel} is measured"] = taken.astype(int)
         height = m.specimen.height
         if m.displacement is not None:
             columns["measured strain"] = m.displacement / height

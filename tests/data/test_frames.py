@@ -1,0 +1,388 @@
+"""A motion in a file of its own, with its own clock: put on that of the force, or refused.
+
+The records are synthetic: a force at 100 kHz, frames of a camera at 10 kHz.
+"""
+
+import numpy as np
+import pytest
+
+import foamfit as ff
+from conftest import without_pictures
+from foamfit.cli import main
+from foamfit.data.csv_file import read_test
+from foamfit.data.frames import Frames, join
+from foamfit.data.measurement import Record, Specimen, Striker
+from foamfit.data.prepare import condition
+from foamfit.errors import InputError
+from foamfit.fitting.problem import make_problem
+from foamfit.study.batch_work import Recipe, Task, fingerprint, work
+from foamfit.study.test_files import find_tests
+
+LAST = 4e-3  # s
+SPECIMEN = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\n'
+STRIKER = '[striker]\nmass = "1 kg"\nvelocity = "1 m/s"\n'
+MOTION = '[motion]\nfile = "camera.csv"\n'
+
+
+def clock(rate):
+    return np.arange(round(LAST * rate) + 1) / rate
+
+
+def press(t):
+    """A displacement of 4 mm at most, m."""
+    return 4e-3 * np.sin(np.pi * t / LAST)
+
+
+def table(path, **columns):
+    rows = np.column_stack([*columns.values()])
+    np.savetxt(path, rows, delimiter=",", header=",".join(columns), comments="")
+
+
+def written(folder, toml=MOTION, rate=1e5, frames=None, motion=None, force=None):
+    """The two files: a force over time, and frames (s) of the motion."""
+    t, at = clock(rate), clock(1e4) if frames is None else frames
+    given = {"time (ms)": 1e3 * t, "force (N)": 200.0 * np.sin(np.pi * t / LAST)}
+    table(folder / "test.csv", **given, **(force or {}))
+    given = {"t (us)": 1e6 * at, "displacement (um)": 1e6 * press(at)} if motion is None else motion
+    table(folder / "camera.csv", **given)
+    (folder / "test.toml").write_text(SPECIMEN + toml, encoding="utf-8")
+    return folder / "test.csv"
+
+
+def taken(test, channel="displacement"):
+    return np.flatnonzero(test.sampled[channel])
+
+
+# What is read.
+
+
+def test_frames_are_put_on_the_clock_of_the_force(tmp_path):
+    test = read_test(written(tmp_path))
+    assert test.motion == "measured"
+    assert test.time.size == 401
+    assert test.displacement == pytest.approx(press(test.time), abs=1e-9)
+    assert taken(test).tolist() == list(range(0, 401, 10))
+    assert test.uncertainties == {}
+    notes = " ".join(test.notes)
+    assert "the motion is that of camera.csv: 41 frames, every 100 µs from 0 s to 4 ms" in (
+        notes.replace("The", "the")
+    )
+    assert "the delay is 0 s exactly" in notes
+    assert "41 of 401 samples have a frame of the displacement" in notes
+    assert test.noise.of("displacement").how.endswith("of 41 frames on their own clock")
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_time_of_the_force_is_that_of_the_motion_and_the_delay(tmp_path, sign):
+    late = sign * 2.5e-4
+    at = clock(1e4)
+    motion = {"time (s)": at - late, "strain (%)": 1e4 * press(at)}
+    toml = f'{MOTION}delay = "{late * 1e6} ± 50 us"\n'
+    test = read_test(written(tmp_path, toml, motion=motion))
+    assert test.displacement == pytest.approx(press(test.time), abs=1e-9)
+    assert test.uncertainties == {"delay": pytest.approx(5e-5)}
+    assert any(f"the delay is {'' if sign > 0 else '-'}250 µs ± 50 µs" in n for n in test.notes)
+
+
+def test_a_frame_counts_at_the_sample_nearest_to_it(tmp_path):
+    at = clock(1e4)[:-1] + 3.4e-5 + 2e-6  # 4e-6 ahead of a sample
+    test = read_test(written(tmp_path, frames=at))
+    assert test.count.rows == 401
+    [gone] = test.count.dropped
+    assert gone.why == "outside the time of camera.csv"
+    assert gone.rows == 401 - test.time.size == 4 + 7
+    samples = clock(1e5)[4 : 4 + test.time.size]
+    near = samples[taken(test)]
+    assert near[:-1] == pytest.approx(at[: near.size - 1], abs=0.5e-5)  # the last is dropped
+    assert near[0] == pytest.approx(at[0], abs=0.5e-5)
+
+
+def test_rows_without_a_frame_are_dropped_with_their_reason(tmp_path):
+    at = clock(1e4)[5:31]
+    test = read_test(written(tmp_path, frames=at))
+    assert test.time.size == 251
+    gone = [item for item in test.count.dropped if "camera.csv" in item.why]
+    assert sum(item.rows for item in gone) == 150
+    assert test.count.used == 251
+
+
+def test_frames_outside_of_the_force_are_named(tmp_path):
+    at = np.arange(-10, 51) / 1e4
+    test = read_test(written(tmp_path, frames=at))
+    assert any("20 frames of camera.csv outside the time of the force" in n for n in test.notes)
+    assert test.time.size == 401
+
+
+@pytest.mark.parametrize(("rate", "sigma"), [(1e5, 1.0), (2.5e4, 0.5)])
+def test_a_faster_motion_is_interpolated_or_averaged_and_counts_everywhere(rate, sigma):
+    at = clock(1e5)
+    noise = 1e-5 * np.random.default_rng(0).standard_normal(at.size)
+    t = clock(rate)
+    record = Record(t, np.sin(np.pi * t / LAST), None)
+    joined, _ = join(record, Frames("camera.csv", at, {"displacement": press(at) + noise}))
+    assert joined.sampled == {}
+    off = joined.displacement - press(t)
+    assert np.std(off) == pytest.approx(1e-5 * sigma, rel=0.15)
+    clean, _ = join(record, Frames("camera.csv", at, {"displacement": press(at)}))
+    assert clean.displacement == pytest.approx(press(t), abs=4e-7)
+
+
+def test_masses_inside_and_columns_of_the_toml(tmp_path):
+    at = clock(1e4)
+    toml = MOTION + (
+        "[motion.columns]\n"
+        'time = { column = "A", unit = "ms" }\n'
+        'displacement = { column = "B", unit = "px", scale = "-10 um/px ± 2 %" }\n'
+        'displacement_1 = { column = "C", unit = "mm" }\n'
+    ).replace("px", "V")
+    motion = {"A": 1e3 * at, "B": -1e5 * press(at), "C": 0.4e3 * press(at), "D": at}
+    test = read_test(written(tmp_path, toml, motion=motion))
+    assert test.displacement.max() == pytest.approx(4e-3)
+    assert test.interior[1].max() == pytest.approx(1.6e-3)
+    assert test.sampled.keys() == {"displacement", "displacement_1"}
+    assert test.uncertainties == {"displacement_scale": pytest.approx(0.02)}
+    assert any(n.startswith("camera.csv: Read") and "not used: 'D'" in n for n in test.notes)
+
+
+def test_few_frames_and_pauses_are_joined_by_straight_lines():
+    t = clock(1e5)
+    few = np.linspace(0.0, LAST, 5)
+    record = Record(t, np.sin(np.pi * t / LAST), None)
+    joined, _ = join(record, Frames("camera.csv", few, {"displacement": press(few)}))
+    assert joined.displacement == pytest.approx(np.interp(t, few, press(few)))
+    at = np.delete(clock(1e4), slice(10, 30))
+    joined, _ = join(record, Frames("camera.csv", at, {"displacement": press(at)}))
+    pause = (t > at[9]) & (t < at[10])
+    assert joined.displacement[pause] == pytest.approx(np.interp(t[pause], at, press(at)))
+    assert joined.displacement[~pause] == pytest.approx(press(t[~pause]), abs=1e-6)
+
+
+def test_a_spike_is_no_frame(tmp_path):
+    at = clock(1e4)
+    motion = {"t (us)": 1e6 * at, "displacement (um)": 1e6 * press(at)}
+    motion["displacement (um)"][12] += 900.0
+    test = read_test(written(tmp_path, motion=motion))
+    assert 120 not in taken(test)
+    assert taken(test).size == 40
+    assert test.displacement == pytest.approx(press(test.time), abs=1e-6)
+    assert any("1 frame of the displacement stood out" in note for note in test.notes)
+
+
+def test_the_noise_is_that_of_the_frames(tmp_path):
+    at = clock(5e4)
+    noise = 2e-5 * np.random.default_rng(1).standard_normal(at.size)
+    motion = {"time (s)": at, "displacement (m)": press(at) + noise}
+    test = read_test(written(tmp_path, motion=motion, rate=3e5))
+    level = test.noise.of("displacement")
+    assert level.sigma == pytest.approx(2e-5, rel=0.15)
+    assert level.time == 1.0
+    assert "201 frames on their own clock" in level.how
+
+
+@pytest.mark.parametrize(("rate", "several"), [(1e4, False), (5e5, True)])
+def test_blocks_of_samples_keep_the_frames(rate, several):
+    """3001 samples in 1001 blocks, with 0.04 or 2 frames each."""
+    t = LAST * np.arange(3001) / 3000
+    at = clock(rate)
+    noise = 1e-5 * np.random.default_rng(2).standard_normal(at.size)
+    record = Record(t, 2e6 * np.sin(np.pi * t / LAST), None)
+    joined, _ = join(record, Frames("camera.csv", at, {"displacement": press(at) + noise}))
+    test = condition(joined, Specimen(0.01, 1e-4))
+    assert 998 <= test.time.size <= 1001  # of one cycle
+    level = test.noise.of("displacement")
+    if several:
+        assert test.sampled == {}
+        off = test.displacement - press(test.time)
+        assert np.std(off) == pytest.approx(1e-5 / np.sqrt(2), rel=0.15)
+        assert level.sigma == pytest.approx(np.std(off), rel=0.2)
+    else:
+        assert taken(test).size in (40, 41)
+        inside = np.interp(test.time, joined.time, joined.displacement)
+        assert test.displacement == pytest.approx(inside, abs=1e-12)
+        assert level.sigma == pytest.approx(1e-5, rel=0.4)
+        assert "averaged" not in level.how
+
+
+# What a fit does with it.
+
+
+def impact(folder, **changed):
+    given = {"toml": STRIKER + MOTION + 'delay = "0 ± 50 us"\n'} | changed
+    return read_test(written(folder, **given))
+
+
+def test_only_frames_are_fitted_and_the_others_are_no_outliers(tmp_path):
+    test = impact(tmp_path)
+    problem = make_problem(
+        test, "bistable", "impact", params=None, weights=None, interior_mass=False
+    )
+    objective = problem.objective
+    assert objective.kept("displacement_time").tolist() == taken(test).tolist()
+    assert objective.kept("stress_time").size == test.time.size
+    assert objective.n_measured("displacement_time") == taken(test).size
+    assert objective.n_data == sum(objective.kept(name).size for name in objective.counted)
+
+
+def test_the_result_says_which_samples_were_measured(tmp_path, monkeypatch):
+    test = impact(tmp_path)
+    result = ff.fit(test, model="linear", starts=1)
+    assert result.statistics["n_left_out"] == 0
+    assert not any("outlier" in note for note in result.notes)
+    without_pictures(monkeypatch)
+    result.save(tmp_path / "out")
+    curves = np.genfromtxt(tmp_path / "out" / "curves.csv", delimiter=",", names=True)
+    assert np.flatnonzero(curves["displacement_is_measured"]).tolist() == taken(test).tolist()
+
+
+def test_the_digest_covers_both_files(tmp_path):
+    path = written(tmp_path)
+    first = read_test(path).data_sha256
+    assert len(first) == 64
+    camera = tmp_path / "camera.csv"
+    camera.write_text(camera.read_text() + "\n")
+    assert read_test(path).data_sha256 != first
+    before = fingerprint("key", b"a", b"b", b"c")
+    assert before != fingerprint("key", b"a", b"b", b"d")
+    assert before != fingerprint("key", b"a", b"b", None)
+
+
+@pytest.mark.parametrize("file", ["camera.csv", "film/1.csv"])
+def test_a_task_takes_both_files_to_another_machine(tmp_path, file):
+    path = written(tmp_path, MOTION.replace("camera.csv", file))
+    camera = tmp_path / file
+    camera.parent.mkdir(exist_ok=True)
+    (tmp_path / "camera.csv").rename(camera)
+    toml = path.with_suffix(".toml")
+    content = tuple(one.read_bytes() for one in (path, toml, camera))
+    for one in (path, toml, camera):
+        one.unlink()
+    task = Task("test", path, toml, Recipe("linear", {"starts": 1}), "", content=content)
+    [row] = work(task).rows
+    assert row.status in ("ok", "warnings")
+
+
+def test_a_motion_is_no_test_of_its_own(tmp_path):
+    path = written(tmp_path)
+    assert find_tests(tmp_path) == [("test", path)]
+    assert find_tests("*.csv", tmp_path) == [("test", path)]
+    named = find_tests(tmp_path / "camera.csv")
+    assert [name for name, _ in named] == ["camera"]
+
+
+# What is refused.
+
+
+@pytest.mark.parametrize(
+    ("toml", "words"),
+    [
+        ('[motion]\nfile = "film.csv"\n', ["film.csv: no such file", "[motion] file of test.toml"]),
+        ("[motion]\nfile = 3\n", ["test.toml: [motion] must name a file"]),
+        ('[motion]\nfile = "a\\u0000"\n', ["test.toml: [motion] must name a file"]),
+        ('[motion]\nfile = "."\n', ["cannot be read", "[motion] file of test.toml"]),
+        ('[motion]\ndelay = "1 us"\n', ["[motion] must name a file"]),
+        ('[motion]\nfile = "test.csv"\n', ["test.toml: [motion] file", "is the file of the force"]),
+        ('[motion]\nfile = "./test.csv"\n', ["is the file of the force"]),
+        (MOTION + 'shift = "1 us"\n', ["[motion] has no key 'shift'"]),
+        (MOTION + "delay = 5\n", ["[motion] delay = 5 is no quantity"]),
+        (MOTION + 'delay = "5"\n', ["[motion] delay", "another kind"]),
+        (MOTION + 'delay = "5 mm"\n', ["[motion] delay", "another kind"]),
+        (MOTION + 'delay = "0 ± -5 us"\n', ["[motion] delay", "must not be negative"]),
+        (MOTION + 'delay = "0 ± 5 %"\n', ["[motion] delay", "is of another kind"]),
+        (MOTION + 'delay = "0 us ± 5 %"\n', ["[motion] delay", "less than the value"]),
+        (MOTION + 'delay = "0 us ± 5 um"\n', ["[motion] delay", "± is of another kind"]),
+        (MOTION + 'delay = "5 ms"\n', ["[motion] delay = 5 ms is longer than the record, 4 ms"]),
+        (MOTION + 'delay = "-1 s"\n', ["[motion] delay = 1 s is longer than the record"]),
+        (MOTION + 'delay = "0 ± 5 ms"\n', ["[motion] ± of delay = 5 ms is longer"]),
+        (
+            MOTION + 'delay = "3.95 ms"\n',
+            ["camera.csv overlaps with 6 samples of the force in time, not with 10", "0 s to 4 ms"],
+        ),
+        (
+            MOTION + '[motion.columns]\nforce = { column = "F" }\n',
+            ["[motion.columns] has no key 'force'"],
+        ),
+        (
+            MOTION + '[motion.columns]\ndisplacement = { column = "x" }\n',
+            ["[motion.columns] displacement: column 'x' is nowhere in camera.csv"],
+        ),
+    ],
+)
+def test_a_wrong_motion_is_refused(tmp_path, toml, words):
+    refused(written(tmp_path, toml), *words)
+
+
+def refused(path, *words):
+    with pytest.raises(InputError) as error:
+        read_test(path)
+    told = str(error.value)
+    for word in words:
+        assert word in told
+    assert "\n" not in told
+    assert told.endswith(".")
+
+
+@pytest.mark.parametrize(
+    ("motion", "words"),
+    [
+        ({"displacement (mm)": press}, ["camera.csv: no column is a time", "[motion.columns]"]),
+        (
+            {"time (ms)": lambda t: 1e3 * t, "x": press},
+            ["camera.csv: no column is a displacement or a strain"],
+        ),
+        (
+            {"time (ms)": lambda t: 1e3 * t, "displacement": press},
+            ["'displacement' has no unit", "in [motion.columns] like displacement"],
+        ),
+        (
+            {"time (ms)": lambda t: -t, "displacement (mm)": press},
+            ["camera.csv: row 3", "goes back"],
+        ),
+        (
+            {"time (ms)": lambda t: 1e3 * t, "displacement (mm)": lambda t: -1e3 * press(t)},
+            ["negative or gets smaller", "in [motion.columns]"],
+        ),
+        (
+            {"time (s)": lambda t: t + 1.0, "displacement (mm)": press},
+            ["test.toml: [motion] camera.csv does not overlap in time"],
+        ),
+    ],
+)
+def test_a_file_of_frames_that_cannot_be_used_is_refused(tmp_path, motion, words):
+    columns = {name: made(clock(1e4)) for name, made in motion.items()}
+    columns |= {"note": clock(1e4)} if len(columns) == 1 else {}
+    refused(written(tmp_path, motion=columns), *words)
+
+
+@pytest.mark.parametrize("name", ["displacement (mm)", "strain (%)", "displacement_1 (mm)"])
+def test_a_motion_in_both_files_is_refused(tmp_path, name):
+    path = written(tmp_path, force={name: 1e3 * press(clock(1e5))})
+    refused(path, "test.csv: column", "'camera.csv' has the motion; leave one of them out")
+
+
+def test_a_force_without_a_time_is_refused(tmp_path):
+    path = written(tmp_path)
+    table(path, **{"force (N)": 200.0 * clock(1e5), "more": clock(1e5)})
+    refused(path, "test.csv: no column is a time")
+
+
+def test_nothing_is_written(tmp_path):
+    path = written(tmp_path, MOTION + 'delay = "1 s"\n')
+    with pytest.raises(SystemExit) as end:
+        main(["fit", str(path), "--model", "bistable", "--out", str(tmp_path / "out")])
+    assert end.value.code == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_striker_and_motion_of_two_files_are_one_impact(tmp_path):
+    """The same record in one file, sampled as the force is, and in two."""
+    t, at = np.arange(0, 701) * 1e-6, np.arange(0, 36) * 2e-5
+    spring = ff.published["foam-1/model-1"].bistable
+    run = ff.simulate(ff.Chain([spring], [1.19e-3], 1.9635e-5), ff.Impact(7e-3, 2.0), t)
+    w = run.displacement[-1]
+    whole = Record(t, run.base_stress, w)
+    frames = Frames("camera.csv", at, {"displacement": np.interp(at, t, w)})
+    joined, _ = join(Record(t, run.base_stress, None), frames)
+    given = Specimen(1.19e-3, 1.9635e-5), Striker(7e-3, 2.0)
+    one, two = (condition(r, given[0], striker=given[1]) for r in (whole, joined))
+    assert two.time.size == one.time.size
+    assert two.displacement == pytest.approx(one.displacement, abs=1e-3 * np.ptp(w))

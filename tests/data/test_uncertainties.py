@@ -1,0 +1,201 @@
+"""Standard deviations of what the TOML says: how they are written, kept, shown and refused."""
+
+import math
+
+import numpy as np
+import pytest
+
+from foamfit.cli import main
+from foamfit.data.csv_file import read_test
+from foamfit.data.describe import describe
+from foamfit.data.energy import audit
+from foamfit.errors import InputError
+from foamfit.page.desk import join_toml, split_toml
+
+LOOP = np.sin(np.linspace(0.0, np.pi, 41))
+TIME = np.arange(41) * 1e-3
+
+
+def written(folder, toml, **columns):
+    """A test with these columns, by default time, stress and displacement of a loop."""
+    given = columns or {
+        "time (s)": TIME, "stress (MPa)": 2.0 * LOOP, "displacement (mm)": 4.0 * LOOP,
+    }  # fmt: skip
+    path = folder / "test.csv"
+    table = np.column_stack(list(given.values()))
+    np.savetxt(path, table, delimiter=",", header=",".join(given), comments="")
+    path.with_suffix(".toml").write_text(toml, encoding="utf-8")
+    return path
+
+
+def specimen(height='"10 mm"', area='area = "100 mm^2"'):
+    return f"[specimen]\nheight = {height}\n{area}\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "sigma"),
+    [
+        ("10 ± 0.05 mm", 5e-5),
+        ("10 mm ± 0.05 mm", 5e-5),
+        ("10 mm ± 50 um", 5e-5),
+        ("10 mm +/- 50 um", 5e-5),
+        ("1 cm ± 5e-2 mm", 5e-5),
+        ("10.0±.05 mm", 5e-5),
+        ("(10 ± 0.05) mm", 5e-5),
+        ("10 mm ± 0.5 %", 5e-5),
+        ("10 mm ± 0.5%", 5e-5),
+    ],
+)
+def test_ways_to_write_a_standard_deviation(tmp_path, text, sigma):
+    test = read_test(written(tmp_path, specimen(f'"{text}"')))
+    assert test.specimen.height == pytest.approx(0.01)
+    assert test.uncertainties == {"height": pytest.approx(sigma)}
+
+
+def test_without_a_standard_deviation_a_quantity_is_exact(tmp_path):
+    assert read_test(written(tmp_path, specimen())).uncertainties == {}
+    assert read_test(written(tmp_path, specimen('"10 ± 0 mm"'))).uncertainties == {}
+
+
+EVERYTHING = """
+[specimen]
+height = "10 mm ± 50 um"
+diameter = "5 ± 0.02 mm"
+mass = "60 mg ± 1 mg"
+heights = ["6 ± 0.1 mm", "4 mm"]
+[striker]
+mass = "7 g +/- 0.02 g"
+velocity = "1.75 ± 0.01 m/s"
+[columns]
+force = { column = "Load", unit = "V", scale = "-10 ± 0.05 N/V" }
+displacement = { column = "x", unit = "mm", scale = "1.00 ± 0.01" }
+"""
+
+
+def test_every_quantity_keeps_its_own_and_check_shows_it(tmp_path):
+    columns = {"time (s)": TIME, "Load": -2.0 * LOOP, "x": 4.0 * LOOP}
+    path = written(tmp_path, EVERYTHING, **columns)
+    test = read_test(path)
+    area = math.pi / 4 * 0.005**2
+    assert test.specimen.area == pytest.approx(area)
+    assert test.specimen.heights == pytest.approx((6e-3, 4e-3))
+    assert test.stress.max() == pytest.approx(20.0 / area)
+    assert test.uncertainties == pytest.approx(
+        {
+            "height": 5e-5, "height_1": 1e-4, "area": 2 * 0.02 / 5 * area, "specimen_mass": 1e-6,
+            "striker_mass": 2e-5, "velocity": 0.01, "stress_scale": 0.005,
+            "displacement_scale": 0.01,
+        }
+    )  # fmt: skip
+    told = " ".join(describe(test, audit(test)).split())
+    for part in (
+        "height 10 mm ± 50 µm, area 19.63 ± 0.16 mm², mass 60 mg ± 1 mg",
+        "springs from the base 6 mm ± 100 µm + 4 mm",
+        "7 g ± 20 mg, 1.75 ± 0.01 m/s",
+        "force from 'Load' in V times -10 N/V ± 0.5 %",
+        "displacement from 'x' in mm times 1 ± 1 %",
+    ):
+        assert part in told
+
+
+@pytest.mark.parametrize(
+    ("area", "sigma"),
+    [
+        ('area = "20 ± 0.5 mm^2"', 0.5e-6),
+        ('area = "20 mm^2 ± 1 %"\ndiameter = "5.046 ± 1 mm"', 0.2e-6),
+        ('area = "20 mm^2"\ndiameter = "5.046 mm ± 1 %"', 0.4e-6),
+    ],
+)
+def test_the_area_goes_before_the_diameter(tmp_path, area, sigma):
+    test = read_test(written(tmp_path, specimen(area=area)))
+    assert test.specimen.area == pytest.approx(20e-6)
+    assert test.uncertainties == {"area": pytest.approx(sigma, rel=1e-3)}
+
+
+def test_only_what_is_read_has_a_scale(tmp_path):
+    """Of a stress and a force the stress is used; an acceleration stands for a stress."""
+    motion = {"time (s)": TIME, "displacement (mm)": 4.0 * LOOP}
+    columns = motion | {"stress (MPa)": 2.0 * LOOP, "load cell": LOOP}
+    force = '[columns]\nforce = { column = "load cell", unit = "N", scale = "200 ± 1" }\n'
+    test = read_test(written(tmp_path, specimen() + force, **columns))
+    assert test.uncertainties == {"stress_scale": pytest.approx(0.005)}
+    both = force + 'stress = { column = "stress (MPa)" }\n'
+    assert read_test(written(tmp_path, specimen() + both, **columns)).uncertainties == {}
+    columns = motion | {"accelerometer": 2.0 * LOOP}
+    entry = 'acceleration = { column = "accelerometer", unit = "V", scale = "9 m/s^2/V ± 2 %" }'
+    striker = '[striker]\nmass = "1 kg"\n'
+    toml = specimen() + striker + f"[columns]\n{entry}\n"
+    test = read_test(written(tmp_path, toml, **columns))
+    assert test.uncertainties == {"stress_scale": pytest.approx(0.02)}
+
+
+BAD = [
+    ("10 ± -1 mm", "must not be negative"),
+    ("10 ± 10 mm", "must be less than the value"),
+    ("10 mm ± 2 cm", "must be less than the value"),
+    ("10 mm ± 100 %", "must be less than the value"),
+    ("10 mm ± 1e999 mm", "must be less than the value"),
+    ("0 ± 1 mm", "must be less than the value"),
+    ("10 mm ± 1 kg", "the ± is of another kind"),
+    ("10 mm ± 1", "the ± is of another kind"),
+    ("10 mm ± 1 furlings", "the ± has an unknown unit"),
+    ("10 mm ± small", "the ± is no quantity"),
+    ("10 mm ±", "the ± is no quantity"),
+    ("10 mm ± 0,1 mm", "decimal point"),
+    ("10 mm ± 1 mm ± 2 mm", "the ± has an unknown unit"),
+    ("± 1 mm", "is no quantity"),
+]
+
+
+@pytest.mark.parametrize(("text", "words"), BAD)
+def test_a_wrong_standard_deviation_is_refused(tmp_path, text, words):
+    path = written(tmp_path, specimen(f'"{text}"'))
+    with pytest.raises(InputError) as refused:
+        read_test(path)
+    told = str(refused.value)
+    assert told.startswith(f"{path.with_suffix('.toml')}: [specimen] height = ")
+    assert text in told
+    assert words in told
+    assert told.count(". ") == 0  # one sentence
+
+
+@pytest.mark.parametrize(
+    ("toml", "words"),
+    [
+        ('[noise]\nstress = "20 ± 1 kPa"\n', "[noise] stress"),
+        ('[window]\nstart = "1 ± 0.1 ms"\n', "[window] start"),
+        (
+            '[columns]\ntime = { column = "time (s)", scale = "1 ± 0.01" }\n',
+            "[columns] time: scale",
+        ),
+    ],
+)
+def test_where_none_has_a_meaning_it_is_refused(tmp_path, toml, words):
+    with pytest.raises(InputError) as refused:
+        read_test(written(tmp_path, specimen() + toml))
+    assert words in str(refused.value)
+    assert "has a ±, which has no meaning there" in str(refused.value)
+
+
+@pytest.mark.parametrize("scale", ["2 ± 2 N/V", "2 N/V ± 1 N", "2 ± x N/V", "2 ± -0.1 N/V"])
+def test_a_wrong_scale_is_refused(tmp_path, scale):
+    columns = {"time (s)": TIME, "Load": LOOP, "displacement (mm)": 4.0 * LOOP}
+    entry = f'[columns]\nforce = {{ column = "Load", unit = "V", scale = "{scale}" }}\n'
+    with pytest.raises(InputError, match=r"\[columns\] force: scale = .*: the ± "):
+        read_test(written(tmp_path, specimen() + entry, **columns))
+
+
+def test_nothing_is_written(tmp_path, capsys):
+    path = written(tmp_path, specimen('"10 ± 20 mm"'))
+    with pytest.raises(SystemExit) as end:
+        main(["fit", str(path), "--model", "bistable", "--out", str(tmp_path / "out")])
+    assert end.value.code == 1
+    assert not (tmp_path / "out").exists()
+    assert len(capsys.readouterr().err.strip().splitlines()) <= 3
+
+
+def test_the_page_keeps_what_is_typed():
+    text = specimen('"10 ± 0.1 mm"') + '[striker]\nvelocity = "1.75 ± 0.01 m/s"\n'
+    again = join_toml(*split_toml(text))
+    assert '"10 ± 0.1 mm"' in again
+    assert '"1.75 ± 0.01 m/s"' in again
