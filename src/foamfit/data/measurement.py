@@ -276,7 +276,7 @@ class Measurement:
         what the foam had not recovered. It is taken off.
     sampled : dict of str to (n,) bool array
         Of a channel of which some samples do not count as measured: True at those that do, which
-        are those at which its own instrument took a value. Elsewhere it is interpolated.
+        are those at which its instrument took or renewed a value. Elsewhere it is interpolated.
     uncertainties : dict of str to float
         What the TOML says is uncertain, one standard deviation each: "height" and those of the
         springs of a chain, "height_1", … (m), "area" (m²), "specimen_mass" and "striker_mass" (kg),
