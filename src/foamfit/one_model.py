@@ -313,10 +313,7 @@ def _weigh_motion(problem: Problem, tracker: Tracker) -> None:
     for _ in range(WEIGHED):
         if tracker.best_values is None:
             return
-        try:
-            uncertain = problem.objective.by_motion(tracker.best_values)
-        except SimulationError:  # along a motion a little off: the residual stays as it is
-            return
+        uncertain = problem.objective.by_motion(tracker.best_values)
         if uncertain is None:
             return
         problem.objective.weigh(uncertain)

@@ -291,7 +291,7 @@ def test_a_motion_is_no_test_of_its_own(tmp_path):
         (MOTION + 'delay = "0 us ± 5 %"\n', ["[motion] delay", "less than the value"]),
         (MOTION + 'delay = "0 us ± 5 um"\n', ["[motion] delay", "± is of another kind"]),
         (MOTION + 'delay = "5 ms"\n', ["[motion] delay = 5 ms is longer than the record, 4 ms"]),
-        (MOTION + 'delay = "-1 s"\n', ["[motion] delay = 1 s is longer than the record"]),
+        (MOTION + 'delay = "-1 s"\n', ["[motion] delay = -1 s is longer than the record"]),
         (MOTION + 'delay = "0 ± 5 ms"\n', ["[motion] ± of delay = 5 ms is longer"]),
         (
             MOTION + 'delay = "3.95 ms"\n',

@@ -282,6 +282,7 @@ def test_a_staircase_becomes_its_ramp():
     filled, notes = fill_staircase(Record(t, w, held))
     assert np.abs(filled.displacement - w)[:-5].max() < 0.02 * np.abs(held - w).max()
     assert "5 samples" in notes[0]
+    assert np.flatnonzero(filled.sampled["displacement"]).tolist() == list(range(0, 1000, 5))
 
 
 def test_a_true_hold_stays_a_hold():

@@ -34,7 +34,7 @@ def noise_sentences(measurement: Measurement) -> list[str]:
         if level is not None:
             sigma = engineering(level.sigma, "Pa" if channel == "stress" else "m")
             share = percent(level.sigma / (float(np.ptp(values)) or 1.0))
-            slow = f", correlated over {level.time:.1f} samples" if level.time > 1.0 else ""
+            slow = f", correlated over {level.time:.1f} samples" if level.time >= 1.05 else ""
             sentences.append(f"{channel} {sigma} ({share} of its range), {level.how}{slow}.")
     return sentences
 

@@ -64,11 +64,11 @@ def join(record: Record, frames: Frames) -> tuple[Record, list[str]]:
     time = record.time
     assert time is not None  # a force without it is refused
     longest = max(np.ptp(time), np.ptp(frames.time))
-    for size, what in ((abs(frames.delay), "delay"), (frames.spread or 0.0, "± of delay")):
-        if size > longest:
+    for size, what in ((frames.delay, "delay"), (frames.spread or 0.0, "± of delay")):
+        if abs(size) > longest:
             raise InputError(
                 f"[motion] {what} = {engineering(size, 's')} is longer than the record, "
-                f"{engineering(float(longest), 's')}; it must be less."
+                f"{engineering(float(longest), 's')}; it must be shorter."
             )
     at = frames.time + frames.delay
     slack = 1e-9 * longest  # of rounding

@@ -278,8 +278,8 @@ def noise_of_held(record: Record) -> dict[str, NoiseLevel]:
 def fill_staircase(record: Record) -> tuple[Record, list[str]]:
     """Interpolate displacements that are held while the stress goes on.
 
-    The instants where a value is fresh are kept. A hold of more than three usual steps is a real
-    one: it lasts until one usual step before the next fresh value.
+    The instants where a value is fresh are kept, and only these count as measured. A hold of more
+    than three usual steps is a real one: it lasts until one usual step before the next fresh value.
     """
     notes, time = [], record.instants
     for name, values in record.curves().items():
@@ -289,6 +289,9 @@ def fill_staircase(record: Record) -> tuple[Record, list[str]]:
             continue
         knots = np.union1d(fresh, (fresh + lengths - step)[lengths > 3 * step])
         record = record.changed(name, np.interp(time, time[knots], values[knots]))
+        taken = np.zeros(len(values), dtype=bool)
+        taken[knots] = True
+        record = replace(record, sampled=record.sampled | {name: taken})
         shown = "The displacement" if name == "displacement" else name
         notes.append(
             f"{shown} is held for about {step} samples at a time; it is interpolated between the "

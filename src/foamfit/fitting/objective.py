@@ -199,24 +199,21 @@ class Objective:
         return np.asarray(rows - root * (self._lean @ (less * (self._lean.T @ plain))))
 
     def by_motion(self, values: Array) -> Array | None:
-        """Change of the residual by each mode of the motion that drives, (n_data, m), or None.
-
-        Raises SimulationError if the springs cannot be simulated along one of them.
-        """
+        """Change of the residual by each mode of the motion that drives, (n_data, m), or None."""
         if not self._driven or self.motion is None:
             return None
         modes = self.motion.modes(self._clock)
         out = np.empty((self.n_data, modes.shape[1]))
         for column, mode in zip(out.T, modes.T, strict=True):
-            sides = [self._moved_by(side * mode).simulate(values) for side in (-0.5, 0.5)]
-            ends = [self.compare(side, values)[: self.n_data] for side in sides]
-            column[:] = ends[1] - ends[0]
+            sides = [self._moved_by(side * mode).differences(values) for side in (-0.5, 0.5)]
+            column[:] = (sides[1] - sides[0])[: self.n_data]
         self.evaluations += 2 * modes.shape[1]
         return out
 
     def _moved_by(self, change: Array) -> Objective:
-        """The same objective with another driving motion."""
+        """The same objective with another driving motion, and plain residuals."""
         other = copy(self)
+        other.uncertain = None
         other._plans = {
             damped: plan._replace(values=plan.values + change)
             for damped, plan in self._plans.items()

@@ -194,8 +194,7 @@ def simulated_test(like: Measurement, chain: Chain, drive: Impact) -> Measuremen
     inside = {node: response.displacement[node - 1] for node in like.interior}
     return replace(
         like, time=time, stress=stress, displacement=motion, interior=inside, noise=noise,
-        striker=Striker(drive.mass, drive.velocity), outliers={}, sampled={},
-        contact="file",
+        striker=Striker(drive.mass, drive.velocity), outliers={}, contact="file",
     )  # fmt: skip
 
 
