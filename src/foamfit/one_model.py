@@ -29,7 +29,7 @@ from foamfit.fitting.search import (
     what_stopped,
 )
 from foamfit.results import Fit, Intervals
-from foamfit.springs.parameters import HYSTERETIC, split_name
+from foamfit.springs.parameters import HYSTERETIC, relaxation_names, split_name
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
 from foamfit.trust.covariance import AT_LIMIT
@@ -353,7 +353,20 @@ def _ordered(problem: Problem, values: Array) -> Array:
     """
     for kind in HYSTERETIC:
         values = _ordered_of_kind(problem, values, kind)
-    return values
+    return _terms_by_time(problem, values)
+
+
+def _terms_by_time(problem: Problem, values: Array) -> Array:
+    """Order the relaxation terms of each spring by their times, unless one of them is held."""
+    model, out = problem.model, values.copy()
+    for spring in range(1, len(model.kinds) + 1):
+        names = [f"s{spring}_{short}" for short in relaxation_names(model.relaxation)]
+        if not names or names[0] not in model.index:
+            continue
+        if all(problem.params[name].vary for name in names):
+            terms = values[[model.index[name] for name in names]].reshape(-1, 2)
+            out[[model.index[name] for name in names]] = terms[np.argsort(terms[:, 1])].ravel()
+    return out
 
 
 def _ordered_of_kind(problem: Problem, values: Array, kind: str) -> Array:

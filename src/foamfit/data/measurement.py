@@ -276,8 +276,7 @@ class Measurement:
         what the foam had not recovered. It is taken off.
     sampled : dict of str to (n,) bool array
         Of a channel of which some samples do not count as measured: True at those that do, which
-<<<<<<< HEAD
-        are those at which its own instrument took a value. Elsewhere it is interpolated.
+        are those at which its instrument took or renewed a value. Elsewhere it is interpolated.
     zeros : dict of str to float
         Standard error of the zero of a channel ("stress", Pa, "acceleration", m/s², and
         "displacement", m), where samples before contact show the zero.
@@ -290,9 +289,6 @@ class Measurement:
         Channels that were computed from others and are no measurement of their own.
     block : int
         Rows of the file that are averaged in each sample.
-=======
-        are those at which its instrument took or renewed a value. Elsewhere it is interpolated.
->>>>>>> toml
     uncertainties : dict of str to float
         What the TOML says is uncertain, one standard deviation each: "height" and those of the
         springs of a chain, "height_1", … (m), "area" (m²), "specimen_mass" and "striker_mass" (kg),

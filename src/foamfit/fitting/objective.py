@@ -593,6 +593,12 @@ class Objective:
         bounded = self._weighed(bounded)
         return np.append(bounded, self.off_priors(values)) if self.priors else bounded
 
+    @property
+    def floor(self) -> float:
+        """Sum of squares that leaves no more of the curves than noise, with a margin of half."""
+        levels = zip(self.counted, self.sizes, strict=True)
+        return 1.5 * sum(n * (self.noise(name).sigma * self.factor(name)) ** 2 for name, n in levels)
+
     def factor(self, name: str) -> float:
         """Residual of a curve that is off by one SI unit."""
         return float(self.weights[name] ** 0.5 / self.scale[name])

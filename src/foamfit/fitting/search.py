@@ -30,6 +30,9 @@ PULSE = 16  # evaluations
 # Shares of the time of a search, as measured, at which its parts begin.
 DESCENTS, ON_CURVES, REFINED = 0.25, 0.75, 0.95
 CURVE_STARTS = 300
+# Searches at most: another one where a single descent led to the best end, which misses more of the
+# curves than noise.
+ATTEMPTS = 3
 # Minima of the loop whose cost on the drive's curves is within this factor of the best go on.
 PROMISING = 100.0
 # Factors by which the stiffness that an interior mass vibrates on is changed, and their inverses.
@@ -354,29 +357,41 @@ def search(
     """Search for the best parameters; the tracker keeps them.
 
     Of the descents on the loop (so many `starts`) the best quarter go on to the curves of the
-    drive. Returned are the final costs there, best first, and how many descents on the loop led to
+    drive; see `ATTEMPTS` for when that is done again. Returned are the final costs there, best first, and how many descents on the loop led to
     each. Raises SearchStoppedError when the time is up.
     """
     progress(0.0, "start values")
     points = [space.encode(space.values), *box_starts(space, rng, CURVE_STARTS // 3)]
-    counts: dict[int, int] = {}
-    if tracker.objective.measurement.displacement is not None:
-        found = distinct(_search_loop(tracker, space, points, starts, rng, progress))
-        points = [point for _, point in found]
-        counts = {id(point): count for count, point in found}
-    ranked = rank(tracker, space, points)
-    if tracker.objective.interior_mass:
-        progress(ON_CURVES, "vibration")
-        ranked = sorted(ranked + _scan_vibration(tracker, space, points[0]), key=_cost)
-    promising = [item for item in ranked if item[0] <= PROMISING * ranked[0][0]]
-    points = [point for _, point in distinct(promising)][: max(3, starts // 4)]
-    out = []
-    for i, point in enumerate(points):
-        progress(ON_CURVES + (REFINED - ON_CURVES) * i / len(points), "curves")
-        cost, end = descend(tracker, space, point, 60)
-        tracker.ends.append(space.decode(end))
-        out.append((cost, counts.get(id(point), 1)))
+    out: list[tuple[float, int]] = []
+    for attempt in range(ATTEMPTS):
+        counts: dict[int, int] = {}
+        if tracker.objective.measurement.displacement is not None:
+            found = distinct(_search_loop(tracker, space, points, starts, rng, progress))
+            points = [point for _, point in found]
+            counts = {id(point): count for count, point in found}
+        ranked = rank(tracker, space, points)
+        if tracker.objective.interior_mass:
+            progress(ON_CURVES, "vibration")
+            ranked = sorted(ranked + _scan_vibration(tracker, space, points[0]), key=_cost)
+        promising = [item for item in ranked if item[0] <= PROMISING * ranked[0][0]]
+        points = [point for _, point in distinct(promising)][: max(3, starts // 4)]
+        for i, point in enumerate(points):
+            progress(ON_CURVES + (REFINED - ON_CURVES) * i / len(points), "curves")
+            cost, end = descend(tracker, space, point, 60)
+            tracker.ends.append(space.decode(end))
+            out.append((cost, counts.get(id(point), 1)))
+        if attempt + 1 == ATTEMPTS or _settled(tracker, out):
+            break
+        points = box_starts(space, rng, CURVE_STARTS // 3)
     return sorted(out)
+
+
+def _settled(tracker: Tracker, ends: list[tuple[float, int]]) -> bool:
+    """Whether descents agree on the best end, or this leaves no more of the curves than noise."""
+    best = min(ends)[0]
+    if sum(count for cost, count in ends if cost <= 1.02 * best) > 1:
+        return True
+    return best <= tracker.objective.floor
 
 
 def ensure_feasible(tracker: Tracker, space: Space, rng: np.random.Generator) -> None:
