@@ -20,6 +20,12 @@ from foamfit.data.cycles import (
     find_reload,
     inner_reversals,
 )
+from foamfit.data.gauge import (
+    bridge_standstills,
+    find_standstills,
+    standstill_notes,
+    standstill_spans,
+)
 from foamfit.data.measurement import (
     INTEGRATED,
     MEASURED,
@@ -76,7 +82,8 @@ def condition(
     spoilt = {name: int(np.count_nonzero(excess)) for name, excess in record.excess.items()}
     check_signs(record, advice)
     held = noise_of_held(record)
-    record = done(fill_staircase(record))
+    still = [] if impact else find_standstills(record)
+    record = bridge_standstills(done(fill_staircase(record)), still)
     if impact and window.cycle not in (None, 1):
         raise InputError("[window] cycle is for slow tests; for an impact give start and end.")
     cycles = [] if impact else find_cycles(record)
@@ -109,6 +116,7 @@ def condition(
     outliers = outliers_of_blocks(whole, block)
     for name, n in spoilt.items():
         notes.append(outlier_note(name, n, outliers.get(name), record.time is not None))
+    notes += standstill_notes(whole, specimen.height)
     channels = record.time, record.stress, record.displacement
     return Measurement(
         *("", None, "", *channels, specimen, striker),  # no name and no file
@@ -122,6 +130,7 @@ def condition(
         cycle=chosen.number if chosen else 1,
         cycles=tuple(cycle.number for cycle in cycles) or (1,),
         start_strain=start_strain,
+        standstills=standstill_spans(whole, block),
     )
 
 
@@ -273,6 +282,8 @@ def count_rows(record: Record, outliers: dict[str, Outliers], block: int) -> Row
         f"a spike or gap of the {name}, bridged by a straight line": excess != 0.0
         for name, excess in record.excess.items()
     }
+    if record.standstills:
+        wrong["the displacement stands still, bridged by a straight line"] = record.stood_still
     if record.clipped is not None:
         wrong["the force is clipped"] = of_blocks["stress"] & record.clipped
     for name, left_out in of_blocks.items():
