@@ -223,7 +223,9 @@ def _with_more(fit: Fit) -> Fit:
 def _find_kinks(samples: Samples) -> Fit:
     """Find the kinks, from those at the turns or from none, then drop needless ones."""
     none = Fit.of(samples, np.empty(0))
-    fit = min(none, Fit.of(samples, _likely_turns(samples)).settled(none.best[1]), key=lambda f: f.best[0])
+    fit = min(
+        none, Fit.of(samples, _likely_turns(samples)).settled(none.best[1]), key=lambda f: f.best[0]
+    )
     while fit.instants.size < _KINKS:
         trial = _with_more(fit).settled(fit.best[1])
         if trial.best[0] >= fit.best[0]:

@@ -101,6 +101,24 @@ class Outliers:
 
 
 @dataclass(frozen=True)
+class Standstill:
+    """A stretch in which the gauge stood still before it jumped; a straight line bridges it.
+
+    `first` and `last` are rows of the file. In them the stress changed by the share `change` of its
+    largest value there; the displacement then jumped by `jump`, m.
+    """
+
+    first: int
+    last: int
+    change: float
+    jump: float
+
+    def among(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which of the rows with these numbers are in the stretch."""
+        return (rows >= self.first) & (rows <= self.last)
+
+
+@dataclass(frozen=True)
 class Dropped:
     """Rows of a file that are not used, for one reason; rows that are used may lie between.
 
@@ -162,8 +180,9 @@ class Record:
     file has beyond the straight line that bridges an outlier, 0 elsewhere, for each channel that
     has outliers. `clipped` marks the samples at which the force is clipped. `cycle` is the number
     of the cycle, where a column counts them. `numbers` holds the row number in the file of each
-    sample (None: they count from 1), and `dropped` the rows of the file that were left out so far.
-    `sampled` is that of `Measurement`.
+    sample (None: they count from 1), `dropped` the rows of the file that were left out so far, and
+    `standstills` those over which the displacement is bridged, whether or not they are left. `sampled`
+    is that of `Measurement`.
     """
 
     time: Array | None
@@ -178,6 +197,7 @@ class Record:
     numbers: NDArray[np.int64] | None = None
     dropped: tuple[Dropped, ...] = ()
     sampled: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
+    standstills: tuple[Standstill, ...] = ()
 
     def __len__(self) -> int:
         """Count the samples."""
@@ -192,6 +212,14 @@ class Record:
     def instants(self) -> Array:
         """Time, or the sample's number where there is none, shape (n,)."""
         return np.arange(len(self), dtype=np.float64) if self.time is None else self.time
+
+    @property
+    def stood_still(self) -> NDArray[np.bool_]:
+        """Samples at which the gauge stood still, shape (n,)."""
+        still = np.zeros(len(self), dtype=bool)
+        for one in self.standstills:
+            still |= one.among(self.row_numbers)
+        return still
 
     def curves(self, *more: str) -> dict[str, Array]:
         """Stress, displacement, `more` and displacements inside, as far as they are there."""
@@ -296,6 +324,9 @@ class Measurement:
         "displacement_scale", "acceleration_scale", "velocity_scale"; and "delay" (s) of a
         motion with its own clock: time of the force = time of the motion + delay. What it does not
         say is not there.
+    standstills
+        First and last time, s, of each stretch in which the gauge stood still and the displacement
+        is bridged by a straight line; samples where the test has no time.
     """
 
     name: str
@@ -323,6 +354,7 @@ class Measurement:
     derived: tuple[str, ...] = ()
     block: int = 1
     uncertainties: dict[str, float] = field(default_factory=dict)
+    standstills: tuple[tuple[float, float], ...] = ()
 
     @property
     def rows(self) -> RowCount:

@@ -223,4 +223,6 @@ def _monotone(
     # A cubic is monotone if its velocity at the ends is at most three times that of its chord.
     over = np.where(chord, chord, np.inf)
     a, b = (chord * np.clip(v / over, 0.0, 3.0) for v in (velocities[1][:-1], velocities[0][1:]))
-    return PPoly(np.stack([(a + b - 2.0 * chord) / h**2, (3.0 * chord - 2.0 * a - b) / h, a, y[:-1]]), x)
+    return PPoly(
+        np.stack([(a + b - 2.0 * chord) / h**2, (3.0 * chord - 2.0 * a - b) / h, a, y[:-1]]), x
+    )

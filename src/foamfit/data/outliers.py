@@ -218,9 +218,14 @@ def outliers_of_blocks(record: Record, block: int) -> dict[str, Outliers]:
         share = np.add.reduceat(wrong.astype(float), edges) / block
         at = np.flatnonzero(wrong)
         found[name] = Outliers(share > 0.5, record.instants[at], values[at] + excess[at])
+    still = record.stood_still
+    none = np.zeros(0)
+    if still.any():
+        left_out = np.add.reduceat(still.astype(float), edges) > 0.5 * block
+        spikes = found.get("displacement") or Outliers(np.zeros_like(left_out), none, none)
+        found["displacement"] = replace(spikes, left_out=spikes.left_out | left_out)
     if record.clipped is not None and record.clipped.any():
         left_out = np.add.reduceat(record.clipped.astype(float), edges) > 0.0
-        none = np.zeros(0)
         spikes = found.get("stress") or Outliers(np.zeros_like(left_out), none, none)
         top = float(record.stress[record.clipped].max())
         found["stress"] = replace(spikes, left_out=spikes.left_out | left_out, clipped_at=top)

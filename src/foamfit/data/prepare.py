@@ -7,7 +7,6 @@ thing that it changed or left out.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
@@ -22,6 +21,12 @@ from foamfit.data.cycles import (
     inner_reversals,
 )
 from foamfit.data.frames import frames_of_blocks, noise_of_blocks
+from foamfit.data.gauge import (
+    bridge_standstills,
+    find_standstills,
+    standstill_notes,
+    standstill_spans,
+)
 from foamfit.data.measurement import (
     INTEGRATED,
     MEASURED,
@@ -78,7 +83,8 @@ def condition(
     spoilt = {name: int(np.count_nonzero(excess)) for name, excess in record.excess.items()}
     check_signs(record, advice)
     held = noise_of_held(record)
-    record = done(fill_staircase(record))
+    still = [] if impact else find_standstills(record)
+    record = bridge_standstills(done(fill_staircase(record)), still)
     if impact and window.cycle not in (None, 1):
         raise InputError("[window] cycle is for slow tests; for an impact give start and end.")
     cycles = [] if impact else find_cycles(record)
@@ -112,6 +118,7 @@ def condition(
     outliers = outliers_of_blocks(whole, block)
     for name, n in spoilt.items():
         notes.append(outlier_note(name, n, outliers.get(name), record.time is not None))
+    notes += standstill_notes(whole, specimen.height)
     channels = record.time, record.stress, record.displacement
     return Measurement(
         *("", None, "", *channels, specimen, striker),  # no name and no file
@@ -127,6 +134,7 @@ def condition(
         start_strain=start_strain,
         sampled=record.sampled,
         block=block,
+        standstills=standstill_spans(whole, block),
     )
 
 
@@ -279,6 +287,8 @@ def count_rows(record: Record, outliers: dict[str, Outliers], block: int) -> Row
         f"a spike or gap of the {name}, bridged by a straight line": excess != 0.0
         for name, excess in record.excess.items()
     }
+    if record.standstills:
+        wrong["the displacement stands still, bridged by a straight line"] = record.stood_still
     if record.clipped is not None:
         wrong["the force is clipped"] = of_blocks["stress"] & record.clipped
     for name, left_out in of_blocks.items():

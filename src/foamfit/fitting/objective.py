@@ -597,7 +597,9 @@ class Objective:
     def floor(self) -> float:
         """Sum of squares that leaves no more of the curves than noise, with a margin of half."""
         levels = zip(self.counted, self.sizes, strict=True)
-        return 1.5 * sum(n * (self.noise(name).sigma * self.factor(name)) ** 2 for name, n in levels)
+        return 1.5 * sum(
+            n * (self.noise(name).sigma * self.factor(name)) ** 2 for name, n in levels
+        )
 
     def factor(self, name: str) -> float:
         """Residual of a curve that is off by one SI unit."""

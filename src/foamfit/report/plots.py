@@ -53,6 +53,7 @@ IN_WORDS = {"snap-through": (-6.0, 6.0), "held": (-6.0, 4.0), "snap-back": (7.0,
 BESIDE = {"a": (-6, 4), "d": (-6, 4), "c": (7, -3), "e": (4, -7)}  # points from the branch
 MARKERS = 60  # of a measured curve: more of them blot
 PALE = "#A6CEE3"
+STOOD = "#F2DC6B"  # where the gauge stood still
 # Of masses inside, from the base up: beside their colours, for who sees or prints grey.
 DASHES: Any = ((0, (5, 1.2)), (0, (2.5, 1.2)), (0, (1, 1)), (0, (5, 1.2, 1, 1.2)))
 MARKS = ("^", "v", "D", "p")
@@ -85,6 +86,7 @@ def plot_fit(result: Fit, path: str | Path | None = None, *, width: str = TWO) -
             ax.set_label(panel.key.replace("_", "-"))
             _draw(ax, panel)
             _mark_outliers(ax, panel, result)
+            _shade_standstills(ax, panel, result)
             labels = _Labels(ax, panel, size)
             if panel.key == "stress_strain":
                 _draw_law(labels, result)
@@ -286,7 +288,8 @@ def _mark_outliers(ax: Axes, panel: _Panel, result: Fit) -> None:
     fx, _, fy, _ = panel.scale()
     own = "displacement" if panel.key == "displacement_time" else "stress"
     for channel, found in test.outliers.items():
-        if not channel.startswith(own) or (panel.key != "stress_strain" and test.time is None):
+        elsewhere = panel.key != "stress_strain" and test.time is None
+        if not channel.startswith(own) or elsewhere or not found.at.size:
             continue
         x = found.at
         if panel.key == "stress_strain":
@@ -302,6 +305,22 @@ def _mark_outliers(ax: Axes, panel: _Panel, result: Fit) -> None:
             label="outlier, not fitted",
         )  # fmt: skip
         ax.set_ylim(low, high)
+
+
+def _shade_standstills(ax: Axes, panel: _Panel, result: Fit) -> None:
+    """Shade where the displacement is bridged: a span of time, a stretch of the measured loop."""
+    test = result.measurement
+    fx, _, fy, _ = panel.scale()
+    style: Any = {"color": STOOD, "zorder": 0.5, "label": "gauge stands still, bridged"}
+    for start, end in test.standstills:
+        if panel.key != "stress_strain":
+            ax.axvspan(start / fx, end / fx, lw=0.0, **style)
+            continue
+        for line in panel.lines:
+            instants = np.arange(line.x.size) if test.time is None else test.time
+            if line.kind == "measured":
+                at = (instants >= start) & (instants <= end)
+                ax.plot(line.x[at] / fx, line.y[at] / fy, lw=7.0, solid_capstyle="butt", **style)
 
 
 class _Labels:

@@ -1,0 +1,217 @@
+"""A gauge that stands still and then jumps: found and bridged, and never invented."""
+
+import csv
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex
+
+import fabricated
+from conftest import DATA
+from foamfit.data.csv_file import read_test
+from foamfit.report.plots import STOOD, plot_fit
+
+HEIGHT = 10.0  # mm
+SPECIMEN = f'[specimen]\nheight = "{HEIGHT} mm"\narea = "100 mm^2"\n'
+STEP, TAU = 0.004, 0.5  # s
+TOP = 6.0  # mm
+
+
+def motion(*ramps):
+    """Displacement (mm) at even times: where each ramp leads, in how many samples."""
+    out = [0.0]
+    for to, samples in ramps:
+        out += list(np.linspace(out[-1], to, samples + 1)[1:])
+    return np.array(out)
+
+
+def relaxing_stress(w):
+    """Synthetic stress (kPa), by formulas of its own: stiffening spring, friction, Maxwell."""
+    elastic = 20.0 * w + 3.0 * np.maximum(w - 3.0, 0.0) ** 2
+    friction, maxwell = np.zeros_like(w), np.zeros_like(w)
+    for i in range(1, w.size):
+        dw = w[i] - w[i - 1]
+        friction[i] = np.clip(friction[i - 1] + 60.0 * dw, -15.0, 15.0)
+        maxwell[i] = np.exp(-STEP / TAU) * (maxwell[i - 1] + 15.0 * dw)
+    return elastic + (friction + maxwell) * np.minimum(np.maximum(w, 0.0), 1.0)
+
+
+def held(w, samples):
+    """What a gauge shows that is read at every so many samples only."""
+    return w[np.arange(w.size) // samples * samples]
+
+
+def recorded(folder, shown, stress, *, noise=(0.0, 0.0), timed=True, seed=0):
+    """Write and read a test; the noise is a share of each range: displacement, stress."""
+    rng = np.random.default_rng(seed)
+    shown = shown + noise[0] * TOP * rng.standard_normal(shown.size)
+    stress = stress + noise[1] * np.ptp(stress) * rng.standard_normal(shown.size)
+    columns = {"displacement (mm)": shown, "stress (kPa)": stress}
+    if timed:
+        columns = {"time (s)": STEP * np.arange(shown.size)} | columns
+    path = folder / "test.csv"
+    np.savetxt(
+        path, np.column_stack(list(columns.values())), delimiter=",", header=",".join(columns),
+        comments="", fmt="%.9g",
+    )  # fmt: skip
+    path.with_suffix(".toml").write_text(SPECIMEN)
+    return read_test(path)
+
+
+def notes(test):
+    return [note for note in test.notes if "stands still" in note]
+
+
+# The way back is not sampled at the displacements of the way there, which would be a digitiser's.
+CYCLE = ((TOP, 600), (0.0, 613))
+SLOW_TOP = ((TOP, 600), (TOP, 60), (0.0, 613))  # it rests at its top
+
+
+def stuck(w, first, last):
+    """What a gauge shows that stands still from one sample up to another, and then is right."""
+    return np.concatenate((w[:first], np.full(last - first, w[first]), w[last:]))
+
+
+# ------------------------------------------------------------------------------------------ found
+
+
+@pytest.mark.parametrize("timed", [True, False], ids=["time", "no time"])
+@pytest.mark.parametrize(
+    ("ramps", "first", "last", "every"),
+    [
+        (SLOW_TOP, 594, 650, 1),  # late at the top: on while the machine rests there
+        (SLOW_TOP, 594, 645, 5),  # the same, read at every fifth sample
+        (CYCLE, 600, 640, 1),  # backlash: it stays at the top while the machine goes back
+        (((TOP, 500), (3.0, 250), (TOP, 250), (0.0, 450)), 750, 790, 1),  # of an inner turn
+    ],
+)
+@pytest.mark.parametrize("noise", [(0.0, 0.0), (0.0, 0.001), (0.0002, 0.002)])
+def test_a_gauge_that_stands_still_and_jumps_is_bridged(
+    tmp_path, ramps, first, last, every, timed, noise
+):
+    w = motion(*ramps)
+    # It sticks at what it showed last.
+    at = first // every * every
+    shown = stuck(held(w, every), at, last)
+    test = recorded(tmp_path, shown, relaxing_stress(w), noise=noise, timed=timed)
+    (note,) = notes(test)
+    jump = abs(shown[last] - shown[last - 1]) / HEIGHT
+    told = [float(part.split(" %")[0].split()[-1]) for part in note.split("jumps by")[1:]]
+    assert told == pytest.approx([100.0 * jump], rel=0.1, abs=0.05)
+    (dropped,) = (item for item in test.rows.dropped if "stands still" in item.why)
+    # Line 1 is the header, and sample 0 the line after it.
+    assert abs(dropped.first - (at + 3)) <= (2 if noise[0] == 0.0 else 25)
+    assert abs(dropped.last - (last + 1)) <= 1
+    assert f"rows {dropped.first} to {dropped.last} " in note
+    assert test.rows.rows == test.rows.used + sum(item.rows for item in test.rows.dropped)
+    # A straight line leads from before the stretch to after the jump.
+    ((start, end),) = test.standstills
+    instants = np.arange(test.stress.size) if test.time is None else test.time
+    bridged = (instants >= start) & (instants <= end)
+    assert bridged.sum() == dropped.rows
+    assert np.abs(np.diff(test.displacement[bridged], 2)).max() < 1e-9
+    at_ends = np.flatnonzero(bridged)[[0, -1]] + [-1, 1]
+    line = np.interp(instants[bridged], instants[at_ends], test.displacement[at_ends])
+    np.testing.assert_allclose(test.displacement[bridged], line, rtol=0.0, atol=1e-9)
+    np.testing.assert_array_equal(test.outliers["displacement"].left_out, bridged)
+
+
+def test_only_the_stretches_of_the_cycle_that_is_used_are_named(tmp_path):
+    one = motion(*CYCLE)
+    w = np.concatenate((one, one[1:]))
+    second = one.size - 1
+    shown = stuck(w, second + 600, second + 640)
+    path = recorded(tmp_path, shown, relaxing_stress(w)).path
+    assert not notes(read_test(path))
+    path.with_suffix(".toml").write_text(SPECIMEN + "[window]\ncycle = 2\n")
+    (note,) = notes(read_test(path))
+    assert f"rows {second + 603} to {second + 641} " in note
+
+
+# ---------------------------------------------------------------------------------- never invented
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.001, 0.003])
+@pytest.mark.parametrize("digit", [0.0, 0.05, 0.3])  # mm
+@pytest.mark.parametrize("every", [1, 5])
+@pytest.mark.parametrize(
+    "ramps",
+    [
+        CYCLE,
+        ((TOP, 600), (TOP, 250), (0.0, 613)),  # a hold of 1 s
+        ((TOP, 600), (TOP, 2500), (0.0, 600)),  # of 10 s
+        ((3.0, 300), (3.0, 250), (TOP, 300), (3.0, 300), (3.0, 250), (0.0, 300)),  # on the way
+        ((2.0, 4), (2.0, 300), (4.0, 4), (4.0, 300), (TOP, 4), (TOP, 300), (0.0, 600)),  # by steps
+        ((0.0, 400), (TOP, 600), (0.0, 600), (0.0, 400)),  # it waits before contact and after
+        ((TOP, 30), (TOP, 20), (0.0, 30)),  # few samples
+    ],
+    ids=["turn", "1 s", "10 s", "twice", "steps", "dwell", "few"],
+)
+def test_a_true_hold_is_no_standstill(tmp_path, ramps, every, digit, noise):
+    w = motion(*ramps)
+    stress = relaxing_stress(w)
+    shown = held(w + noise * TOP * np.random.default_rng(5).standard_normal(w.size), every)
+    shown = np.round(shown / digit) * digit if digit else shown
+    assert not notes(recorded(tmp_path, shown, stress, noise=(0.0, noise)))
+
+
+@pytest.mark.parametrize("late", [-8, -3, 3, 8])
+@pytest.mark.parametrize("every", [1, 5])
+def test_a_hold_with_a_force_beside_its_time_is_no_standstill(tmp_path, late, every):
+    w = motion((TOP, 600), (TOP, 250), (0.0, 613))
+    stress = relaxing_stress(w)
+    at = np.clip(np.arange(w.size) - late, 0, w.size - 1)
+    assert not notes(recorded(tmp_path, held(w, every), stress[at], noise=(0.0, 0.001)))
+
+
+@pytest.mark.parametrize("digit", [0.0, 0.03, 0.3])
+@pytest.mark.parametrize("samples", [60, 400, 4000])
+@pytest.mark.parametrize("every", [1, 5])
+def test_a_smooth_turn_is_no_standstill(tmp_path, samples, digit, every):
+    w = TOP * np.sin(np.linspace(0.0, np.pi, samples)) ** 2
+    shown = held(w, every)
+    shown = np.round(shown / digit) * digit if digit else shown
+    assert not notes(recorded(tmp_path, shown, relaxing_stress(w), noise=(0.0, 0.001)))
+
+
+# --------------------------------------------------------------------------------------- in figures
+
+
+def test_the_stretch_is_shaded_in_every_panel_and_has_a_key():
+    result = fabricated.result()
+    time = result.measurement.time
+    spans = ((float(time[20]), float(time[40])),)
+    figure = plot_fit(replace(result, measurement=replace(result.measurement, standstills=spans)))
+    key = "gauge stands still, bridged"
+    assert key in [text.get_text() for text in figure.legends[0].get_texts()]
+    for ax in figure.axes:
+        (shade,) = (a for a in (*ax.lines, *ax.patches) if a.get_label() == key)
+        color = shade.get_facecolor() if shade in ax.patches else shade.get_color()
+        assert to_hex(color).upper() == STOOD
+    assert key not in [text.get_text() for text in plot_fit(result).legends[0].get_texts()]
+
+
+# ------------------------------------------------------------------------------------ real records
+
+
+@pytest.mark.skipif(not (DATA / "shoe-foam-twins").is_dir(), reason="the records are not here")
+def test_the_gauge_of_every_shoe_foam_stands_still_at_the_top(tmp_path):
+    """Ten specimens by others (arXiv:2602.12694): 34 to 76 samples, then 0.4 to 1 % strain."""
+    with (DATA / "shoe-foam-twins" / "specimens.csv").open() as table:
+        specimens = list(csv.DictReader(table))
+    for specimen in specimens:
+        toml = tmp_path / "test.toml"
+        toml.write_text(
+            f'[specimen]\nheight = "{specimen["height_mm"]} mm"\n'
+            f'diameter = "{specimen["diameter_mm"]} mm"\n'
+            '[columns]\ndisplacement = { column = "Gap (um)", counts_down = true }\n'
+        )
+        test = read_test(DATA / "shoe-foam-twins" / f"{specimen['test']}_raw.txt", toml)
+        (note,) = notes(test)
+        ((start, end),) = test.standstills
+        (dropped,) = (item for item in test.rows.dropped if "stands still" in item.why)
+        assert 30 <= dropped.rows <= 80
+        top = test.time[np.argmax(test.displacement)]
+        assert start < top <= end + 0.15
+        assert "falls by" in note
