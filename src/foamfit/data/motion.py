@@ -148,7 +148,7 @@ def _motion(
     part = after[back] / (after[back] - before[back + 1])
     x = np.union1d(x, x[back] + part * np.diff(x)[back])
     values, velocities = middle + bend(x) + kink(x, instants) @ jumps, velocity(x)
-    turns = _turns(x, values, modes, 0.0)
+    turns = _turns(x, values, modes, (1e-300, 2.0 * unit))
     stderr = _turns_stderr(x, turns, velocities, modes)
     curve, (start, duration) = _monotone(x, values, velocities, turns), span
     at = start + duration * x[turns[1:-1]]
@@ -161,22 +161,25 @@ def _exact(times: Array, values: Array, sigma: float) -> SmoothMotion:
     x, none = (times - start) / duration, np.empty((0, 1))
     flat = BSpline(np.array([0.0, 1.0]), np.zeros((1, 1)), 0)
     modes = _Modes(flat, none, none, np.empty((4, 0)))
-    turns, slopes = _turns(x, values, modes, 8.0 * sigma), np.gradient(values, x)
+    turns, slopes = _turns(x, values, modes, (2.0 * sigma, 2.0 * sigma)), np.gradient(values, x)
     curve, at = _monotone(x, values, (slopes, slopes), turns), turns[1:-1]
     gap = 0.5 * (times[at + 1] - times[at - 1])
     return SmoothMotion(times[at], gap, sigma, float(x.size), curve, modes, start, duration)
 
 
-def _turns(x: Array, values: Array, modes: _Modes, least: float) -> NDArray[np.int64]:
-    """Return the places between which the motion goes back significantly, with both ends."""
+def _turns(x: Array, values: Array, modes: _Modes, bounds: tuple[float, float]) -> NDArray[np.int64]:
+    """Return the places between which the motion goes back significantly, with both ends.
+
+    Standard errors of differences are taken within `bounds`.
+    """
     up = np.sign(np.diff(values))
     moves = np.flatnonzero(up)
     turn = moves[np.flatnonzero(np.diff(up[moves]) != 0.0) + 1]
     at = np.concatenate([[0], turn, [x.size - 1]])
     changes = modes(x[at])
     while at.size > 2:
-        stderr = np.linalg.norm(np.diff(changes, axis=0), axis=1)
-        sure = np.abs(np.diff(values[at])) / np.maximum(_SIGNIFICANT * stderr, max(least, 1e-300))
+        stderr = np.clip(np.linalg.norm(np.diff(changes, axis=0), axis=1), *bounds)
+        sure = np.abs(np.diff(values[at])) / (_SIGNIFICANT * stderr)
         i = int(np.argmin(sure))
         if sure[i] >= 1.0:
             break
