@@ -109,7 +109,7 @@ class Fit:
         s = self.samples
         weight = 1.0 / (s.data + penalties[:, None] * s.rough)
         left = self.gram - self.onto.T @ (weight[:, :, None] * self.onto)
-        left += 1e-10 * np.diag(np.diag(self.gram))
+        left += 1e-12 * np.diag(np.diag(self.gram))
         return weight, left, s.y @ self.columns - (weight * s.y_onto) @ self.onto
 
     def solve(self, penalty: float) -> tuple[Array, Array]:
@@ -126,6 +126,13 @@ class Fit:
         out = s.y @ s.y - weight @ s.y_onto**2 - (right * found).sum(axis=1)
         out -= np.log(weight[:, _ORDER:] * s.rough[_ORDER:] * penalties[:, None]).sum(axis=1)
         return np.asarray(out + np.linalg.slogdet(left)[1] if restricted else out)
+
+    def left(self, penalty: float) -> float:
+        """Estimate the noise from the residuals."""
+        s, (spline, found) = self.samples, self.solve(penalty)
+        residual = s.y - s.basis @ spline - self.columns @ found
+        dof = float((s.data / (s.data + penalty * s.rough)).sum()) + 2.0 * self.instants.size
+        return float(np.sqrt(residual @ residual / max(s.x.size - dof, 1.0)))
 
     @cached_property
     def apart(self) -> bool:
