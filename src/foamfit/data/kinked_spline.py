@@ -25,7 +25,7 @@ DEGREE, _ORDER = 5, 3
 _SPOTS, _ENOUGH = 120, 1000
 _KINKS = 40
 _STIFF = 100.0  # refined first at so many times the penalty: what is rough may be a kink
-_EVIDENCE = 3.0  # price of a kink in twice the log-likelihood, beside 2 ln n for its two unknowns
+_EVIDENCE = 0.0  # price of a kink in twice the log-likelihood, beside 2 ln n for its two unknowns
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +109,7 @@ class Fit:
         s = self.samples
         weight = 1.0 / (s.data + penalties[:, None] * s.rough)
         left = self.gram - self.onto.T @ (weight[:, :, None] * self.onto)
-        left += 1e-10 * np.diag(np.diag(self.gram))
+        left += 1e-12 * np.diag(np.diag(self.gram))
         return weight, left, s.y @ self.columns - (weight * s.y_onto) @ self.onto
 
     def solve(self, penalty: float) -> tuple[Array, Array]:
@@ -127,9 +127,24 @@ class Fit:
         out -= np.log(weight[:, _ORDER:] * s.rough[_ORDER:] * penalties[:, None]).sum(axis=1)
         return np.asarray(out + np.linalg.slogdet(left)[1] if restricted else out)
 
+    def left(self, penalty: float) -> float:
+        """Estimate the noise from the residuals."""
+        s, (spline, found) = self.samples, self.solve(penalty)
+        residual = s.y - s.basis @ spline - self.columns @ found
+        dof = float((s.data / (s.data + penalty * s.rough)).sum()) + 2.0 * self.instants.size
+        return float(np.sqrt(residual @ residual / max(s.x.size - dof, 1.0)))
+
+    @cached_property
+    def apart(self) -> bool:
+        """Whether there are samples between any two kinks: without, there is no telling them."""
+        cells = np.searchsorted(self.samples.x, self.instants)
+        return bool(np.all(np.diff(cells) > 0))
+
     @cached_property
     def best(self) -> tuple[float, float]:
         """The least −2 ln likelihood over all penalties, with a price for each kink; its penalty."""
+        if not self.apart:
+            return np.inf, float(self.samples.penalties[0])
         levels = self.unlikely(self.samples.penalties)
         i = int(np.argmin(levels))
         price = 2.0 * np.log(self.samples.x.size) + _EVIDENCE
@@ -137,11 +152,13 @@ class Fit:
 
     def step(self, penalty: float, which: Array) -> Array:
         """How far to move some of the kinks, to first order, (k,)."""
-        jumps = self.solve(penalty)[1][which]
-        delays = np.where(self.samples.x[:, None] > self.instants[which], -jumps, 0.0)
+        jumps = self.solve(penalty)[1]
+        delays = np.where(self.samples.x[:, None] > self.instants[which], -jumps[which], 0.0)
         moving = Fit(self.samples, self.instants, np.hstack([self.columns, delays]))
         _, left, right = moving.reduced(np.array([penalty]))
-        found = np.linalg.lstsq(left[0], right[0], rcond=1e-13)[0][self.instants.size :]
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(left[0]), 1e-300))
+        scaled = scale[:, None] * left[0] * scale
+        found = (scale * np.linalg.lstsq(scaled, scale * right[0], rcond=1e-13)[0])[jumps.size :]
         room = np.diff(np.concatenate([[0.0], self.instants, [1.0]]))
         step = np.zeros(self.instants.size)
         step[which] = found
@@ -161,7 +178,7 @@ class Fit:
                 for part in (1.0, 0.4, 0.1):
                     moved = np.clip(fit.instants + part * step, x[1], x[-2])
                     trial = Fit.of(self.samples, moved)
-                    if (better := trial.unlikely(at)[0]) < level:
+                    if trial.apart and (better := trial.unlikely(at)[0]) < level:
                         level, fit = better, trial
                         break
             if before - level < 1e-2:

@@ -13,15 +13,17 @@ from scipy.special import ndtr
 from foamfit.arrays import Array
 from foamfit.data.kinked_spline import DEGREE, Fit, fitted, kink
 from foamfit.data.measurement import NoiseLevel
-from foamfit.data.noise import residual_noise
+from foamfit.data.noise import quantum, residual_noise
 
 # Samples for a piece of the spline; most pieces, and most where these do not follow the data.
 _PIECE, _PIECES, _MANY = 4, 64, 256
 _SIGNIFICANT = 4.5  # standard errors by which a motion goes back where it turns
 _MODES = 40
+# Noise that counts as rounding, as a share of the range.
+_ROUNDING = 1e-7
 # Residuals over noise from which on a spline does not follow the motion; noise, as a share of the
-# range, below which the data are then taken as they stand; noise that counts as none.
-_OFF, _LITTLE, _EXACT = 1.3, 1e-5, 1e-7
+# range, up to which the data are taken as they stand.
+_OFF, _LITTLE = 1.3, 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,23 +104,23 @@ def follow(
     start, duration = float(times[0]), float(times[-1] - times[0])
     x, w = (times[taken] - start) / duration, displacement[taken]
     middle, size = float(np.mean(w)), max(float(np.ptp(w)), 1e-300)
-    sigma, slow = noise.sigma, np.sqrt(max(noise.time, 1.0))
     pieces, finest = max(4, min(x.size // _PIECE, _PIECES)), min(_MANY, x.size // 2)
-    for _ in range(5):
-        sigma = max(sigma, _EXACT * size)
+    slow, shown, digital = np.sqrt(max(noise.time, 1.0)), residual_noise(w)[0], quantum(w) / 12**0.5
+    # Too much noise hides a kink until the next turn, too little invents many.
+    sigma = noise.sigma if noise.given and shown < _OFF * noise.sigma else max(noise.sigma, shown)
+    for _ in range(8):
+        if sigma <= _LITTLE * size:
+            return _exact(times[taken], w, max(sigma, _ROUNDING * size))
         fit, penalty = fitted(x, (w - middle) / (sigma * slow), pieces)
-        s, (spline, jumps) = fit.samples, fit.solve(penalty)
-        residual = s.y - s.basis @ spline - fit.columns @ jumps
-        left = float(np.sqrt(np.mean(residual**2))) * sigma * slow
-        if left > _OFF * sigma and sigma < _LITTLE * size:
-            return _exact(times[taken], w, sigma)
-        if left > _OFF * sigma and pieces < finest and residual_noise(w)[0] < left / _OFF:
+        left = fit.left(penalty) * sigma * slow
+        if left > _OFF * max(sigma, shown) and pieces < finest:
             pieces = min(4 * pieces, finest)
             continue
-        right = left < _OFF * sigma if noise.given else abs(left / sigma - 1.0) < 0.1
-        if right or max(left, sigma) <= _EXACT * size:
+        # Steps of a digitiser leave about what they are, a motion of equal steps leaves nothing.
+        least = noise.sigma if noise.given else digital * (left > 0.2 * digital)
+        if abs(max(left, least) / sigma - 1.0) < 0.1:
             break
-        sigma = left
+        sigma = max(left, least)
     return _motion(fit, penalty, sigma, sigma * slow, middle, (start, duration))
 
 
@@ -148,7 +150,7 @@ def _motion(
     part = after[back] / (after[back] - before[back + 1])
     x = np.union1d(x, x[back] + part * np.diff(x)[back])
     values, velocities = middle + bend(x) + kink(x, instants) @ jumps, velocity(x)
-    turns = _turns(x, values, modes, 0.0)
+    turns = _turns(x, values, modes, (1e-300, 2.0 * unit))
     stderr = _turns_stderr(x, turns, velocities, modes)
     curve, (start, duration) = _monotone(x, values, velocities, turns), span
     at = start + duration * x[turns[1:-1]]
@@ -156,27 +158,55 @@ def _motion(
 
 
 def _exact(times: Array, values: Array, sigma: float) -> SmoothMotion:
-    """Go through data without noise as they stand."""
+    """Go through data without noise as they stand; sharp turns between samples are added."""
     start, duration = float(times[0]), float(times[-1] - times[0])
     x, none = (times - start) / duration, np.empty((0, 1))
     flat = BSpline(np.array([0.0, 1.0]), np.zeros((1, 1)), 0)
-    modes = _Modes(flat, none, none, np.empty((4, 0)))
-    turns, slopes = _turns(x, values, modes, 8.0 * sigma), np.gradient(values, x)
+    modes, bounds = _Modes(flat, none, none, np.empty((4, 0))), (2.0 * sigma,) * 2
+    turns = _turns(x, values, modes, bounds)[1:-1]
+    corners = [corner for i in turns if (corner := _corner(x, values, int(i), 4.0 * sigma))]
+    if corners:
+        more, heights = np.array(corners).T
+        order = np.argsort(np.append(x, more), kind="stable")
+        x, values = np.append(x, more)[order], np.append(values, heights)[order]
+    turns, slopes = _turns(x, values, modes, bounds), np.gradient(values, x)
     curve, at = _monotone(x, values, (slopes, slopes), turns), turns[1:-1]
-    gap = 0.5 * (times[at + 1] - times[at - 1])
-    return SmoothMotion(times[at], gap, sigma, float(x.size), curve, modes, start, duration)
+    gap = 0.5 * duration * (x[at + 1] - x[at - 1])
+    at_times = start + duration * x[at]
+    return SmoothMotion(at_times, gap, sigma, float(x.size), curve, modes, start, duration)
 
 
-def _turns(x: Array, values: Array, modes: _Modes, least: float) -> NDArray[np.int64]:
-    """Return the places between which the motion goes back significantly, with both ends."""
+def _corner(x: Array, y: Array, i: int, off: float) -> tuple[float, float] | None:
+    """Return where the straight lines on both sides of a turn at or beside sample i meet."""
+    for a in (i, i - 1):  # the last sample on the way there
+        if a < 2 or a + 3 >= x.size:
+            continue
+        there, back = ((y[j + 1] - y[j]) / (x[j + 1] - x[j]) for j in (a - 1, a + 1))
+        bends = (
+            y[a] + there * (x[a - 2] - x[a]) - y[a - 2],
+            y[a + 1] + back * (x[a + 3] - x[a + 1]) - y[a + 3],
+        )
+        step = (x[a + 1] - x[a]) * max(abs(there), abs(back))
+        at = (y[a + 1] - y[a] + there * x[a] - back * x[a + 1]) / ((there - back) or np.inf)
+        straight = max(map(abs, bends)) <= 0.01 * step + off
+        if straight and there * back < 0.0 and x[a] < at < x[a + 1]:
+            return float(at), float(y[a] + there * (at - x[a]))
+    return None
+
+
+def _turns(x: Array, values: Array, modes: _Modes, bounds: tuple[float, float]) -> NDArray[np.int64]:
+    """Return the places between which the motion goes back significantly, with both ends.
+
+    Standard errors of differences are taken within `bounds`.
+    """
     up = np.sign(np.diff(values))
     moves = np.flatnonzero(up)
     turn = moves[np.flatnonzero(np.diff(up[moves]) != 0.0) + 1]
     at = np.concatenate([[0], turn, [x.size - 1]])
     changes = modes(x[at])
     while at.size > 2:
-        stderr = np.linalg.norm(np.diff(changes, axis=0), axis=1)
-        sure = np.abs(np.diff(values[at])) / np.maximum(_SIGNIFICANT * stderr, max(least, 1e-300))
+        stderr = np.clip(np.linalg.norm(np.diff(changes, axis=0), axis=1), *bounds)
+        sure = np.abs(np.diff(values[at])) / (_SIGNIFICANT * stderr)
         i = int(np.argmin(sure))
         if sure[i] >= 1.0:
             break
