@@ -21,7 +21,7 @@ from foamfit.data.headers import CHANNELS, example
 from foamfit.data.measurement import MIN_ROWS, Dropped, Measurement, Record, Striker, interior_node
 from foamfit.data.noise import with_noise
 from foamfit.data.outliers import fresh_samples
-from foamfit.data.prepare import condition
+from foamfit.data.prepare import condition, stress_of_motion
 from foamfit.data.toml_file import Column, Settings, read_settings
 from foamfit.errors import InputError
 from foamfit.text import engineering, percent
@@ -131,11 +131,20 @@ def _to_record(numbers: dict[str, Array], settings: Settings, notes: list[str]) 
     stress = _one_of(numbers, "stress", "force", specimen.area, "the area", notes)
     displacement = _one_of(numbers, "displacement", "strain", 1 / specimen.height, "height", notes)
     acceleration = numbers.get("acceleration")
+    derived: tuple[str, ...] = ()
     if stress is None:
         assert mass is not None  # see needed_columns
-        assert acceleration is not None
-        stress, acceleration = acceleration * mass / specimen.area, None
-        notes.append("The force is the striker's mass times its acceleration.")
+        if acceleration is not None:
+            stress, acceleration = acceleration * mass / specimen.area, None
+            notes.append("The force is the striker's mass times its acceleration.")
+        else:
+            motion = displacement, numbers.get("velocity")
+            stress = stress_of_motion(numbers["time"], *motion, mass / specimen.area)
+            derived = ("stress",)
+            notes.append(
+                "The force is the striker's mass times the deceleration of its motion, read off a "
+                "smoothing spline; it is no measurement of its own."
+            )
     inside = {}
     for channel, values in numbers.items():
         node, top = interior_node(channel), displacement
@@ -145,7 +154,7 @@ def _to_record(numbers: dict[str, Array], settings: Settings, notes: list[str]) 
             inside[node] = values
     return Record(
         numbers.get("time"), stress, displacement, numbers.get("velocity"), acceleration, inside,
-        cycle=numbers.get("cycle"),
+        cycle=numbers.get("cycle"), derived=derived,
     )  # fmt: skip
 
 

@@ -177,6 +177,7 @@ class Record:
     numbers: NDArray[np.int64] | None = None
     dropped: tuple[Dropped, ...] = ()
     sampled: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
+    derived: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         """Count the samples."""
