@@ -124,13 +124,16 @@ def needed_columns(table: Table, columns: dict[str, int], settings: Settings) ->
     """Choose the channels worth reading; refuse a file that lacks one that nothing can replace."""
     has, striker = set(columns), settings.striker or Striker()
     forced = bool(has & {"stress", "force"})
-    if not forced and not ({"acceleration", "time"} <= has and striker.mass):
+    braked = bool(has & {"acceleration", "velocity"} or (has & set(_MOTIONS) and striker.velocity))
+    if not forced and not ("time" in has and braked and striker.mass):
         raise InputError(
             f"{table.path}: no column is a stress or a force (there are {table.listed}); name one "
             'like \'stress (MPa)\', or write force = { column = "…", unit = "N" } in [columns]; '
-            "with a time and the [striker] mass an acceleration will do."
+            "with a time and the [striker] mass an acceleration or a velocity will do, and with "
+            "its velocity a displacement."
         )
-    helping = {"velocity", "acceleration"} if forced else {"velocity"}
+    helping = {"velocity"} if has & {"acceleration", *_MOTIONS} else set[str]()
+    helping = {"velocity", "acceleration"} if forced else helping
     if settings.motion is not None:
         _check_motion(table, columns, settings.motion.file)
     if has & set(_MOTIONS) or settings.motion is not None:

@@ -42,7 +42,7 @@ from foamfit.data.measurement import (
 )
 from foamfit.data.noise import with_noise
 from foamfit.data.outliers import fresh_samples
-from foamfit.data.prepare import condition
+from foamfit.data.prepare import condition, stress_of_motion
 from foamfit.data.toml_file import Column, Settings, read_settings
 from foamfit.errors import InputError
 from foamfit.text import engineering, percent
@@ -96,8 +96,9 @@ def read_test(
         advice = partial(_advice_of, advice, moved.advice)
     try:
         test = condition(
-            record, settings.specimen, striker=settings.striker, window=window, advice=advice
-        )
+            record, settings.specimen, striker=settings.striker, window=window, advice=advice,
+            spread=settings.uncertainties.get("velocity", 0.0),
+        )  # fmt: skip
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     _check_noise(toml, settings, test)
@@ -221,15 +222,24 @@ def _to_record(numbers: dict[str, Array], settings: Settings, notes: list[str]) 
     stress = _one_of(numbers, "stress", "force", specimen.area, "the area", notes)
     displacement = _one_of(numbers, "displacement", "strain", 1 / specimen.height, "height", notes)
     acceleration = numbers.get("acceleration")
+    derived: tuple[str, ...] = ()
     if stress is None:
         assert mass is not None  # see needed_columns
-        assert acceleration is not None
-        stress, acceleration = acceleration * mass / specimen.area, None
-        notes.append("The force is the striker's mass times its acceleration.")
+        if acceleration is not None:
+            stress, acceleration = acceleration * mass / specimen.area, None
+            notes.append("The force is the striker's mass times its acceleration.")
+        else:
+            motion = displacement, numbers.get("velocity")
+            stress = stress_of_motion(numbers["time"], *motion, mass / specimen.area)
+            derived = ("stress",)
+            notes.append(
+                "The force is the striker's mass times the deceleration of its motion, read off a "
+                "smoothing spline; it is no measurement of its own."
+            )
     inside = _inside(numbers, displacement, notes)
     return Record(
         numbers.get("time"), stress, displacement, numbers.get("velocity"), acceleration, inside,
-        cycle=numbers.get("cycle"),
+        cycle=numbers.get("cycle"), derived=derived,
     )  # fmt: skip
 
 

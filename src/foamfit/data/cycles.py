@@ -175,17 +175,17 @@ def _hinge(w: Array, stress: Array) -> float:
     return float(places[int(np.argmin(left))])
 
 
-def cut_to_reload(record: Record, cycle: Cycle, at: Reload, zero: float, height: float) -> tuple[
-    Record, list[str]
-]:  # fmt: skip
+def cut_to_reload(
+    record: Record, cycle: Cycle, at: Reload, height: float
+) -> tuple[Record, list[str]]:
     """Cut a later cycle to its contact, with time, displacement and stress zero where it starts.
 
-    `zero` is the displacement (m) of the first contact: what the foam has not recovered since is
-    taken off, and said as a strain.
+    The displacement was zero at the first contact: what the foam has not recovered since is taken
+    off, and said as a strain.
     """
     number, w = cycle.number, record.displacement
     assert w is not None  # it has cycles
-    strain = (at.displacement - zero) / height
+    strain = at.displacement / height
     peak = float(record.stress[cycle.top]) - at.offset
     moment = "" if record.time is None else f" {engineering(at.time, 's')} in the file,"
     notes = [

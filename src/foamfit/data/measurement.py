@@ -181,8 +181,8 @@ class Record:
     has outliers. `clipped` marks the samples at which the force is clipped. `cycle` is the number
     of the cycle, where a column counts them. `numbers` holds the row number in the file of each
     sample (None: they count from 1), `dropped` the rows of the file that were left out so far, and
-    `standstills` those over which the displacement is bridged, whether or not they are left. `sampled`
-    is that of `Measurement`.
+    `standstills` those over which the displacement is bridged, left or not. `sampled`
+    and `derived` are those of `Measurement`.
     """
 
     time: Array | None
@@ -198,6 +198,7 @@ class Record:
     dropped: tuple[Dropped, ...] = ()
     sampled: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
     standstills: tuple[Standstill, ...] = ()
+    derived: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         """Count the samples."""

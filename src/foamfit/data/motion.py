@@ -194,7 +194,9 @@ def _corner(x: Array, y: Array, i: int, off: float) -> tuple[float, float] | Non
     return None
 
 
-def _turns(x: Array, values: Array, modes: _Modes, bounds: tuple[float, float]) -> NDArray[np.int64]:
+def _turns(
+    x: Array, values: Array, modes: _Modes, bounds: tuple[float, float]
+) -> NDArray[np.int64]:
     """Return the places between which the motion goes back significantly, with both ends.
 
     Standard errors of differences are taken within `bounds`.

@@ -7,11 +7,12 @@ thing that it changed or left out.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.data.contact import cut_to_contact, find_start, remove_offset, smooth, zero_interior
+from foamfit.data.contact import Start, leave_rest, smooth, start_of_impact, start_of_slow_test
 from foamfit.data.cycles import (
     choose_cycle,
     cut_to_cycle,
@@ -42,7 +43,7 @@ from foamfit.data.measurement import (
     Window,
     interior_channel,
 )
-from foamfit.data.noise import estimated_noise, noise_before_contact, noise_level
+from foamfit.data.noise import averaged, estimated_noise, noise_before_contact, noise_level
 from foamfit.data.outliers import (
     bridge_outliers,
     fill_staircase,
@@ -50,6 +51,14 @@ from foamfit.data.outliers import (
     noise_of_held,
     outlier_note,
     outliers_of_blocks,
+)
+from foamfit.data.zeros import (
+    Span,
+    flight_notes,
+    mark_flight,
+    span_of_impact,
+    span_of_slow_test,
+    take_zeros,
 )
 from foamfit.errors import InputError
 from foamfit.text import engineering, percent
@@ -64,6 +73,7 @@ def condition(
     striker: Striker | None = None,
     window: Window | None = None,
     advice: Callable[[str], str] | None = None,
+    spread: float = 0.0,
 ) -> Measurement:
     """Turn all samples of a file into one loading and unloading, a test without a name.
 
@@ -90,29 +100,44 @@ def condition(
     cycles = [] if impact else find_cycles(record)
     chosen = choose_cycle(cycles, window.cycle) if cycles else None
     first = cut_to_cycle(record, cycles, cycles[0])[0] if cycles else record
-    levels = held | {c: estimated_noise(v) for c, v in first.curves().items() if c not in held}
-    start = find_start(first, levels, striker if impact else None)
-    # Before a slow test nothing shows that the specimen is free.
-    resting = start.rest(first) if impact or start.free else 0
-    record = done(zero_interior(record, first, start, levels))
-    record = done(remove_offset(record, resting, levels["stress"]))
-    start_strain = 0.0
+    levels = held | {
+        c: estimated_noise(v) for c, v in first.curves("acceleration").items() if c not in held
+    }
+    if impact:
+        assert striker is not None
+        start = start_of_impact(first, levels, striker)
+        span = span_of_impact(first, start, levels)
+        notes += flight_notes(first, start, span, levels, striker, spread)
+    else:
+        start = start_of_slow_test(first, levels)
+        span = span_of_slow_test(first, start)
+    record, zeros = take_zeros(record, first, start, span, levels)
+    notes += zeros.notes
+    start_strain, origins = 0.0, zeros.origins
     if chosen is not None and chosen.place:  # not the first: it has a contact of its own
         at = find_reload(record, cycles, chosen)
         notes += cut_to_cycle(record, cycles, chosen)[1]
-        record = done(cut_to_reload(record, chosen, at, start.zero, specimen.height))
-        start_strain = (at.displacement - start.zero) / specimen.height
+        record = done(cut_to_reload(record, chosen, at, specimen.height))
+        start_strain = at.displacement / specimen.height
+        origins["stress_zero"] += at.offset
+        origins["displacement_zero"] += at.displacement
+        contact_time = at.time
     else:
         record = done(cut_to_cycle(record, cycles, chosen)) if chosen else record
-        record = done(cut_to_contact(record, start, impact, levels["stress"]))
+        record = done(cut_to_contact(record, start, span))
+        contact_time = start.time
+    if record.time is not None:
+        origins["contact_time"] = contact_time
+    record = mark_flight(record, start) if impact else record
     record, motion = integrate_motion(record, specimen, striker or Striker())
     if motion != MEASURED:
         notes.append(f"The file has no displacement: the motion is {motion}.")
     notes += checks(record, specimen, striker or Striker(), motion)
     whole, record = record, done(thin(record))
     block = -(-len(whole) // len(record))
-    before = {name: values[:resting] for name, values in first.curves().items()}
-    noise = noise_before_contact(before, record.curves(), block)
+    resting = max(0, start.first - 2) if start.free else 0
+    before = {name: values[:resting] for name, values in first.curves("acceleration").items()}
+    noise = noise_before_contact(before, record.curves("acceleration"), block)
     taken = whole.sampled
     noise |= {c: noise_of_blocks(level, block, taken.get(c)) for c, level in held.items()}
     outliers = outliers_of_blocks(whole, block)
@@ -133,9 +158,30 @@ def condition(
         cycles=tuple(cycle.number for cycle in cycles) or (1,),
         start_strain=start_strain,
         sampled=record.sampled,
+        zeros=zeros.errors,
+        origins=origins,
+        acceleration=record.acceleration if impact else None,
+        derived=record.derived,
         block=block,
         standstills=standstill_spans(whole, block),
     )
+
+
+def cut_to_contact(record: Record, start: Start, span: Span) -> tuple[Record, list[str]]:
+    """Keep the rows of contact and those just before it; time is zero where it starts."""
+    n, lead = len(record), start.first - span.first
+    notes = (
+        [] if span.returned else ["Check: the record ends before the stress has returned to zero."]
+    )
+    cut = f"; {span.first} samples before and {n - span.end} after are cut, "
+    cut += f"{span.end - span.first} kept" + (f", {lead} of them before contact" if lead else "")
+    at = "" if record.time is None else f", {engineering(start.time, 's')} in the file"
+    cut = cut if span.end - start.first < n else ""
+    notes.insert(0, f"Contact starts {start.how}{at}{cut}.")
+    if record.time is not None:
+        record = replace(record, time=record.time - start.time)
+    why = "before contact starts", "after contact ends"
+    return record.between(span.first, span.end, *why), notes
 
 
 def cut_to_window(record: Record, window: Window) -> tuple[Record, list[str]]:
@@ -187,7 +233,7 @@ def integrate_motion(record: Record, specimen: Specimen, striker: Striker) -> tu
     samples.
     """
     if record.displacement is not None:
-        return record, MEASURED
+        return replace(record, acceleration=None), MEASURED
     time = record.time
     assert time is not None  # without a time the file has been refused
     if record.clipped is not None and record.acceleration is None and record.velocity is None:
@@ -202,17 +248,59 @@ def integrate_motion(record: Record, specimen: Specimen, striker: Striker) -> tu
     else:
         assert striker.mass  # likewise
         rate, source = -record.stress * specimen.area / striker.mass, "force"
-    # From time zero, which may lie before the first sample, to each sample.
-    first = rate[0] if source == "velocity" else 0.0
-    lead = time[0] > 0
-    t, r = (np.append(0.0, time), np.append(first, rate)) if lead else (time, rate)
+    # Time zero, which may lie between two samples or before the first, is a point of its own.
+    at = int(np.searchsorted(time, 0.0))
+    if source == "velocity":
+        start = float(np.interp(0.0, time, rate))
+    else:
+        start, rate = 0.0, np.where(time < 0.0, 0.0, rate)
+    t, r = np.insert(time, at, 0.0), np.insert(rate, at, start)
     dt = np.diff(t)
     w = np.append(0.0, np.cumsum(0.5 * dt * (r[1:] + r[:-1])))
     if source != "velocity":
         assert striker.velocity
-        v = striker.velocity + w
+        v = striker.velocity + w - w[at]
         w = np.append(0.0, np.cumsum(v[:-1] * dt + dt**2 * (2 * r[:-1] + r[1:]) / 6))
-    return record.changed("displacement", w[1:] if lead else w), f"integrated from {source}"
+        record = replace(record, derived=(*record.derived, "displacement"))
+    w = np.delete(w - w[at], at)
+    return record.changed("displacement", w), f"integrated from {source}"
+
+
+def stress_of_motion(
+    time: Array, displacement: Array | None, velocity: Array | None, ratio: float
+) -> Array:
+    """Stress that brakes a striker, `ratio` (mass over area, kg/m²) times its deceleration.
+
+    That is read off a smoothing spline through the motion, to which it is as close as the noise
+    demands. A gauge at rest until contact is followed from there on.
+    """
+    from scipy.interpolate import make_smoothing_spline
+
+    values = displacement if velocity is None else velocity
+    assert values is not None  # see needed_columns
+    noise, first = estimated_noise(values), 0
+    if velocity is None:
+        up = slice(int(np.argmax(values)) + 1)
+        found = leave_rest(time[up], values[up], noise, 0.5)
+        first = int(np.searchsorted(time, found.time)) if found else 0
+    n = len(time) - first
+    block = max(1, min(round(noise.time), n // 50), n // 1000)
+    edges = np.arange(first, len(time), block)
+    counts = np.diff(np.append(edges, len(time)))
+    t, y = (np.add.reduceat(x, edges) / counts for x in (time, values))
+    t, step = t - t[0], (t[-1] - t[0]) / len(t)
+    # An estimate that is a little too small would have the curve follow the noise.
+    sigma, low, high = 1.1 * averaged(noise, block).sigma, -6.0, 14.0
+    for _ in range(24):
+        middle = 0.5 * (low + high)
+        curve = make_smoothing_spline(t / step, y, lam=10.0**middle)
+        close = float(np.std(curve(t / step) - y)) <= sigma
+        low, high = (middle, high) if close else (low, middle)
+    order = 2 if velocity is None else 1
+    braked = -ratio * curve.derivative(order)(t / step) / step**order
+    stress = np.interp(time - time[first], t, braked)
+    stress[:first] = 0.0
+    return np.asarray(stress)
 
 
 def checks(record: Record, specimen: Specimen, striker: Striker, motion: str) -> list[str]:
@@ -276,6 +364,7 @@ def thin(record: Record) -> tuple[Record, list[str]]:
     for name, values in record.curves("acceleration").items():
         thinned = thinned.changed(name, np.add.reduceat(values, edges) / counts)
     thinned = frames_of_blocks(record, thinned, edges)
+    thinned = replace(thinned, derived=record.derived)
     return thinned, [f"{n} samples are averaged in {len(edges)} blocks of {size}."]
 
 

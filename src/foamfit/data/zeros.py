@@ -1,0 +1,240 @@
+"""What the rows around contact show: zeros of the channels, and the flight of a striker."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from foamfit.arrays import Array
+from foamfit.data.contact import (
+    ELSEWHERE,
+    Level,
+    Levels,
+    Start,
+    level_on_line,
+    mean_level,
+    smooth,
+)
+from foamfit.data.measurement import NoiseLevel, Record, Striker
+from foamfit.text import engineering, percent
+
+_LEAST_LEAD, _FEWEST = 8, 3  # rows kept before contact; rows that show a zero
+_GRAVITY = 9.81  # m/s²
+
+
+@dataclass(frozen=True)
+class Span:
+    """Rows around contact: `first` up to `end` are kept, those before `rest` show zeros.
+
+    `returned` says whether the stress has returned to zero at the end.
+    """
+
+    first: int
+    end: int
+    rest: int
+    returned: bool = True
+
+
+@dataclass
+class Zeros:
+    """What was taken off the channels, and the standard errors of the zeros that were measured."""
+
+    origins: dict[str, float] = field(default_factory=dict)
+    errors: dict[str, float] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+
+def span_of_slow_test(record: Record, start: Start) -> Span:
+    """Keep a slow test from its contact on; nothing else shows that the specimen was free."""
+    return Span(start.first, len(record), max(0, start.first - 2) if start.free else 0)
+
+
+def span_of_impact(record: Record, start: Start, levels: Levels) -> Span:
+    """Keep a tenth of the rows of contact before it, a fiftieth after it.
+
+    The rows kept from before contact show no zeros: the estimate of contact may be late. A derived
+    stress shows its end less well: a quarter is kept after it.
+    """
+    first, stress = start.first, record.stress
+    rest = stress[: max(0, first - 2)]
+    zero = float(rest.mean()) if rest.size >= _FEWEST else 0.0
+    found, returned = contact_end(stress[first:] - zero, levels["stress"])
+    after = found // (4 if "stress" in record.derived else 50)
+    end = min(len(record), first + found + max(3, after)) if returned else len(record)
+    # Of few rows before contact half are kept and half show the zeros.
+    lead = min(max(_LEAST_LEAD, found // 10), first // 2 if first >= 2 * _FEWEST else first)
+    late = int(3 * start.error / float(np.median(np.diff(record.instants))))
+    return Span(first - lead, end, first - max(lead, min(late, 2 * first // 3)), returned)
+
+
+def take_zeros(
+    record: Record, first: Record, start: Start, span: Span, levels: Levels
+) -> tuple[Record, Zeros]:
+    """Take off what the channels of `first` show before contact, or a motion at contact.
+
+    Where fewer than three rows show it the file's own zero of stress and acceleration stands.
+    """
+    done, n = Zeros(), span.rest
+    for name, values in first.curves("acceleration").items():
+        if name in record.derived:
+            continue
+        noise, zero = levels[name], Level(0.0, 0.0, 0)
+        if name in ("stress", "acceleration"):
+            if n >= _FEWEST:
+                zero = _zero_at_rest(name, values, n, noise, done.notes)
+                done.errors[name] = zero.error
+            elif start.first:
+                done.notes.append(
+                    f"Only {n} rows certainly lie before contact: the file's own zero of the "
+                    f"{name} stands."
+                )
+        else:
+            zero, source = _zero_of_motion(name, first, start, n, noise)
+            if name == "displacement" and start.gauge == "rest" and n >= _FEWEST:
+                done.errors[name] = zero.error
+            size = engineering(zero.value, "m")
+            if name == "displacement" and zero.value != 0.0:
+                done.notes.append(f"The displacement at contact, {size}, is taken off ({source}).")
+            elif abs(zero.value) > 1e-3 * np.ptp(values):
+                done.notes.append(f"{name} at contact, {size}, is taken off ({source}).")
+        whole = record.channel(name)
+        assert whole is not None  # the record has the channels of its first cycle
+        record = record.changed(name, whole - zero.value)
+        done.origins[f"{name}_zero"] = zero.value
+    return record, done
+
+
+def _zero_at_rest(name: str, values: Array, n: int, noise: NoiseLevel, notes: list[str]) -> Level:
+    """Zero of a stress or acceleration at rest; one that drifts more than it is off is kept."""
+    rest, unit = values[:n], "Pa" if name == "stress" else "m/s²"
+    zero = mean_level(rest, noise)
+    scatter = float(rest.std())
+    slope = level_on_line(np.arange(n, dtype=np.float64), rest, 0.0, noise)[1]
+    rise = slope.value * n
+    if abs(rise) > max(0.01 * np.ptp(values), 4 * slope.error * n):
+        told = f"The {name} drifts by {engineering(rise, unit)} in the {n} samples before contact"
+        kept = abs(zero.value) <= abs(rise)
+        done = "no offset is taken off" if kept else "its zero is known no better"
+        notes.append(f"{told}, so {done}.")
+        error = float(np.hypot(zero.error, rise))
+        zero = Level(0.0 if kept else zero.value, error, n)
+    if zero.value:
+        ratio = f", {abs(zero.value) / scatter:.2g} times that" if scatter > 0 else ""
+        notes.append(
+            f"The {name} before contact, {engineering(zero.value, unit)}, is taken off as the "
+            f"sensor's offset ({n} samples at rest with a standard deviation of "
+            f"{engineering(scatter, unit)}{ratio}; standard error "
+            f"{engineering(zero.error, unit)})."
+        )
+    return zero
+
+
+def _zero_of_motion(
+    name: str, record: Record, start: Start, n: int, noise: NoiseLevel
+) -> tuple[Level, str]:
+    """Value of a motion at contact: the mean of its rest, or else that of a line there.
+
+    Where nothing was recorded before contact, the file's zero stands unless it lies elsewhere.
+    """
+    time, values, first = record.instants, record.channel(name), start.first
+    assert values is not None  # asked for by its name
+    top = name == "displacement"
+    if top and start.zero is not None:
+        return start.zero, start.zero_from
+    rows = n if n >= _FEWEST else max(0, first - 2)
+    if rows >= _FEWEST and (not top or start.gauge == "rest"):
+        zero = mean_level(values[:rows], noise)
+        return zero, zero.source(noise, "mean of") + " at rest before contact"
+    flies = top and start.gauge == "flight"
+    reach = max(5, (int(np.argmax(values)) - first) // (24 if flies else 12))
+    near = slice(max(0, first - reach) if flies else first, first + reach)
+    zero = level_on_line(time[near], values[near], start.time, noise)[0]
+    source = zero.source(noise, "line through") + (" around it" if flies else " from there on")
+    least = max(ELSEWHERE * zero.error, (0.1 if top else 2e-3) * float(np.ptp(values)))
+    return (zero if flies or abs(zero.value) > least else Level(0.0, 0.0, 0)), source
+
+
+def mark_flight(record: Record, start: Start) -> Record:
+    """Mark the rows before contact in which the motion is not the striker's as not measured.
+
+    Three rows or so after contact, which may be earlier, a gauge that was at rest is not either.
+    """
+    if record.displacement is None or start.gauge in ("flight", ""):
+        return record
+    step = float(np.median(np.diff(record.instants)))
+    moves = record.instants > max(2.5 * step, 2 * start.error)
+    kept = record.sampled.get("displacement", np.ones(len(record), dtype=np.bool_))
+    return replace(record, sampled=record.sampled | {"displacement": kept & moves})
+
+
+def flight_notes(
+    record: Record, start: Start, span: Span, levels: Levels, striker: Striker, spread: float
+) -> list[str]:
+    """Compare the striker's flight before contact with its velocity ± `spread`, m/s.
+
+    An acceleration near that of gravity is said, too: no law here has it.
+    """
+    n, w, given, notes = start.first - 2, record.displacement, striker.velocity, list[str]()
+    if w is None or not given or n < 8:
+        return notes
+    noise, t = levels["displacement"], record.instants[:n] - start.time
+    (half, speed, _), variance = np.polyfit(t, w[:n], 2, cov="unscaled")
+    sigma = noise.sigma * float(np.sqrt(noise.time))
+    gravity, error = 2.0 * float(half), 2.0 * sigma * float(np.sqrt(variance[0, 0]))
+    falls = gravity > 4.0 * error and abs(gravity - _GRAVITY) < 0.2 * _GRAVITY + 2.0 * error
+    if falls:
+        error = sigma * float(np.sqrt(variance[1, 1]))
+        gain = gravity * float(record.instants[span.end - 1] - start.time) / given
+        notes.append(
+            f"Check: before contact the striker is still accelerated by gravity, by "
+            f"{engineering(gravity, 'm/s²')}, {gravity * 1e-3:.3g} m/s per ms; the law has no "
+            f"gravity in it, which over the contact is {percent(gain)} of its velocity."
+        )
+    else:
+        speed, error = level_on_line(t, w[:n], 0.0, noise)[1][:2]
+    off, error = abs(speed - given), float(np.hypot(error, spread))
+    if off > max(3.0 * error, 0.005 * given) and abs(speed) > 0.5 * given:
+        notes.append(
+            f"Check: before contact the displacement moves at {speed:.4g} ± {error:.2g} m/s, but "
+            f"the striker's velocity is given as {given:.4g} m/s."
+        )
+    return notes
+
+
+def contact_end(stress: Array, noise: NoiseLevel) -> tuple[int, bool]:
+    """Index after the last sample of the contact with the highest stress, and if it was reached.
+
+    The end is the last return to zero of a moving mean, whose noise is half a percent of the peak
+    if the pulse is long enough. A stress that soon rises again has not ended, nor one whose mean
+    over the next quarter of the time since the peak is not zero within its error.
+    """
+    top = int(np.argmax(stress))
+    peak = float(stress[top])
+    below = np.flatnonzero(stress[top:] < 0.5 * peak)
+    loaded = int(np.count_nonzero(stress > 0.1 * peak))
+    needed = noise.time * (2 * noise.sigma / (0.005 * peak)) ** 2
+    steep = int(below[0]) if below.size else 0
+    width = max(1, steep // 12, int(min(needed, loaded // 24)))
+    mean = smooth(stress, width)
+
+    def zero(samples: int) -> float:
+        """Level that the mean of so many samples stays below at zero stress."""
+        error = noise.sigma * np.sqrt(min(1.0, noise.time / samples))
+        return min(0.0025 * peak + 2 * float(error), 0.04 * peak)
+
+    level, end = zero(width), top
+    while True:
+        quiet = np.flatnonzero(mean[end:] <= level)
+        if not quiet.size:  # a record cut right at the end of contact has returned
+            return len(stress), bool(stress[-1] <= 0.02 * peak + level)
+        end += int(quiet[0])
+        ahead = end + max(1, (end - top) // 5)
+        again = np.flatnonzero(mean[end:ahead] > 0.05 * peak)
+        tail = stress[end : end + max(4 * width, (end - top) // 4)]
+        if again.size:
+            end += max(1, int(again[-1]))
+        elif len(tail) > width and tail.mean() > zero(len(tail)):
+            end += 1
+        else:
+            return end, True
