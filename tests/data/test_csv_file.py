@@ -509,7 +509,7 @@ def test_cartilage_as_labview_wrote_it(tmp_path, more, motion, strain):
     raw = DATA / "cartilage-impact" / "test_1_raw.txt"
     test = read_test(raw, cartilage_toml(tmp_path, VOLTS + more))
     assert test.motion == motion
-    assert test.displacement.max() / test.specimen.height == pytest.approx(strain, abs=0.04)
+    assert test.displacement.max() / test.specimen.height == pytest.approx(strain, abs=0.05)
     assert test.time[-1] == pytest.approx(1.45e-3, abs=0.15e-3)  # not the second bounce
     assert any("announces 100000 samples" in note for note in test.notes)
 

@@ -166,5 +166,5 @@ def test_cartilage_does_not_close(tmp_path, number, velocity):
         f'[striker]\nmass = "358.39 g"\nvelocity = "{velocity} m/s"\n'
     )
     found = audit(read_test(DATA / "cartilage-impact" / f"test_{number}_impact.csv", toml))
-    assert 0.765 < found.impulse_ratio < 0.795
+    assert 0.745 < found.impulse_ratio < 0.795  # which zero the eight rows at rest have is in it
     assert any("impulse of the force" in warning for warning in found.warnings())

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import NoiseLevel, Record, Striker
@@ -132,11 +133,16 @@ def kink(time: Array, values: Array, noise: NoiseLevel, power: int = 1) -> Kink 
 
 def _rise(values: Array, share: float) -> int:
     """First of three samples in a row above a share of the way from the lowest level to the top."""
-    before_peak = values[: int(np.argmax(values)) + 1]
-    base = float(np.percentile(before_peak, 5))
-    above = before_peak > base + share * (before_peak[-1] - base)
+    above = _above(values, share)
     run = above[:-2] & above[1:-1] & above[2:]
     return int(np.argmax(run)) if run.any() else int(np.argmax(above))
+
+
+def _above(values: Array, share: float) -> NDArray[np.bool_]:
+    """Mark the samples up to the peak that are above that share."""
+    before_peak = values[: int(np.argmax(values)) + 1]
+    base = float(np.percentile(before_peak, 5))
+    return np.asarray(before_peak > base + share * (before_peak[-1] - base))
 
 
 def _nearest(time: Array, values: Array, noise: NoiseLevel, power: int = 1) -> Kink | None:
@@ -145,8 +151,9 @@ def _nearest(time: Array, values: Array, noise: NoiseLevel, power: int = 1) -> K
     for share in _SHARES:
         if found is not None and share * peak < 8 * noise.sigma:
             break
-        high, low = _rise(values, share), _rise(values, share / 3)
-        part = slice(max(0, high - 4 * max(high - low, 3) - 8), high + 1)
+        high = _rise(values, share)
+        lasts = 1 + int(np.argmin(_above(values, share / 3)[: high + 1][::-1]))
+        part = slice(max(0, high - 4 * max(lasts, 3) - 8), high + 1)
         nearer = kink(time[part], values[part], noise, power)
         if nearer is None and found is None:
             return None
@@ -254,27 +261,33 @@ def start_of_impact(record: Record, levels: Levels, striker: Striker) -> Start:
         # Where the motion starts at its zero, no stress that rises is taken for a rest.
         first, top = first_level(time, w, levels["displacement"]), int(np.argmax(w))
         drift = np.inf if is_elsewhere(first, float(w[top])) else 0.002
-    found: list[tuple[Kink, str, str]] = []
     for name in ("stress", "acceleration"):
         values = record.channel(name)
         if values is not None and name not in record.derived:
             least = drift * float(np.ptp(values))
             at = leave_rest(time, values, levels[name], _STILL_IMPACT, least)
-            found += [(at, "stress", f"where the {name} leaves its rest")] if at else []
-    if w is not None:
-        up = slice(int(np.argmax(w)) + 1)
-        at = leave_rest(time[up], w[up], levels["displacement"], 0.5)
-        found += [(at, "motion", "where the displacement leaves its rest")] if at else []
-        if "stress" in record.derived and not found:
-            at = leave_flight(time[up], w[up], levels["displacement"])
-            found += [(at, "motion", "where the displacement leaves its line")] if at else []
-    if not found:
-        return _first_sample(record, levels)
-    at, by, how = min(found, key=lambda one: one[0].error)
-    start = Start(how, at.time, int(np.searchsorted(time, at.time)), at.error, by, True)
+            if at is not None:
+                start = _at_kink(f"where the {name} leaves its rest", time, at, "stress")
+                break
+    else:
+        start = _first_sample(record, levels)
     if w is None:
         return start
-    return replace(start, gauge=_gauge(record, start, levels["displacement"], striker))
+    noise, up = levels["displacement"], slice(int(np.argmax(w)) + 1)
+    by_motion, how = leave_rest(time[up], w[up], noise, 0.5), "where the displacement leaves its "
+    if by_motion is not None:
+        # Far from the onset of the stress something else than contact has moved the gauge.
+        alike = abs(by_motion.time - start.time) < 0.1 * (time[up][-1] - start.time)
+        if not start.free or (by_motion.error < start.error and alike):
+            start = _at_kink(f"{how}rest", time, by_motion, "motion")
+    elif "stress" in record.derived:
+        by_motion = leave_flight(time[up], w[up], noise)
+        start = _at_kink(f"{how}line", time, by_motion, "motion") if by_motion else start
+    return replace(start, gauge=_gauge(record, start, noise, striker)) if start.free else start
+
+
+def _at_kink(how: str, time: Array, at: Kink, by: str) -> Start:
+    return Start(how, at.time, int(np.searchsorted(time, at.time)), at.error, by, True)
 
 
 def first_time(time: Array) -> float:
@@ -319,10 +332,11 @@ def start_of_slow_test(record: Record, levels: Levels) -> Start:
     """
     time, w, stress = record.instants, record.displacement, record.stress
     drift, none = 0.01 * float(stress.max()), Level(0.0, 0.0, 0)
+    shown = "where the stress leaves its rest"
     at_first = Start("at the first sample", first_time(time), 0, zero=none)
     if w is None:
         at = leave_rest(time, stress, levels["stress"], drift=drift)
-        return at_first if at is None else _by_stress(time, at)
+        return at_first if at is None else replace(_at_kink(shown, time, at, "stress"), zero=none)
     noise, top = levels["displacement"], int(np.argmax(w))
     first = first_level(time, w, noise)
     away, elsewhere = abs(first.value) > ELSEWHERE * first.error, is_elsewhere(first, float(w[top]))
@@ -366,25 +380,13 @@ def start_of_slow_test(record: Record, levels: Levels) -> Start:
         near = slice(max(0, onset - reach), onset + reach)
         zero = level_on_line(time[near], w[near], by_stress.time, noise)[0]
         source = zero.source(noise, "line through") + " around it, the stress being at rest before"
-        return replace(_by_stress(time, by_stress), zero=zero, zero_from=source)
+        by = _at_kink(shown, time, by_stress, "stress")
+        return replace(by, zero=zero, zero_from=source)
     under_load = stress[:3].mean() > 0.05 * stress.max() and 0 < first.value < travel
     if under_load or not elsewhere:
         return at_first
     source = first.source(noise, "line through") + " from the first on; the file's zero lies"
     return replace(at_first, zero=first, zero_from=f"{source} elsewhere")
-
-
-def _by_stress(time: Array, at: Kink) -> Start:
-    first = int(np.searchsorted(time, at.time))
-    return Start(
-        "where the stress leaves its rest",
-        at.time,
-        first,
-        at.error,
-        "stress",
-        True,
-        zero=Level(0.0, 0.0, 0),
-    )
 
 
 def _loaded(record: Record, at: float, levels: Levels) -> bool:

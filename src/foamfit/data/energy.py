@@ -189,7 +189,9 @@ def _momentum(test: Measurement) -> tuple[float | None, float | None, float | No
     time, stress, w, striker = test.time, test.stress, test.displacement, test.striker
     if striker is None or time is None or stress is None:
         return None, None, None
-    impulse = test.specimen.area * float(np.trapezoid(stress, time) + 0.5 * stress[0] * time[0])
+    impulse = test.specimen.area * float(
+        np.trapezoid(stress, time) + 0.5 * stress[0] * max(time[0], 0.0)
+    )
     if w is None or not _unloaded(stress):
         return None, impulse, None
     last = slice(-max(5, len(w) // 20), None)

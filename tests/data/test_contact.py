@@ -1,0 +1,281 @@
+"""The start of an impact, and what the rows before it show, on closed-form synthetic pulses."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from foamfit.data.csv_file import read_test
+from foamfit.data.measurement import Record, Specimen, Striker
+from foamfit.data.prepare import condition
+
+HEIGHT, AREA, MASS, VELOCITY = 10e-3, 1e-4, 0.5, 2.0
+DURATION = 4e-3
+OMEGA = np.pi / DURATION
+BRAKED = 0.95 * VELOCITY * OMEGA  # m/s², at its peak: 95 % of the momentum is turned round
+PEAK = BRAKED * MASS / AREA
+SPECIMEN, STRIKER = Specimen(HEIGHT, AREA), Striker(MASS, VELOCITY)
+
+
+def noise(rng, n, tau):
+    """Noise of unit variance, correlated over `tau` samples."""
+    rho = (tau - 1) / (tau + 1)
+    white = rng.standard_normal(n + 400)
+    return lfilter([np.sqrt(1 - rho**2)], [1.0, -rho], white)[400:]
+
+
+def record(
+    channels="FW", n=500, before=200, phase=0.37, level=0.003, tau=1, gauge="flight", seed=0,
+    clock=0.0, zeros=(0.0, 0.0, 0.0), after=0.3, gravity=0.0,
+):  # fmt: skip
+    """A half-sine pulse in `n` samples, contact at the time `clock`, `zeros` in peaks."""
+    rng = np.random.default_rng(seed)
+    step = DURATION / n
+    t = (np.arange(-before, int(n * (1 + after))) + phase) * step
+    inside = np.clip(t, 0.0, DURATION)
+    a = BRAKED * np.sin(OMEGA * inside) * (t > 0) * (t < DURATION)
+    w = VELOCITY * inside - BRAKED / OMEGA * (inside - np.sin(OMEGA * inside) / OMEGA)
+    last = VELOCITY - 2 * BRAKED / OMEGA
+    w = w + last * np.maximum(t - DURATION, 0.0)
+    if gauge == "flight":
+        w = w + np.where(t < 0, VELOCITY * t + 0.5 * gravity * t**2, 0.0)
+    top = w[(t > 0) & (t < DURATION)].max()
+    a, s, w = (
+        x + size * (level * noise(rng, t.size, tau) + zero)
+        for x, size, zero in ((a, BRAKED, zeros[2]), (a * MASS / AREA, PEAK, zeros[0]),
+                              (w, top, zeros[1]))
+    )  # fmt: skip
+    motion = w if "W" in channels else None
+    if "F" in channels:
+        return Record(t + clock, s, motion, None, a if "A" in channels else None)
+    return Record(t + clock, a * MASS / AREA, motion)
+
+
+def run(given, striker=STRIKER, **more):
+    return condition(given, SPECIMEN, striker=striker, **more)
+
+
+def error(done, clock=0.0):
+    """Error of the start, s."""
+    return done.origins["contact_time"] - clock
+
+
+ZEROS = [(0.0, 0.0, 0.0), (-0.9, 0.7, 0.4), (0.8, -1.0, -0.6)]
+
+
+@pytest.mark.parametrize("channels", ["F", "A", "FA", "FW", "AW"])
+@pytest.mark.parametrize("gauge", ["flight", "rest"])
+@pytest.mark.parametrize("tau", [1, 8])
+@pytest.mark.parametrize(("n", "before"), [(80, 40), (500, 150), (500, 2000), (8000, 3000)])
+def test_the_start_is_found_within_samples_or_a_few_percent(channels, gauge, tau, n, before):
+    for seed, (level, zeros) in enumerate(
+        (level, zeros) for level in (5e-4, 5e-3, 0.02) for zeros in ZEROS
+    ):
+        clock = (0.0, 12.5, -3.0)[seed % 3]
+        given = record(channels, n, before, 0.37, level, tau, gauge, seed, clock, zeros)
+        done = run(given)
+        share = 0.02 if tau == 1 else 0.03  # slow noise looks like a rise
+        assert abs(error(done, clock)) <= max(3 * DURATION / n, share * DURATION)
+        assert done.contact != "file"
+
+
+@pytest.mark.parametrize("channels", ["F", "FW", "AW", "FA"])
+def test_one_impact_written_in_several_ways_starts_at_one_instant(channels):
+    first = run(record(channels, level=0.01))
+    for clock, zeros in ((7.0, ZEROS[1]), (-1e3, ZEROS[2]), (0.25, ZEROS[0])):
+        done = run(record(channels, level=0.01, clock=clock, zeros=zeros))
+        assert error(done, clock) == pytest.approx(error(first), abs=1e-4 * DURATION)
+        np.testing.assert_allclose(done.time, first.time, atol=1e-4 * DURATION)
+        np.testing.assert_allclose(done.stress, first.stress, atol=1e-6 * PEAK)
+        np.testing.assert_allclose(done.displacement, first.displacement, atol=2e-6)
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.5])
+@pytest.mark.parametrize("level", [5e-4, 0.02])
+def test_a_record_that_begins_at_contact_loses_nothing(phase, level):
+    given = record(before=0, phase=phase, level=level)
+    done = run(given)
+    assert error(done) == 0.0
+    assert (done.contact, done.zeros, done.sampled) == ("file", {}, {})
+    np.testing.assert_array_equal(done.stress, given.stress[: len(done.stress)])
+    np.testing.assert_array_equal(done.displacement, given.displacement[: len(done.stress)])
+    assert done.origins == {"contact_time": 0.0, "stress_zero": 0.0, "displacement_zero": 0.0}
+
+
+def test_a_motion_alone_gives_the_start_of_a_gauge_at_rest():
+    for seed in range(10):
+        given = record(gauge="rest", seed=seed, level=0.005, zeros=ZEROS[seed % 3])
+        done = run(replace(given, derived=("stress",)))
+        assert abs(error(done)) <= 0.02 * DURATION
+        assert (done.contact, done.derived) == ("motion", ("stress",))
+        assert "stress" not in done.zeros  # which is none of its own
+
+
+def test_a_motion_alone_followed_in_flight_gives_a_rough_start():
+    found = []
+    for seed in range(20):
+        given = record(seed=seed, level=1e-3, n=1000, before=400)
+        found.append(error(run(replace(given, derived=("stress",)))))
+    assert np.median(np.abs(found)) < 0.02 * DURATION
+
+
+def test_a_gauge_that_moves_before_contact_is_not_taken_for_it():
+    """A striker released in sight of its gauge: the stress says where contact starts."""
+    given = record(before=900, level=1e-3)
+    t = given.time
+    fall = np.where(t < -0.6 * DURATION, VELOCITY * -0.6 * DURATION, VELOCITY * t)
+    done = run(replace(given, displacement=np.where(t < 0, fall, given.displacement)))
+    assert abs(error(done)) < 3 * DURATION / 500
+    assert done.contact == "stress"
+
+
+# What the rows before contact show.
+
+
+def test_zeros_have_the_error_of_their_mean():
+    errors = {"stress": [], "acceleration": [], "displacement": []}
+    told = {name: [] for name in errors}
+    for seed in range(40):
+        one = run(record("FA", level=0.01, tau=8, seed=seed, zeros=ZEROS[1], before=600))
+        two = run(record("FW", level=0.01, tau=8, seed=seed, zeros=ZEROS[1], gauge="rest"))
+        top = 0.7 * record(level=0.0).displacement[200:].max()
+        for name, done, truth in (
+            ("stress", one, -0.9 * PEAK),
+            ("acceleration", one, 0.4 * BRAKED),
+            ("displacement", two, top),
+        ):
+            errors[name].append(done.origins[f"{name}_zero"] - truth)
+            told[name].append(done.zeros[name])
+    for name, found in errors.items():
+        assert np.std(found) == pytest.approx(np.median(told[name]), rel=0.35)
+        assert abs(np.mean(found)) < 0.6 * np.median(told[name])
+
+
+@pytest.mark.parametrize(("before", "rest"), [(5, 0), (6, 3), (20, 10), (300, 250)])
+def test_few_rows_are_shared_between_zeros_and_contact(before, rest):
+    done = run(record(before=before, phase=0.5, level=1e-4, gauge="rest"))
+    lead = int(np.count_nonzero(done.time < -1e-9))
+    assert lead == pytest.approx(before - rest, abs=2)
+    assert ("stress" in done.zeros) == (rest > 0)
+    assert any("file's own zero of the stress stands" in n for n in done.notes) == (rest == 0)
+
+
+def test_a_rest_that_drifts_owns_up_to_it():
+    given = record(level=1e-3, before=400)
+    t = given.time
+    drift = np.where(t < 0, 0.1 * PEAK * (t - t[0]) / -t[0], 0.0)
+    still, drifting = run(given), run(replace(given, stress=given.stress + drift))
+    assert any("The stress drifts by" in note for note in drifting.notes)
+    assert drifting.zeros["stress"] > 0.05 * PEAK > 50 * still.zeros["stress"]
+    assert drifting.origins["stress_zero"] == 0.0
+    # A zero that lies farther off than it drifts is taken off all the same.
+    far = run(replace(given, stress=given.stress + drift + 3 * PEAK))
+    assert far.stress.max() == pytest.approx(PEAK, rel=0.1)
+
+
+def test_a_motion_counts_before_contact_only_in_flight():
+    flight, rest = run(record()), run(record(gauge="rest"))
+    assert flight.time[0] == pytest.approx(-0.1 * DURATION, rel=0.1)
+    assert flight.sampled == {}
+    assert "displacement" not in flight.zeros
+    marked = rest.sampled["displacement"]
+    assert not marked[rest.time < 0].any()
+    assert not marked[(rest.time > 0) & (rest.time < 1.9 * DURATION / 500)].any()
+    assert marked[rest.time > 3 * DURATION / 500].all()
+    assert rest.rows.used == len(rest.time)
+
+
+def test_blocks_keep_what_the_samples_are():
+    given = record("FW", n=8000, before=3000, gauge="rest")
+    done = run(given)
+    assert done.block == 10
+    assert done.sampled["displacement"].shape == done.time.shape
+    assert done.sampled["displacement"].sum() == np.count_nonzero(done.time > 4e-6)
+    force = run(record("FA", n=8000, before=3000))
+    assert force.acceleration.shape == force.time.shape
+    assert force.noise.of("acceleration").sigma == pytest.approx(0.003 * BRAKED / 10**0.5, rel=0.2)
+
+
+# Channels.
+
+
+def test_an_acceleration_is_kept_where_there_is_no_displacement():
+    done = run(record("FA", zeros=ZEROS[1]))
+    assert done.derived == ("displacement",)
+    assert done.motion == "integrated from acceleration"
+    truth = np.where(done.time > 0, BRAKED * np.sin(OMEGA * done.time), 0.0)
+    inside = done.time < DURATION
+    assert np.abs(done.acceleration - truth)[inside].max() < 0.02 * BRAKED
+    lead = done.time < 0
+    np.testing.assert_allclose(done.displacement[lead], VELOCITY * done.time[lead], rtol=1e-9)
+    assert run(record("FW")).acceleration is None
+
+
+def write(folder, header, *columns, velocity=f"{VELOCITY} m/s"):
+    path = folder / "test.csv"
+    np.savetxt(path, np.column_stack(columns), delimiter=",", header=header, comments="")
+    path.with_suffix(".toml").write_text(
+        f'[specimen]\nheight = "{HEIGHT} m"\narea = "{AREA} m^2"\n'
+        f'[striker]\nmass = "{MASS} kg"\nvelocity = "{velocity}"\n'
+    )
+    return path
+
+
+@pytest.mark.parametrize("gauge", ["flight", "rest"])
+def test_a_file_of_the_motion_alone_gives_a_derived_stress(tmp_path, gauge):
+    given = record(gauge=gauge, n=1000, level=1e-3, zeros=ZEROS[2])
+    path = write(tmp_path, "time (s),displacement (m)", given.time, given.displacement)
+    done = read_test(path)
+    assert done.derived == ("stress",)
+    assert done.motion == "measured"
+    assert any("deceleration of its motion" in note for note in done.notes)
+    truth = np.where(done.time > 0, PEAK * np.sin(OMEGA * np.clip(done.time, 0, DURATION)), 0.0)
+    assert np.sqrt(np.mean((done.stress - truth) ** 2)) < 0.05 * PEAK
+    assert ("displacement" in done.zeros) == (gauge == "rest")
+
+
+def test_a_file_of_the_velocity_alone_gives_motion_and_stress(tmp_path):
+    given = record("FW", n=1000, level=0.0)
+    velocity = np.gradient(given.displacement, given.time)
+    velocity += 0.01 * np.random.default_rng(0).standard_normal(velocity.size)
+    done = read_test(write(tmp_path, "time (s),velocity (m/s)", given.time, velocity))
+    assert done.derived == ("stress",)
+    assert done.motion == "integrated from velocity"
+    assert done.stress.max() == pytest.approx(PEAK, rel=0.1)
+
+
+def test_a_file_of_the_acceleration_alone_counts_its_stress(tmp_path):
+    given = record("A", zeros=ZEROS[1])
+    path = write(tmp_path, "time (s),acceleration (m/s^2)", given.time, given.stress * AREA / MASS)
+    done = read_test(path)
+    assert (done.derived, done.acceleration) == (("displacement",), None)
+    assert done.stress.max() == pytest.approx(PEAK, rel=0.02)
+    assert "stress" in done.zeros
+
+
+# The striker's flight.
+
+
+@pytest.mark.parametrize(("given", "spread", "told"), [(2.0, 0, 0), (2.1, 0, 1), (2.1, 0.05, 0)])
+def test_a_velocity_that_the_flight_contradicts_is_told(given, spread, told):
+    done = run(record(level=1e-3), striker=Striker(MASS, given), spread=spread)
+    notes = [note for note in done.notes if "before contact the displacement moves at" in note]
+    assert len(notes) == told
+    if told:
+        assert notes[0].startswith("Check:")
+        assert "velocity is given as 2.1 m/s" in notes[0]
+        assert re.search(r"moves at (2|2\.00\d|1\.99\d) ± ", notes[0])
+
+
+@pytest.mark.parametrize(("gravity", "told"), [(0.0, 0), (9.81, 1)])
+def test_a_striker_that_gravity_still_accelerates_is_told(gravity, told):
+    done = run(record(level=1e-4, before=4000, gravity=gravity))
+    notes = [note for note in done.notes if "accelerated by gravity" in note]
+    assert len(notes) == told
+    if told:
+        assert "m/s per ms" in notes[0]
+        assert "no gravity in it" in notes[0]
