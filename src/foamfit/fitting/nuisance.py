@@ -54,11 +54,16 @@ def values_of(measurement: Measurement) -> dict[str, float]:
 
 
 def priors_of(measurement: Measurement) -> dict[str, Prior]:
-    """Priors of nuisance parameters: zeros shown before contact, and each ± of the TOML."""
+    """Priors of nuisance parameters: zeros shown before contact, and each ± of the TOML.
+
+    The mass has none where the stress was computed with it: force and inertia then change together.
+    """
     values = values_of(measurement)
     known = {zero: measurement.zeros.get(channel) for zero, channel in ZEROS.items()}
     stated = {VELOCITY: "velocity", STRIKER_MASS: "striker_mass", TIME_SHIFT: "delay"}
     known |= {name: measurement.uncertainties.get(key) for name, key in stated.items()}
+    if measurement.braked:
+        del known[STRIKER_MASS]
     return {name: Prior(name, values[name], sigma) for name, sigma in known.items() if sigma}
 
 
