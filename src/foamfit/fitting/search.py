@@ -30,8 +30,8 @@ PULSE = 16  # evaluations
 # Shares of the time of a search, as measured, at which its parts begin.
 DESCENTS, ON_CURVES, REFINED = 0.25, 0.75, 0.95
 CURVE_STARTS = 300
-# Searches at most: another one where a single descent led to the best end, which misses more of the
-# curves than noise.
+# Searches at most: a second one where a single descent led to the best end, and a third where this
+# still misses more of the curves than noise.
 ATTEMPTS = 3
 # Minima of the loop whose cost on the drive's curves is within this factor of the best go on.
 PROMISING = 100.0
@@ -138,7 +138,7 @@ def smooth_loop(measurement: Measurement, followed: Array | None = None) -> Meas
     return replace(
         measurement, displacement=motion[keep], stress=stress[keep], time=thinned,
         outliers={}, sampled={}, interior={},  # bridged, and smoothed over
-        acceleration=None, block=1,
+        acceleration=None, block=1, noise=replace(measurement.noise, displacement=0.0),
     )  # fmt: skip
 
 
@@ -380,18 +380,18 @@ def search(
             cost, end = descend(tracker, space, point, 60)
             tracker.ends.append(space.decode(end))
             out.append((cost, counts.get(id(point), 1)))
-        if attempt + 1 == ATTEMPTS or _settled(tracker, out):
+        if attempt + 1 == ATTEMPTS or _settled(tracker, out, attempt):
             break
         points = box_starts(space, rng, CURVE_STARTS // 3)
     return sorted(out)
 
 
-def _settled(tracker: Tracker, ends: list[tuple[float, int]]) -> bool:
-    """Whether descents agree on the best end, or this leaves no more of the curves than noise."""
+def _settled(tracker: Tracker, ends: list[tuple[float, int]], attempt: int) -> bool:
+    """Whether descents agree on the best end, or none of a second search is better than noise."""
     best = min(ends)[0]
     if sum(count for cost, count in ends if cost <= 1.02 * best) > 1:
         return True
-    return best <= tracker.objective.floor
+    return attempt > 0 and best <= tracker.objective.floor
 
 
 def ensure_feasible(tracker: Tracker, space: Space, rng: np.random.Generator) -> None:
