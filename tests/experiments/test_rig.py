@@ -1,0 +1,122 @@
+"""Synthetic records as a rig writes them: their truth is foamfit's, and files hold the records."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import foamfit as ff
+from conftest import EXPERIMENTS
+
+sys.path.insert(0, str(EXPERIMENTS / "recovery"))
+import rig
+from truth import Bistable, Rig
+
+
+def chain_of(made: Rig) -> ff.Chain:
+    """The springs of a record as foamfit knows them."""
+    springs = []
+    for spring in made.springs:
+        values = {f.name: getattr(spring, f.name) for f in fields(spring) if f.name != "terms"}
+        law = ff.BistableSpring if isinstance(spring, Bistable) else ff.MicroscaleSpring
+        springs.append(law(**values, relaxation=spring.terms))
+    return ff.Chain(springs, made.heights, made.area)
+
+
+def share(found: np.ndarray, truth: np.ndarray) -> float:
+    return float(np.abs(found - truth).max() / np.ptp(truth))
+
+
+@pytest.mark.parametrize("law", ["bistable", "microscale"])
+@pytest.mark.parametrize("relaxation", [0, 1])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_impacts_are_those_of_foamfit(law: str, relaxation: int, seed: int) -> None:
+    course = rig.impact(rig.Impact(law=law, relaxation=relaxation), seed).course
+    time, drive = np.linspace(0.0, 1.02 * course.end, 800), course.rig
+    found = ff.simulate(chain_of(drive), ff.Impact(drive.mass, drive.velocity), time, rtol=1e-9)
+    assert share(found.base_stress, course.stress(time)) < 1e-6
+    assert share(found.displacement[-1], course.top(time, gauge=False)) < 1e-6
+    assert found.contact_end == pytest.approx(course.end, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "setup",
+    [
+        rig.Slow(law="bistable", inner=0.05, motion="trapezoid"),
+        rig.Slow(law="bistable+bistable", inner=0.1),
+        rig.Slow(inner=0.1),
+        rig.Slow(relaxation=2, motion="ramp", early=True),
+        rig.Slow(relaxation=1, motion="sine"),
+        rig.Slow(dashpot=True, relaxation=1),
+    ],
+)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_slow_tests_are_those_of_foamfit(setup: rig.Slow, seed: int) -> None:
+    course = rig.slow(setup, seed).course
+    assert course.rig.motion is not None
+    turns = [t for t in course.rig.motion.times if course.start < t < course.end]
+    time = np.union1d(np.linspace(course.start, course.end, 20_001), turns)
+    drive = ff.DisplacementDrive(course.top(time, gauge=False))
+    found = ff.simulate(chain_of(course.rig), drive, time - course.start, rtol=1e-9)
+    smooth = ~np.isin(time, [*turns, course.start])  # at a turn a dashpot's stress has two values
+    assert share(found.base_stress[smooth], course.stress(time)[smooth]) < 1e-6
+
+
+def test_gravity_and_a_gauge_on_the_specimen() -> None:
+    setup = rig.Impact(law="microscale", relaxation=1, noise=0.0, gravity=True, before=0.3)
+    made = rig.impact(setup, 3)
+    course, mass, area = made.course, made.rig.mass, made.rig.area
+    time = np.linspace(-0.2 * course.end, 1.2 * course.end, 20_001)
+    gained = np.gradient(np.gradient(course.top(time, False), time), time)
+    braked = rig.GRAVITY - course.stress(time) * area / mass
+    assert np.abs(gained - braked)[5:-5].max() < 1e-3 * np.ptp(braked)
+    rests = course.top(time, gauge=True)
+    assert np.all(rests[time <= 0.0] == 0.0)
+    after = time > course.end
+    assert np.all(np.diff(rests[after]) <= 0.0)  # the specimen recovers, the striker is gone
+    assert rests[after][0] == pytest.approx(course.state[0], rel=1e-3)
+    assert course.top(time, False)[-1] < rests[-1]
+
+
+def test_a_file_says_what_the_record_holds(tmp_path: Path) -> None:
+    setup = rig.Impact(channels=("force", "displacement", "acceleration"), samples=400, before=0.4)
+    made = rig.impact(setup, 5)
+    contact = made.truth["contact_time"]
+    before = made.time < contact
+    assert before.mean() == pytest.approx(0.4, abs=0.01)
+    assert np.ptp(made.clean["force"][before]) == 0.0  # the offset of the sensor
+    assert made.clean["force"][0] != 0.0
+    zero = np.interp(contact, made.time[before][-2:], made.clean["displacement"][before][-2:])
+    flown = made.rig.velocity * (contact - made.time[before][-1])
+    assert zero + flown == pytest.approx(made.truth["displacement_zero"], abs=1e-9)
+    path = rig.write(made, tmp_path)
+    header, *rows = path.read_text().splitlines()
+    assert header == "time (ms),force (N),displacement (mm),acceleration (m/s^2)"
+    table = np.array([row.split(",") for row in rows], dtype=float)
+    assert table[:, 0] == pytest.approx(1e3 * made.time, abs=1e-7)
+    assert table[:, 2] == pytest.approx(1e3 * made.channels["displacement"])
+    other = made.written_so(zero=1e-3, clock=2.0, skip=30)
+    assert other.truth["contact_time"] == contact + 2.0
+    assert np.array_equal(other.channels["force"], made.channels["force"][30:])
+    assert other.truth["displacement_zero"] == made.truth["displacement_zero"] + 1e-3
+
+
+def test_one_seed_is_one_test_whatever_is_recorded() -> None:
+    whole = rig.impact(rig.Impact(channels=("force", "displacement"), noise=0.01), 7)
+    force = rig.impact(rig.Impact(channels=("force",), noise=0.01), 7)
+    assert np.array_equal(whole.channels["force"], force.channels["force"])
+    trimmed = rig.impact(replace(whole.setup, trimmed=True), 7)
+    same = [name for name in whole.truth if name.startswith("s1_")]
+    assert all(trimmed.truth[name] == whole.truth[name] for name in same)
+    assert trimmed.truth["contact_time"] == trimmed.time[0] == 0.0
+
+
+def test_relaxation_and_dashpot_come_under_their_names() -> None:
+    truth = rig.slow(rig.Slow(relaxation=2, dashpot=True), 1).truth
+    assert truth["s1_eta"] > 0.0
+    assert truth["s1_tau1"] < truth["s1_tau2"]
+    assert truth["s1_g1"] > 0.0
