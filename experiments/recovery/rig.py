@@ -66,8 +66,9 @@ class Slow:
     `law` is "bistable", "microscale" or bistable springs joined by "+", all of one height. With
     `dashpot` an only spring has an eta. `motion` is "triangle", "sine", "trapezoid" (a short hold)
     or "ramp" (a slow start). `inner` is the size of a partial unloading, as a share of the peak.
-    `noise` is a share of the range, of displacement and force alike. With `early` the motion begins
-    before contact; with `zero` its zero is arbitrary. `noise_given` writes it into the TOML.
+    `noise` is a share of the range, of displacement and force alike; `noise_given` writes it into
+    the TOML, and with `exact` the displacement has none. With `early` the motion begins before
+    contact; with `zero` its zero is arbitrary.
     """
 
     law: str = "microscale"
@@ -80,6 +81,7 @@ class Slow:
     early: bool = False
     zero: bool = False
     noise_given: bool = False
+    exact: bool = False
 
 
 @dataclass(frozen=True)
@@ -331,6 +333,7 @@ def slow(setup: Slow, seed: int) -> Record:
     motion, stress = course.top(own, gauge=False), course.stress(own)
     clean = {"force": stress * rig.area, "displacement": motion + zero}
     ranges = {name: float(np.ptp(values)) for name, values in clean.items()}
+    ranges["displacement"] *= not setup.exact
     channels, sizes = noisy(clean, ranges, setup.noise, 1.0, seed)
     truth = parameters(rig.springs) | {"contact_time": course.start, "displacement_zero": zero}
     return Record(setup, own, channels, clean, sizes, truth, rig, course)
