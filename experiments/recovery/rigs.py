@@ -1,10 +1,10 @@
 """Do the 95 % intervals hold on records as rigs write them?
 
 `rig` makes synthetic impacts, recorded by an oscilloscope from before the contact, and synthetic
-slow tests, whose motion drives the fit and has noise. Each record goes the way of a user: a CSV
-with its TOML, `foamfit.read_test`, the defaults of `foamfit.fit`. A row for each parameter keeps its
-truth and its interval; a test that cannot be read or fitted is a row with its sentence. Intervals of
-the springs' parameters are counted, those of contact time, zero, velocity and mass apart. A value is
+slow tests, whose motion drives the fit and has noise. Each record goes the way of a user: a CSV and
+its TOML, `foamfit.read_test`, the defaults of `foamfit.fit`. A row for each parameter keeps truth
+and interval; a test that cannot be read or fitted is a row with its sentence. Intervals of the
+springs' parameters are counted, those of contact time, zero, velocity and mass apart. A value is
 far if it is called determined and its interval misses the truth by more than its own width.
 
 With `--invariance` each impact is written several ways: with another zero of the motion, another
@@ -245,7 +245,7 @@ def run(
 def coverage(rows: pd.DataFrame, by: str) -> pd.DataFrame:
     """Count the intervals that hold, for each value of a column and for all together."""
     fits = rows[rows["parameter"].notna()]
-    own = fits["parameter"].str.match(r"s\d_")
+    own = fits["parameter"].astype(str).str.match(r"s\d_")
     out = []
     for name, group in [*rows.groupby(by, sort=False), ("all", rows)]:
         mine = fits.loc[fits.index.intersection(group.index)]

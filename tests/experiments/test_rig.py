@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import foamfit as ff
@@ -14,6 +16,7 @@ from conftest import EXPERIMENTS
 
 sys.path.insert(0, str(EXPERIMENTS / "recovery"))
 import rig
+import rigs
 from truth import Bistable, Rig
 
 
@@ -120,3 +123,82 @@ def test_relaxation_and_dashpot_come_under_their_names() -> None:
     assert truth["s1_eta"] > 0.0
     assert truth["s1_tau1"] < truth["s1_tau2"]
     assert truth["s1_g1"] > 0.0
+
+
+class Found:
+    """A fit with these values and intervals; its springs and terms are exchanged."""
+
+    status = "ok"
+
+    def __init__(self, record: rig.Record, swap: dict[str, str], off: float) -> None:
+        self.parameters = {}
+        for name, value in record.truth.items():
+            if name.startswith("s"):
+                near = value + off * max(abs(value), 1.0)
+                self.parameters[swap.get(name, name)] = Estimate(near)
+
+
+class Estimate:
+    def __init__(self, value: float) -> None:
+        self.value, self.stderr = value, 0.01 * abs(value)
+        self.ci95 = value - 0.02 * abs(value), value + 0.02 * abs(value)
+        self.vary, self.state = True, "determined"
+
+
+@pytest.mark.parametrize("name", ["two springs, 300 rows, 0.3 %", "microscale+2, 300 rows, 0.3 %"])
+def test_springs_and_terms_in_another_order_are_the_same(
+    monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    kind = "^()(s)(.)" if name.startswith("two") else "^(.*_)(g|tau)(.)$"
+    other = {"1": "2", "2": "1"}
+    record = rigs.make("slow", name, 1)
+    names = [name for name in record.truth if name.startswith("s")]
+    swap = {n: re.sub(kind, lambda m: f"{m[1]}{m[2]}{other[m[3]]}", n) for n in names}
+    monkeypatch.setattr(ff, "fit", lambda *_, **__: Found(record, swap, 0.0))
+    rows = rigs.run_test("slow", name, 1)
+    assert all(row["holds"] and row["value"] == row["truth"] for row in rows)
+    assert len({row["parameter"] for row in rows}) == len(swap)
+
+
+@pytest.mark.parametrize(("off", "holds", "far"), [(0.0, 1, 0), (0.03, 0, 0), (0.1, 0, 1)])
+def test_far_is_an_interval_that_misses_by_more_than_its_width(
+    monkeypatch: pytest.MonkeyPatch, off: float, holds: int, far: int
+) -> None:
+    record = rigs.make("slow", "microscale, 300 rows, 0.3 %", 1)
+    monkeypatch.setattr(ff, "fit", lambda *_, **__: Found(record, {}, off))
+    rows = pd.DataFrame(rigs.run_test("slow", "microscale, 300 rows, 0.3 %", 1))
+    row = rows[rows["parameter"] == "s1_k0"].iloc[0]
+    assert (row["holds"], row["far"]) == (holds, far)
+    table = rigs.coverage(rows.assign(error=None), "class")
+    assert list(table["holds %"]) == [100.0 * rows["holds"].mean()] * 2
+    assert list(table["far"]) == [rows["far"].sum()] * 2
+
+
+def test_a_failure_is_a_row_and_what_is_done_is_not_done_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise ff.InputError("the record is empty.")
+
+    monkeypatch.setattr(ff, "fit", refuse)
+    raw = tmp_path / "rows.csv"
+    job = ("slow", "microscale, 300 rows, 0.3 %", 1)
+    rows = rigs.run(rigs.run_test, [job], raw, 1)
+    assert list(rows["error"]) == ["InputError: the record is empty."]
+    assert rigs.coverage(rows, "class")["failed"].tolist() == [1, 1]
+    again = rigs.run(pytest.fail, [job], raw, 1)
+    assert again["error"].tolist() == rows["error"].tolist()
+
+
+def test_a_move_is_counted_in_standard_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fitted(record: rig.Record) -> tuple[None, dict[str, Estimate]]:
+        return None, {"s1_k0": Estimate(1.0 if record.time[0] < 12.0 else 1.002)}
+
+    monkeypatch.setattr(rigs, "fitted", fitted)
+    rows = pd.DataFrame(rigs.run_invariance("impact", "any zero", 3))
+    moved = rows[rows["move"] > 0.0]
+    assert moved["way"].tolist() == ["clock"]
+    assert moved["move"].tolist() == [pytest.approx(0.2)]
+    table = rigs.moves(rows.assign(error=None), "way").set_index("way")
+    assert table.loc["clock", "largest"] == pytest.approx(0.2)
+    assert table.loc["all", "moved %"] == 0.0
