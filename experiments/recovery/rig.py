@@ -38,10 +38,11 @@ class Impact:
     `zero` says whether the motion's zero is arbitrary, `sensor` whether those of force and
     acceleration are. `noise` is a share of each channel's range during contact, of autocorrelation
     time `tau` in samples. `before` is the share of the record before contact (None: drawn up to
-    0.6), `samples` those during contact (None: 150 to 3000). A record that is `trimmed` begins at
-    contact, at time zero, with all zeros right. A `gauge` on the specimen rests until contact.
-    `gravity` acts on the striker before, during and after contact. `velocity_sd` is what the TOML
-    says of its velocity, as a share: the velocity there is off by so much, at random.
+    0.6), `samples` those during contact (None: 150 to 3000, where 20 kHz to 2 MHz allow it). A
+    record that is `trimmed` begins at contact, at time zero, with all zeros right. A `gauge` on the
+    specimen rests until contact. `gravity` acts on the striker before, during and after contact.
+    `velocity_sd` is what the TOML says of its velocity, as a share: the velocity there is off by so
+    much, at random.
     """
 
     law: str = "bistable"
@@ -231,7 +232,9 @@ def impact(setup: Impact, seed: int) -> Record:
     course = drawn_impact(setup, np.random.default_rng([seed, 1]))
     rng = np.random.default_rng([seed, 2])
     rig, lasts = course.rig, course.end
-    samples = setup.samples or round(10 ** rng.uniform(math.log10(150), math.log10(3000)))
+    drawn = 10 ** rng.uniform(math.log10(150), math.log10(3000))
+    slowest, fastest = 20e3 * lasts, 2e6 * lasts  # samples per second
+    samples = setup.samples or round(max(150.0, min(max(drawn, slowest), fastest)))
     step = float(f"{lasts / samples:.3g}")
     part, after, late = rng.uniform(0.0, 0.6), rng.uniform(0.05, 0.25), rng.uniform(0.05, 0.95)
     origin = rng.uniform(-lasts, 0.0) if rng.random() < 0.5 else rng.uniform(0.0, 20.0)
@@ -306,8 +309,8 @@ def drawn_slow(setup: Slow, rng: np.random.Generator) -> Course:
             springs = [draw_bistable(rng) for _ in kinds]
             tops = sorted(spring.points[0] for spring in springs)
             most = max(spring.points[2] for spring in springs) * rng.uniform(1.1, 1.6)
-            if any(b < 1.5 * a for a, b in pairwise(tops)):
-                continue  # twins cannot be told apart
+            if not all(1.5 < b / a < 4.0 for a, b in pairwise(tops)):
+                continue  # of one foam, but no twins: those cannot be told apart
         heights = (SLOW_HEIGHT / len(kinds),) * len(kinds)
         strains = [spring.strain(most, spring.loading(most))[0] for spring in springs]
         if max(strains) > MOST_STRAIN:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,17 +17,6 @@ from conftest import EXPERIMENTS
 sys.path.insert(0, str(EXPERIMENTS / "recovery"))
 import rig
 import rigs
-from truth import Bistable, Rig
-
-
-def chain_of(made: Rig) -> ff.Chain:
-    """The springs of a record as foamfit knows them."""
-    springs = []
-    for spring in made.springs:
-        values = {f.name: getattr(spring, f.name) for f in fields(spring) if f.name != "terms"}
-        law = ff.BistableSpring if isinstance(spring, Bistable) else ff.MicroscaleSpring
-        springs.append(law(**values, relaxation=spring.terms))
-    return ff.Chain(springs, made.heights, made.area)
 
 
 def share(found: np.ndarray, truth: np.ndarray) -> float:
@@ -40,7 +29,9 @@ def share(found: np.ndarray, truth: np.ndarray) -> float:
 def test_impacts_are_those_of_foamfit(law: str, relaxation: int, seed: int) -> None:
     course = rig.impact(rig.Impact(law=law, relaxation=relaxation), seed).course
     time, drive = np.linspace(0.0, 1.02 * course.end, 800), course.rig
-    found = ff.simulate(chain_of(drive), ff.Impact(drive.mass, drive.velocity), time, rtol=1e-9)
+    found = ff.simulate(
+        rigs.chain_of(drive), ff.Impact(drive.mass, drive.velocity), time, rtol=1e-9
+    )
     assert share(found.base_stress, course.stress(time)) < 1e-6
     assert share(found.displacement[-1], course.top(time, gauge=False)) < 1e-6
     assert found.contact_end == pytest.approx(course.end, rel=1e-6)
@@ -64,7 +55,7 @@ def test_slow_tests_are_those_of_foamfit(setup: rig.Slow, seed: int) -> None:
     turns = [t for t in course.rig.motion.times if course.start < t < course.end]
     time = np.union1d(np.linspace(course.start, course.end, 20_001), turns)
     drive = ff.DisplacementDrive(course.top(time, gauge=False))
-    found = ff.simulate(chain_of(course.rig), drive, time - course.start, rtol=1e-9)
+    found = ff.simulate(rigs.chain_of(course.rig), drive, time - course.start, rtol=1e-9)
     smooth = ~np.isin(time, [*turns, course.start])  # at a turn a dashpot's stress has two values
     assert share(found.base_stress[smooth], course.stress(time)[smooth]) < 1e-6
 
@@ -136,6 +127,7 @@ class Found:
             if name.startswith("s"):
                 near = value + off * max(abs(value), 1.0)
                 self.parameters[swap.get(name, name)] = Estimate(near)
+        self.chain = rigs.chain_of(record.rig)
 
 
 class Estimate:
@@ -158,6 +150,7 @@ def test_springs_and_terms_in_another_order_are_the_same(
     rows = rigs.run_test("slow", name, 1)
     assert all(row["holds"] and row["value"] == row["truth"] for row in rows)
     assert len({row["parameter"] for row in rows}) == len(swap)
+    assert rows[0]["over truth"] == 1.0
 
 
 @pytest.mark.parametrize(("off", "holds", "far"), [(0.0, 1, 0), (0.03, 0, 0), (0.1, 0, 1)])
@@ -191,8 +184,8 @@ def test_a_failure_is_a_row_and_what_is_done_is_not_done_again(
 
 
 def test_a_move_is_counted_in_standard_errors(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fitted(record: rig.Record) -> tuple[None, dict[str, Estimate]]:
-        return None, {"s1_k0": Estimate(1.0 if record.time[0] < 12.0 else 1.002)}
+    def fitted(record: rig.Record) -> tuple[None, None, dict[str, Estimate]]:
+        return None, None, {"s1_k0": Estimate(1.0 if record.time[0] < 12.0 else 1.002)}
 
     monkeypatch.setattr(rigs, "fitted", fitted)
     rows = pd.DataFrame(rigs.run_invariance("impact", "any zero", 3))
@@ -202,3 +195,13 @@ def test_a_move_is_counted_in_standard_errors(monkeypatch: pytest.MonkeyPatch) -
     table = rigs.moves(rows.assign(error=None), "way").set_index("way")
     assert table.loc["clock", "largest"] == pytest.approx(0.2)
     assert table.loc["all", "moved %"] == 0.0
+
+
+def test_a_minimum_that_the_search_missed_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    name = "microscale, 300 rows, 0.3 %"
+    wrong = Found(rigs.make("slow", name, 2), {}, 0.0)
+    monkeypatch.setattr(ff, "fit", lambda *_, **__: wrong)
+    rows = pd.DataFrame(rigs.run_test("slow", name, 1))
+    table = rigs.coverage(rows.assign(error=None), "class")
+    assert table["missed"].tolist() == [1, 1]
+    assert table["others hold %"].isna().all()
