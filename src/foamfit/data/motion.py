@@ -113,8 +113,9 @@ def follow(
     for _ in range(8):
         if sigma <= _LITTLE * size:
             return _exact(times[taken], w, max(sigma, _ROUNDING * size))
-        fit, penalty = fitted(x, (w - middle) / (sigma * slow), pieces)
-        left = fit.left(penalty) * sigma * slow
+        unit = sigma * slow
+        fit, penalty = fitted(x, (w - middle) / unit, pieces)
+        left = fit.left(penalty) * unit
         if left > _OFF * max(sigma, shown) and pieces < finest:
             pieces = min(2 * pieces, finest)
             continue
@@ -123,7 +124,7 @@ def follow(
         if abs(max(left, least) / sigma - 1.0) < 0.1:
             break
         sigma = max(left, least)
-    return _motion(fit, penalty, sigma, sigma * slow, middle, (start, duration))
+    return _motion(fit, penalty, unit / slow, unit, middle, (start, duration))
 
 
 def _motion(
