@@ -157,6 +157,8 @@ def averaged(level: NoiseLevel, block: int) -> NoiseLevel:
 def with_noise(measurement: Measurement) -> Measurement:
     """Estimate the noise of the channels that have none; a test that has all stays as it is."""
     noise, curves = measurement.noise, measurement.channels()
+    if measurement.acceleration is not None:
+        curves["acceleration"] = measurement.acceleration
     missing = {c: estimated_noise(v) for c, v in curves.items() if noise.of(c) is None}
     if not missing:
         return measurement
