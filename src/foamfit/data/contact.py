@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import NoiseLevel, Record, Striker
-from foamfit.data.noise import MIN_REST
+from foamfit.data.noise import MIN_REST, correlation_time, lag_one
 
 # A signal rests where its slope is less than this share of the slope that follows: the branches of
 # a foam differ less on loading (6 times in the published sets), so that a soft start is no rest.
@@ -67,9 +67,13 @@ class Kink(NamedTuple):
 
 def mean_level(values: Array, noise: NoiseLevel) -> Level:
     """Level of a signal at rest: the mean of its samples; few of them do not show their noise."""
-    n = len(values)
-    sigma = float(np.std(values, ddof=1)) if n >= MIN_REST * noise.time else noise.sigma
-    return Level(float(values.mean()), sigma * float(np.sqrt(min(noise.time, n) / n)), n)
+    n, sigma, time, zero = len(values), noise.sigma, noise.time, float(values.mean())
+    if n >= MIN_REST:
+        phi = lag_one(values - zero)
+        time = max(time, correlation_time(phi)) if 2 / np.sqrt(n) < phi < 1 else time
+    if n >= MIN_REST * time:
+        sigma = float(np.std(values, ddof=1))
+    return Level(zero, sigma * float(np.sqrt(min(time, n) / n)), n)
 
 
 def line_at(time: Array, values: Array, at: float) -> tuple[float, float]:

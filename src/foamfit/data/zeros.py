@@ -27,12 +27,14 @@ _GRAVITY = 9.81  # m/s²
 class Span:
     """Rows around contact: `first` up to `end` are kept, those before `rest` show zeros.
 
-    `returned` says whether the stress has returned to zero at the end.
+    From the row `leaves` on there is no contact any more. `returned` says whether the stress has
+    returned to zero at the end.
     """
 
     first: int
     end: int
     rest: int
+    leaves: int
     returned: bool = True
 
 
@@ -47,7 +49,8 @@ class Zeros:
 
 def span_of_slow_test(record: Record, start: Start) -> Span:
     """Keep a slow test from its contact on; nothing else shows that the specimen was free."""
-    return Span(start.first, len(record), max(0, start.first - 2) if start.free else 0)
+    n = len(record)
+    return Span(start.first, n, max(0, start.first - 2) if start.free else 0, n)
 
 
 def span_of_impact(record: Record, start: Start, levels: Levels) -> Span:
@@ -57,15 +60,16 @@ def span_of_impact(record: Record, start: Start, levels: Levels) -> Span:
     stress shows its end less well: a quarter is kept after it.
     """
     first, stress = start.first, record.stress
-    rest = stress[: max(0, first - 2)]
-    zero = float(rest.mean()) if rest.size >= _FEWEST else 0.0
+    before = stress[: max(0, first - 2)]
+    zero = float(before.mean()) if before.size >= _FEWEST else 0.0
     found, returned = contact_end(stress[first:] - zero, levels["stress"])
     after = found // (4 if "stress" in record.derived else 50)
     end = min(len(record), first + found + max(3, after)) if returned else len(record)
     # Of few rows before contact half are kept and half show the zeros.
     lead = min(max(_LEAST_LEAD, found // 10), first // 2 if first >= 2 * _FEWEST else first)
     late = int(3 * start.error / float(np.median(np.diff(record.instants))))
-    return Span(first - lead, end, first - max(lead, min(late, 2 * first // 3)), returned)
+    rest = first - max(lead, min(late, 2 * first // 3))
+    return Span(first - lead, end, rest, first + found, returned)
 
 
 def take_zeros(
@@ -155,15 +159,17 @@ def _zero_of_motion(
     return (zero if flies or abs(zero.value) > least else Level(0.0, 0.0, 0)), source
 
 
-def mark_flight(record: Record, start: Start) -> Record:
-    """Mark the rows before contact in which the motion is not the striker's as not measured.
+def mark_flight(record: Record, start: Start, span: Span) -> Record:
+    """Mark the rows outside of contact in which the motion is not the striker's as not measured.
 
-    Three rows or so after contact, which may be earlier, a gauge that was at rest is not either.
+    Three rows or so about contact, which may be earlier or later, are not measured either.
     """
     if record.displacement is None or start.gauge in ("flight", ""):
         return record
     step = float(np.median(np.diff(record.instants)))
     moves = record.instants > max(2.5 * step, 2 * start.error)
+    if start.gauge == "rest":
+        moves[span.leaves - span.first :] = False
     kept = record.sampled.get("displacement", np.ones(len(record), dtype=np.bool_))
     return replace(record, sampled=record.sampled | {"displacement": kept & moves})
 

@@ -357,8 +357,9 @@ def search(
     """Search for the best parameters; the tracker keeps them.
 
     Of the descents on the loop (so many `starts`) the best quarter go on to the curves of the
-    drive; see `ATTEMPTS` for when that is done again. Returned are the final costs there, best first, and how many descents on the loop led to
-    each. Raises SearchStoppedError when the time is up.
+    drive; see `ATTEMPTS` for when that is done again. Returned are the final costs there, best
+    first, and how many descents on the loop led to each. Raises SearchStoppedError when the time is
+    up.
     """
     progress(0.0, "start values")
     points = [space.encode(space.values), *box_starts(space, rng, CURVE_STARTS // 3)]
