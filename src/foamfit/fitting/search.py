@@ -17,7 +17,7 @@ from scipy.stats import qmc
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.fitting import levenberg
-from foamfit.fitting.box import BOX, LAST_STRAIN, Scales, Space, family
+from foamfit.fitting.box import BOX, LAST_STRAIN, Scales, Space, family, is_logarithmic
 from foamfit.fitting.curves import smoothed
 from foamfit.fitting.objective import Objective
 from foamfit.springs.law import least_eps_star
@@ -33,6 +33,8 @@ CURVE_STARTS = 300
 # Searches at most: a second one where a single descent led to the best end, and a third where this
 # still misses more of the curves than noise.
 ATTEMPTS = 3
+# Share of the box that counts as its edge, and where inside a descent begins again.
+EDGE, INSIDE = 0.02, (0.35, 0.5, 0.65)
 # Minima of the loop whose cost on the drive's curves is within this factor of the best go on.
 PROMISING = 100.0
 # Factors by which the stiffness that an interior mass vibrates on is changed, and their inverses.
@@ -381,10 +383,30 @@ def search(
             cost, end = descend(tracker, space, point, 60)
             tracker.ends.append(space.decode(end))
             out.append((cost, counts.get(id(point), 1)))
+        out += [(cost, 1) for cost in _off_edges(tracker, space)]
         if attempt + 1 == ATTEMPTS or _settled(tracker, out, attempt):
             break
         points = box_starts(space, rng, CURVE_STARTS // 3)
     return sorted(out)
+
+
+def _off_edges(tracker: Tracker, space: Space) -> list[float]:
+    """Descend from the best point with what lies at an edge of the box moved inside; the costs.
+
+    A stiffness that few samples show may run to an edge and stay there while all else is found.
+    """
+    low, high = space.box
+    best = space.encode(tracker.best_values) if tracker.best_values is not None else low
+    span, costs = high - low, []
+    edges = (best - low < EDGE * span) | (high - best < EDGE * span)
+    for at in np.flatnonzero(edges & [is_logarithmic(short) for _, short, _ in space.coordinates]):
+        for share in INSIDE:
+            start = best.copy()
+            start[at] = low[at] + share * span[at]
+            cost, end = descend(tracker, space, start, 60)
+            tracker.ends.append(space.decode(end))
+            costs.append(cost)
+    return costs
 
 
 def _settled(tracker: Tracker, ends: list[tuple[float, int]], attempt: int) -> bool:
