@@ -111,7 +111,7 @@ def condition(
     else:
         start = start_of_slow_test(first, levels)
         span = span_of_slow_test(first, start)
-    record, zeros = take_zeros(record, first, start, span, levels)
+    record, zeros = take_zeros(record, first, start, span, levels, impact=impact)
     notes += zeros.notes
     start_strain, origins = 0.0, zeros.origins
     if chosen is not None and chosen.place:  # not the first: it has a contact of its own
