@@ -101,8 +101,9 @@ def follow(
     """
     taken = np.ones(displacement.size, bool) if counts is None else counts
     times = np.arange(displacement.size, dtype=float) if time is None else time
-    start, duration = float(times[0]), float(times[-1] - times[0])
-    x, w = (times[taken] - start) / duration, displacement[taken]
+    own, w = times[taken], displacement[taken]
+    start, duration = float(own[0]), float(np.ptp(own))  # past them the motion stands still
+    x = (own - start) / duration
     middle, size = float(np.mean(w)), max(float(np.ptp(w)), 1e-300)
     pieces, finest = max(4, min(x.size // _PIECE, _PIECES)), min(_MANY, x.size // 2)
     slow, shown, digital = np.sqrt(max(noise.time, 1.0)), residual_noise(w)[0], quantum(w) / 12**0.5
