@@ -27,13 +27,14 @@ from foamfit.springs import kernels
 from foamfit.springs.chain import Drive
 
 COUNTS: Counter[str] = Counter()
+PACKAGE = Path(ff.__file__).parent
 
 
 @functools.cache
 def _module(filename: str) -> str:
     """The project's module of a file; empty for any other file."""
     path = Path(filename)
-    return path.stem if "foamfit" in path.parent.parts[-3:] else ""
+    return path.stem if path.is_relative_to(PACKAGE) else ""
 
 
 def _caller() -> str:

@@ -3,8 +3,8 @@
 Synthetic motions of known turns are sampled with white noise; `foamfit.data.motion.follow` gives
 the motion, its turns and its modes, which are compared with the truth.
 
-    python experiments/motion/motion.py                # 225 draws a class, two minutes
-    python experiments/motion/motion.py --draws 4
+    python experiments/motion/motion.py                # 225 draws a class, a minute; README.md
+    python experiments/motion/motion.py --draws 4      # prints the tables only
 """
 
 from __future__ import annotations
@@ -67,7 +67,9 @@ def triangle(rng: np.random.Generator) -> Motion:
 
 
 def asymmetric(rng: np.random.Generator) -> Motion:
-    return straight([0.0, rng.choice([rng.uniform(0.08, 0.4), rng.uniform(0.6, 0.92)]), 1.0], [0.0, 1.0, 0.0])
+    return straight(
+        [0.0, rng.choice([rng.uniform(0.08, 0.4), rng.uniform(0.6, 0.92)]), 1.0], [0.0, 1.0, 0.0]
+    )
 
 
 def sine(rng: np.random.Generator) -> Motion:
@@ -93,7 +95,8 @@ def slow_start(rng: np.random.Generator) -> Motion:
 
     high = float(up(np.array(turn)))
     return Motion(
-        lambda t: np.where(t < turn, up(t), high * (1.0 - t) / (1.0 - turn)) / high, np.array([turn])
+        lambda t: np.where(t < turn, up(t), high * (1.0 - t) / (1.0 - turn)) / high,
+        np.array([turn]),
     )
 
 
@@ -157,7 +160,9 @@ def matched(motion: Motion, turns: np.ndarray, t: np.ndarray) -> list[tuple[int,
     return pairs
 
 
-def one(name: str, rows: int, noise: float, rng: np.random.Generator, given: bool) -> Iterator[dict]:
+def one(
+    name: str, rows: int, noise: float, rng: np.random.Generator, given: bool
+) -> Iterator[dict]:
     """Follow one noisy motion; a row for it and one for each true turn."""
     motion = CLASSES[name](rng)
     t = sampled(rng, rows)
@@ -209,54 +214,94 @@ def one(name: str, rows: int, noise: float, rng: np.random.Generator, given: boo
         yield turn
 
 
-def table(data: pd.DataFrame, by: list[str]) -> pd.DataFrame:
+def table(data: pd.DataFrame, by: str) -> pd.DataFrame:
     """Means over draws."""
     motions, turns = data[data.what == "motion"], data[data.what == "turn"]
-    m, found = motions.groupby(by), turns[turns.found == True].groupby(by)  # noqa: E712
-    return pd.DataFrame(
-        {
-            "draws": m.size(),
-            "RMS": m.rms.mean() ** 0.5,
-            "near": m.near.mean() ** 0.5,
-            "worst": m.worst.max(),
-            "held": 100.0 * m.held.mean(),
-            "held near": 100.0 * m.held_near.mean(),
-            "height bias": found.height.mean(),
-            "height RMS": found.height.apply(lambda v: np.sqrt(np.mean(v**2))),
-            "height held": 100.0 * found.height_z.apply(lambda v: np.mean(np.abs(v) < Z95)),
-            "instant RMS": found.late.apply(lambda v: np.sqrt(np.mean(v**2))),
-            "instant held": 100.0 * found.late_z.apply(lambda v: np.mean(np.abs(v[v.notna()]) < Z95)),
-            "missed": 100.0 * (1.0 - turns.groupby(by).found.mean()),
-            "invented": 100.0 * m.invented.apply(lambda v: np.mean(v > 0)),
-            "dof": m.dof.mean(),
-            "kinks": m.kinks.mean(),
-            "back": m.back.max(),
-            "ms": m.ms.median(),
-        }
-    )
+    m, found = motions.groupby(by, sort=False), turns[turns.found.eq(True)]
+    f = found.groupby(by, sort=False)
+
+    def held(values: pd.Series) -> float:
+        return 100.0 * float((values.dropna().abs() < Z95).mean())
+
+    columns = {
+        "draws": m.size(),
+        "RMS (σ)": m.rms.mean() ** 0.5,
+        "RMS near turns (σ)": m.near.mean() ** 0.5,
+        "worst (σ)": m.worst.max(),
+        "held (%)": 100.0 * m.held.mean(),
+        "held near turns (%)": 100.0 * m.held_near.mean(),
+        "height: bias (σ)": f.height.mean(),
+        "height: RMS (σ)": f.height.apply(lambda v: np.sqrt(np.mean(v**2))),
+        "height held (%)": f.height_z.apply(held),
+        "instant: RMS (samples)": f.late.apply(lambda v: np.sqrt(np.mean(v**2))),
+        "instant held (%)": f.late_z.apply(held),
+        "invented turns (%)": 100.0 * m.invented.apply(lambda v: np.mean(v > 0)),
+        "largest reversal (σ)": m.back.max(),
+        "modes": m.modes.median(),
+        "median time (ms)": m.ms.median(),
+    }
+    return pd.DataFrame(columns)
+
+
+def found_by_size(data: pd.DataFrame) -> pd.DataFrame:
+    """Share of the turns of inner loops that are found, by how far they show above the noise."""
+    turns = data[(data.what == "turn") & (data["class"] == "inner loop")]
+    turns = turns[turns["size"] * turns.noise < 0.3]  # those of the triangle itself are larger
+    shows = pd.cut(turns["size"] * turns.samples**0.5, [0, 5, 10, 15, 20, 30, 1e9])
+    long = turns.samples.gt(3.0).map({True: "of 3 samples and more", False: "of fewer"})
+    seen = turns.found.astype(float)
+    out = seen.groupby([shows, long], observed=True).agg(["mean", "size"]).unstack()
+    out.columns = [f"{kind}: {'found (%)' if what == 'mean' else 'turns'}" for what, kind in out]
+    share = [column for column in out if "found" in column]
+    out[share] *= 100.0
+    out.index = ["0 to 5", "5 to 10", "10 to 15", "15 to 20", "20 to 30", "above 30"]
+    out.index.name = "drop (σ) × √samples"
+    return out
+
+
+def markdown(frame: pd.DataFrame) -> str:
+    head = [frame.index.name or "", *frame.columns]
+    rows = [[str(i), *(f"{v:.3g}" if v == v else "–" for v in row)] for i, row in
+            zip(frame.index, frame.to_numpy(dtype=float), strict=True)]  # fmt: skip
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--draws", type=int, default=25, help="of each class, rows and noise")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", default="")
     parser.add_argument("--estimated", action="store_true", help="the noise is not given")
     options = parser.parse_args()
-    rows = [
+    data = pd.DataFrame(
         row
         for k, name in enumerate(CLASSES)
-        if options.only in name
         for n in ROWS
         for i, noise in enumerate(NOISE)
         for draw in range(options.draws)
-        for row in one(name, n, noise, np.random.default_rng([options.seed, k, n, i, draw]), not options.estimated)
-    ]
-    data = pd.DataFrame(rows)
-    pd.set_option("display.width", 250, "display.max_columns", 30)
-    print(table(data, ["class"]).round(2).to_string())
-    print(table(data, ["rows", "noise"]).round(2).to_string())
-    data.to_pickle("/tmp/motion.pkl")
+        for row in one(
+            name, n, noise, np.random.default_rng([options.seed, k, n, i, draw]),
+            given=not options.estimated,
+        )
+    )  # fmt: skip
+    motions = data[data.what == "motion"].assign(all="all")
+    data["cell"] = (
+        data.rows.astype(str) + " rows, " + (100.0 * data.noise).round(3).astype(str) + " %"
+    )
+    parts = {
+        "classes": markdown(table(data, "class")),
+        "cells": markdown(table(data, "cell")),
+        "found": markdown(found_by_size(data)),
+        "draws": str(options.draws * len(ROWS) * len(NOISE)),
+        "sigma": f"{motions.sigma.quantile(0.025):.2f} to {motions.sigma.quantile(0.975):.2f}",
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "foamfit": ff.__version__,
+    }
+    text = (HERE / "page.template.md").read_text().format(**parts)
+    print(text)
+    if options.draws >= 25 and not options.estimated and options.seed == 0:
+        (HERE / "README.md").write_text(text)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,9 @@ from scipy.signal import lfilter
 
 from foamfit.data.csv_file import read_test
 from foamfit.data.measurement import Record, Specimen, Striker
+from foamfit.data.noise import with_noise
 from foamfit.data.prepare import condition
+from foamfit.errors import InputError
 
 HEIGHT, AREA, MASS, VELOCITY = 10e-3, 1e-4, 0.5, 2.0
 DURATION = 4e-3
@@ -185,8 +187,10 @@ def test_a_motion_counts_before_contact_only_in_flight():
     marked = rest.sampled["displacement"]
     assert not marked[rest.time < 0].any()
     assert not marked[(rest.time > 0) & (rest.time < 1.9 * DURATION / 500)].any()
-    assert marked[rest.time > 3 * DURATION / 500].all()
+    assert marked[(rest.time > 3 * DURATION / 500) & (rest.time < 0.97 * DURATION)].all()
+    assert not marked[-3:].any()  # it rests again
     assert rest.rows.used == len(rest.time)
+    assert not any("the displacement starts at" in note for note in rest.notes)
 
 
 def test_blocks_keep_what_the_samples_are():
@@ -194,7 +198,9 @@ def test_blocks_keep_what_the_samples_are():
     done = run(given)
     assert done.block == 10
     assert done.sampled["displacement"].shape == done.time.shape
-    assert done.sampled["displacement"].sum() == np.count_nonzero(done.time > 4e-6)
+    inside = (done.time > 4e-6) & (done.time < 0.97 * DURATION)
+    assert done.sampled["displacement"][inside].all()
+    assert not done.sampled["displacement"][done.time < 0].any()
     force = run(record("FA", n=8000, before=3000))
     assert force.acceleration.shape == force.time.shape
     assert force.noise.of("acceleration").sigma == pytest.approx(0.003 * BRAKED / 10**0.5, rel=0.2)
@@ -213,6 +219,10 @@ def test_an_acceleration_is_kept_where_there_is_no_displacement():
     lead = done.time < 0
     np.testing.assert_allclose(done.displacement[lead], VELOCITY * done.time[lead], rtol=1e-9)
     assert run(record("FW")).acceleration is None
+    few = with_noise(run(record("FA", before=0, phase=0.0)))
+    assert few.noise.of("acceleration").sigma == pytest.approx(0.003 * BRAKED, rel=0.2)
+    stated = replace(few, noise=replace(few.noise, stress=1.0))
+    assert stated.noise.of("acceleration") == few.noise.of("acceleration")
 
 
 def write(folder, header, *columns, velocity=f"{VELOCITY} m/s"):
@@ -225,9 +235,12 @@ def write(folder, header, *columns, velocity=f"{VELOCITY} m/s"):
     return path
 
 
-@pytest.mark.parametrize("gauge", ["flight", "rest"])
+@pytest.mark.parametrize("gauge", ["flight", "rest", "rest after it too"])
 def test_a_file_of_the_motion_alone_gives_a_derived_stress(tmp_path, gauge):
-    given = record(gauge=gauge, n=1000, level=1e-3, zeros=ZEROS[2])
+    given = record(gauge=gauge.split()[0], n=1000, level=1e-3, zeros=ZEROS[2])
+    if "after" in gauge:
+        gone = (given.time > 0.2 * DURATION) & (given.displacement < given.displacement[0])
+        given.displacement[np.argmax(gone) :] = given.displacement[0]
     path = write(tmp_path, "time (s),displacement (m)", given.time, given.displacement)
     done = read_test(path)
     assert done.derived == ("stress",)
@@ -235,7 +248,10 @@ def test_a_file_of_the_motion_alone_gives_a_derived_stress(tmp_path, gauge):
     assert any("deceleration of its motion" in note for note in done.notes)
     truth = np.where(done.time > 0, PEAK * np.sin(OMEGA * np.clip(done.time, 0, DURATION)), 0.0)
     assert np.sqrt(np.mean((done.stress - truth) ** 2)) < 0.05 * PEAK
-    assert ("displacement" in done.zeros) == (gauge == "rest")
+    assert ("displacement" in done.zeros) == (gauge != "flight")
+    turned = write(tmp_path, "time (s),displacement (m)", given.time, -given.displacement)
+    with pytest.raises(InputError, match="displacement is negative or gets smaller"):
+        read_test(turned)
 
 
 def test_a_file_of_the_velocity_alone_gives_motion_and_stress(tmp_path):
@@ -255,6 +271,18 @@ def test_a_file_of_the_acceleration_alone_counts_its_stress(tmp_path):
     assert (done.derived, done.acceleration) == (("displacement",), None)
     assert done.stress.max() == pytest.approx(PEAK, rel=0.02)
     assert "stress" in done.zeros
+
+
+def test_a_start_from_which_the_motion_passes_the_height_is_moved():
+    given = record("FW", level=1e-4)
+    top = float(given.displacement.max())
+    thin = replace(SPECIMEN, height=top / 1.1)  # as if contact had been found too early
+    done = condition(given, thin, striker=STRIKER)
+    assert done.displacement.max() == pytest.approx(0.97 * thin.height, rel=1e-3)
+    assert error(done) == pytest.approx((top - 0.97 * thin.height) / VELOCITY, rel=0.02)
+    assert any("does not go farther than the height" in note for note in done.notes)
+    with pytest.raises(InputError, match="beyond one"):
+        condition(given, replace(SPECIMEN, height=top / 1.5), striker=STRIKER)
 
 
 # The striker's flight.

@@ -436,7 +436,9 @@ def test_memory_errors_and_other_versions_are_not_the_fault_of_a_test(here, monk
         (["tests", "--jobs", "0"], "--jobs"),
     ],
 )
-def test_a_wrong_call_is_one_sentence_and_nothing_is_written(here, words, told):
+def test_a_wrong_call_is_one_sentence_and_nothing_is_written(here, monkeypatch, words, told):
+    # Else what is not in the cache yet is announced before the refusal.
+    monkeypatch.setattr(module.cache, "compiled", lambda *_: True)
     before = sorted(here.rglob("*"))
     result = run("batch", *words)
     assert (result.exit_code, result.stdout) == (1, "")
@@ -604,18 +606,20 @@ def test_a_dask_cluster_loses_a_worker_and_no_test(here):
 
 
 def test_one_fit_compiles_what_all_need_before_the_others_start(here, monkeypatch):
-    order = []
+    order, second = [], threading.Event()
 
     class Slow(ThreadPoolExecutor):
         def submit(self, fn, /, task):
             order.append(f"{task.name} given")
+            if len(order) > 1:
+                second.set()
             return super().submit(fn, task)
 
         def stop(self):
             """Nothing to end."""
 
     def fit(test, **options):
-        time.sleep(0.02)
+        second.wait(60.0 if module.cache.compiled("integrate_with_memory") else 0.02)
         order.append(f"{test.name} fitted")
         return fabricated.result(measurement=test)
 
@@ -623,6 +627,7 @@ def test_one_fit_compiles_what_all_need_before_the_others_start(here, monkeypatc
     monkeypatch.setattr(module, "Processes", lambda *_: Slow(3))
     for compiled in (False, True):
         order.clear()
+        second.clear()
         have = {"integrate", "integrate_with_memory"} if compiled else {"integrate"}
         monkeypatch.setattr(module.cache, "compiled", lambda name="integrate", h=have: name in h)
         again(executor=None, model="microscale", fresh=True)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import NoiseLevel, Record, Striker
-from foamfit.data.noise import MIN_REST
+from foamfit.data.noise import MIN_REST, correlation_time, lag_one
 
 # A signal rests where its slope is less than this share of the slope that follows: the branches of
 # a foam differ less on loading (6 times in the published sets), so that a soft start is no rest.
@@ -18,6 +18,9 @@ STILL = 0.15
 ERRORS = 2.0  # standard errors that decide whether a signal rises or rests
 _STILL_IMPACT = 0.3  # as `STILL`, for a signal that a fit goes on from
 ELSEWHERE = 5.0  # standard errors that decide whether the zero of a motion lies elsewhere
+# Share of its travel from which on a machine that moves without a stress has not touched the
+# specimen yet.
+APPROACH = 0.02
 _SHARES = 0.2, 0.1, 0.05, 0.025  # of the peak, up to which a rise is taken for straight
 
 Levels = dict[str, NoiseLevel]
@@ -67,9 +70,13 @@ class Kink(NamedTuple):
 
 def mean_level(values: Array, noise: NoiseLevel) -> Level:
     """Level of a signal at rest: the mean of its samples; few of them do not show their noise."""
-    n = len(values)
-    sigma = float(np.std(values, ddof=1)) if n >= MIN_REST * noise.time else noise.sigma
-    return Level(float(values.mean()), sigma * float(np.sqrt(min(noise.time, n) / n)), n)
+    n, sigma, time, zero = len(values), noise.sigma, noise.time, float(values.mean())
+    if n >= MIN_REST:
+        phi = lag_one(values - zero)
+        time = max(time, correlation_time(phi)) if 2 / np.sqrt(n) < phi < 1 else time
+    if n >= MIN_REST * time:
+        sigma = float(np.std(values, ddof=1))
+    return Level(zero, sigma * float(np.sqrt(min(time, n) / n)), n)
 
 
 def line_at(time: Array, values: Array, at: float) -> tuple[float, float]:
@@ -358,7 +365,7 @@ def start_of_slow_test(record: Record, levels: Levels) -> Start:
     approach = w[onset] - first.value if by_stress is not None else 0.0
     if (
         by_motion is not None
-        and approach < 0.1 * travel
+        and approach < APPROACH * travel
         and not _loaded(record, by_motion.time, levels)
     ):
         rows = int(np.searchsorted(time, by_motion.time))
@@ -375,7 +382,7 @@ def start_of_slow_test(record: Record, levels: Levels) -> Start:
             zero,
             source,
         )
-    if by_stress is not None and approach > (0.02 if elsewhere else 0.1) * travel:
+    if by_stress is not None and approach > APPROACH * travel:
         reach = max(5, min(onset, (top - onset) // 24))
         near = slice(max(0, onset - reach), onset + reach)
         zero = level_on_line(time[near], w[near], by_stress.time, noise)[0]

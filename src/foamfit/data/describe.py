@@ -121,7 +121,8 @@ def _samples(test: Measurement) -> str:
     if time is None:
         return f"{text}; no time, so only slow drives make sense"
     step, end = float(np.median(np.diff(time))), float(time[-1])
-    return f"{text}, every {engineering(step, 's')} from time zero to {engineering(end, 's')}"
+    first = engineering(float(time[0]), "s") if time[0] < 0.0 else "time zero"
+    return f"{text}, every {engineering(step, 's')} from {first} to {engineering(end, 's')}"
 
 
 def _peaks(test: Measurement) -> list[tuple[str, list[str]]]:

@@ -24,13 +24,14 @@ DEGREE, _ORDER = 5, 3
 # Where kinks are looked for: among so many spots, on so many samples (blocks of more are averaged).
 _SPOTS, _ENOUGH = 120, 1000
 _KINKS = 40
-_STIFF = 100.0  # refined first at so many times the penalty: what is rough may be a kink
-_EVIDENCE = 0.0  # price of a kink in twice the log-likelihood, beside 2 ln n for its two unknowns
+# Kinks are moved first at so many times the penalty: what looks rough may be a kink out of place.
+_STIFF = 100.0
+_SETTLED = 1e-2  # gain of a step, in twice the log-likelihood, that is not worth another
 
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Samples (n,) in units of record and noise, and a basis that makes spline and penalty diagonal.
+    """Samples (n,) in units of record and noise, and a basis in which all is diagonal.
 
     A rotation takes the spline's coefficients to coordinates b, of which the fit has the normal
     equations `data` and the penalty `rough`; `basis` (n, b) are its values.
@@ -49,7 +50,7 @@ class Samples:
         """Put knots even in time and in samples, by halves."""
         level = 0.5 * (x + np.linspace(0.0, 1.0, x.size))
         inner = np.interp(np.linspace(0.0, 1.0, pieces + 1), level, x)
-        knots = np.concatenate([np.zeros(DEGREE), inner, np.ones(DEGREE)])
+        knots = np.pad(inner, DEGREE, mode="edge")
         basis = BSpline.design_matrix(x, knots, DEGREE)
         half, (points, weights) = 0.5 * np.diff(inner), np.polynomial.legendre.leggauss(3)
         places = (inner[:-1, None] + half[:, None] * (points + 1.0)).ravel()
@@ -65,6 +66,11 @@ class Samples:
     def y_onto(self) -> Array:
         """Products of the basis with the samples."""
         return np.asarray(self.basis.T @ self.y)
+
+    @property
+    def price(self) -> float:
+        """What a kink, two unknowns, has to add to twice the log-likelihood (BIC)."""
+        return 2.0 * float(np.log(self.x.size))
 
     @cached_property
     def penalties(self) -> Array:
@@ -142,46 +148,38 @@ class Fit:
 
     @cached_property
     def best(self) -> tuple[float, float]:
-        """The least −2 ln likelihood over all penalties, with a price for each kink; its penalty."""
+        """The least −2 ln likelihood over all penalties, kinks at their price; its penalty."""
         if not self.apart:
             return np.inf, float(self.samples.penalties[0])
         levels = self.unlikely(self.samples.penalties)
         i = int(np.argmin(levels))
-        price = 2.0 * np.log(self.samples.x.size) + _EVIDENCE
-        return float(levels[i]) + price * self.instants.size, float(self.samples.penalties[i])
+        priced = float(levels[i]) + self.samples.price * self.instants.size
+        return priced, float(self.samples.penalties[i])
 
-    def step(self, penalty: float, which: Array) -> Array:
-        """How far to move some of the kinks, to first order, (k,)."""
+    def step(self, penalty: float) -> Array:
+        """How far to move the kinks, (k,), by Gauss and Newton."""
         jumps = self.solve(penalty)[1]
-        delays = np.where(self.samples.x[:, None] > self.instants[which], -jumps[which], 0.0)
+        delays = np.where(self.samples.x[:, None] > self.instants, -jumps, 0.0)
         moving = Fit(self.samples, self.instants, np.hstack([self.columns, delays]))
         _, left, right = moving.reduced(np.array([penalty]))
         scale = 1.0 / np.sqrt(np.maximum(np.diag(left[0]), 1e-300))
         scaled = scale[:, None] * left[0] * scale
-        found = (scale * np.linalg.lstsq(scaled, scale * right[0], rcond=1e-13)[0])[jumps.size :]
-        room = np.diff(np.concatenate([[0.0], self.instants, [1.0]]))
-        step = np.zeros(self.instants.size)
-        step[which] = found
-        return np.asarray(np.clip(step, -0.4 * room[:-1], 0.4 * room[1:]))
+        found = scale * np.linalg.lstsq(scaled, scale * right[0], rcond=1e-13)[0]
+        room = 0.4 * np.diff(np.concatenate([[0.0], self.instants, [1.0]]))
+        return np.asarray(np.clip(found[jumps.size :], -room[:-1], room[1:]))
 
     def refined(self, penalty: float, steps: int) -> Fit:
-        """Move the kinks to where they fit best at one penalty, all at once or else one by one."""
+        """Move the kinks to where they fit best at one penalty."""
         fit, x, at = self, self.samples.x, np.array([penalty])
         level = fit.unlikely(at)[0]
-        every = np.arange(self.instants.size)
-        for _ in range(steps if every.size else 0):
-            before = level
-            for which in (every, *every[:, None]):
-                if which.size < every.size and level < before:
+        for _ in range(steps if self.instants.size else 0):
+            before, step = level, fit.step(penalty)
+            for part in (1.0, 0.4, 0.1):
+                trial = Fit.of(self.samples, np.clip(fit.instants + part * step, x[1], x[-2]))
+                if trial.apart and (better := trial.unlikely(at)[0]) < level:
+                    level, fit = better, trial
                     break
-                step = fit.step(penalty, which)
-                for part in (1.0, 0.4, 0.1):
-                    moved = np.clip(fit.instants + part * step, x[1], x[-2])
-                    trial = Fit.of(self.samples, moved)
-                    if trial.apart and (better := trial.unlikely(at)[0]) < level:
-                        level, fit = better, trial
-                        break
-            if before - level < 1e-2:
+            if before - level < _SETTLED:
                 break
         return fit
 
@@ -190,11 +188,12 @@ class Fit:
         fit = self.refined(_STIFF * penalty, 4)
         return fit.refined(fit.best[1], 6)
 
-    def covariance(self, penalty: float) -> tuple[Array, Array, float]:
+    def covariance(self, penalty: float, share: float) -> tuple[Array, Array, float]:
         """What stays uncertain of the spline's coordinates, of the kinks' jumps and instants.
 
-        Returns changes by one standard deviation each (unknowns, m), the most important first; the
-        standard errors of the instants; the effective number of parameters.
+        Returns changes by one standard deviation each (unknowns, m), the largest first, so many
+        that they hold a share of the variance at the samples; the standard errors of the instants;
+        the effective number of parameters.
         """
         s, k, size = self.samples, self.instants.size, self.samples.rough.size
         jumps, late = self.solve(penalty)[1], s.x[:, None] - self.instants
@@ -208,8 +207,10 @@ class Fit:
             half = scale[:, None] * linalg.solve_triangular(factor, eye, lower=True).T
             stderr = np.maximum(np.linalg.norm(half[size + k :], axis=1), 1e-15)
             past = ndtr(late / stderr)
-        shares, turned = np.linalg.eigh(half.T @ data @ half)
-        return half @ turned[:, ::-1], stderr, float(shares.sum())
+        parts, turned = np.linalg.eigh(half.T @ data @ half)
+        dof = float(parts.sum())
+        few = int(np.searchsorted(np.cumsum(parts[::-1]), share * dof)) + 1
+        return half @ turned[:, ::-1][:, :few], stderr, dof
 
 
 def _with_more(fit: Fit) -> Fit:
@@ -218,7 +219,6 @@ def _with_more(fit: Fit) -> Fit:
     at = np.unique(np.linspace(2, s.x.size - 2, min(s.x.size - 3, _SPOTS)).astype(int))
     spots = 0.5 * (s.x[at] + s.x[at - 1])
     tried = Fit(s, spots, np.hstack([fit.columns, kink(s.x, spots)]))
-    price = 2.0 * np.log(s.x.size) + _EVIDENCE
     best, more = np.inf, spots[:1]
     penalties = s.penalties[s.penalties >= 0.1 * fit.best[1]][::2]  # a kink takes roughness away
     _, lefts, rights = tried.reduced(penalties)
@@ -226,36 +226,31 @@ def _with_more(fit: Fit) -> Fit:
         solved = np.linalg.solve(left[:k, :k], left[:k, k:])
         q, gram = right[k:] - right[:k] @ solved, left[k:, k:] - left[k:, :k] @ solved
         own = np.maximum(np.diag(gram), 1e-300)
-        one = level + price - q**2 / own
+        one = level + s.price - q**2 / own
         if one.min() < best:
             best, more = one.min(), spots[[int(np.argmin(one))]]
         det = np.maximum(np.outer(own, own) - gram**2, 1e-4 * np.outer(own, own))
         gain = np.outer(q**2, own)
-        two = level + 2.0 * price - (gain + gain.T - 2.0 * gram * np.outer(q, q)) / det
+        two = level + 2.0 * s.price - (gain + gain.T - 2.0 * gram * np.outer(q, q)) / det
         if two.min() < best:
             best, more = two.min(), spots[list(np.unravel_index(int(np.argmin(two)), two.shape))]
     return Fit.of(s, np.sort(np.append(fit.instants, more)))
 
 
 def _find_kinks(samples: Samples) -> Fit:
-    """Find the kinks, from those at the turns or from none, then drop needless ones."""
+    """Find the kinks, from those at likely turns or from none, then drop needless ones."""
     none = Fit.of(samples, np.empty(0))
-    fit = min(
-        none, Fit.of(samples, _likely_turns(samples)).settled(none.best[1]), key=lambda f: f.best[0]
-    )
-    while fit.instants.size < _KINKS:
+    turned = Fit.of(samples, _likely_turns(samples)).settled(none.best[1])
+    fit = min(none, turned, key=lambda f: f.best[0])
+    while fit.instants.size < min(_KINKS, samples.x.size // 8):
         trial = _with_more(fit).settled(fit.best[1])
         if trial.best[0] >= fit.best[0]:
             break
         fit = trial
     while fit.instants.size:
-        at, jumps = fit.instants, fit.solve(fit.best[1])[1]
-        rest = [np.delete(at, i) for i in range(at.size)]
-        for i in np.flatnonzero(jumps[:-1] * jumps[1:] > 0.0):  # two for one
-            rest.append(np.delete(at, i))
-            rest[-1][i] = at[i : i + 2] @ jumps[i : i + 2] / jumps[i : i + 2].sum()
-        trials = [Fit.of(samples, r).settled(fit.best[1]) for r in rest]
-        trial = min(trials, key=lambda f: f.best[0])
+        rest = [np.delete(fit.instants, i) for i in range(fit.instants.size)]
+        likely = sorted((Fit.of(samples, r) for r in rest), key=lambda f: f.best[0])[:2]
+        trial = min((f.settled(fit.best[1]) for f in likely), key=lambda f: f.best[0])
         if trial.best[0] > fit.best[0]:
             break
         fit = trial
@@ -270,7 +265,7 @@ def _likely_turns(samples: Samples) -> Array:
         mean = (total[width:] - total[:-width]) / width
         at = find_turns(mean, 8.0 / np.sqrt(width)) + 0.5 * (width - 1)
         at = at[(at > 1) & (at < samples.x.size - 2)]
-        best = at if at.size > best.size else best
+        best = at if best.size < at.size <= _KINKS else best
     return np.interp(best, np.arange(samples.x.size), samples.x)
 
 

@@ -70,7 +70,7 @@ class Noise:
 
     `stress` and `displacement` are what the TOML states; the second holds for masses inside too.
     `estimated` holds what was estimated from the data of the channels that it does not state
-    ("stress", "displacement", "displacement_1", …).
+    ("stress", "displacement", "displacement_1", …, and "acceleration", m/s²).
     """
 
     stress: float | None = None
@@ -80,7 +80,8 @@ class Noise:
     def of(self, channel: str) -> NoiseLevel | None:
         """Return the noise of a channel, stated or else estimated; None where neither is known."""
         given = self.displacement if channel.startswith("displacement") else self.stress
-        if given is not None and channel != "acceleration":
+        given = None if channel == "acceleration" else given
+        if given is not None:
             return NoiseLevel(given, True, "given")
         return self.estimated.get(channel)
 

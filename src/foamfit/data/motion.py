@@ -1,4 +1,4 @@
-"""The motion behind a noisy displacement: smooth between its turns, and what stays uncertain of it."""
+"""The motion behind a noisy displacement, smooth between its turns, and how sure it is."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from foamfit.data.noise import quantum, residual_noise
 # Samples for a piece of the spline; most pieces, and most where these do not follow the data.
 _PIECE, _PIECES, _MANY = 4, 64, 256
 _SIGNIFICANT = 4.5  # standard errors by which a motion goes back where it turns
-_MODES = 40
+_SHARE = 0.98  # of the mean variance that the modes hold
 # Noise that counts as rounding, as a share of the range.
 _ROUNDING = 1e-7
 # Residuals over noise from which on a spline does not follow the motion; noise, as a share of the
@@ -77,7 +77,7 @@ class SmoothMotion:
         return np.asarray(self._curve(self._part(times)))
 
     def modes(self, times: Array) -> Array:
-        """Changes of the motion by one standard deviation each, (n, m), m.
+        """Changes of the motion by one standard deviation each, (n, m), m, the largest first.
 
         The covariance of the motion at these times is `modes @ modes.T`. At a turn itself they are
         the changes of its height, wherever its instant moves to.
@@ -101,27 +101,31 @@ def follow(
     """
     taken = np.ones(displacement.size, bool) if counts is None else counts
     times = np.arange(displacement.size, dtype=float) if time is None else time
-    start, duration = float(times[0]), float(times[-1] - times[0])
-    x, w = (times[taken] - start) / duration, displacement[taken]
+    own, w = times[taken], displacement[taken]
+    start, duration = float(own[0]), float(np.ptp(own))  # past them the motion stands still
+    x = (own - start) / duration
     middle, size = float(np.mean(w)), max(float(np.ptp(w)), 1e-300)
     pieces, finest = max(4, min(x.size // _PIECE, _PIECES)), min(_MANY, x.size // 2)
     slow, shown, digital = np.sqrt(max(noise.time, 1.0)), residual_noise(w)[0], quantum(w) / 12**0.5
     # Too much noise hides a kink until the next turn, too little invents many.
-    sigma = noise.sigma if noise.given and shown < _OFF * noise.sigma else max(noise.sigma, shown)
+    sigma = max(noise.sigma, shown)
+    if noise.given and not _LITTLE * size < noise.sigma < sigma / _OFF:
+        sigma = noise.sigma
     for _ in range(8):
         if sigma <= _LITTLE * size:
             return _exact(times[taken], w, max(sigma, _ROUNDING * size))
-        fit, penalty = fitted(x, (w - middle) / (sigma * slow), pieces)
-        left = fit.left(penalty) * sigma * slow
+        unit = sigma * slow
+        fit, penalty = fitted(x, (w - middle) / unit, pieces)
+        left = fit.left(penalty) * unit
         if left > _OFF * max(sigma, shown) and pieces < finest:
-            pieces = min(4 * pieces, finest)
+            pieces = min(2 * pieces, finest)
             continue
         # Steps of a digitiser leave about what they are, a motion of equal steps leaves nothing.
         least = noise.sigma if noise.given else digital * (left > 0.2 * digital)
         if abs(max(left, least) / sigma - 1.0) < 0.1:
             break
         sigma = max(left, least)
-    return _motion(fit, penalty, sigma, sigma * slow, middle, (start, duration))
+    return _motion(fit, penalty, unit / slow, unit, middle, (start, duration))
 
 
 def _motion(
@@ -130,8 +134,8 @@ def _motion(
     """Make the monotone curve, its turns and its modes."""
     samples, instants = fit.samples, fit.instants
     spline, jumps = (unit * v for v in fit.solve(penalty))
-    half, stderr, dof = fit.covariance(penalty)
-    k, size, half = instants.size, spline.size, half[:, :_MODES]
+    half, stderr, dof = fit.covariance(penalty, _SHARE)
+    k, size = instants.size, spline.size
     bend = BSpline(samples.knots, samples.rotation @ spline, DEGREE)
 
     def velocity(x: Array) -> tuple[Array, Array]:  # before and after
@@ -144,7 +148,7 @@ def _motion(
         half[size + k :],
         np.stack([instants, stderr, jumps, velocity(instants)[0]]),
     )
-    x = np.unique(np.concatenate([samples.x, samples.knots, instants]))
+    x = np.unique(np.concatenate([[0.0, 1.0], samples.x, samples.knots, instants]))
     before, after = velocity(x)
     back = np.flatnonzero(after[:-1] * before[1:] < 0.0)  # where the velocity passes through zero
     part = after[back] / (after[back] - before[back + 1])

@@ -112,7 +112,7 @@ def condition(
     else:
         start = start_of_slow_test(first, levels)
         span = span_of_slow_test(first, start)
-    record, zeros = take_zeros(record, first, start, span, levels)
+    record, zeros = take_zeros(record, first, start, span, levels, impact=impact)
     notes += zeros.notes
     start_strain, origins = 0.0, zeros.origins
     if chosen is not None and chosen.place:  # not the first: it has a contact of its own
@@ -129,8 +129,17 @@ def condition(
         contact_time = start.time
     if record.time is not None:
         origins["contact_time"] = contact_time
-    record = mark_flight(record, start) if impact else record
+    if impact:
+        record = mark_flight(record, start, span)
     record, motion = integrate_motion(record, specimen, striker or Striker())
+    if striker is not None and impact:
+        record, late = start_within_height(record, specimen, striker)
+        origins["contact_time"] += late
+        if late:
+            told = f"Contact is taken to be {engineering(late, 's')} later, where"
+            notes.append(f"{told} the motion does not go farther than the height.")
+            if motion == MEASURED:
+                origins["displacement_zero"] += late * (striker.velocity or 0.0)
     if motion != MEASURED:
         notes.append(f"The file has no displacement: the motion is {motion}.")
     notes += checks(record, specimen, striker or Striker(), motion)
@@ -213,10 +222,16 @@ def check_signs(record: Record, advice: Callable[[str], str] | None) -> None:
     stress, peak = record.stress, int(np.argmax(record.stress))
     first, lowest = float(np.median(stress[:5])), stress.min()
     negative = first - lowest > 2 * max(stress[peak] - first, 0) and abs(lowest) > stress[peak]
-    wrong = ["stress"] if negative else []
+    derived = "stress" in record.derived
+    wrong = ["stress"] if negative and not derived else []
+    if derived and record.displacement is not None:  # which has no turn but the deepest
+        w, low = record.displacement, int(np.argmin(record.displacement))
+        fallen, risen = w[0] - w[low], w[: low + 1].max() - w[0]
+        turned = low < 0.98 * len(w) and fallen > max(2 * risen, 0.3 * np.ptp(w))
+        wrong += ["displacement"] if turned else []
     for name, values in record.curves().items():
         moved = values[peak] - values[0]
-        if name != "stress" and moved < -0.5 * np.ptp(values[: peak + 1]):
+        if name != "stress" and not derived and moved < -0.5 * np.ptp(values[: peak + 1]):
             wrong.append(name)
     acceleration, velocity = record.acceleration, record.velocity
     if record.displacement is None and acceleration is not None:
@@ -274,22 +289,24 @@ def stress_of_motion(
     """Stress that brakes a striker, `ratio` (mass over area, kg/m²) times its deceleration.
 
     That is read off a smoothing spline through the motion, to which it is as close as the noise
-    demands. A gauge at rest until contact is followed from there on.
+    demands. A gauge that rests before contact, and perhaps after it, is followed in between.
     """
     from scipy.interpolate import make_smoothing_spline
 
     values = displacement if velocity is None else velocity
     assert values is not None  # see needed_columns
-    noise, first = estimated_noise(values), 0
+    noise, first, end = estimated_noise(values), 0, len(time)
     if velocity is None:
-        up = slice(int(np.argmax(values)) + 1)
-        found = leave_rest(time[up], values[up], noise, 0.5)
+        top = int(np.argmax(values))
+        found = leave_rest(time[: top + 1], values[: top + 1], noise, 0.5)
         first = int(np.searchsorted(time, found.time)) if found else 0
-    n = len(time) - first
+        found = leave_rest(-time[top:][::-1], values[top:][::-1], noise, 0.5)
+        end = int(np.searchsorted(time, -found.time)) if found else end
+    n = end - first
     block = max(1, min(round(noise.time), n // 50), n // 1000)
-    edges = np.arange(first, len(time), block)
-    counts = np.diff(np.append(edges, len(time)))
-    t, y = (np.add.reduceat(x, edges) / counts for x in (time, values))
+    edges = np.arange(first, end, block)
+    counts = np.diff(np.append(edges, end))
+    t, y = (np.add.reduceat(x[:end], edges) / counts for x in (time, values))
     t, step = t - t[0], (t[-1] - t[0]) / len(t)
     # An estimate that is a little too small would have the curve follow the noise.
     sigma, low, high = 1.1 * averaged(noise, block).sigma, -6.0, 14.0
@@ -300,9 +317,26 @@ def stress_of_motion(
         low, high = (middle, high) if close else (low, middle)
     order = 2 if velocity is None else 1
     braked = -ratio * curve.derivative(order)(t / step) / step**order
-    stress = np.interp(time - time[first], t, braked)
-    stress[:first] = 0.0
-    return np.asarray(stress)
+    stress = np.zeros(len(time))
+    stress[first:end] = np.interp(time[first:end] - time[first], t, braked)
+    return stress
+
+
+def start_within_height(
+    record: Record, specimen: Specimen, striker: Striker
+) -> tuple[Record, float]:
+    """Move the start of an impact, s, if its motion goes a little farther than the height.
+
+    It started too early by then: contact is as much later as the motion goes too far.
+    """
+    w, most = record.displacement, 0.97 * specimen.height
+    assert w is not None  # measured or integrated by now
+    over, rough = float(w.max()) - most, 0.5 if "stress" in record.derived else 0.2
+    if not striker.velocity or not 0.03 * specimen.height <= over < rough * specimen.height:
+        return record, 0.0
+    assert record.time is not None  # it is an impact
+    late = over / striker.velocity
+    return replace(record, time=record.time - late, displacement=w - over), late
 
 
 def checks(record: Record, specimen: Specimen, striker: Striker, motion: str) -> list[str]:
@@ -327,6 +361,7 @@ def checks(record: Record, specimen: Specimen, striker: Striker, motion: str) ->
     if striker.velocity and record.time is not None and motion != INTEGRATED:
         early = displacement <= 0.15 * displacement.max()
         early[int(np.argmax(displacement)) :] = False
+        early &= record.sampled.get("displacement", True)
         if early.sum() >= 3:
             speed = float(np.polyfit(record.time[early], displacement[early], 1)[0])
             if abs(speed / striker.velocity - 1) > 0.1:

@@ -56,6 +56,7 @@ EXACT = 1e-6
 FINEST = 8
 # Steps of differences: of the velocity and the mass, relative, and of times over the instants' gap.
 RELATIVE_STEP, STEP_OF_TIME = 1e-3, 0.02
+STEP_OF_ZERO = 1e-4  # of a motion that drives, over its range
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,13 +231,11 @@ class Objective:
         }
         gap = float(np.median(np.diff(self._clock)))
         self.usual = nuisances.values_of(self.measurement)
-        self._steps = {
-            name: RELATIVE_STEP * self.usual[name]
-            if name in (nuisances.VELOCITY, nuisances.STRIKER_MASS)
-            else STEP_OF_TIME * gap
-            for name in self.nuisance
-        }
-        known = nuisances.priors_of(self.measurement)
+        self._steps = dict.fromkeys(self.nuisance, STEP_OF_TIME * gap)
+        self._steps |= {name: RELATIVE_STEP * self.usual[name] for name in nuisances.STRIKER}
+        if self._driven:
+            self._steps["displacement_zero"] = STEP_OF_ZERO * float(np.ptp(self._moved))
+        known = nuisances.priors_of(self.measurement, self.drive)
         self.priors = tuple(known[name] for name in self.nuisance if name in known)
         count, places = len(self.model.names), {n: i for i, n in enumerate(self.nuisance)}
         self._prior_places = np.array([count + places[one.name] for one in self.priors], np.int64)
@@ -382,10 +381,10 @@ class Objective:
         whose error is far below that of their steps.
         """
         name, n = self.nuisance[at], self.time.size
-        if name in nuisances.ZEROS:
+        if name in nuisances.ZEROS and not (self._driven and name == "displacement_zero"):
             own = {curve: self._zero_of.get(curve) == name for curve in self.curves}
             return {curve: np.full(n, float(shifted)) for curve, shifted in own.items()}
-        if self.drive != "impact" and name != nuisances.TIME_SHIFT:
+        if self.drive != "impact" and name not in (nuisances.TIME_SHIFT, "displacement_zero"):
             return {curve: np.zeros(n) for curve in self.curves}
         step = self._steps[name]
         sides = []
@@ -483,6 +482,9 @@ class Objective:
 
     def _placed(self, plan: Plan, at: dict[str, float]) -> Plan:
         """Plan of an impact with its contact, and its striker, where the nuisance has them."""
+        if self._driven and at.get("displacement_zero", 0.0) != 0.0:
+            moved = plan.values - at["displacement_zero"]
+            return plan._replace(values=np.maximum(moved, 0.0))  # contact comes later, or is lost
         if self.drive != "impact":
             return plan
         mass = plan.mass.copy()

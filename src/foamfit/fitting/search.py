@@ -17,7 +17,7 @@ from scipy.stats import qmc
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.fitting import levenberg
-from foamfit.fitting.box import BOX, LAST_STRAIN, Scales, Space, family
+from foamfit.fitting.box import BOX, LAST_STRAIN, Scales, Space, family, is_logarithmic
 from foamfit.fitting.curves import smoothed
 from foamfit.fitting.objective import Objective
 from foamfit.springs.law import least_eps_star
@@ -30,9 +30,11 @@ PULSE = 16  # evaluations
 # Shares of the time of a search, as measured, at which its parts begin.
 DESCENTS, ON_CURVES, REFINED = 0.25, 0.75, 0.95
 CURVE_STARTS = 300
-# Searches at most: another one where a single descent led to the best end, which misses more of the
-# curves than noise.
+# Searches at most: a second one where a single descent led to the best end, and a third where this
+# still misses more of the curves than noise.
 ATTEMPTS = 3
+# Share of the box that counts as its edge, and where inside a descent begins again.
+EDGE, INSIDE = 0.02, (0.35, 0.5, 0.65)
 # Minima of the loop whose cost on the drive's curves is within this factor of the best go on.
 PROMISING = 100.0
 # Factors by which the stiffness that an interior mass vibrates on is changed, and their inverses.
@@ -138,7 +140,7 @@ def smooth_loop(measurement: Measurement, followed: Array | None = None) -> Meas
     return replace(
         measurement, displacement=motion[keep], stress=stress[keep], time=thinned,
         outliers={}, sampled={}, interior={},  # bridged, and smoothed over
-        acceleration=None, block=1,
+        acceleration=None, block=1, noise=replace(measurement.noise, displacement=0.0),
     )  # fmt: skip
 
 
@@ -357,8 +359,9 @@ def search(
     """Search for the best parameters; the tracker keeps them.
 
     Of the descents on the loop (so many `starts`) the best quarter go on to the curves of the
-    drive; see `ATTEMPTS` for when that is done again. Returned are the final costs there, best first, and how many descents on the loop led to
-    each. Raises SearchStoppedError when the time is up.
+    drive; see `ATTEMPTS` for when that is done again. Returned are the final costs there, best
+    first, and how many descents on the loop led to each. Raises SearchStoppedError when the time is
+    up.
     """
     progress(0.0, "start values")
     points = [space.encode(space.values), *box_starts(space, rng, CURVE_STARTS // 3)]
@@ -380,18 +383,38 @@ def search(
             cost, end = descend(tracker, space, point, 60)
             tracker.ends.append(space.decode(end))
             out.append((cost, counts.get(id(point), 1)))
-        if attempt + 1 == ATTEMPTS or _settled(tracker, out):
+        out += [(cost, 1) for cost in _off_edges(tracker, space)]
+        if attempt + 1 == ATTEMPTS or _settled(tracker, out, attempt):
             break
         points = box_starts(space, rng, CURVE_STARTS // 3)
     return sorted(out)
 
 
-def _settled(tracker: Tracker, ends: list[tuple[float, int]]) -> bool:
-    """Whether descents agree on the best end, or this leaves no more of the curves than noise."""
+def _off_edges(tracker: Tracker, space: Space) -> list[float]:
+    """Descend from the best point with what lies at an edge of the box moved inside; the costs.
+
+    A stiffness that few samples show may run to an edge and stay there while all else is found.
+    """
+    low, high = space.box
+    best = space.encode(tracker.best_values) if tracker.best_values is not None else low
+    span, costs = high - low, []
+    edges = (best - low < EDGE * span) | (high - best < EDGE * span)
+    for at in np.flatnonzero(edges & [is_logarithmic(short) for _, short, _ in space.coordinates]):
+        for share in INSIDE:
+            start = best.copy()
+            start[at] = low[at] + share * span[at]
+            cost, end = descend(tracker, space, start, 60)
+            tracker.ends.append(space.decode(end))
+            costs.append(cost)
+    return costs
+
+
+def _settled(tracker: Tracker, ends: list[tuple[float, int]], attempt: int) -> bool:
+    """Whether descents agree on the best end, or none of a second search is better than noise."""
     best = min(ends)[0]
     if sum(count for cost, count in ends if cost <= 1.02 * best) > 1:
         return True
-    return best <= tracker.objective.floor
+    return attempt > 0 and best <= tracker.objective.floor
 
 
 def ensure_feasible(tracker: Tracker, space: Space, rng: np.random.Generator) -> None:

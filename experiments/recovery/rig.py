@@ -1,0 +1,366 @@
+"""Synthetic records as a rig writes them, with the parameters that made them.
+
+`impact` and `slow` draw springs and a test and make a `Record`; `write` puts it into a CSV and its
+TOML. Nothing here or in `truth`, which follows the springs, comes from foamfit.
+
+An impact is recorded by an oscilloscope from before the contact until after it. Each channel has a
+zero of its own, the clock starts anywhere, and contact lies between two samples. A slow test
+follows a given motion, whose record has noise, until the stress is back at zero. One seed draws the
+same springs and striker for one law, and the same noise of a channel, whatever else is recorded.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from scipy.integrate import quad
+from scipy.signal import lfilter
+from scipy.special import ndtri
+from truth import Array, Bistable, Course, Law, Microscale, Motion, Rig, Terms
+
+GRAVITY = 9.80665
+DURATION = 4.0  # s, of a slow motion
+MOST_STRAIN = 0.93
+UNITS = {"force": ("N", 1.0), "displacement": ("mm", 1e3), "acceleration": ("m/s^2", 1.0)}
+# Height (m), cross-section (m²) and striker (kg): the paper's bench, and a drop tower.
+BENCH, TOWER = (1.2e-3, 1.9635e-5, 7e-3), (20e-3, 1e-3, 5.0)
+SLOW_HEIGHT, SLOW_AREA = 10e-3, 0.25 * math.pi * 7.6e-3**2
+
+
+@dataclass(frozen=True)
+class Impact:
+    """How an impact is made and recorded.
+
+    `zero` says whether the motion's zero is arbitrary, `sensor` whether those of force and
+    acceleration are. `noise` is a share of each channel's range during contact, of autocorrelation
+    time `tau` in samples. `before` is the share of the record before contact (None: drawn up to
+    0.6), `samples` those during contact (None: 150 to 3000, where 20 kHz to 2 MHz allow it). A
+    record that is `trimmed` begins at contact, at time zero, with all zeros right. A `gauge` on the
+    specimen rests until contact. `gravity` acts on the striker before, during and after contact.
+    `velocity_sd` is what the TOML says of its velocity, as a share: the velocity there is off by so
+    much, at random.
+    """
+
+    law: str = "bistable"
+    relaxation: int = 0
+    channels: tuple[str, ...] = ("force", "displacement")
+    samples: int | None = None
+    noise: float = 0.01
+    tau: float = 1.0
+    before: float | None = None
+    zero: bool = True
+    sensor: bool = True
+    trimmed: bool = False
+    gauge: bool = False
+    gravity: bool = False
+    velocity_sd: float = 0.0
+
+
+@dataclass(frozen=True)
+class Slow:
+    """How a slow test is made and recorded.
+
+    `law` is "bistable", "microscale" or bistable springs joined by "+", all of one height. With
+    `dashpot` an only spring has an eta. `motion` is "triangle", "sine", "trapezoid" (a short hold)
+    or "ramp" (a slow start). `inner` is the size of a partial unloading, as a share of the peak.
+    `noise` is a share of the range, of displacement and force alike; `noise_given` writes it into
+    the TOML, and with `exact` the displacement has none. With `early` the motion begins before
+    contact; with `zero` its zero is arbitrary.
+    """
+
+    law: str = "microscale"
+    relaxation: int = 0
+    dashpot: bool = False
+    motion: str = "triangle"
+    inner: float = 0.0
+    rows: int = 1000
+    noise: float = 0.003
+    early: bool = False
+    zero: bool = False
+    noise_given: bool = False
+    exact: bool = False
+
+
+@dataclass(frozen=True)
+class Record:
+    """A record in SI, compression positive: `time` as the file counts it, noisy and clean channels.
+
+    `truth` has the true parameters by foamfit's names, and contact_time (s) and displacement_zero
+    (m): what the file's clock and its displacement say at contact; of an impact also velocity and
+    striker_mass.
+    """
+
+    setup: Impact | Slow
+    time: Array
+    channels: dict[str, Array]
+    clean: dict[str, Array]
+    noise: dict[str, float]
+    truth: dict[str, float]
+    rig: Rig
+    course: Course
+    toml_velocity: str = ""
+
+    @property
+    def model(self) -> str:
+        """What `--model` is."""
+        return self.setup.law
+
+    def written_so(self, zero: float = 0.0, clock: float = 0.0, skip: int = 0) -> Record:
+        """Return the same samples with another zero of the motion (m, added) and clock (s, added).
+
+        The first `skip` rows are left out.
+        """
+        shift = {"displacement": zero}
+        channels = {c: (v + shift.get(c, 0.0))[skip:] for c, v in self.channels.items()}
+        clean = {c: (v + shift.get(c, 0.0))[skip:] for c, v in self.clean.items()}
+        truth = dict(self.truth)
+        truth["contact_time"] += clock
+        truth["displacement_zero"] += zero
+        time = self.time[skip:] + clock
+        return replace(self, time=time, channels=channels, clean=clean, truth=truth)
+
+
+def draw_bistable(rng: np.random.Generator) -> Bistable:
+    """Draw a bistable spring, over the range of the paper's and beyond."""
+    k0, eps_a = 10 ** rng.uniform(6.0, 7.5), rng.uniform(0.05, 0.35)
+    eps_c, drop = eps_a + rng.uniform(0.1, 0.45), rng.uniform(0.05, 0.8)
+    sigma_a = k0 * eps_a / (1.0 - eps_a)
+    return Bistable(
+        k0=k0,
+        kc=k0 * 10 ** rng.uniform(0.7, 1.7),
+        dsigma=-drop * sigma_a,
+        eps_a=eps_a,
+        eps_c=eps_c,
+        kh_plus=k0 * rng.uniform(0.1, 3.0),
+        kh_minus=sigma_a * (1.0 - drop) / eps_c * rng.uniform(0.5, 1.1),
+    )
+
+
+def draw_microscale(rng: np.random.Generator) -> tuple[Microscale, float]:
+    """Draw a microscale spring, and the stress that snaps 70 to 98 % of it."""
+    while True:
+        k0 = 10 ** rng.uniform(5.0, 7.0)
+        kc = k0 * 10 ** rng.uniform(-0.5, 1.0)
+        least = max(0.0, (math.sqrt(kc) - math.sqrt(k0)) / (math.sqrt(kc) + math.sqrt(k0)))
+        plus, spread = k0 * rng.uniform(0.1, 0.5), rng.uniform(0.15, 0.6)
+        spring = Microscale(
+            k0=k0,
+            kc=kc,
+            eps_star=least + rng.uniform(0.02, 0.3),
+            sigma_plus=plus,
+            spread_plus=spread,
+            sigma_minus=plus * rng.uniform(0.3, 0.8),
+            spread_minus=rng.uniform(0.3, 0.9),
+        )
+        most = plus * math.exp(spread * float(ndtri(rng.uniform(0.7, 0.98))))
+        if spring.strain(most, spring.start)[0] < 0.85:
+            return spring, most
+
+
+def draw_terms(rng: np.random.Generator, count: int, lasts: float) -> Terms:
+    """Draw relaxation terms for a test of so many seconds, the fastest first."""
+    decades = [(-2.0, -0.5)] if count == 1 else [(-2.2, -1.5), (-1.0, -0.3)]
+    return tuple(
+        (rng.uniform(0.1, 1.0), lasts * 10 ** rng.uniform(*decade)) for decade in decades[:count]
+    )
+
+
+def work(spring: Law, most: float) -> float:
+    """Work per volume of a first loading to a stress, J/m³."""
+    cuts = [s for s in spring.points[:3:2] if s < most] if isinstance(spring, Bistable) else []
+    ends = [0.0, *cuts, most]
+    return math.fsum(
+        quad(lambda s: s * spring.strain(s, spring.loading(s))[1], low, high, limit=200)[0]
+        for low, high in pairwise(ends)
+    )
+
+
+def parameters(springs: tuple[Law, ...]) -> dict[str, float]:
+    """Parameters of springs by foamfit's names."""
+    named: dict[str, float] = {}
+    for i, spring in enumerate(springs, start=1):
+        own = [item.name for item in fields(spring) if item.name != "terms"]
+        named |= {f"s{i}_{name}": float(getattr(spring, name)) for name in own}
+        for k, (g, tau) in enumerate(spring.terms, start=1):
+            named |= {f"s{i}_g{k}": g, f"s{i}_tau{k}": tau}
+    return named
+
+
+def noisy(
+    clean: dict[str, Array], ranges: dict[str, float], share: float, tau: float, seed: int
+) -> tuple[dict[str, Array], dict[str, float]]:
+    """Add noise to channels, drawn for each by itself; return its standard deviations too."""
+    rho, out = (tau - 1.0) / (tau + 1.0), {}
+    for name, values in clean.items():
+        rng = np.random.default_rng([seed, 3, list(UNITS).index(name)])
+        white = rng.standard_normal(len(values) + 500)
+        unit = lfilter([math.sqrt(1.0 - rho * rho)], [1.0, -rho], white)[500:]
+        out[name] = values + share * ranges[name] * unit
+    return out, {name: share * ranges[name] for name in clean}
+
+
+def drawn_impact(setup: Impact, rng: np.random.Generator) -> Course:
+    """Draw a spring and a striker that closes its loop and does not press it flat; follow it."""
+    while True:
+        height, area, mass = BENCH if rng.random() < 0.5 else TOWER
+        if setup.law == "bistable":
+            spring: Law = draw_bistable(rng)
+            most, more = spring.points[2], rng.uniform(1.3, 2.0)
+        else:
+            spring, most = draw_microscale(rng)
+            more = 1.0 + 0.3 * setup.relaxation
+        velocity = math.sqrt(2.0 * more * work(spring, most) * area * height / mass)
+        eta = 10 ** rng.uniform(-2.5, -1.0) * most * height / velocity
+        if setup.law == "bistable" and rng.random() < 0.5:
+            spring = replace(spring, eta=eta)
+        terms = draw_terms(rng, setup.relaxation, 1.2 * height / velocity)
+        spring = replace(spring, terms=terms)
+        gravity = GRAVITY if setup.gravity else 0.0
+        rig = Rig((spring,), (height,), area, mass, velocity, gravity)
+        course = rig.run(0.0, 100.0 * height / velocity)
+        reached = course.top(np.linspace(0.0, course.end, 200), gauge=False).max()
+        if reached < MOST_STRAIN * height and course.end < 90.0 * height / velocity:
+            return course
+
+
+def impact(setup: Impact, seed: int) -> Record:
+    """Make the record of an impact."""
+    course = drawn_impact(setup, np.random.default_rng([seed, 1]))
+    rng = np.random.default_rng([seed, 2])
+    rig, lasts = course.rig, course.end
+    drawn = 10 ** rng.uniform(math.log10(150), math.log10(3000))
+    slowest, fastest = 20e3 * lasts, 2e6 * lasts  # samples per second
+    samples = setup.samples or round(max(150.0, min(max(drawn, slowest), fastest)))
+    step = float(f"{lasts / samples:.3g}")
+    part, after, late = rng.uniform(0.0, 0.6), rng.uniform(0.05, 0.25), rng.uniform(0.05, 0.95)
+    origin = rng.uniform(-lasts, 0.0) if rng.random() < 0.5 else rng.uniform(0.0, 20.0)
+    zeros = rng.uniform(-3.0, 3.0), rng.uniform(-0.05, 0.05), rng.uniform(-0.05, 0.05)
+    off = rng.standard_normal()
+    part = part if setup.before is None else setup.before
+    first = round(part / (1.0 - part) * (1.0 + after) * samples)
+    if setup.trimmed:
+        first, late, origin = 0, 0.0, 0.0
+    origin = round(origin / step) * step
+    own = (np.arange(first + math.ceil((1.0 + after) * samples)) - first + late) * step
+    motion, stress = course.top(own, setup.gauge), course.stress(own)
+    everything = {
+        "force": stress * rig.area,
+        "displacement": motion,
+        "acceleration": stress * rig.area / rig.mass,  # an accelerometer falling freely reads zero
+    }
+    inside = (own >= 0.0) & (own <= lasts)
+    clean = {name: everything[name] for name in setup.channels}
+    ranges = {name: float(np.ptp(values[inside])) for name, values in clean.items()}
+    zero = round(zeros[0] * rig.height, 7) if setup.zero and not setup.trimmed else 0.0
+    shifts = {"displacement": zero}
+    if setup.sensor and not setup.trimmed:
+        shifts |= {"force": zeros[1] * ranges.get("force", 0.0)}
+        shifts |= {"acceleration": zeros[2] * ranges.get("acceleration", 0.0)}
+    clean = {name: values + shifts.get(name, 0.0) for name, values in clean.items()}
+    channels, sizes = noisy(clean, ranges, setup.noise, setup.tau, seed)
+    sd = setup.velocity_sd
+    said = f"{rig.velocity * (1.0 + sd * off):.12g}" + (f" ± {sd * rig.velocity:.3g}" if sd else "")
+    truth = parameters(rig.springs) | {
+        "contact_time": origin + (first - late) * step,
+        "displacement_zero": zero,
+        "velocity": rig.velocity,
+        "striker_mass": rig.mass,
+    }
+    time = origin + np.arange(len(own)) * step
+    return Record(setup, time, channels, clean, sizes, truth, rig, course, f"{said} m/s")
+
+
+def slow_motion(setup: Slow, peak: float, rng: np.random.Generator) -> Motion:
+    """Draw a motion to a displacement and back, with what its shape asks for."""
+    gap = peak * rng.uniform(0.02, 0.1) if setup.early else 0.0
+    at, unloading = rng.uniform(0.4, 0.8), rng.random() < 0.5
+    up, down = [-gap, peak], [peak, 0.0]
+    if setup.inner:
+        turns = [at * peak, (at - setup.inner) * peak]
+        if unloading:
+            turns = [max(turns[1], 0.35 * peak), max(turns[1], 0.35 * peak) + setup.inner * peak]
+            down[1:1] = turns
+        else:
+            up[1:1] = turns
+    levels = [*up, *([peak] if setup.motion == "trapezoid" else []), *down[1:]]
+    ways = np.abs(np.diff(levels))
+    ways[ways == 0.0] = 0.05 * ways.sum()
+    shape = "cosine" if setup.motion == "sine" else "line"
+    shapes = [shape] * len(ways)
+    if setup.motion == "ramp":
+        shapes[0] = "ramp"
+    times = np.append(0.0, np.cumsum(ways)) * DURATION / ways.sum()
+    return Motion(tuple(times.tolist()), tuple(levels), tuple(shapes))
+
+
+def drawn_slow(setup: Slow, rng: np.random.Generator) -> Course:
+    """Draw springs and a motion that closes their loops, and follow them."""
+    kinds = setup.law.split("+")
+    while True:
+        springs = list[Law]()
+        if kinds[0] == "microscale":
+            spring, most = draw_microscale(rng)
+            springs.append(spring)
+        else:
+            springs = [draw_bistable(rng) for _ in kinds]
+            tops = sorted(spring.points[0] for spring in springs)
+            most = max(spring.points[2] for spring in springs) * rng.uniform(1.1, 1.6)
+            if not all(1.5 < b / a < 4.0 for a, b in pairwise(tops)):
+                continue  # of one foam, but no twins: those cannot be told apart
+        heights = (SLOW_HEIGHT / len(kinds),) * len(kinds)
+        strains = [spring.strain(most, spring.loading(most))[0] for spring in springs]
+        if max(strains) > MOST_STRAIN:
+            continue
+        peak = float(np.dot(heights, strains))
+        motion = slow_motion(setup, peak, rng)
+        terms = draw_terms(rng, setup.relaxation, DURATION)
+        eta = 10 ** rng.uniform(-2.0, -0.8) * most * SLOW_HEIGHT / (2.0 * peak / DURATION)
+        springs[0] = replace(springs[0], terms=terms, eta=eta if setup.dashpot else 0.0)
+        springs = sorted(springs, key=lambda s: s.points[0]) if len(kinds) > 1 else springs
+        rig = Rig(tuple(springs), heights, SLOW_AREA, motion=motion)
+        course = rig.run(motion.contact(), motion.times[-1])
+        if course.end > motion.times[-2] + 0.3 * (motion.times[-1] - motion.times[-2]):
+            return course
+
+
+def slow(setup: Slow, seed: int) -> Record:
+    """Make the record of a slow test."""
+    course = drawn_slow(setup, np.random.default_rng([seed, 1]))
+    rng = np.random.default_rng([seed, 2])
+    rig, own = course.rig, np.linspace(0.0, course.end, setup.rows)
+    zero = round(rng.uniform(-3.0, 3.0) * rig.height, 7) if setup.zero else 0.0
+    motion, stress = course.top(own, gauge=False), course.stress(own)
+    clean = {"force": stress * rig.area, "displacement": motion + zero}
+    ranges = {name: float(np.ptp(values)) for name, values in clean.items()}
+    ranges["displacement"] *= not setup.exact
+    channels, sizes = noisy(clean, ranges, setup.noise, 1.0, seed)
+    truth = parameters(rig.springs) | {"contact_time": course.start, "displacement_zero": zero}
+    return Record(setup, own, channels, clean, sizes, truth, rig, course)
+
+
+def write(record: Record, folder: Path, name: str = "test") -> Path:
+    """Write a record as CSV and TOML; return the path of the CSV."""
+    path, rig, setup = folder / f"{name}.csv", record.rig, record.setup
+    unit, factor = ("ms", 1e3) if isinstance(setup, Impact) else ("s", 1.0)
+    columns = [[f"{t * factor:.12g}" for t in record.time]]
+    header = [f"time ({unit})"]
+    for channel, values in record.channels.items():
+        unit, factor = UNITS[channel]
+        header.append(f"{channel} ({unit})")
+        columns.append([f"{v * factor:.9g}" for v in values])
+    rows = [",".join(row) for row in zip(*columns, strict=True)]
+    path.write_text("\n".join([",".join(header), *rows]) + "\n", encoding="utf-8")
+    lines = ["[specimen]", f'height = "{rig.height} m"', f'area = "{rig.area} m^2"']
+    if len(rig.heights) > 1:
+        lines.append("heights = [" + ", ".join(f'"{h} m"' for h in rig.heights) + "]")
+    if isinstance(setup, Impact):
+        lines += ["[striker]", f'mass = "{rig.mass} kg"', f'velocity = "{record.toml_velocity}"']
+    elif setup.noise_given:
+        lines += ["[noise]", f'stress = "{record.noise["force"] / rig.area} Pa"',
+                  f'displacement = "{record.noise["displacement"]} m"']  # fmt: skip
+    path.with_suffix(".toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path

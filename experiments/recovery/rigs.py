@@ -1,0 +1,375 @@
+"""Do the 95 % intervals hold on records as rigs write them?
+
+`rig` makes synthetic impacts, recorded by an oscilloscope from before the contact, and synthetic
+slow tests, whose motion drives the fit and has noise. Each record goes the way of a user: a CSV and
+its TOML, `foamfit.read_test`, the defaults of `foamfit.fit`. A row for each parameter keeps truth
+and interval; a test that cannot be read or fitted is a row with its sentence. Intervals of the
+springs' parameters are counted, those of contact time, zero, velocity and mass apart. A value is
+far if it is called determined and its interval misses the truth by more than its own width. The
+search has missed the minimum of a slow test where the true springs follow its stress better.
+
+With `--invariance` each impact is written several ways: with another zero of the motion, another
+clock, fewer rows before contact. The moves of its parameters are counted in standard errors.
+
+    python experiments/recovery/rigs.py --raw rows.csv         # 200 tests of each class, resumable
+    python experiments/recovery/rigs.py --family slow --classes microscale --tests 20
+    python experiments/recovery/rigs.py --invariance --tests 20
+"""
+
+from __future__ import annotations
+
+import argparse
+import platform
+import re
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import nullcontext, suppress
+from dataclasses import fields, replace
+from itertools import permutations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from rig import Impact, Record, Slow, impact, slow, write
+from scipy.stats import binomtest
+from truth import Bistable, Rig
+
+import foamfit as ff
+from foamfit.errors import InputError, SimulationError
+
+HERE = Path(__file__).parent
+Row = dict[str, Any]
+Job = tuple[str, str, int]
+JOB = ["family", "class", "test"]
+COLUMNS = [
+    *JOB, "way", "rows", "parameter", "truth", "value", "low", "high", "stderr", "state", "holds",
+    "far", "move", "status", "over truth", "seconds", "error",
+]  # fmt: skip
+AS_RECORDED = "as recorded"
+MISSED = 1.1  # with so much more misfit than the true springs have, the search missed the minimum
+
+BOTH = ("force", "displacement")
+IMPACTS = {
+    "trimmed at contact": Impact(trimmed=True),
+    "right zero": Impact(zero=False),
+    "any zero": Impact(),
+    "any zero, 0.05 %": Impact(noise=5e-4),
+    "any zero, 2 %": Impact(noise=0.02),
+    "any zero, correlated": Impact(tau=8.0),
+    "any zero, 150 samples": Impact(samples=150),
+    "any zero, 3000 samples": Impact(samples=3000),
+    "few rows before": Impact(before=0.02),
+    "force only": Impact(channels=("force",)),
+    "acceleration only": Impact(channels=("acceleration",)),
+    "acceleration only, 0.1 %": Impact(channels=("acceleration",), noise=1e-3),
+    "force and acceleration": Impact(channels=("force", "acceleration")),
+    "acceleration and motion": Impact(channels=("acceleration", "displacement")),
+    "all three": Impact(channels=(*BOTH, "acceleration")),
+    "gauge on the specimen": Impact(gauge=True),
+    "gravity": Impact(gravity=True),
+    "velocity ± 1 %": Impact(velocity_sd=0.01),
+    "microscale": Impact(law="microscale"),
+    "microscale, force only": Impact(law="microscale", channels=("force",)),
+    "microscale+1": Impact(law="microscale", relaxation=1),
+    "microscale+1, force only": Impact(law="microscale", relaxation=1, channels=("force",)),
+}
+LAWS = {
+    "bistable": Slow("bistable"),
+    "microscale": Slow("microscale"),
+    "microscale+1": Slow("microscale", 1),
+    "microscale+2": Slow("microscale", 2),
+    "two springs": Slow("bistable+bistable"),
+}
+SLOW = {
+    f"{law}, {rows} rows, {100.0 * noise:g} %": replace(setup, rows=rows, noise=noise)
+    for law, setup in LAWS.items()
+    for rows in (300, 1000, 5000)
+    for noise in (5e-4, 1e-3, 3e-3)
+} | {
+    "microscale, exact motion": Slow(exact=True),
+    "microscale with dashpot": Slow(dashpot=True, noise=1e-3),
+    "microscale+1 with dashpot": Slow(relaxation=1, dashpot=True, noise=1e-3),
+    "microscale+1, sine": Slow(relaxation=1, motion="sine", noise=1e-3),
+    "microscale+1, trapezoid": Slow(relaxation=1, motion="trapezoid", noise=1e-3),
+    "microscale+1, slow start": Slow(
+        relaxation=1, motion="ramp", noise=1e-3, early=True, zero=True
+    ),
+    "microscale, unloading by 10 %": Slow(inner=0.1, noise=1e-3),
+    "microscale, unloading by 3 %": Slow(inner=0.03, noise=1e-3),
+    "microscale, unloading by 1 %": Slow(inner=0.01, noise=1e-3),
+    "microscale, noise given": Slow(noise_given=True),
+    "bistable, before contact, any zero": Slow("bistable", noise=1e-3, early=True, zero=True),
+}
+FAMILIES: dict[str, dict[str, Any]] = {"impact": IMPACTS, "slow": SLOW}
+
+
+def make(family: str, name: str, seed: int) -> Record:
+    """Make one record of a class."""
+    setup = FAMILIES[family][name]
+    return impact(setup, seed) if family == "impact" else slow(setup, seed)
+
+
+def chain_of(made: Rig) -> ff.Chain:
+    """The true springs as foamfit knows them."""
+    springs = []
+    for spring in made.springs:
+        values = {f.name: getattr(spring, f.name) for f in fields(spring) if f.name != "terms"}
+        law = ff.BistableSpring if isinstance(spring, Bistable) else ff.MicroscaleSpring
+        springs.append(law(**values, relaxation=spring.terms))
+    return ff.Chain(springs, made.heights, made.area)
+
+
+def over_truth(record: Record, test: Any, chain: ff.Chain) -> float:
+    """Misfit of a slow test's stress along its measured motion, over that of the true springs."""
+    drive = ff.DisplacementDrive(test.displacement)
+    each = [ff.simulate(springs, drive, test.time) for springs in (chain, chain_of(record.rig))]
+    return float(np.divide(*[np.std(found.base_stress - test.stress) for found in each]))
+
+
+def fitted(record: Record) -> tuple[Any, Any, dict[str, Any]]:
+    """Write, read and fit a record; return test, result and estimates by the names of the truth.
+
+    Springs in series and relaxation terms have no order: they are named as they are closest to it.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        test = ff.read_test(write(record, Path(folder)))
+    result = ff.fit(test, model=record.model, relaxation=record.setup.relaxation, seed=0)
+    found, truth = result.parameters, record.truth
+
+    def off(names: dict[str, str]) -> float:
+        sizes = [
+            abs(found[a].value - truth[b]) / abs(truth[b]) for a, b in names.items() if truth[b]
+        ]
+        return float(np.sum(np.minimum(sizes, 1.0)))
+
+    kinds = [("s", len(record.rig.springs)), ("g", record.setup.relaxation)]
+    names = {name: name for name in found if name in truth}
+    for kind, count in kinds:
+        if count > 1:
+            orders = [dict(zip("123", p, strict=False)) for p in permutations("123"[:count])]
+            ways = [{a: renamed(a, kind, order) for a in names} for order in orders]
+            names = min(ways, key=off)
+    return test, result, {b: found[a] for a, b in names.items()}
+
+
+def renamed(name: str, kind: str, order: dict[str, str]) -> str:
+    """Exchange the numbers of springs ("s") or of relaxation terms ("g") in a name."""
+    pattern = r"^()(s)(\d)" if kind == "s" else r"^(.*_)(g|tau)(\d)$"
+    return re.sub(pattern, lambda m: f"{m[1]}{m[2]}{order.get(m[3], m[3])}", name)
+
+
+def sentence(error: Exception) -> str:
+    """What a fit that failed says; of what is no refusal also where it was raised."""
+    told = f"{type(error).__name__}: {error}"
+    if isinstance(error, InputError | SimulationError):
+        return told
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{told} ({Path(last.filename).name}:{last.lineno})"
+
+
+def run_test(family: str, name: str, seed: int) -> list[Row]:
+    """Make, write, read and fit one test: a row for each free parameter, or one for the failure."""
+    about: Row = {"family": family, "class": name, "test": seed}
+    began = time.perf_counter()
+    try:
+        record = make(family, name, seed)
+        about["rows"] = len(record.time)
+        began = time.perf_counter()
+        test, result, estimates = fitted(record)
+    except Exception as error:
+        return [about | {"error": sentence(error), "seconds": time.perf_counter() - began}]
+    about |= {"status": result.status, "seconds": time.perf_counter() - began}
+    if family == "slow":
+        with suppress(SimulationError):
+            about["over truth"] = over_truth(record, test, result.chain)
+    rows = []
+    for parameter, estimate in estimates.items():
+        if not estimate.vary:
+            continue
+        truth = record.truth[parameter]
+        low, high = map(float, estimate.ci95 or (np.nan, np.nan))
+        outside = max(low - truth, truth - high)
+        rows.append(
+            about
+            | {
+                "parameter": parameter,
+                "truth": truth,
+                "value": float(estimate.value),
+                "low": low,
+                "high": high,
+                "stderr": estimate.stderr,
+                "state": estimate.state,
+                "holds": bool(outside <= 0.0),
+                "far": estimate.state == "determined" and bool(outside > high - low),
+            }
+        )
+    return rows
+
+
+def ways(record: Record) -> Iterator[tuple[str, Record]]:
+    """Write an impact several ways, the first as it was recorded."""
+    yield AS_RECORDED, record
+    if "displacement" in record.channels:
+        yield "zero", record.written_so(zero=0.7 * record.rig.height)
+        yield "zero back", record.written_so(zero=-2.3 * record.rig.height)
+    yield "clock", record.written_so(clock=12.7 - float(record.time[0]))
+    before = int(np.count_nonzero(record.time < record.truth["contact_time"]))
+    yield "half of the rows before", record.written_so(skip=before // 2)
+    yield "a tenth of the rows before", record.written_so(skip=before - before // 10)
+
+
+def run_invariance(family: str, name: str, seed: int) -> list[Row]:
+    """Fit one impact written several ways: a row for each parameter and way, or the failure."""
+    setup = FAMILIES[family][name]
+    record = impact(replace(setup, before=setup.before or 0.4), seed)
+    first: dict[str, Any] = {}
+    rows = []
+    for way, other in ways(record):
+        about: Row = {"family": family, "class": name, "test": seed, "way": way}
+        try:
+            found = fitted(other)[2]
+        except Exception as error:
+            rows.append(about | {"error": sentence(error)})
+            continue
+        first = first or found
+        for parameter, estimate in found.items():
+            error = first[parameter].stderr if parameter in first else None
+            if estimate.vary and error and parameter.startswith("s"):
+                move = abs(estimate.value - first[parameter].value) / error
+                rows.append(about | {"parameter": parameter, "move": move})
+    return rows
+
+
+def run(
+    work: Callable[[str, str, int], list[Row]], jobs: list[Job], raw: Path | None, processes: int
+) -> pd.DataFrame:
+    """Do the jobs that `raw` does not hold yet; it is kept up after each."""
+    old = pd.read_csv(raw) if raw is not None and raw.exists() else pd.DataFrame(columns=COLUMNS)
+    done = set(zip(*(old[key] for key in JOB), strict=True))
+    left = [job for job in jobs if job not in done]
+    tables = [old] if len(old) else []
+    with ProcessPoolExecutor(processes) if processes > 1 else nullcontext() as pool:
+        columns = list(zip(*left, strict=True)) or [[], [], []]
+        for number, more in enumerate((pool.map if pool else map)(work, *columns), start=1):
+            tables.append(pd.DataFrame(more, columns=COLUMNS).astype(object))
+            if raw is not None:
+                tables[-1].to_csv(raw, mode="a", index=False, header=not raw.exists())
+            print(f"\r{number} of {len(left)}", end="", file=sys.stderr, flush=True)
+    print(file=sys.stderr)
+    rows, asked = pd.concat(tables, ignore_index=True).infer_objects(), set(jobs)
+    return rows[[job in asked for job in zip(*(rows[key] for key in JOB), strict=True)]]
+
+
+def coverage(rows: pd.DataFrame, by: str) -> pd.DataFrame:
+    """Count the intervals that hold, for each value of a column and for all together."""
+    fits = rows[rows["parameter"].notna()]
+    own = fits["parameter"].astype(str).str.match(r"s\d_")
+    out = []
+    for name, group in [*rows.groupby(by, sort=False), ("all", rows)]:
+        mine = fits.loc[fits.index.intersection(group.index)]
+        springs, zeros = mine[own.loc[mine.index]], mine[~own.loc[mine.index]]
+        given, known = springs[springs["low"].notna()], zeros[zeros["low"].notna()]
+        holds, low, high = share(given["holds"])
+        missed = given["over truth"] > MISSED
+        each = group.drop_duplicates(JOB)
+        out.append(
+            {
+                by: name,
+                "tests": len(each),
+                "failed": int(each["parameter"].isna().sum()),
+                "intervals": len(given),
+                "holds %": holds,
+                "from %": low,
+                "to %": high,
+                "far": int(given["far"].sum()),
+                "missed": int((each["over truth"] > MISSED).sum()),
+                "others hold %": share(given["holds"][~missed])[0],
+                "not determined": int((springs["state"] == "not determined").sum()),
+                "zeros etc. hold %": share(known["holds"])[0],
+                "zeros etc. far": int(known["far"].sum()),
+                "warned": int((each["status"] == "warnings").sum()),
+                "seconds": each["seconds"].median(),
+            }
+        )
+    return pd.DataFrame(out)
+
+
+def moves(rows: pd.DataFrame, by: str) -> pd.DataFrame:
+    """Count the moves beyond 0.3 standard errors, for each value of a column and all together."""
+    out, rows = [], rows[rows["way"] != AS_RECORDED]
+    for name, group in [*rows.groupby(by, sort=False), ("all", rows)]:
+        given = group[group["move"].notna()]
+        worst = given.loc[given["move"].idxmax()] if len(given) else None
+        out.append(
+            {
+                by: name,
+                "comparisons": len(given),
+                "moved %": 100.0 * (given["move"] > 0.3).mean(),
+                "median": given["move"].median(),
+                "largest": given["move"].max(),
+                "of": "" if worst is None else f"{worst['parameter']}, test {worst['test']}",
+                "failed": int(group["error"].notna().sum()),
+            }
+        )
+    return pd.DataFrame(out)
+
+
+def share(held: pd.Series) -> tuple[float, float, float]:
+    """Per cent of what holds, and its binomial 95 % interval."""
+    if not len(held):
+        return np.nan, np.nan, np.nan
+    held = held.astype(bool)
+    error = binomtest(int(held.sum()), len(held)).proportion_ci(method="wilson")
+    return 100.0 * held.mean(), 100.0 * error.low, 100.0 * error.high
+
+
+def tell(rows: pd.DataFrame, invariance: bool) -> pd.DataFrame:
+    """Print the tables and the failures; return the table of classes."""
+    count = moves if invariance else coverage
+    table = count(rows, "class")
+    tables = [table, count(rows, "way" if invariance else "parameter")]
+    if not invariance and rows["class"].str.contains(" rows, ").any():  # the grid of slow tests
+        grid = rows["class"].str.extract(r"(?P<law>.*), (?P<n>\d+ rows), (?P<noise>.* %)")
+        tables += [count(rows.assign(**grid).dropna(subset=name), name) for name in grid]
+    for each in tables:
+        print(each.to_string(index=False, float_format=lambda x: f"{x:.3g}"), end="\n\n")
+    failed = rows[rows["error"].notna()]
+    for row in failed.itertuples():
+        print(f"{row[1 + rows.columns.get_loc('class')]}, test {row.test}: {row.error}")
+    return table
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--family", choices=[*FAMILIES], help="by default both")
+    parser.add_argument("--classes", default="", help="a pattern that names of classes begin with")
+    parser.add_argument("--tests", type=int, default=200)
+    parser.add_argument("--first-seed", type=int, default=1)
+    parser.add_argument("--invariance", action="store_true", help="impacts written several ways")
+    parser.add_argument("--raw", type=Path, help="rows of all tests; resumed")
+    parser.add_argument("--out", type=Path, help="the table of classes")
+    parser.add_argument("--jobs", type=int, default=1)
+    options = parser.parse_args()
+    families = [options.family] if options.family else list(FAMILIES)
+    families = ["impact"] if options.invariance else families
+    jobs = [
+        (family, name, seed)
+        for seed in range(options.first_seed, options.first_seed + options.tests)
+        for family in families
+        for name in FAMILIES[family]
+        if re.match(options.classes, name)
+    ]
+    rows = run(run_invariance if options.invariance else run_test, jobs, options.raw, options.jobs)
+    table = tell(rows, options.invariance)
+    if options.out is not None:
+        table.to_csv(options.out, index=False, float_format="%.4g")
+    print(f"foamfit {ff.__version__}, Python {platform.python_version()}, {platform.machine()}")
+
+
+if __name__ == "__main__":
+    main()

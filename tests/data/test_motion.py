@@ -1,0 +1,189 @@
+"""The motion behind a noisy displacement, against synthetic motions that are known."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from foamfit.data.measurement import NoiseLevel
+from foamfit.data.motion import SmoothMotion, follow
+from foamfit.data.noise import estimated_noise
+
+DRAWS = 40
+SHAPES = {  # places and heights of straight lines, over a duration and a range of one
+    "triangle": ([0.0, 0.4873, 1.0], [0.0, 1.0, 0.0]),
+    "trapezoid": ([0.0, 0.4312, 0.5123, 1.0], [0.0, 1.0, 1.0, 0.0]),
+    "inner loop": ([0.0, 0.3011, 0.3312, 0.5531, 1.0], [0.0, 0.6, 0.54, 1.0, 0.0]),
+    "cycles": ([0.0, 0.13, 0.27, 0.44, 0.61, 0.8, 1.0], [0.0, 0.4, 0.1, 0.7, 0.1, 1.0, 0.0]),
+    "sine": None,
+    "haversine": None,
+}
+
+
+def truth(shape: str, t: np.ndarray) -> np.ndarray:
+    if shape == "sine":
+        return np.sin(0.93 * np.pi * t)
+    if shape == "haversine":
+        return 0.5 - 0.5 * np.cos(2.0 * np.pi * t)
+    return np.interp(t, *SHAPES[shape])
+
+
+def given(sigma: float) -> NoiseLevel:
+    return NoiseLevel(sigma, True, "given")
+
+
+def measured(shape: str, n: int, sigma: float, seed: int) -> tuple[np.ndarray, ...]:
+    t, rng = np.linspace(0.0, 1.0, n), np.random.default_rng(seed)
+    true = truth(shape, t)
+    return t, true, true + sigma * rng.standard_normal(n)
+
+
+def reversal(motion: SmoothMotion, t: np.ndarray) -> float:
+    """Furthest that the motion goes back from one place to the next between its turns."""
+    ends, worst = np.concatenate([t[:1], motion.turns, t[-1:]]), 0.0
+    for a, b in pairwise(ends):
+        steps = np.diff(motion.at(np.linspace(a, b, 5 * t.size)))
+        worst = max(worst, min(steps.max(), -steps.min()))
+    return worst
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("sigma", [0.0005, 0.003])
+def test_intervals_hold_the_motion_as_often_as_they_say(shape, sigma):
+    held, errors = [], []
+    for seed in range(DRAWS):
+        t, true, noisy = measured(shape, 400, sigma, seed)
+        motion = follow(t, noisy, given(sigma))
+        off = motion.at(t) - true
+        held.append(np.mean(np.abs(off) < 1.96 * np.linalg.norm(motion.modes(t), axis=1)))
+        errors.append(np.sqrt(np.mean(off**2)) / sigma)
+    # Errors along one record go together: over 40 records the share scatters by some 2.5 %.
+    assert 0.88 < np.mean(held) < 0.995
+    assert np.mean(errors) < 0.4
+
+
+@pytest.mark.parametrize("shape", ["triangle", "inner loop", "cycles"])
+def test_turns_are_found_with_their_instants_and_heights(shape):
+    places, heights = (np.array(v) for v in SHAPES[shape])
+    late, high = [], []
+    for seed in range(DRAWS):
+        t, _, noisy = measured(shape, 1000, 0.001, seed)
+        motion = follow(t, noisy, given(0.001))
+        assert motion.turns.size == places.size - 2
+        late.append((motion.turns - places[1:-1]) / motion.turns_stderr)
+        stderr = np.linalg.norm(motion.modes(motion.turns), axis=1)
+        high.append((motion.at(motion.turns) - heights[1:-1]) / stderr)
+        assert np.all(motion.turns_stderr < 0.5 * t[1])  # sharp: to a part of a sample
+    for off in (np.concatenate(late), np.concatenate(high)):
+        assert 0.7 < np.sqrt(np.mean(off**2)) < 1.3
+        assert abs(np.mean(off)) < 0.5
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("n", [300, 3000])
+def test_noise_makes_no_turn_and_no_reversal(shape, n):
+    turns = {"inner loop": 3, "cycles": 5}.get(shape, 1)
+    for seed in range(8):
+        t, _, noisy = measured(shape, n, 0.002, seed)
+        motion = follow(t, noisy, given(0.002))
+        assert motion.turns.size == turns
+        assert reversal(motion, t) == 0.0
+
+
+@pytest.mark.parametrize("hold", [0.0, 1.0])
+def test_a_line_and_a_hold_have_no_turn(hold):
+    t = np.linspace(0.0, 2e-3, 500)
+    line = 1e-3 * np.interp(t, [0.0, 1e-3, 2e-3], [0.0, 1.0, 2.0 - hold])
+    rng = np.random.default_rng(3)
+    motion = follow(t, line + 1e-6 * rng.standard_normal(t.size), given(1e-6))
+    assert motion.turns.size == 0
+    assert np.all(np.diff(motion.at(t)) >= 0.0)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("rounding", [0.0, 1e-7])
+def test_data_without_noise_stay_as_they_are(shape, rounding):
+    t = np.linspace(5.0, 5.002, 700)
+    part = (t - t[0]) / (t[-1] - t[0])
+    true = truth(shape, part)
+    values = np.round(true / rounding) * rounding if rounding else true
+    motion = follow(t, values, given(rounding / 12**0.5))
+    assert np.abs(motion.at(t) - true).max() < 1e-6
+    assert motion.turns.size == {"inner loop": 3, "cycles": 5}.get(shape, 1)
+    assert reversal(motion, t) == 0.0
+
+
+def test_a_sharp_turn_between_samples_without_noise_is_where_the_lines_meet():
+    t = np.linspace(0.0, 1.0, 700)
+    motion = follow(t, truth("triangle", t), given(0.0))
+    np.testing.assert_allclose(motion.turns, 0.4873, atol=1e-9)
+    np.testing.assert_allclose(motion.at(motion.turns), 1.0, atol=1e-9)
+
+
+def test_an_unknown_noise_is_found():
+    for shape in ("triangle", "haversine", "trapezoid"):
+        t, _, noisy = measured(shape, 1000, 0.002, 1)
+        for level in (estimated_noise(noisy), NoiseLevel(0.006, False, ""), given(0.0005)):
+            assert follow(t, noisy, level).sigma == pytest.approx(0.002, rel=0.12)
+
+
+def test_a_motion_of_equal_steps_is_not_taken_for_a_digitised_one():
+    t = np.linspace(0.0, 1.0, 301)
+    values = 1.0 - np.abs(2.0 * t - 1.0)
+    motion = follow(t, values, NoiseLevel(t[1] / 12**0.5, False, "steps of a digitiser"))
+    assert np.abs(motion.at(t) - values).max() < 1e-6
+
+
+def test_steps_of_a_digitiser_are_noise():
+    t = np.linspace(0.0, 1.0, 1000)
+    true = truth("haversine", t)
+    values = np.round(true / 0.004) * 0.004
+    motion = follow(t, values, estimated_noise(values))
+    assert motion.turns.size == 1
+    assert motion.sigma == pytest.approx(0.004 / 12**0.5, rel=0.15)
+    assert np.abs(motion.at(t) - true).max() < 0.002
+
+
+def test_samples_that_do_not_count_change_nothing():
+    t, true, noisy = measured("triangle", 600, 0.001, 5)
+    counts = np.ones(600, dtype=bool)
+    counts[[0, 100, 101, 102, 350, 599]] = False
+    spoilt = np.where(counts, noisy, 7.0)
+    motion, same = (follow(t, values, given(0.001), counts) for values in (noisy, spoilt))
+    np.testing.assert_array_equal(motion.at(t), same.at(t))
+    assert np.abs(motion.at(t) - true).max() < 0.001
+
+
+def test_without_a_time_samples_count():
+    t, _, noisy = measured("inner loop", 500, 0.001, 6)
+    timed, counted = follow(t, noisy, given(0.001)), follow(None, noisy, given(0.001))
+    np.testing.assert_allclose(counted.turns, timed.turns * 499.0, atol=1e-2)
+
+
+@pytest.mark.parametrize("n", [10, 12, 20, 60])
+def test_short_records_are_followed(n):
+    for seed in range(10):
+        t, true, noisy = measured("triangle", n, 0.002, seed)
+        motion = follow(t, noisy, given(0.002))
+        assert motion.turns.size == 1
+        assert np.abs(motion.at(t) - true).max() < 0.02
+
+
+def test_units_and_origin_of_the_clock_change_nothing():
+    t, _, noisy = measured("trapezoid", 500, 0.001, 7)
+    first, moved = follow(t, noisy, given(0.001)), follow(
+        1.7e9 + 1e-2 * t, 1e-6 * (noisy + 3.0), given(1e-9)
+    )  # fmt: skip
+    np.testing.assert_allclose(moved.at(1.7e9 + 1e-2 * t) * 1e6 - 3.0, first.at(t), atol=2e-4)
+    assert moved.dof == pytest.approx(first.dof, rel=0.05)
+
+
+def test_correlated_noise_leaves_more_uncertain():
+    t, _, noisy = measured("haversine", 800, 0.001, 8)
+    white, slow = (
+        np.linalg.norm(follow(t, noisy, NoiseLevel(0.001, True, "", time)).modes(t), axis=1).mean()
+        for time in (1.0, 4.0)
+    )
+    assert 1.5 < slow / white < 2.2

@@ -1,0 +1,207 @@
+"""Synthetic records as a rig writes them: their truth is foamfit's, and files hold the records."""
+
+from __future__ import annotations
+
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import foamfit as ff
+from conftest import EXPERIMENTS
+
+sys.path.insert(0, str(EXPERIMENTS / "recovery"))
+import rig
+import rigs
+
+
+def share(found: np.ndarray, truth: np.ndarray) -> float:
+    return float(np.abs(found - truth).max() / np.ptp(truth))
+
+
+@pytest.mark.parametrize("law", ["bistable", "microscale"])
+@pytest.mark.parametrize("relaxation", [0, 1])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_impacts_are_those_of_foamfit(law: str, relaxation: int, seed: int) -> None:
+    course = rig.impact(rig.Impact(law=law, relaxation=relaxation), seed).course
+    time, drive = np.linspace(0.0, 1.02 * course.end, 800), course.rig
+    found = ff.simulate(
+        rigs.chain_of(drive), ff.Impact(drive.mass, drive.velocity), time, rtol=1e-9
+    )
+    assert share(found.base_stress, course.stress(time)) < 1e-6
+    assert share(found.displacement[-1], course.top(time, gauge=False)) < 1e-6
+    assert found.contact_end == pytest.approx(course.end, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "setup",
+    [
+        rig.Slow(law="bistable", inner=0.05, motion="trapezoid"),
+        rig.Slow(law="bistable+bistable", inner=0.1),
+        rig.Slow(inner=0.1),
+        rig.Slow(relaxation=2, motion="ramp", early=True),
+        rig.Slow(relaxation=1, motion="sine"),
+        rig.Slow(dashpot=True, relaxation=1),
+    ],
+)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_slow_tests_are_those_of_foamfit(setup: rig.Slow, seed: int) -> None:
+    course = rig.slow(setup, seed).course
+    assert course.rig.motion is not None
+    turns = [t for t in course.rig.motion.times if course.start < t < course.end]
+    time = np.union1d(np.linspace(course.start, course.end, 20_001), turns)
+    drive = ff.DisplacementDrive(course.top(time, gauge=False))
+    found = ff.simulate(rigs.chain_of(course.rig), drive, time - course.start, rtol=1e-9)
+    smooth = ~np.isin(time, [*turns, course.start])  # at a turn a dashpot's stress has two values
+    assert share(found.base_stress[smooth], course.stress(time)[smooth]) < 1e-6
+
+
+def test_gravity_and_a_gauge_on_the_specimen() -> None:
+    setup = rig.Impact(law="microscale", relaxation=1, noise=0.0, gravity=True, before=0.3)
+    made = rig.impact(setup, 3)
+    course, mass, area = made.course, made.rig.mass, made.rig.area
+    time = np.linspace(-0.2 * course.end, 1.2 * course.end, 20_001)
+    gained = np.gradient(np.gradient(course.top(time, False), time), time)
+    braked = rig.GRAVITY - course.stress(time) * area / mass
+    assert np.abs(gained - braked)[5:-5].max() < 1e-3 * np.ptp(braked)
+    rests = course.top(time, gauge=True)
+    assert np.all(rests[time <= 0.0] == 0.0)
+    after = time > course.end
+    assert np.all(np.diff(rests[after]) <= 0.0)  # the specimen recovers, the striker is gone
+    assert rests[after][0] == pytest.approx(course.state[0], rel=1e-3)
+    assert course.top(time, False)[-1] < rests[-1]
+
+
+def test_a_file_says_what_the_record_holds(tmp_path: Path) -> None:
+    setup = rig.Impact(channels=("force", "displacement", "acceleration"), samples=400, before=0.4)
+    made = rig.impact(setup, 5)
+    contact = made.truth["contact_time"]
+    before = made.time < contact
+    assert before.mean() == pytest.approx(0.4, abs=0.01)
+    assert np.ptp(made.clean["force"][before]) == 0.0  # the offset of the sensor
+    assert made.clean["force"][0] != 0.0
+    zero = np.interp(contact, made.time[before][-2:], made.clean["displacement"][before][-2:])
+    flown = made.rig.velocity * (contact - made.time[before][-1])
+    assert zero + flown == pytest.approx(made.truth["displacement_zero"], abs=1e-9)
+    path = rig.write(made, tmp_path)
+    header, *rows = path.read_text().splitlines()
+    assert header == "time (ms),force (N),displacement (mm),acceleration (m/s^2)"
+    table = np.array([row.split(",") for row in rows], dtype=float)
+    assert table[:, 0] == pytest.approx(1e3 * made.time, abs=1e-7)
+    assert table[:, 2] == pytest.approx(1e3 * made.channels["displacement"])
+    other = made.written_so(zero=1e-3, clock=2.0, skip=30)
+    assert other.truth["contact_time"] == contact + 2.0
+    assert np.array_equal(other.channels["force"], made.channels["force"][30:])
+    assert other.truth["displacement_zero"] == made.truth["displacement_zero"] + 1e-3
+
+
+def test_one_seed_is_one_test_whatever_is_recorded() -> None:
+    whole = rig.impact(rig.Impact(channels=("force", "displacement"), noise=0.01), 7)
+    force = rig.impact(rig.Impact(channels=("force",), noise=0.01), 7)
+    assert np.array_equal(whole.channels["force"], force.channels["force"])
+    trimmed = rig.impact(replace(whole.setup, trimmed=True), 7)
+    same = [name for name in whole.truth if name.startswith("s1_")]
+    assert all(trimmed.truth[name] == whole.truth[name] for name in same)
+    assert trimmed.truth["contact_time"] == trimmed.time[0] == 0.0
+
+
+def test_relaxation_and_dashpot_come_under_their_names() -> None:
+    truth = rig.slow(rig.Slow(relaxation=2, dashpot=True), 1).truth
+    assert truth["s1_eta"] > 0.0
+    assert truth["s1_tau1"] < truth["s1_tau2"]
+    assert truth["s1_g1"] > 0.0
+
+
+class Found:
+    """A fit with these values and intervals; its springs and terms are exchanged."""
+
+    status = "ok"
+
+    def __init__(self, record: rig.Record, swap: dict[str, str], off: float) -> None:
+        self.parameters = {}
+        for name, value in record.truth.items():
+            if name.startswith("s"):
+                near = value + off * max(abs(value), 1.0)
+                self.parameters[swap.get(name, name)] = Estimate(near)
+        self.chain = rigs.chain_of(record.rig)
+
+
+class Estimate:
+    def __init__(self, value: float) -> None:
+        self.value, self.stderr = value, 0.01 * abs(value)
+        self.ci95 = value - 0.02 * abs(value), value + 0.02 * abs(value)
+        self.vary, self.state = True, "determined"
+
+
+@pytest.mark.parametrize("name", ["two springs, 300 rows, 0.3 %", "microscale+2, 300 rows, 0.3 %"])
+def test_springs_and_terms_in_another_order_are_the_same(
+    monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    kind = "^()(s)(.)" if name.startswith("two") else "^(.*_)(g|tau)(.)$"
+    other = {"1": "2", "2": "1"}
+    record = rigs.make("slow", name, 1)
+    names = [name for name in record.truth if name.startswith("s")]
+    swap = {n: re.sub(kind, lambda m: f"{m[1]}{m[2]}{other[m[3]]}", n) for n in names}
+    monkeypatch.setattr(ff, "fit", lambda *_, **__: Found(record, swap, 0.0))
+    rows = rigs.run_test("slow", name, 1)
+    assert all(row["holds"] and row["value"] == row["truth"] for row in rows)
+    assert len({row["parameter"] for row in rows}) == len(swap)
+    assert rows[0]["over truth"] == 1.0
+
+
+@pytest.mark.parametrize(("off", "holds", "far"), [(0.0, 1, 0), (0.03, 0, 0), (0.1, 0, 1)])
+def test_far_is_an_interval_that_misses_by_more_than_its_width(
+    monkeypatch: pytest.MonkeyPatch, off: float, holds: int, far: int
+) -> None:
+    record = rigs.make("slow", "microscale, 300 rows, 0.3 %", 1)
+    monkeypatch.setattr(ff, "fit", lambda *_, **__: Found(record, {}, off))
+    rows = pd.DataFrame(rigs.run_test("slow", "microscale, 300 rows, 0.3 %", 1))
+    row = rows[rows["parameter"] == "s1_k0"].iloc[0]
+    assert (row["holds"], row["far"]) == (holds, far)
+    table = rigs.coverage(rows.assign(error=None), "class")
+    assert list(table["holds %"]) == [100.0 * rows["holds"].mean()] * 2
+    assert list(table["far"]) == [rows["far"].sum()] * 2
+
+
+def test_a_failure_is_a_row_and_what_is_done_is_not_done_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise ff.InputError("the record is empty.")
+
+    monkeypatch.setattr(ff, "fit", refuse)
+    raw = tmp_path / "rows.csv"
+    job = ("slow", "microscale, 300 rows, 0.3 %", 1)
+    rows = rigs.run(rigs.run_test, [job], raw, 1)
+    assert list(rows["error"]) == ["InputError: the record is empty."]
+    assert rigs.coverage(rows, "class")["failed"].tolist() == [1, 1]
+    again = rigs.run(pytest.fail, [job], raw, 1)
+    assert again["error"].tolist() == rows["error"].tolist()
+
+
+def test_a_move_is_counted_in_standard_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fitted(record: rig.Record) -> tuple[None, None, dict[str, Estimate]]:
+        return None, None, {"s1_k0": Estimate(1.0 if record.time[0] < 12.0 else 1.002)}
+
+    monkeypatch.setattr(rigs, "fitted", fitted)
+    rows = pd.DataFrame(rigs.run_invariance("impact", "any zero", 3))
+    moved = rows[rows["move"] > 0.0]
+    assert moved["way"].tolist() == ["clock"]
+    assert moved["move"].tolist() == [pytest.approx(0.2)]
+    table = rigs.moves(rows.assign(error=None), "way").set_index("way")
+    assert table.loc["clock", "largest"] == pytest.approx(0.2)
+    assert table.loc["all", "moved %"] == 0.0
+
+
+def test_a_minimum_that_the_search_missed_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    name = "microscale, 300 rows, 0.3 %"
+    wrong = Found(rigs.make("slow", name, 2), {}, 0.0)
+    monkeypatch.setattr(ff, "fit", lambda *_, **__: wrong)
+    rows = pd.DataFrame(rigs.run_test("slow", name, 1))
+    table = rigs.coverage(rows.assign(error=None), "class")
+    assert table["missed"].tolist() == [1, 1]
+    assert table["others hold %"].isna().all()
