@@ -169,7 +169,7 @@ def test_a_velocity_that_the_flight_contradicts_is_a_warning(tmp_path: Path) -> 
         for v in ("2 m/s", "1.9 m/s")
     )  # fmt: skip
     assert not any("velocity" in warning for warning in right.warnings)
-    (told,) = [warning for warning in wrong.warnings if "velocity" in warning]
+    (told,) = [warning for warning in wrong.warnings if "velocity is given" in warning]
     assert "moves at 2" in told
     assert "given as 1.9 m/s" in told
     assert wrong.status == "warnings"
