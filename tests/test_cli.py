@@ -151,7 +151,7 @@ def test_fit_writes_beneath_the_current_directory(fitted: tuple[Path, Result]) -
     folder, result = fitted
     at = f"fits/{RECONSTRUCTION.stem}/bistable"
     profiled = "profile likelihood" in (folder / at / "parameters.csv").read_text()
-    names = FILES | ({"profiles.csv"} if profiled else set())
+    names = FILES | {"budget.csv"} | ({"profiles.csv"} if profiled else set())
     assert set(files(folder)) == {f"{at}/{name}" for name in names}
     assert f"written to {at}" in result.stdout
     assert "s1_kh_minus" in result.stdout
@@ -176,11 +176,12 @@ def test_an_older_result_is_replaced_and_quiet_is_quiet(
     here: Path, fitted: tuple[Path, Result]
 ) -> None:
     shutil.copytree(next(fitted[0].rglob("fit.json")).parent, "old")
-    (here / "old" / "profiles.csv").write_text("x")
+    (here / "old" / "ladder.csv").write_text("x")
     args = ("--drive", "displacement", "--fix", "s1_k0=5.5e6", "--vary", "s1_eta", "--starts", 3)
     result = accepted("fit", RECONSTRUCTION, "--out", "old", "--quiet", *args)
     assert result.stdout == ""
-    assert set(files(here)) == {f"old/{name}" for name in FILES}
+    more = {"old/budget.csv", "old/profiles.csv"}
+    assert set(files(here)) - more == {f"old/{name}" for name in FILES}
     content = json.loads((here / "old" / "fit.json").read_text())
     assert (content["drive"], content["statistics"]["n_starts"]) == ("displacement", 3)
     held, freed = (content["parameters"][name] for name in ("s1_k0", "s1_eta"))

@@ -188,6 +188,11 @@ class Budget:
         rows = self.contributions.values()
         return tuple(one for one in SOURCES if any(row[one] > 0.0 for row in rows))
 
+    @property
+    def telling(self) -> bool:
+        """Whether it says more than the standard errors and ranges of the parameters."""
+        return bool(set(self.sources) - {"noise", "law"})
+
     def combined(self, name: str) -> float:
         """Root of the sum of the squares of all contributions to a parameter, SI."""
         return math.hypot(*self.contributions[name].values())

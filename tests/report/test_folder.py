@@ -75,7 +75,7 @@ def test_json_keeps_the_contract(saved: Path) -> None:
     assert content["parameters"]["s1_k0"] == {
         "value": 5.5e6, "stderr": 66000.0, "ci95": [5370640.0, 5629360.0], "unit": "Pa",
         "vary": True, "state": "determined", "why": "the test reaches its branch",
-        "ci95_method": None, "range": None,
+        "ci95_method": None, "range": None, "systematic": 0.0,
     }  # fmt: skip
     assert content["visited"] == {"s1": ["a", "d", "c", "e"]}
     assert content["misfit"]["stress_strain"] is None

@@ -551,7 +551,7 @@ def test_the_pictures_show_every_parameter_and_curve() -> None:
 def test_report_and_plan_show_them_too() -> None:
     result = concluded()
     page = render_report(result)
-    assert page.count("data:image/png;base64,") == 3
+    assert page.count("data:image/png;base64,") == 4
     for words in ("Checklist", "What the test determines", "Is the noise floor reached?"):
         assert words in page
     assert result.insight.sentence() in page

@@ -96,6 +96,7 @@ class Objective:
     # residual; the residual is counted in its full covariance, see `weigh`.
     uncertain: Array | None = None
     loss: str = "linear"  # One of `LOSSES`
+    followed: SmoothMotion | None = None  # The motion behind the displacement, if it is known
     evaluations: int = field(default=0, init=False)  # Sets of parameters that were simulated
     failures: int = field(default=0, init=False)  # Those of them that could not be
 
@@ -154,6 +155,8 @@ class Objective:
         level = self.measurement.noise.of("displacement")
         if values is None or level is None or level.sigma <= EXACT * float(np.ptp(values)):
             return None
+        if self.followed is not None:
+            return self.followed
         return follow(self.time, values, level, self.measurement.sampled.get("displacement"))
 
     @cached_property

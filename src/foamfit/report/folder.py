@@ -45,9 +45,9 @@ def save_result(result: Fit, folder: str | Path, *, width: str = TWO, mapped: Ma
 
     It is made with its parents; InputError if something else stands there (see `check_target`) or
     it cannot be written, and nothing is changed then. ``profiles.csv`` is written where there are
-    profiles, ``ladder.csv`` where there is a ladder, ``budget.csv`` where a parameter is
-    determined. `width` and `mapped` are those of the figures,
-    see `foamfit.report.result_figures.draw_all`. Returns the folder.
+    profiles, ``ladder.csv`` where there is a ladder, ``budget.csv`` where the budget says more
+    than the parameters. `width` and `mapped` are those of the figures, see
+    `foamfit.report.result_figures.draw_all`. Returns the folder.
     """
     return save_whole(folder, lambda fresh: write_result(result, fresh, width=width, mapped=mapped))
 
@@ -183,7 +183,7 @@ def write_result(
     write_table(folder / "curves.csv", _curve_rows(result.curves, result.measurement))
     if result.intervals is not None and result.intervals.profiles:
         write_table(folder / "profiles.csv", _profile_rows(result.intervals))
-    if result.budget is not None:
+    if pages and result.budget is not None and result.budget.telling:
         write_table(folder / "budget.csv", result.budget.rows())
     if result.ladder is not None:
         write_table(folder / "ladder.csv", result.ladder.rows())

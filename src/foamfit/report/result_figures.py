@@ -88,10 +88,7 @@ def _profiles(result: Fit) -> Figure | None:
 
 
 def _budget(result: Fit) -> Figure | None:
-    # With these two alone all of it stands in the table of parameters.
-    if (budget := result.budget) is None or not set(budget.sources) - {"noise", "law"}:
-        return None
-    return plot_budget(budget)
+    return plot_budget(result.budget) if result.budget and result.budget.telling else None
 
 
 # In the order in which they are begun: what takes longest first.

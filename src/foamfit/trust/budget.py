@@ -84,7 +84,9 @@ def _changed(best: BestPoint, quantity: str, share: float) -> tuple[Array, Array
                 values[best.index[name]] *= 1.0 + share
     elif quantity in best.index:
         values[best.index[quantity]] *= 1.0 + share
-    objective = replace(problem.objective, measurement=test)
+    same = test.displacement is problem.measurement.displacement
+    followed = problem.objective.motion if same else None
+    objective = replace(problem.objective, measurement=test, followed=followed)
     return values, objective.compare(objective.simulate(values), values)
 
 
