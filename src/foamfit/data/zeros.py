@@ -23,6 +23,8 @@ _LEAST_LEAD, _FEWEST = 8, 3  # rows kept before contact; rows that show a zero
 _FEW = 20  # rows before contact below which the end of a record that is flat shows the zero better
 _TAIL, _HIGHEST = 0.04, 0.1  # share of a record that is its end; of the range, its highest level
 _GRAVITY = 9.81  # m/s²
+# How a note begins to say which velocity a motion contradicts.
+CONTRADICTED = "but the striker's velocity is given as"
 
 
 @dataclass(frozen=True)
@@ -239,8 +241,8 @@ def flight_notes(
     off, error = abs(speed - given), float(np.hypot(error, spread))
     if off > max(3.0 * error, 0.005 * given) and abs(speed) > 0.5 * given:
         notes.append(
-            f"Check: before contact the displacement moves at {speed:.4g} ± {error:.2g} m/s, but "
-            f"the striker's velocity is given as {given:.4g} m/s."
+            f"Check: before contact the displacement moves at {speed:.4g} ± {error:.2g} m/s, "
+            f"{CONTRADICTED} {given:.4g} m/s."
         )
     return notes
 

@@ -61,7 +61,8 @@ def priors_of(measurement: Measurement, drive: str) -> dict[str, Prior]:
     """Priors of nuisance parameters: zeros shown before contact, and each ± of the TOML.
 
     A machine may move before it touches the specimen: its rest does not show the zero of a motion
-    that drives.
+    that drives. The mass has no prior where the stress was computed with it: force and inertia then
+    change together.
     """
     values = values_of(measurement)
     known = {zero: measurement.zeros.get(channel) for zero, channel in ZEROS.items()}
@@ -69,6 +70,8 @@ def priors_of(measurement: Measurement, drive: str) -> dict[str, Prior]:
         known["displacement_zero"] = None
     stated = {VELOCITY: "velocity", STRIKER_MASS: "striker_mass", TIME_SHIFT: "delay"}
     known |= {name: measurement.uncertainties.get(key) for name, key in stated.items()}
+    if measurement.braked:
+        del known[STRIKER_MASS]
     return {name: Prior(name, values[name], sigma) for name, sigma in known.items() if sigma}
 
 

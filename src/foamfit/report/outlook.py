@@ -14,10 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from foamfit.arrays import Array
+from foamfit.data.describe import taken_for_exact
 from foamfit.data.measurement import Measurement, Noise, NoiseLevel, Striker
 from foamfit.data.toml_file import read_settings
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.branches import visited
+from foamfit.fitting.nuisance import VELOCITY
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.search import Tracker, search
 from foamfit.report.folder import load_result
@@ -27,10 +29,11 @@ from foamfit.solve.simulation import Response, simulate
 from foamfit.springs import kernels
 from foamfit.springs.chain import Chain, Impact
 from foamfit.springs.model import Model
-from foamfit.springs.parameters import split_name, unit_of
+from foamfit.springs.parameters import NUISANCE, split_name, unit_of
 from foamfit.springs.published import published
 from foamfit.trust import covariance
 from foamfit.trust.best_point import BestPoint
+from foamfit.trust.budget import response
 from foamfit.trust.conclude import state_of
 from foamfit.trust.identifiability import Insight, look
 
@@ -69,6 +72,9 @@ class Outlook:
     closing: dict[str, float | None]
     faster: Expected | None  # 5 % faster than what closes all loops, where one is left open
     noise: dict[str, NoiseLevel]  # Of each counted curve
+    # Of each quantity that the TOML gives without a ±: the parameter that 1 % of it moves farthest
+    # in standard errors by noise, by how many of these, and by which share of its scale.
+    exact: dict[str, tuple[str, float, float]]
 
 
 def make_outlook(problem: Problem, values: Array, source: str) -> Outlook:
@@ -90,8 +96,30 @@ def make_outlook(problem: Problem, values: Array, source: str) -> Outlook:
         }
         fast = max((v for v in closing.values() if v is not None), default=0.0)
         if fast > impact.velocity:
-            quicker = expect(_faster(problem, values, BEYOND * fast, sd), values, sd)
-    return Outlook(problem, values, source, planned, closing, quicker, noise)
+            there = values.copy()
+            there[problem.index[VELOCITY]] = BEYOND * fast
+            quicker = expect(_faster(problem, values, BEYOND * fast, sd), there, sd)
+    exact = _moved_farthest(BestPoint(problem, values), planned.estimates)
+    return Outlook(problem, values, source, planned, closing, quicker, noise, exact)
+
+
+def _moved_farthest(
+    best: BestPoint, expected: Mapping[str, ParameterEstimate]
+) -> dict[str, tuple[str, float, float]]:
+    """What 1 % of each quantity without a ± does, most telling first; see `Outlook.exact`."""
+    found, sizes = {}, dict(zip(best.names, best.sizes.tolist(), strict=True))
+    for quantity in taken_for_exact(best.problem.measurement):
+        change = response(best, quantity, 0.01)
+        steps = {
+            name: abs(float(change[best.index[name]]))
+            for name, item in expected.items()
+            if item.stderr and name in sizes and name not in NUISANCE
+        }
+        times = {name: step / (expected[name].stderr or 1.0) for name, step in steps.items()}
+        if times and max(times.values()) > 0.0:
+            most = max(times, key=times.__getitem__)
+            found[quantity] = most, times[most], steps[most] / sizes[most]
+    return dict(sorted(found.items(), key=lambda item: -item[1][1]))
 
 
 # ---------------------------------------------------------------- start values
@@ -139,13 +167,15 @@ def result_values(problem: Problem, folder: Path) -> tuple[Array, str]:
     """Start values of an earlier result, from its folder or its fit.json."""
     content = load_result(folder)
     given = content.get("parameters", {})
-    missing = [name for name in problem.names if name not in given]
+    missing = [name for name in problem.model.names if name not in given]
     if missing:
         raise InputError(
             f"{folder} has no {missing[0]}; it is a {content.get('model')}, not a "
             f"{problem.model.name}"
         )
-    values = np.array([float(given[name]["value"]) for name in problem.names])
+    values = problem.vector()  # contact and zeros are those of this test
+    for name in problem.model.names:
+        values[problem.index[name]] = float(given[name]["value"])
     return problem.space().complete(values), f"the result in {folder}"
 
 

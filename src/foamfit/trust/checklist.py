@@ -12,6 +12,7 @@ import numpy as np
 
 from foamfit.data.energy import EnergyAudit
 from foamfit.data.measurement import INTEGRATED
+from foamfit.data.zeros import CONTRADICTED
 from foamfit.errors import InputError
 from foamfit.fitting.branches import covered, visited
 from foamfit.fitting.curves import check_time_shift
@@ -291,6 +292,16 @@ def _bounds(e: Findings) -> _Answer:
 # ---------------------------------------------------------------- the test itself
 
 
+def _flight(e: Findings) -> _Answer:
+    measurement = e.best.problem.measurement
+    if e.objective.drive != "impact" or measurement.displacement is None:
+        return None, "The test has no motion that could tell."
+    wrong = tuple(note for note in measurement.notes if CONTRADICTED in note)
+    if wrong:
+        return False, "See the warning.", wrong
+    return True, "Nothing recorded contradicts it."
+
+
 def _energy(e: Findings) -> _Answer:
     taken, warnings = e.balance.absorbed_over_striker, tuple(e.balance.energy_warnings())
     if taken is None and not warnings:
@@ -341,6 +352,7 @@ def _spoken(name: str) -> str:
 QUESTIONS: dict[str, tuple[str, Callable[[Findings], _Answer]]] = {
     "ended": ("Did the search end by itself?", _ended),
     "followed": ("Does the model follow the curves?", _followed),
+    "velocity": ("Is the striker's velocity that of its motion?", _flight),
     "floor": ("Is the noise floor reached?", _floor),
     "determined": ("Are all parameters determined?", _determined),
     "intervals": ("Are the intervals those that were asked for?", _trusted),

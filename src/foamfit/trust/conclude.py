@@ -30,6 +30,7 @@ from foamfit.springs.parameters import split_name, unit_of
 from foamfit.text import engineering, listed, percent
 from foamfit.trust import covariance
 from foamfit.trust.best_point import BestPoint
+from foamfit.trust.budget import make_budget
 from foamfit.trust.checklist import MAY_VANISH, Findings, make_checklist, status_of, warnings_of
 from foamfit.trust.identifiability import Insight, look
 from foamfit.trust.residuals.law_error import CurveError
@@ -44,7 +45,7 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
     measurement, specimen = problem.measurement, problem.measurement.specimen
     intervals = Intervals() if intervals is None else intervals
     insight = look(best, _left_over(best)) if best.names else None
-    estimates = _estimates(best, insight, intervals)
+    estimates, budget = make_budget(best, _estimates(best, insight, intervals))
     balance, misfit = audit(measurement), objective.misfit(simulated)
     checklist = make_checklist(Findings(best, estimates, misfit, record, balance, intervals))
     springs = best.values[: len(problem.model.names)]
@@ -87,6 +88,7 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         interior_mass=objective.interior_mass,
         noise=noise_of(best, best.errors if best.names else ()),
         intervals=intervals,
+        budget=budget,
     )
 
 
