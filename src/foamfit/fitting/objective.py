@@ -162,7 +162,14 @@ class Objective:
         level = self.measurement.noise.of("displacement")
         if values is None or level is None or level.sigma <= EXACT * float(np.ptp(values)):
             return None
-        found = follow(self.time, values, level, self.measurement.sampled.get("displacement"))
+        counts = self.measurement.sampled.get("displacement")
+        found = follow(self.time, values, level, counts)
+        if self.measurement.block > 1 and found.turns.size:
+            # The mean of rows on either side of a turn lies off the motion.
+            gap = float(np.median(np.diff(self.time)))
+            apart = np.abs(self.time[:, None] - found.turns).min(axis=1) > 0.75 * gap
+            counts = apart if counts is None else counts & apart
+            found = follow(self.time, values, level, counts)
         return found if found.sigma <= FOLLOWED * level.sigma else None
 
     @cached_property
