@@ -54,8 +54,9 @@ MAX_STEPS = 20_000
 EXACT = 1e-6
 # Most instants that are simulated for each sample that averages rows of the file.
 FINEST = 8
-# Steps of differences: of the velocity and the mass, relative, and of times over the instants' gap.
-RELATIVE_STEP, STEP_OF_TIME = 1e-3, 0.02
+# Steps of differences: of the velocity and the mass, relative, of times over the instants' gap, and
+# of the zero of a motion over its range.
+RELATIVE_STEP, STEP_OF_TIME, STEP_OF_ZERO = 1e-3, 0.02, 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,6 +237,10 @@ class Objective:
             else STEP_OF_TIME * gap
             for name in self.nuisance
         }
+        if self.measurement.displacement is not None:
+            self._steps["displacement_zero"] = STEP_OF_ZERO * float(
+                np.ptp(self.measurement.displacement)
+            )
         known = nuisances.priors_of(self.measurement)
         self.priors = tuple(known[name] for name in self.nuisance if name in known)
         count, places = len(self.model.names), {n: i for i, n in enumerate(self.nuisance)}
@@ -379,10 +384,12 @@ class Objective:
         """Derivative of the curves by one nuisance parameter.
 
         The zero of a channel adds to it; the others by a central difference of two simulations,
-        whose error is far below that of their steps.
+        whose error is far below that of their steps. So is the zero of a motion along which the
+        stress of an impact is counted.
         """
         name, n = self.nuisance[at], self.time.size
-        if name in nuisances.ZEROS:
+        followed = self.drive == "impact" and "stress_strain" in self.counted
+        if name in nuisances.ZEROS and not (followed and name == "displacement_zero"):
             own = {curve: self._zero_of.get(curve) == name for curve in self.curves}
             return {curve: np.full(n, float(shifted)) for curve, shifted in own.items()}
         if self.drive != "impact" and name != nuisances.TIME_SHIFT:
