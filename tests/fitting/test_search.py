@@ -316,13 +316,16 @@ force = { column = "Load", unit = "V", scale = "4444.4 N/V" }
 
 @needs_data
 @pytest.mark.parametrize(
-    ("name", "columns", "motion"),
+    ("name", "columns", "motion", "ratio"),
     [
-        ("test_1_impact.csv", "", "measured"),
-        ("test_1_raw.txt", VOLTS, "integrated from acceleration"),
+        # its 8 rows at rest are 90 kPa above those of the whole record, 2 % of the impulse
+        ("test_1_impact.csv", "", "measured", 0.755),
+        ("test_1_raw.txt", VOLTS, "integrated from acceleration", 0.775),
     ],
 )
-def test_a_striker_on_cartilage_is_fitted_and_its_impulse_doubted(name, columns, motion, tmp_path):
+def test_a_striker_on_cartilage_is_fitted_and_its_impulse_doubted(
+    name, columns, motion, ratio, tmp_path
+):
     """Measurements of JoVE 64450, also from the instrument's own text in volts."""
     toml = tmp_path / "cartilage.toml"
     toml.write_text(CARTILAGE + columns)
@@ -330,6 +333,6 @@ def test_a_striker_on_cartilage_is_fitted_and_its_impulse_doubted(name, columns,
     assert measurement.motion == motion
     result = ff.fit(measurement)
     assert result.drive == "impact"
-    assert result.energy["impulse_ratio"] == pytest.approx(0.78, abs=0.02)
+    assert result.energy["impulse_ratio"] == pytest.approx(ratio, abs=0.01)
     assert any("momentum" in warning for warning in result.warnings)
     assert result.misfit["stress_time"] < 0.2
