@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import foamfit as ff
-from conftest import DATA, needs_data, synthetic_impact, synthetic_loop
+from conftest import DATA, EXPERIMENTS, needs_data, synthetic_impact, synthetic_loop
 from foamfit.data.measurement import Measurement, Noise, Specimen
 from foamfit.fitting import search
 from foamfit.fitting.problem import make_params
@@ -91,6 +91,26 @@ def test_fixed_values_bounds_and_expressions_are_kept():
     assert result.params["s1_eps_c"].value <= 0.305
     assert result.parameters["s1_k0"].state == "fixed"
     assert result.parameters["s1_eps_c"].state == "weak"  # the true value lies past the bound
+
+
+def test_contact_and_zero_are_reported_in_the_numbers_of_the_file():
+    """And a caller's own parameters, which speak of the file too, are as good for a second fit."""
+    test = ff.read_test(EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv")
+    params = make_params(test)
+    before = params.valuesdict(), {name: (one.min, one.max) for name, one in params.items()}
+    result = ff.fit(test, params=params, starts=1)
+    assert before == (params.valuesdict(), {n: (one.min, one.max) for n, one in params.items()})
+    for name, true in (("contact_time", 49.5 * 1.416e-6), ("displacement_zero", 0.0)):
+        origin, item = test.origins[name], result.parameters[name]
+        assert origin != 0.0
+        assert before[0][name] == origin
+        assert item.ci95[0] < true < item.ci95[1], name
+        assert result.params[name].value == item.value
+    held = make_params(test)
+    held["contact_time"].set(value=66e-6, vary=False)
+    result = ff.fit(test, params=held, starts=1)
+    assert result.params["contact_time"].value == pytest.approx(66e-6, rel=1e-12)
+    assert result.parameters["contact_time"].state == "fixed"
 
 
 @pytest.mark.parametrize(("model", "max_time"), [("bistable", 0.02), ("bistable+bistable", 1e-6)])
