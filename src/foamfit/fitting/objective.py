@@ -57,9 +57,9 @@ NORMAL = 1.4826
 EXACT, FOLLOWED = 1e-6, 1.5
 # Most instants that are simulated for each sample that averages rows of the file.
 FINEST = 8
-# Steps of differences: of the velocity and the mass, relative, and of times over the instants' gap.
-RELATIVE_STEP, STEP_OF_TIME = 1e-3, 0.02
-STEP_OF_ZERO = 1e-4  # of a motion that drives, over its range
+# Steps of differences: of the velocity and the mass, relative, of times over the instants' gap, and
+# of the zero of a motion over its range.
+RELATIVE_STEP, STEP_OF_TIME, STEP_OF_ZERO = 1e-3, 0.02, 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,8 +262,9 @@ class Objective:
         self.usual = nuisances.values_of(self.measurement)
         self._steps = dict.fromkeys(self.nuisance, STEP_OF_TIME * gap)
         self._steps |= {name: RELATIVE_STEP * self.usual[name] for name in nuisances.STRIKER}
-        if self._driven:
-            self._steps["displacement_zero"] = STEP_OF_ZERO * float(np.ptp(self._moved))
+        if self.measurement.displacement is not None:
+            span = float(np.ptp(self.measurement.displacement))
+            self._steps["displacement_zero"] = STEP_OF_ZERO * span
         known = nuisances.priors_of(self.measurement, self.drive)
         self.priors = tuple(known[name] for name in self.nuisance if name in known)
         count, places = len(self.model.names), {n: i for i, n in enumerate(self.nuisance)}
@@ -407,10 +408,12 @@ class Objective:
         """Derivative of the curves by one nuisance parameter.
 
         The zero of a channel adds to it; the others by a central difference of two simulations,
-        whose error is far below that of their steps.
+        whose error is far below that of their steps. So is the zero of a motion along which the
+        stress of an impact is counted.
         """
         name, n = self.nuisance[at], self.time.size
-        if name in nuisances.ZEROS and not (self._driven and name == "displacement_zero"):
+        followed = self._driven or "stress_strain" in self.counted
+        if name in nuisances.ZEROS and not (followed and name == "displacement_zero"):
             own = {curve: self._zero_of.get(curve) == name for curve in self.curves}
             return {curve: np.full(n, float(shifted)) for curve, shifted in own.items()}
         if self.drive != "impact" and name not in (nuisances.TIME_SHIFT, "displacement_zero"):
