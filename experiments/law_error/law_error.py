@@ -211,7 +211,8 @@ def linear_problem(kind: str) -> tuple[BestPoint, np.ndarray, np.ndarray]:
     with tempfile.TemporaryDirectory() as folder:
         test = ff.read_test(measured(kind, None, Path(folder)))
     problem, rho = make_problem(test, "bistable", "impact", None, None, False), KINDS[kind]
-    truth = np.array([*SPRING.seven, 0.0, 0.0])
+    truth = problem.vector()
+    truth[:9] = *SPRING.seven, 0.0, 0.0
     around = BestPoint(problem, truth, tuple(problem.free()[:7]))
     pull = np.linalg.pinv(around.jacobian * around.sizes)
     noise = NoiseProcess(np.array([rho] if rho else []), 1.0)

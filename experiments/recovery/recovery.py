@@ -162,7 +162,8 @@ def linear_test(group: Class, seed: int) -> list[dict[str, object]]:
 
     spring, measurement = random_case(group.rng(seed), group.samples, draw)
     problem = make_problem(measurement, "bistable", "impact", None, None, False)
-    truth = np.array([*spring.seven, spring.eta, 0.0])
+    truth = problem.vector()
+    truth[:9] = *spring.seven, spring.eta, 0.0
     around = BestPoint(problem, truth)
     names = around.names
     scaled = around.jacobian * around.sizes

@@ -47,7 +47,8 @@ DRAWS = {"bootstrap": 500, "mcmc": 2000}
 # Evaluations that the default spends on profiles, and on ranges, over those of the search; and how
 # often it goes on from a better point that these have met.
 PROFILE_SHARE, IMPROVEMENTS = 0.5, 3
-# Evaluations over those of the search past which no better point is gone on from.
+# Evaluations over those of the search past which no better point is gone on from, unless intervals
+# were asked for.
 TOGETHER = 0.8
 # Cost over the one before below which the ranges are made anew from a better point.
 MOVED = 0.999
@@ -221,6 +222,7 @@ def _assess(
     problem, tracker, record = found.problem, found.tracker, found.record
     budget = PROFILE_SHARE * problem.objective.evaluations
     enough = (1.0 + TOGETHER) * problem.objective.evaluations
+    enough = enough if choice.method in ("auto", "local") else math.inf
     left, there = Open(), math.inf
     for _ in range(IMPROVEMENTS + 1):
         if not best.names or problem.objective.evaluations > enough:
@@ -313,10 +315,8 @@ def _weigh_motion(problem: Problem, tracker: Tracker) -> None:
     for _ in range(WEIGHED):
         if tracker.best_values is None:
             return
-        uncertain = problem.objective.by_motion(tracker.best_values)
-        if uncertain is None:
+        if not problem.objective.weigh_motion(tracker.best_values):
             return
-        problem.objective.weigh(uncertain)
         tracker.restart()
         _refine(problem, tracker)
 

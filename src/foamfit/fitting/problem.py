@@ -350,7 +350,7 @@ def make_problem(
     )  # fmt: skip
     measurement = objective.measurement  # with the noise of each channel
     wanted = make_params(measurement, model, drive, time_shift=time_shift)
-    params = lmfit.Parameters() if params is None else params
+    params = lmfit.Parameters() if params is None else params.copy()  # a caller's own stay
     if unknown := [name for name in params if name not in wanted]:
         raise InputError(
             f"parameter '{unknown[0]}' is not one of the model {model.name}; "

@@ -19,7 +19,6 @@ from foamfit.data.measurement import Measurement, Noise, NoiseLevel, Striker
 from foamfit.data.toml_file import read_settings
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.branches import visited
-from foamfit.fitting.nuisance import VELOCITY
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.search import Tracker, search
 from foamfit.report.folder import load_result
@@ -96,9 +95,8 @@ def make_outlook(problem: Problem, values: Array, source: str) -> Outlook:
         }
         fast = max((v for v in closing.values() if v is not None), default=0.0)
         if fast > impact.velocity:
-            there = values.copy()
-            there[problem.index[VELOCITY]] = BEYOND * fast
-            quicker = expect(_faster(problem, values, BEYOND * fast, sd), there, sd)
+            faster, there = _faster(problem, values, BEYOND * fast, sd)
+            quicker = expect(faster, there, sd)
     exact = _moved_farthest(BestPoint(problem, values), planned.estimates)
     return Outlook(problem, values, source, planned, closing, quicker, noise, exact)
 
@@ -164,18 +162,17 @@ def published_values(problem: Problem, name: str) -> tuple[Array, str]:
 
 
 def result_values(problem: Problem, folder: Path) -> tuple[Array, str]:
-    """Start values of an earlier result, from its folder or its fit.json."""
+    """Start values of the springs of an earlier result, from its folder or its fit.json."""
     content = load_result(folder)
-    given = content.get("parameters", {})
-    missing = [name for name in problem.model.names if name not in given]
+    given, springs = content.get("parameters", {}), problem.model.names
+    missing = [name for name in springs if name not in given]
     if missing:
         raise InputError(
             f"{folder} has no {missing[0]}; it is a {content.get('model')}, not a "
             f"{problem.model.name}"
         )
-    values = problem.vector()  # contact and zeros are those of this test
-    for name in problem.model.names:
-        values[problem.index[name]] = float(given[name]["value"])
+    values = problem.vector()
+    values[: len(springs)] = [float(given[name]["value"]) for name in springs]
     return problem.space().complete(values), f"the result in {folder}"
 
 
@@ -222,9 +219,12 @@ def simulated_test(like: Measurement, chain: Chain, drive: Impact) -> Measuremen
         like.noise.displacement or NOISE * float(np.ptp(motion)),
     )
     inside = {node: response.displacement[node - 1] for node in like.interior}
+    slowed = -np.gradient(np.gradient(motion, time), time)
     return replace(
         like, time=time, stress=stress, displacement=motion, interior=inside, noise=noise,
-        striker=Striker(drive.mass, drive.velocity), outliers={}, contact="file",
+        acceleration=None if like.acceleration is None else slowed,
+        striker=Striker(drive.mass, drive.velocity), outliers={}, sampled={}, block=1,
+        contact="file",
     )  # fmt: skip
 
 
@@ -283,17 +283,29 @@ def _closes(chain: Chain, drive: Impact, spring: int) -> bool:
 
 def _faster(
     problem: Problem, values: Array, velocity: float, noise: Mapping[str, float]
-) -> Problem:
-    """Return the same problem at another velocity of the striker, its curves simulated."""
-    test = problem.measurement
-    given = {name.startswith("displacement"): value for name, value in noise.items()}
-    test = replace(test, noise=Noise(given.get(False), given.get(True)))
+) -> tuple[Problem, Array]:
+    """Return the same problem at another velocity of the striker, and its vector of parameters.
+
+    Its curves are simulated, and its nuisance parameters those of such a record.
+    """
+    test, springs = problem.measurement, problem.model.names
+    given = {problem.objective.channel(name): value for name, value in noise.items()}
+    moved = next((given[name] for name in given if name.startswith("displacement")), None)
+    estimated = {
+        name: level for name, level in test.noise.estimated.items() if name == "acceleration"
+    }
+    test = replace(test, noise=Noise(given.get("stress"), moved, estimated))
     impact = Impact(_impact(test).mass, velocity)
     test = simulated_test(test, chain_of(problem, values), impact)
-    return make_problem(
-        test, problem.model.name, "impact", problem.params, problem.objective.weights,
+    params = problem.params.copy()
+    for name in problem.objective.nuisance:
+        del params[name]
+    faster = make_problem(
+        test, problem.model.name, "impact", params, problem.objective.weights,
         problem.objective.interior_mass, relaxation=problem.model.relaxation,
     )  # fmt: skip
+    own = values[: len(springs)]
+    return faster, np.append(own, faster.vector()[own.size :])
 
 
 def expect(problem: Problem, values: Array, noise: Mapping[str, float]) -> Expected:
@@ -304,7 +316,7 @@ def expect(problem: Problem, values: Array, noise: Mapping[str, float]) -> Expec
     best, params = BestPoint(problem, values), problem.params
     lost, names = best.unreached, best.names
     insight = look(best, noise) if names else None
-    expected = {}
+    expected, origins = {}, problem.measurement.origins
     for name in problem.free():
         value, unit = float(values[problem.index[name]]), unit_of(name)
         if name in lost or insight is None:
@@ -316,7 +328,8 @@ def expect(problem: Problem, values: Array, noise: Mapping[str, float]) -> Expec
         limits = (params[name].min, params[name].max)
         state, why = state_of(name, value, (value - half, value + half), insight, limits)
         known = None if state == "not determined" else stderr
-        expected[name] = ParameterEstimate(value, known, None, unit, True, state, why)
+        found = ParameterEstimate(value, known, None, unit, True, state, why)
+        expected[name] = found.counted_from(-origins.get(name, 0.0))
     impact = problem.objective.drive == "impact"
     velocity = _impact(problem.measurement).velocity if impact else None
     there = _snapped(best)

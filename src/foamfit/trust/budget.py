@@ -85,7 +85,7 @@ def _changed(best: BestPoint, quantity: str, share: float) -> tuple[Array, Array
     elif quantity in best.index:
         values[best.index[quantity]] *= 1.0 + share
     same = test.displacement is problem.measurement.displacement
-    followed = problem.objective.motion if same else None
+    followed = (problem.objective.motion,) if same else ()
     objective = replace(problem.objective, measurement=test, followed=followed)
     return values, objective.compare(objective.simulate(values), values)
 

@@ -23,7 +23,7 @@ from foamfit.springs.parameters import BRANCHES, NUISANCE, split_name
 from foamfit.text import engineering, listed, percent
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import AT_LIMIT, WEAK
-from foamfit.trust.time_shift import shift_hint
+from foamfit.trust.time_shift import damping_hint, shift_hint
 
 # A curve was not fitted if it is off by more than this share of its own standard deviation; it is
 # fitted poorly if it is off by more than this share of its range.
@@ -345,6 +345,20 @@ def _time_shift(e: Findings) -> _Answer:
     return False, f"The motion seems {told}.", (warning,)
 
 
+def _damping(e: Findings) -> _Answer:
+    if e.objective.drive != "displacement" or not e.best.names:
+        return None, "Only under a driven motion is it left out."
+    found = damping_hint(e.best, [n for n, item in e.estimates.items() if item.stderr is not None])
+    if found is None:
+        return True, "A dashpot would not lower the residuals much."
+    size = engineering(found, "Pa s").replace("Pa s", "Pa·s")
+    warning = (
+        f"A dashpot of about {size}, which was left out, would lower the residuals; fit it by "
+        "--vary s1_eta, else it distorts the other parameters."
+    )
+    return False, f"A dashpot of about {size} would lower the residuals.", (warning,)
+
+
 def _spoken(name: str) -> str:
     return name.replace("_", "-")
 
@@ -365,4 +379,5 @@ QUESTIONS: dict[str, tuple[str, Callable[[Findings], _Answer]]] = {
     "energy": ("Does the energy balance hold?", _energy),
     "impulse": ("Does the momentum balance hold?", _impulse),
     "time_shift": ("Are force and motion free of a time shift?", _time_shift),
+    "damping": ("Is the dashpot rightly left out?", _damping),
 }

@@ -285,8 +285,7 @@ def _varied(
         method = "local covariance"
         why += "; its profile is much narrower and was not taken"
     elif name in intervals.ends and (ratio < 1.0 / ASTRAY or ASTRAY < ratio < math.inf):
-        stderr *= ratio
-        why += "; its standard error is that of the interval, as the local one does not hold"
+        why += "; the local standard error does not give it"
     ci95 = (max(ends[0], low), min(ends[1], high))
     return ParameterEstimate(value, stderr, ci95, unit, True, state, why, method, span)
 

@@ -17,6 +17,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.fitting.box import scale_in_words
 from foamfit.fitting.branches import Section, sections
+from foamfit.springs.parameters import NUISANCE
 from foamfit.text import listed, percent
 
 if TYPE_CHECKING:
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 PART, NAMED = 0.05, 0.3
 # Parameters of a joint change that are named at most.
 MOST = 3
+# Times and zeros count from an arbitrary origin: their powers mean nothing.
+OF_NO_POWER = set(NUISANCE) - {"velocity", "striker_mass"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +172,8 @@ class Insight:
         names, moving = [self.names[i] for i in group], int(np.sum(singular > NAMED))
         if moving == len(group):
             return f"the curves determine no combination of {listed(names)}"
-        if moving == len(group) - 1 and np.all(self.values[group] != 0.0):
+        counted = set(names) & OF_NO_POWER or not np.all(self.values[group] != 0.0)
+        if moving == len(group) - 1 and not counted:
             # d ln|p| = (size/p) dx, so exponents are the weights of x times p/size.
             powers = left[:, -1] * (self.values / self.sizes)[group]
             return f"the data fix only {_product(names, powers)}"
