@@ -11,7 +11,7 @@ import numpy as np
 from foamfit.api import FitResult
 from foamfit.data.measurement import Measurement, Specimen, Striker
 from foamfit.report.result_figures import Images
-from foamfit.results import Curves, ParameterEstimate, Switch
+from foamfit.results import SOURCES, Budget, Curves, ParameterEstimate, Switch
 from foamfit.springs.chain import Chain
 from foamfit.springs.parameters import MICROSCALE_NAMES
 from foamfit.springs.spring import BistableSpring, LinearSpring, MicroscaleSpring
@@ -159,6 +159,17 @@ def result(**changed: Any) -> FitResult:
     return FitResult(**(given | changed))
 
 
+def budget(**shares: float) -> Budget:
+    """An uncertainty budget of two parameters, its sources over the value."""
+    given = {"noise": 0.01} | {name.replace("_", " "): share for name, share in shares.items()}
+    row = dict.fromkeys(SOURCES, 0.0) | given
+    values = {"s1_k0": SPRING.k0, "s1_eps_a": SPRING.eps_a}
+    return Budget(
+        {name: {k: share * value for k, share in row.items()} for name, value in values.items()},
+        values,
+    )
+
+
 def chain_result() -> FitResult:
     """Return a result of linear+bistable, with names that must stay apart."""
     one = result()
@@ -224,4 +235,5 @@ def no_figures() -> dict[str, Images | None]:
         "residuals": Images(few, 250, None, b"x"),
         "sensitivities": None,
         "profiles": None,
+        "budget": None,
     }

@@ -315,10 +315,8 @@ def _weigh_motion(problem: Problem, tracker: Tracker) -> None:
     for _ in range(WEIGHED):
         if tracker.best_values is None:
             return
-        uncertain = problem.objective.by_motion(tracker.best_values)
-        if uncertain is None:
+        if not problem.objective.weigh_motion(tracker.best_values):
             return
-        problem.objective.weigh(uncertain)
         tracker.restart()
         _refine(problem, tracker)
 

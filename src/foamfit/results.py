@@ -24,6 +24,10 @@ if TYPE_CHECKING:
     from foamfit.trust.identifiability import Insight
 
 SCHEMA = 1
+# Of an uncertainty budget.
+SOURCES = (
+    "noise", "contact and zero", "velocity", "mass", "height", "area", "calibration", "law",
+)  # fmt: skip
 DERIVED_POINTS = ("sigma_a", "sigma_c", "eps_star", "eps_hat_a", "eps_hat_c")
 
 
@@ -37,7 +41,9 @@ class ParameterEstimate:
     "block bootstrap", "MCMC" or "other minima" (ends of
     the search's descents that noise could have made the best). `range` is the hull of its values
     over descriptions that follow the curves about as well, which the error of the law leaves open;
-    None where only noise is left of the curves.
+    None where only noise is left of the curves. `systematic` is one standard deviation from height,
+    area, mass and calibration, whose ± the TOML states; it is not in `stderr` and `ci95`, and is 0
+    where none is stated or the test does not determine the parameter.
     """
 
     value: float
@@ -49,6 +55,7 @@ class ParameterEstimate:
     why: str
     ci95_method: str | None = None
     range: tuple[float, float] | None = None
+    systematic: float = 0.0
 
     def counted_from(self, zero: float) -> ParameterEstimate:
         """Count value, interval and range from another zero."""
@@ -154,6 +161,43 @@ class Snapping:
             return None, None
         back = np.flatnonzero(~snapped[turn:])
         return int(np.argmax(snapped)), turn + int(back[0]) if back.size else None
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Uncertainty budget of a fit (after JCGM 100:2008, the GUM).
+
+    `contributions` holds for each determined parameter of the springs one standard deviation of
+    each source, in SI:
+
+    - "noise": of the samples; together with the next two this is the standard error.
+    - "contact and zero", "velocity": what fitting the contact time and the zeros of the channels,
+      and the striker's velocity and mass and a delay within their ±, adds to it.
+    - "mass", "height", "area", "calibration": from their ± in the TOML; together `systematic`.
+    - "law": half of the parameter's `range` over 1.96, as if that were a 95 % interval.
+
+    `scales` (SI) are those of the parameters, mostly their values.
+    """
+
+    contributions: dict[str, dict[str, float]]
+    scales: dict[str, float]
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Sources that contribute to any parameter, in their order."""
+        rows = self.contributions.values()
+        return tuple(one for one in SOURCES if any(row[one] > 0.0 for row in rows))
+
+    def combined(self, name: str) -> float:
+        """Root of the sum of the squares of all contributions to a parameter, SI."""
+        return math.hypot(*self.contributions[name].values())
+
+    def rows(self) -> Iterator[list[object]]:
+        """Rows of budget.csv, the header first: SI, but for what is over the scale."""
+        yield ["name", *SOURCES, "combined", "scale", "combined over scale"]
+        for name, row in self.contributions.items():
+            total, scale = self.combined(name), self.scales[name]
+            yield [name, *(plain(row[source]) for source in SOURCES), total, scale, total / scale]
 
 
 @dataclass(frozen=True)
@@ -321,6 +365,7 @@ class Fit:
     ladder: Ladder | None = None
     relaxation: int = 0  # terms of each hysteretic spring
     interior_mass: bool = False  # whether the specimen's mass sat between the springs
+    budget: Budget | None = None
 
     @property
     def bistable_springs(self) -> dict[str, BistableSpring]:
@@ -384,6 +429,7 @@ class Fit:
                 ],
                 "parameters": {name: asdict(p) for name, p in self.parameters.items()},
                 **({"correlation": vars(self.correlation)} if self.correlation else {}),
+                **({"budget": self.budget.contributions} if self.budget else {}),
                 "derived": {
                     name: {point: getattr(spring, point) for point in DERIVED_POINTS}
                     for name, spring in self.bistable_springs.items()

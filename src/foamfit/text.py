@@ -95,6 +95,6 @@ def labelled(items: Iterable[tuple[str, Iterable[str]]], column: int = 10) -> st
     lines = list[str]()
     for label, texts in items:
         for i, text in enumerate(texts):
-            start, indent = label if i == 0 else "", " " * (column + 2)
-            lines += textwrap.wrap(f"{start:<{column}}{text}", WIDTH, subsequent_indent=indent)
+            start = label if i == 0 else ""
+            lines += wrapped(f"{start:<{column}}{text}", column + 2)
     return "\n".join(lines)

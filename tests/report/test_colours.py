@@ -19,8 +19,10 @@ from matplotlib.colors import to_rgb
 
 import foamfit.report
 from drawn import figures
+from foamfit.report.budget_plot import LOOKS
 from foamfit.report.plots import DASHES, MARKS
 from foamfit.report.studies import cycles, joint_plot, prediction
+from foamfit.results import SOURCES
 
 EYES = {
     "normal": np.eye(3),
@@ -111,6 +113,12 @@ def test_parts_of_a_band_have_dashes_of_their_own() -> None:
     dashes = [str(dash) for _, dash in prediction.COLOURS.values()]
     assert len(set(dashes)) == len(dashes)
     assert len({str(dash) for dash in DASHES}) == len(set(MARKS)) == 4
+
+
+def test_sources_of_a_budget_are_told_apart_by_colour_or_hatching() -> None:
+    assert set(LOOKS) == set(SOURCES)
+    for one, other in combinations(LOOKS.values(), 2):
+        assert one[1] != other[1] or not is_told(one[0], other[0]), (one, other)
 
 
 @pytest.mark.parametrize(

@@ -72,7 +72,7 @@ def check(
     description = ""
     if model is None or test.suffix.lower() != ".toml":
         measurement = read_test(test, specimen)
-        description = describe(measurement, audit(measurement)) + "\n"
+        description = describe(measurement, audit(measurement), exact=model is None) + "\n"
     if model is None:
         say(description, newline=False)
         return

@@ -18,6 +18,9 @@ STILL = 0.15
 ERRORS = 2.0  # standard errors that decide whether a signal rises or rests
 _STILL_IMPACT = 0.3  # as `STILL`, for a signal that a fit goes on from
 ELSEWHERE = 5.0  # standard errors that decide whether the zero of a motion lies elsewhere
+# Share of its travel from which on a machine that moves without a stress has not touched the
+# specimen yet.
+APPROACH = 0.02
 _SHARES = 0.2, 0.1, 0.05, 0.025  # of the peak, up to which a rise is taken for straight
 
 Levels = dict[str, NoiseLevel]
@@ -362,7 +365,7 @@ def start_of_slow_test(record: Record, levels: Levels) -> Start:
     approach = w[onset] - first.value if by_stress is not None else 0.0
     if (
         by_motion is not None
-        and approach < 0.1 * travel
+        and approach < APPROACH * travel
         and not _loaded(record, by_motion.time, levels)
     ):
         rows = int(np.searchsorted(time, by_motion.time))
@@ -379,7 +382,7 @@ def start_of_slow_test(record: Record, levels: Levels) -> Start:
             zero,
             source,
         )
-    if by_stress is not None and approach > (0.02 if elsewhere else 0.1) * travel:
+    if by_stress is not None and approach > APPROACH * travel:
         reach = max(5, min(onset, (top - onset) // 24))
         near = slice(max(0, onset - reach), onset + reach)
         zero = level_on_line(time[near], w[near], by_stress.time, noise)[0]

@@ -222,7 +222,7 @@ def _to_record(numbers: dict[str, Array], settings: Settings, notes: list[str]) 
     stress = _one_of(numbers, "stress", "force", specimen.area, "the area", notes)
     displacement = _one_of(numbers, "displacement", "strain", 1 / specimen.height, "height", notes)
     acceleration = numbers.get("acceleration")
-    derived: tuple[str, ...] = ()
+    derived, braked = tuple[str, ...](), stress is None
     if stress is None:
         assert mass is not None  # see needed_columns
         if acceleration is not None:
@@ -239,7 +239,7 @@ def _to_record(numbers: dict[str, Array], settings: Settings, notes: list[str]) 
     inside = _inside(numbers, displacement, notes)
     return Record(
         numbers.get("time"), stress, displacement, numbers.get("velocity"), acceleration, inside,
-        cycle=numbers.get("cycle"), derived=derived,
+        cycle=numbers.get("cycle"), derived=derived, braked=braked,
     )  # fmt: skip
 
 

@@ -6,11 +6,23 @@ import numpy as np
 
 from foamfit.data.energy import EnergyAudit, largest_motion
 from foamfit.data.measurement import Measurement, Specimen, Striker, interior_node
-from foamfit.text import engineering, labelled, percent
+from foamfit.text import engineering, labelled, listed, percent
+
+# What 1 % of a quantity does: in an impact, and in a slow test (None: it does not enter there).
+# What does most stands first.
+EFFECTS = {
+    "velocity": ("2 % of the striker's energy and 1 % of its momentum", None),
+    "striker_mass": ("1 % of both", None),
+    "area": ("1 % of every stress", "1 % of every stress and stiffness"),
+    "height": ("1 % of every strain", "1 % of every strain, and so of the stiffnesses"),
+}
 
 
-def describe(test: Measurement, audit: EnergyAudit) -> str:
-    """Write what was read of a test, what was done to it, and its energy and momentum."""
+def describe(test: Measurement, audit: EnergyAudit, *, exact: bool = True) -> str:
+    """Write what was read of a test, what was done to it, and its energy and momentum.
+
+    With `exact` also which quantities have no ±.
+    """
     lines = [
         ("test", [test.name]),
         ("file", [str(test.path or "none")]),
@@ -22,8 +34,38 @@ def describe(test: Measurement, audit: EnergyAudit) -> str:
         ("noise", noise_sentences(test)),
         ("done", test.notes),
         ("energy", audit.sentences()),
+        ("exact", _exact_sentences(test) if exact else []),
     ]
     return labelled(lines)
+
+
+def taken_for_exact(test: Measurement) -> dict[str, str]:
+    """Quantities of the TOML that have no ±, and what 1 % of each does, the most telling first.
+
+    A slow test has no use for a striker, unless its mass made the stress.
+    """
+    striker, effects = test.striker or Striker(), dict[str, str]()
+    impact = test.time is not None and striker.mass and striker.velocity
+    for name, (of_impact, of_slow) in EFFECTS.items():
+        effect = of_impact if impact else of_slow
+        if name == "striker_mass" and test.braked:
+            effect = EFFECTS["area"][0]
+        if effect and name not in test.uncertainties:
+            effects[name] = effect
+    return effects
+
+
+def _exact_sentences(test: Measurement) -> list[str]:
+    """Say which ± the TOML lacks, and which of them would matter most."""
+    effects = {name.replace("_", " "): effect for name, effect in taken_for_exact(test).items()}
+    if not effects:
+        return []
+    told = ", ".join(f"1 % of the {name} is {effect}" for name, effect in effects.items())
+    return [
+        f"The TOML states no ± of {listed(effects)}, which therefore count as exact.",
+        f"The ± of the {next(iter(effects))} would probably matter most: {told}. "
+        "With --model check says what each does to the parameters.",
+    ]
 
 
 def noise_sentences(measurement: Measurement) -> list[str]:

@@ -182,8 +182,8 @@ class Record:
     has outliers. `clipped` marks the samples at which the force is clipped. `cycle` is the number
     of the cycle, where a column counts them. `numbers` holds the row number in the file of each
     sample (None: they count from 1), `dropped` the rows of the file that were left out so far, and
-    `standstills` those over which the displacement is bridged, left or not. `sampled`
-    and `derived` are those of `Measurement`.
+    `standstills` those over which the displacement is bridged, left or not. `sampled`,
+    `derived` and `braked` are those of `Measurement`.
     """
 
     time: Array | None
@@ -200,6 +200,7 @@ class Record:
     sampled: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
     standstills: tuple[Standstill, ...] = ()
     derived: tuple[str, ...] = ()
+    braked: bool = False
 
     def __len__(self) -> int:
         """Count the samples."""
@@ -317,6 +318,8 @@ class Measurement:
         Deceleration of the striker, m/s², where an impact has it and no displacement.
     derived : tuple of str
         Channels that were computed from others and are no measurement of their own.
+    braked : bool
+        Whether the stress is the striker's mass over the area times its deceleration.
     block : int
         Rows of the file that are averaged in each sample.
     uncertainties : dict of str to float
@@ -354,6 +357,7 @@ class Measurement:
     origins: dict[str, float] = field(default_factory=dict)
     acceleration: Array | None = None
     derived: tuple[str, ...] = ()
+    braked: bool = False
     block: int = 1
     uncertainties: dict[str, float] = field(default_factory=dict)
     standstills: tuple[tuple[float, float], ...] = ()

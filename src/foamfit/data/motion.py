@@ -74,7 +74,10 @@ class SmoothMotion:
 
     def at(self, times: Array) -> Array:
         """Displacement (m) at times inside the record; monotone between two turns."""
-        return np.asarray(self._curve(self._part(times)))
+        inside = self._part(times)
+        past = (np.asarray(times, float) - self._start) / self._duration - inside
+        ends = self._curve(np.array([0.0, 1.0]), 1)  # it goes straight on past what was measured
+        return np.asarray(self._curve(inside) + past * np.where(past < 0.0, ends[0], ends[1]))
 
     def modes(self, times: Array) -> Array:
         """Changes of the motion by one standard deviation each, (n, m), m, the largest first.
@@ -101,8 +104,9 @@ def follow(
     """
     taken = np.ones(displacement.size, bool) if counts is None else counts
     times = np.arange(displacement.size, dtype=float) if time is None else time
-    start, duration = float(times[0]), float(times[-1] - times[0])
-    x, w = (times[taken] - start) / duration, displacement[taken]
+    own, w = times[taken], displacement[taken]
+    start, duration = float(own[0]), float(np.ptp(own))
+    x = (own - start) / duration
     middle, size = float(np.mean(w)), max(float(np.ptp(w)), 1e-300)
     pieces, finest = max(4, min(x.size // _PIECE, _PIECES)), min(_MANY, x.size // 2)
     slow, shown, digital = np.sqrt(max(noise.time, 1.0)), residual_noise(w)[0], quantum(w) / 12**0.5

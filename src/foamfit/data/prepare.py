@@ -53,6 +53,7 @@ from foamfit.data.outliers import (
     outliers_of_blocks,
 )
 from foamfit.data.zeros import (
+    CONTRADICTED,
     Span,
     flight_notes,
     mark_flight,
@@ -111,7 +112,7 @@ def condition(
     else:
         start = start_of_slow_test(first, levels)
         span = span_of_slow_test(first, start)
-    record, zeros = take_zeros(record, first, start, span, levels)
+    record, zeros = take_zeros(record, first, start, span, levels, impact=impact)
     notes += zeros.notes
     start_strain, origins = 0.0, zeros.origins
     if chosen is not None and chosen.place:  # not the first: it has a contact of its own
@@ -171,6 +172,7 @@ def condition(
         origins=origins,
         acceleration=record.acceleration if impact else None,
         derived=record.derived,
+        braked=record.braked,
         block=block,
         standstills=standstill_spans(whole, block),
     )
@@ -364,8 +366,8 @@ def checks(record: Record, specimen: Specimen, striker: Striker, motion: str) ->
             speed = float(np.polyfit(record.time[early], displacement[early], 1)[0])
             if abs(speed / striker.velocity - 1) > 0.1:
                 notes.append(
-                    f"Check: the displacement starts at {speed:.3g} m/s, but the striker's velocity"
-                    f" is given as {striker.velocity:.3g} m/s."
+                    f"Check: the displacement starts at {speed:.3g} m/s, {CONTRADICTED} "
+                    f"{striker.velocity:.3g} m/s."
                 )
     density = (specimen.mass or 0.0) / (specimen.area * height)
     if specimen.mass and not 1 < density < 3000:
@@ -399,7 +401,7 @@ def thin(record: Record) -> tuple[Record, list[str]]:
     for name, values in record.curves("acceleration").items():
         thinned = thinned.changed(name, np.add.reduceat(values, edges) / counts)
     thinned = frames_of_blocks(record, thinned, edges)
-    thinned = replace(thinned, derived=record.derived)
+    thinned = replace(thinned, derived=record.derived, braked=record.braked)
     return thinned, [f"{n} samples are averaged in {len(edges)} blocks of {size}."]
 
 

@@ -20,7 +20,11 @@ from foamfit.data.measurement import NoiseLevel, Record, Striker
 from foamfit.text import engineering, percent
 
 _LEAST_LEAD, _FEWEST = 8, 3  # rows kept before contact; rows that show a zero
+_FEW = 20  # rows before contact below which the end of a record that is flat shows the zero better
+_TAIL, _HIGHEST = 0.04, 0.1  # share of a record that is its end; of the range, its highest level
 _GRAVITY = 9.81  # m/s²
+# How a note begins to say which velocity a motion contradicts.
+CONTRADICTED = "but the striker's velocity is given as"
 
 
 @dataclass(frozen=True)
@@ -62,6 +66,8 @@ def span_of_impact(record: Record, start: Start, levels: Levels) -> Span:
     first, stress = start.first, record.stress
     before = stress[: max(0, first - 2)]
     zero = float(before.mean()) if before.size >= _FEWEST else 0.0
+    if before.size < _FEW and (tail := tail_level(stress, levels["stress"])):
+        zero = tail.value
     found, returned = contact_end(stress[first:] - zero, levels["stress"])
     after = found // (4 if "stress" in record.derived else 50)
     end = min(len(record), first + found + max(3, after)) if returned else len(record)
@@ -72,12 +78,37 @@ def span_of_impact(record: Record, start: Start, levels: Levels) -> Span:
     return Span(first - lead, end, rest, first + found, returned)
 
 
+def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
+    """Level of a force at the end of an impact's record, if it is flat there and the striker left.
+
+    The end grows backwards as long as the rows before it lie at its level within their noise.
+    """
+    size = max(8, int(_TAIL * len(values)))
+    step, n = max(4, size // 2), size
+    if np.argmax(values) > len(values) - 2 * size:
+        return None
+    level = mean_level(values[-n:], noise)
+    halves = values[-n : -n // 2].mean() - values[-n // 2 :].mean()
+    if abs(halves) > 3.0 * 2.0 * level.error:
+        return None
+    while n + step < len(values) // 2:
+        more = mean_level(values[-n - step : -n], noise)
+        if abs(more.value - level.value) > 2.0 * float(np.hypot(more.error, level.error)):
+            break
+        n += step
+        level = mean_level(values[-n:], noise)
+    # The rows next to the end of contact may still press.
+    level = mean_level(values[step - n :], noise) if n > 2 * step else level
+    return level if abs(level.value) < _HIGHEST * float(np.ptp(values)) else None
+
+
 def take_zeros(
-    record: Record, first: Record, start: Start, span: Span, levels: Levels
+    record: Record, first: Record, start: Start, span: Span, levels: Levels, *, impact: bool
 ) -> tuple[Record, Zeros]:
     """Take off what the channels of `first` show before contact, or a motion at contact.
 
-    Where fewer than three rows show it the file's own zero of stress and acceleration stands.
+    Where hardly a row lies before the contact of an impact, the end of the record shows the zero of
+    a force that has left; where neither does, the file's own zero of the channel stands.
     """
     done, n = Zeros(), span.rest
     for name, values in first.curves("acceleration").items():
@@ -85,7 +116,15 @@ def take_zeros(
             continue
         noise, zero = levels[name], Level(0.0, 0.0, 0)
         if name in ("stress", "acceleration"):
-            if n >= _FEWEST:
+            tail = tail_level(values, noise) if impact and n < _FEW else None
+            if tail is not None and tail.samples > n:
+                zero, done.errors[name] = tail, tail.error
+                size = engineering(zero.value, "Pa" if name == "stress" else "m/s²")
+                done.notes.append(
+                    f"The {name} at the end of the record, {size}, is taken off as the sensor's "
+                    f"offset (the striker has left in the last {zero.samples} rows)."
+                )
+            elif n >= _FEWEST:
                 zero = _zero_at_rest(name, values, n, noise, done.notes)
                 done.errors[name] = zero.error
             elif start.first:
@@ -202,8 +241,8 @@ def flight_notes(
     off, error = abs(speed - given), float(np.hypot(error, spread))
     if off > max(3.0 * error, 0.005 * given) and abs(speed) > 0.5 * given:
         notes.append(
-            f"Check: before contact the displacement moves at {speed:.4g} ± {error:.2g} m/s, but "
-            f"the striker's velocity is given as {given:.4g} m/s."
+            f"Check: before contact the displacement moves at {speed:.4g} ± {error:.2g} m/s, "
+            f"{CONTRADICTED} {given:.4g} m/s."
         )
     return notes
 

@@ -1,6 +1,7 @@
 """What a record does not say exactly: contact, zeros of the channels, and the striker.
 
-They are unknowns of an impact beside the parameters of its springs. Each value counts from what the
+They are unknowns beside the parameters of the springs: all of them of an impact, the zeros of
+motion and stress where a motion drives. Each value counts from what the
 record itself gives (`Measurement.origins`, the striker of the TOML), so that a measurement taken
 for exact has zeros here, and the velocity and mass that the TOML states.
 """
@@ -23,7 +24,10 @@ ZEROS = {
     "acceleration_zero": "acceleration",
 }
 STRIKER = (VELOCITY, STRIKER_MASS)
-OF_IMPACT = (CONTACT_TIME, *ZEROS, *STRIKER)
+UNDER_DRIVE = {
+    "impact": (CONTACT_TIME, *ZEROS, *STRIKER),
+    "displacement": ("displacement_zero", "stress_zero"),
+}
 # Standard deviations of a prior within which its parameter is looked for.
 REACH = 6.0
 # Largest contact time and time shift, over the time under load; largest zeros, over the range.
@@ -41,7 +45,7 @@ class Prior:
 
 def names_of(drive: str, *, time_shift: bool) -> tuple[str, ...]:
     """Names of the nuisance parameters under a drive, in the order of the flat vector."""
-    return (*(OF_IMPACT if drive == "impact" else ()), *((TIME_SHIFT,) if time_shift else ()))
+    return (*UNDER_DRIVE.get(drive, ()), *((TIME_SHIFT,) if time_shift else ()))
 
 
 def values_of(measurement: Measurement) -> dict[str, float]:
@@ -53,32 +57,46 @@ def values_of(measurement: Measurement) -> dict[str, float]:
     return values
 
 
-def priors_of(measurement: Measurement) -> dict[str, Prior]:
-    """Priors of nuisance parameters: zeros shown before contact, and each ± of the TOML."""
+def priors_of(measurement: Measurement, drive: str) -> dict[str, Prior]:
+    """Priors of nuisance parameters: zeros shown before contact, and each ± of the TOML.
+
+    A machine may move before it touches the specimen: its rest does not show the zero of a motion
+    that drives. The mass has no prior where the stress was computed with it: force and inertia then
+    change together.
+    """
     values = values_of(measurement)
     known = {zero: measurement.zeros.get(channel) for zero, channel in ZEROS.items()}
+    if drive != "impact":
+        known["displacement_zero"] = None
     stated = {VELOCITY: "velocity", STRIKER_MASS: "striker_mass", TIME_SHIFT: "delay"}
     known |= {name: measurement.uncertainties.get(key) for name, key in stated.items()}
+    if measurement.braked:
+        del known[STRIKER_MASS]
     return {name: Prior(name, values[name], sigma) for name, sigma in known.items() if sigma}
 
 
-def open_in(measurement: Measurement, counted: Mapping[str, bool]) -> frozenset[str]:
-    """Nuisance parameters that an impact leaves open, by which of its channels are `counted`.
+def open_in(measurement: Measurement, drive: str, counted: Mapping[str, bool]) -> frozenset[str]:
+    """Nuisance parameters that a record leaves open, by which of its channels are `counted`.
 
-    The zero of a motion is arbitrary; that of a force or an acceleration is the file's own where
-    nothing recorded before the contact shows another.
+    The zero of a motion is arbitrary in an impact, and where a slow test was recorded from before
+    its contact; that of a force or an acceleration is the file's own where nothing recorded before
+    the contact shows another.
     """
-    priors = priors_of(measurement)
+    priors = priors_of(measurement, drive)
     known = {name for name in priors if counted.get(ZEROS.get(name, ""), True)}
-    moved = {"displacement_zero"} if counted.get("displacement", False) else set()
-    return frozenset({CONTACT_TIME} | moved | known)
+    if drive == "impact":
+        moved = {"displacement_zero"} if counted.get("displacement", False) else set()
+        return frozenset({CONTACT_TIME} | moved | known)
+    elsewhere = measurement.origins.get("displacement_zero", 0.0) != 0.0
+    moved = {"displacement_zero"} if elsewhere or measurement.contact != "file" else set()
+    return frozenset(moved | known)
 
 
 def limits_of(
-    name: str, measurement: Measurement, duration: float, ranges: Mapping[str, float]
+    name: str, measurement: Measurement, drive: str, duration: float, ranges: Mapping[str, float]
 ) -> tuple[float, float]:
     """Limits of a nuisance parameter, SI; `ranges` are those of the channels."""
-    prior = priors_of(measurement).get(name)
+    prior = priors_of(measurement, drive).get(name)
     middle = values_of(measurement)[name]
     if prior is not None:
         reach = REACH * prior.sigma

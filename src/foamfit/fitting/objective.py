@@ -50,8 +50,11 @@ MODEL_ERROR = 0.005
 _ANY_SPRING: dict[str, Spring] = {"microscale": MicroscaleSpring(1.0, 1.0, 0.0, 1.0, 1.0, 1.0, 1.0)}
 # A trial that needs more steps than this is too stiff to be worth waiting for.
 MAX_STEPS = 20_000
-# Noise of a motion, over its range, that counts as none.
-EXACT = 1e-6
+# Standard deviation of normal residuals over the median of their sizes.
+NORMAL = 1.4826
+# Noise of a motion, over its range, that counts as none; most that a smooth motion may leave of the
+# samples, over their noise.
+EXACT, FOLLOWED = 1e-6, 1.5
 # Most instants that are simulated for each sample that averages rows of the file.
 FINEST = 8
 # Steps of differences: of the velocity and the mass, relative, of times over the instants' gap, and
@@ -95,6 +98,7 @@ class Objective:
     # (n_data, m): what one standard deviation along each mode of a driving motion does to the
     # residual; the residual is counted in its full covariance, see `weigh`.
     uncertain: Array | None = None
+    levels: Array | None = None
     loss: str = "linear"  # One of `LOSSES`
     evaluations: int = field(default=0, init=False)  # Sets of parameters that were simulated
     failures: int = field(default=0, init=False)  # Those of them that could not be
@@ -145,16 +149,28 @@ class Objective:
         # Worse per sample than any curve that stays within ten ranges.
         self.penalty = max(PENALTY * self.span(name) for name in self.counted)
         self._set_nuisance()
-        self.weigh(self.uncertain)
+        self.weigh(self.uncertain, self.levels)
 
     @cached_property
     def motion(self) -> SmoothMotion | None:
-        """The measured motion without its noise; None where it is exact, or is not there."""
+        """The measured motion without its noise; None where it is exact, or is not there.
+
+        Where it leaves the samples more than their noise the machine's motion is not that smooth:
+        the samples themselves are the better motion.
+        """
         values = self.measurement.displacement
         level = self.measurement.noise.of("displacement")
         if values is None or level is None or level.sigma <= EXACT * float(np.ptp(values)):
             return None
-        return follow(self.time, values, level, self.measurement.sampled.get("displacement"))
+        counts = self.measurement.sampled.get("displacement")
+        found = follow(self.time, values, level, counts)
+        if self.measurement.block > 1 and found.turns.size:
+            # The mean of rows on either side of a turn lies off the motion.
+            gap = float(np.median(np.diff(self.time)))
+            apart = np.abs(self.time[:, None] - found.turns).min(axis=1) > 0.75 * gap
+            counts = apart if counts is None else counts & apart
+            found = follow(self.time, values, level, counts)
+        return found if found.sigma <= FOLLOWED * level.sigma else None
 
     @cached_property
     def _moved(self) -> Array:
@@ -173,31 +189,44 @@ class Objective:
         along = DisplacementDrive(self._moved)
         return {damped: self._scene(along, damped=damped) for damped in (False, True)}
 
-    def weigh(self, uncertain: Array | None) -> None:
+    def weigh(self, uncertain: Array | None, levels: Array | None = None) -> None:
         """Count residuals in the covariance v + SSᵀ of noise v and of a motion that drives.
 
-        The columns of S (n_data, m) are those of `uncertain`. The residual r becomes
-        √v (1 + S'S'ᵀ)^(-1/2) r/√v with S' = S/√v, whose covariance is v again.
+        The columns of S (n_data, m) are those of `uncertain`; `levels` (n_data,) are the roots of
+        v. The residual r becomes √v (1 + S'S'ᵀ)^(-1/2) r/√v with S' = S/√v, whose covariance is v
+        again.
         """
-        self.uncertain = uncertain
-        if uncertain is None:
+        self.uncertain, self.levels = uncertain, levels
+        if uncertain is None or levels is None:
             return
-        levels = [
-            np.full(size, self.noise(name).sigma * self.factor(name))
-            for name, size in zip(self.counted, self.sizes, strict=True)
-        ]
-        self._root = np.maximum(np.concatenate(levels), 1e-9)
-        left, size, _ = np.linalg.svd(uncertain / self._root[:, None], full_matrices=False)
+        left, size, _ = np.linalg.svd(uncertain / levels[:, None], full_matrices=False)
         self._lean, self._less = left, 1.0 - 1.0 / np.sqrt(1.0 + size**2)
 
     def _weighed(self, rows: Array) -> Array:
         """Residuals, or columns of their derivatives, in the covariance of `weigh`."""
-        if self.uncertain is None:
+        if self.uncertain is None or self.levels is None:
             return rows
-        root = self._root if rows.ndim == 1 else self._root[:, None]
+        root = self.levels if rows.ndim == 1 else self.levels[:, None]
         less = self._less if rows.ndim == 1 else self._less[:, None]
         plain = rows / root
         return np.asarray(rows - root * (self._lean @ (less * (self._lean.T @ plain))))
+
+    def weigh_motion(self, values: Array) -> bool:
+        """Weigh residuals by the motion's own uncertainty at a point; False where it has none.
+
+        What is left of a curve there, noise or an error of the law, is its level.
+        """
+        uncertain = self.by_motion(values)
+        if uncertain is None:
+            return False
+        plain = np.abs(self._moved_by(0.0).differences(values)[: self.n_data])
+        parts = np.split(plain, np.cumsum(self.sizes)[:-1])
+        levels = [
+            max(NORMAL * float(np.median(part)), self.noise(name).sigma * self.factor(name), 1e-9)
+            for name, part in zip(self.counted, parts, strict=True)
+        ]
+        self.weigh(uncertain, np.repeat(levels, self.sizes))
+        return True
 
     def by_motion(self, values: Array) -> Array | None:
         """Change of the residual by each mode of the motion that drives, (n_data, m), or None."""
@@ -211,7 +240,7 @@ class Objective:
         self.evaluations += 2 * modes.shape[1]
         return out
 
-    def _moved_by(self, change: Array) -> Objective:
+    def _moved_by(self, change: Array | float) -> Objective:
         """The same objective with another driving motion, and plain residuals."""
         other = copy(self)
         other.uncertain = None
@@ -231,17 +260,12 @@ class Objective:
         }
         gap = float(np.median(np.diff(self._clock)))
         self.usual = nuisances.values_of(self.measurement)
-        self._steps = {
-            name: RELATIVE_STEP * self.usual[name]
-            if name in (nuisances.VELOCITY, nuisances.STRIKER_MASS)
-            else STEP_OF_TIME * gap
-            for name in self.nuisance
-        }
+        self._steps = dict.fromkeys(self.nuisance, STEP_OF_TIME * gap)
+        self._steps |= {name: RELATIVE_STEP * self.usual[name] for name in nuisances.STRIKER}
         if self.measurement.displacement is not None:
-            self._steps["displacement_zero"] = STEP_OF_ZERO * float(
-                np.ptp(self.measurement.displacement)
-            )
-        known = nuisances.priors_of(self.measurement)
+            span = float(np.ptp(self.measurement.displacement))
+            self._steps["displacement_zero"] = STEP_OF_ZERO * span
+        known = nuisances.priors_of(self.measurement, self.drive)
         self.priors = tuple(known[name] for name in self.nuisance if name in known)
         count, places = len(self.model.names), {n: i for i, n in enumerate(self.nuisance)}
         self._prior_places = np.array([count + places[one.name] for one in self.priors], np.int64)
@@ -388,11 +412,11 @@ class Objective:
         stress of an impact is counted.
         """
         name, n = self.nuisance[at], self.time.size
-        followed = self.drive == "impact" and "stress_strain" in self.counted
+        followed = self._driven or "stress_strain" in self.counted
         if name in nuisances.ZEROS and not (followed and name == "displacement_zero"):
             own = {curve: self._zero_of.get(curve) == name for curve in self.curves}
             return {curve: np.full(n, float(shifted)) for curve, shifted in own.items()}
-        if self.drive != "impact" and name != nuisances.TIME_SHIFT:
+        if self.drive != "impact" and name not in (nuisances.TIME_SHIFT, "displacement_zero"):
             return {curve: np.zeros(n) for curve in self.curves}
         step = self._steps[name]
         sides = []
@@ -490,6 +514,9 @@ class Objective:
 
     def _placed(self, plan: Plan, at: dict[str, float]) -> Plan:
         """Plan of an impact with its contact, and its striker, where the nuisance has them."""
+        if self._driven and at.get("displacement_zero", 0.0) != 0.0:
+            moved = plan.values - at["displacement_zero"]
+            return plan._replace(values=np.maximum(moved, 0.0))  # contact comes later, or is lost
         if self.drive != "impact":
             return plan
         mass = plan.mass.copy()

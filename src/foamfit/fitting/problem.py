@@ -88,7 +88,7 @@ def make_params(
         vary = short != "eta" or (drive == "impact" and (spring >= 0) == (count == 1))
         params.add(name, value=value, min=low, max=high, vary=vary)
     _add_heights(params, measurement, model)
-    _add_nuisance(params, measurement, scales, nuisance.names_of(drive, time_shift=time_shift))
+    _add_nuisance(params, measurement, scales, drive, time_shift=time_shift)
     for own in (name.removesuffix("dsigma") for name in model.names if name.endswith("_dsigma")):
         eps_a = params[own + "eps_a"].value
         params[own + "dsigma"].value = -0.2 * params[own + "k0"].value * eps_a / (1.0 - eps_a)
@@ -144,20 +144,22 @@ def _add_heights(params: lmfit.Parameters, measurement: Measurement, model: Mode
 
 
 def _add_nuisance(
-    params: lmfit.Parameters, measurement: Measurement, scales: Scales, names: tuple[str, ...]
-) -> None:
+    params: lmfit.Parameters, measurement: Measurement, scales: Scales, drive: str, *,
+    time_shift: bool,
+) -> None:  # fmt: skip
     """What the record does not say exactly, in the numbers of its file."""
-    weights = default_weights(measurement, "impact")
+    names = nuisance.names_of(drive, time_shift=time_shift)
+    weights = default_weights(measurement, drive)
     counted = {
-        "displacement": weights["displacement_time"] > 0.0,
-        "stress": weights["stress_time"] > 0.0,
+        "displacement": weights["displacement_time"] > 0.0 or drive == "displacement",
+        "stress": weights["stress_time"] + weights["stress_strain"] > 0.0,
         "acceleration": measurement.acceleration is not None,
     }
     ranges = {name: float(np.ptp(values)) for name, values in measurement.channels().items()}
-    free = nuisance.open_in(measurement, counted) | {nuisance.TIME_SHIFT}
+    free = nuisance.open_in(measurement, drive, counted) | {nuisance.TIME_SHIFT}
     usual = nuisance.values_of(measurement)
     for name in names:
-        low, high = nuisance.limits_of(name, measurement, scales.duration, ranges)
+        low, high = nuisance.limits_of(name, measurement, drive, scales.duration, ranges)
         origin = measurement.origins.get(name, 0.0)
         vary = name in free and low < high
         limits = {"min": low + origin, "max": high + origin} if vary else {}

@@ -17,7 +17,7 @@ from scipy.stats import qmc
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.fitting import levenberg
-from foamfit.fitting.box import BOX, LAST_STRAIN, Scales, Space, family
+from foamfit.fitting.box import BOX, LAST_STRAIN, Scales, Space, family, is_logarithmic
 from foamfit.fitting.curves import smoothed
 from foamfit.fitting.objective import Objective
 from foamfit.springs.law import least_eps_star
@@ -31,8 +31,11 @@ PULSE = 16  # evaluations
 DESCENTS, ON_CURVES, REFINED = 0.25, 0.75, 0.95
 CURVE_STARTS = 300
 # Searches at most: a second one where a single descent led to the best end, and a third where this
-# still misses more of the curves than noise.
+# still misses more of the curves than noise; twice as many for several hysteretic springs.
 ATTEMPTS = 3
+AROUND = 200  # points about the best one among which another search begins
+# Share of the box that counts as its edge, and where inside a descent begins again.
+EDGE, INSIDE = 0.02, (0.35, 0.5, 0.65)
 # Minima of the loop whose cost on the drive's curves is within this factor of the best go on.
 PROMISING = 100.0
 # Factors by which the stiffness that an interior mass vibrates on is changed, and their inverses.
@@ -364,7 +367,9 @@ def search(
     progress(0.0, "start values")
     points = [space.encode(space.values), *box_starts(space, rng, CURVE_STARTS // 3)]
     out: list[tuple[float, int]] = []
-    for attempt in range(ATTEMPTS):
+    several = sum(kind in HYSTERETIC for kind in space.model.kinds) > 1
+    attempts = ATTEMPTS * (2 if several else 1)
+    for attempt in range(attempts):
         counts: dict[int, int] = {}
         if tracker.objective.measurement.displacement is not None:
             found = distinct(_search_loop(tracker, space, points, starts, rng, progress))
@@ -381,18 +386,56 @@ def search(
             cost, end = descend(tracker, space, point, 60)
             tracker.ends.append(space.decode(end))
             out.append((cost, counts.get(id(point), 1)))
-        if attempt + 1 == ATTEMPTS or _settled(tracker, out, attempt):
+        out += [(cost, 1) for cost in _off_edges(tracker, space)]
+        if attempt + 1 == attempts or _settled(tracker, out, attempt, attempts // 2):
             break
-        points = box_starts(space, rng, CURVE_STARTS // 3)
+        points = box_starts(space, rng, CURVE_STARTS // 3) + _around_best(tracker, space, rng)
     return sorted(out)
 
 
-def _settled(tracker: Tracker, ends: list[tuple[float, int]], attempt: int) -> bool:
-    """Whether descents agree on the best end, or none of a second search is better than noise."""
-    best = min(ends)[0]
+def _around_best(tracker: Tracker, space: Space, rng: np.random.Generator) -> list[Array]:
+    """Points about the best one: some of its coordinates moved by a share of the box or less."""
+    if tracker.best_values is None:
+        return []
+    low, high = space.box
+    best, out = space.encode(tracker.best_values), []
+    for _ in range(AROUND):
+        far = 10.0 ** rng.uniform(-2.0, -0.5) * rng.standard_normal(best.size)
+        moved = best + np.where(rng.random(best.size) < 0.5, far, 0.0) * (high - low)
+        out.append(np.clip(moved, low, high))
+    return out
+
+
+def _off_edges(tracker: Tracker, space: Space) -> list[float]:
+    """Descend from the best point with what lies at an edge of the box moved inside; the costs.
+
+    A stiffness that few samples show may run to an edge and stay there while all else is found.
+    """
+    low, high = space.box
+    best = space.encode(tracker.best_values) if tracker.best_values is not None else low
+    span, costs = high - low, []
+    edges = (best - low < EDGE * span) | (high - best < EDGE * span)
+    for at in np.flatnonzero(edges & [is_logarithmic(short) for _, short, _ in space.coordinates]):
+        for share in INSIDE:
+            start = best.copy()
+            start[at] = low[at] + share * span[at]
+            cost, end = descend(tracker, space, start, 60)
+            tracker.ends.append(space.decode(end))
+            costs.append(cost)
+    return costs
+
+
+def _settled(tracker: Tracker, ends: list[tuple[float, int]], attempt: int, least: int) -> bool:
+    """Whether descents agree on the best end, or none of a second search is better than noise.
+
+    `least` searches are made in any case where the best end misses more of the curves than noise.
+    """
+    best, floor = min(ends)[0], tracker.objective.floor
+    if attempt + 1 < least and best > floor:
+        return False
     if sum(count for cost, count in ends if cost <= 1.02 * best) > 1:
         return True
-    return attempt > 0 and best <= tracker.objective.floor
+    return attempt > 0 and best <= floor
 
 
 def ensure_feasible(tracker: Tracker, space: Space, rng: np.random.Generator) -> None:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 # of the cycles.
 RESULT_FILES = (
     "fit.json", "parameters.csv", "curves.csv", "profiles.csv", "ladder.csv", "fit.png",
-    "fit.pdf", "fit.csv", "residuals.csv", "sensitivities.csv", "report.html",
+    "fit.pdf", "fit.csv", "residuals.csv", "sensitivities.csv", "budget.csv", "report.html",
 )  # fmt: skip
 # What is plotted in cycles.png; cycles.csv is the table of all numbers by cycle.
 CYCLES_PLOTTED = "cycles-plotted.csv"
@@ -45,7 +45,8 @@ def save_result(result: Fit, folder: str | Path, *, width: str = TWO, mapped: Ma
 
     It is made with its parents; InputError if something else stands there (see `check_target`) or
     it cannot be written, and nothing is changed then. ``profiles.csv`` is written where there are
-    profiles, ``ladder.csv`` where there is a ladder. `width` and `mapped` are those of the figures,
+    profiles, ``ladder.csv`` where there is a ladder, ``budget.csv`` where a parameter is
+    determined. `width` and `mapped` are those of the figures,
     see `foamfit.report.result_figures.draw_all`. Returns the folder.
     """
     return save_whole(folder, lambda fresh: write_result(result, fresh, width=width, mapped=mapped))
@@ -182,6 +183,8 @@ def write_result(
     write_table(folder / "curves.csv", _curve_rows(result.curves, result.measurement))
     if result.intervals is not None and result.intervals.profiles:
         write_table(folder / "profiles.csv", _profile_rows(result.intervals))
+    if result.budget is not None:
+        write_table(folder / "budget.csv", result.budget.rows())
     if result.ladder is not None:
         write_table(folder / "ladder.csv", result.ladder.rows())
     drawn = dict(figures)
@@ -203,12 +206,12 @@ def write_table(path: Path, rows: Iterable[Iterable[object]]) -> None:
 
 def _parameter_rows(parameters: Mapping[str, ParameterEstimate]) -> Iterator[list[object]]:
     yield [
-        "name", "value", "stderr", "ci95_low", "ci95_high", "range_low", "range_high", "unit",
-        "state", "why", "ci95_method",
+        "name", "value", "stderr", "ci95_low", "ci95_high", "range_low", "range_high",
+        "systematic", "unit", "state", "why", "ci95_method",
     ]  # fmt: skip
     for name, p in parameters.items():
         ends = (*(p.ci95 or (None, None)), *(p.range or (None, None)))
-        numbers = (plain(number) for number in (p.value, p.stderr, *ends))
+        numbers = (plain(number) for number in (p.value, p.stderr, *ends, p.systematic))
         yield [name, *numbers, p.unit, p.state, p.why, p.ci95_method]
 
 

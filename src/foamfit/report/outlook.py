@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from foamfit.arrays import Array
+from foamfit.data.describe import taken_for_exact
 from foamfit.data.measurement import Measurement, Noise, NoiseLevel, Striker
 from foamfit.data.toml_file import read_settings
 from foamfit.errors import InputError, SimulationError
@@ -27,10 +28,11 @@ from foamfit.solve.simulation import Response, simulate
 from foamfit.springs import kernels
 from foamfit.springs.chain import Chain, Impact
 from foamfit.springs.model import Model
-from foamfit.springs.parameters import split_name, unit_of
+from foamfit.springs.parameters import NUISANCE, split_name, unit_of
 from foamfit.springs.published import published
 from foamfit.trust import covariance
 from foamfit.trust.best_point import BestPoint
+from foamfit.trust.budget import response
 from foamfit.trust.conclude import state_of
 from foamfit.trust.identifiability import Insight, look
 
@@ -69,6 +71,9 @@ class Outlook:
     closing: dict[str, float | None]
     faster: Expected | None  # 5 % faster than what closes all loops, where one is left open
     noise: dict[str, NoiseLevel]  # Of each counted curve
+    # Of each quantity that the TOML gives without a ±: the parameter that 1 % of it moves farthest
+    # in standard errors by noise, by how many of these, and by which share of its scale.
+    exact: dict[str, tuple[str, float, float]]
 
 
 def make_outlook(problem: Problem, values: Array, source: str) -> Outlook:
@@ -92,7 +97,27 @@ def make_outlook(problem: Problem, values: Array, source: str) -> Outlook:
         if fast > impact.velocity:
             faster, there = _faster(problem, values, BEYOND * fast, sd)
             quicker = expect(faster, there, sd)
-    return Outlook(problem, values, source, planned, closing, quicker, noise)
+    exact = _moved_farthest(BestPoint(problem, values), planned.estimates)
+    return Outlook(problem, values, source, planned, closing, quicker, noise, exact)
+
+
+def _moved_farthest(
+    best: BestPoint, expected: Mapping[str, ParameterEstimate]
+) -> dict[str, tuple[str, float, float]]:
+    """What 1 % of each quantity without a ± does, most telling first; see `Outlook.exact`."""
+    found, sizes = {}, dict(zip(best.names, best.sizes.tolist(), strict=True))
+    for quantity in taken_for_exact(best.problem.measurement):
+        change = response(best, quantity, 0.01)
+        steps = {
+            name: abs(float(change[best.index[name]]))
+            for name, item in expected.items()
+            if item.stderr and name in sizes and name not in NUISANCE
+        }
+        times = {name: step / (expected[name].stderr or 1.0) for name, step in steps.items()}
+        if times and max(times.values()) > 0.0:
+            most = max(times, key=times.__getitem__)
+            found[quantity] = most, times[most], steps[most] / sizes[most]
+    return dict(sorted(found.items(), key=lambda item: -item[1][1]))
 
 
 # ---------------------------------------------------------------- start values

@@ -10,7 +10,7 @@ from foamfit.report.outlook import GUESSED, Outlook, chain_of, worth
 from foamfit.report.readable import readable
 from foamfit.results import law_in_words
 from foamfit.springs.law import MICROSCALE
-from foamfit.springs.parameters import KINDS
+from foamfit.springs.parameters import KINDS, NUISANCE
 from foamfit.springs.spring import BistableSpring
 from foamfit.text import aligned, engineering, labelled, percent, significant, wrapped
 from foamfit.trust.checklist import ESTIMATED
@@ -36,13 +36,29 @@ def outlook_text(outlook: Outlook) -> str:
     if planned.insight is not None:
         told.append(("channels", list(_worth_sentences(planned.insight))))
         told.append(("least", [planned.insight.sentence()]))
+    if outlook.exact:
+        told.append(("exact", [_exact_sentence(outlook)]))
     lines = [
         line
         for name, item in planned.estimates.items()
-        if item.state != "determined"
+        if item.state != "determined" and name not in NUISANCE
         for line in wrapped(f"{name}: {item.state}, {item.why}.")
     ]
     return "\n".join([labelled(told), "", *_table(outlook), "", *lines]).rstrip()
+
+
+def _exact_sentence(outlook: Outlook) -> str:
+    """Say what 1 % of each quantity without a ± would do at most, and name the worst."""
+    effects = [
+        f"1 % of the {quantity.replace('_', ' ')} moves {name} by {percent(share)} of its scale "
+        f"({significant(times)} times)"
+        for quantity, (name, times, share) in outlook.exact.items()
+    ]
+    most = next(iter(outlook.exact)).replace("_", " ")
+    return (
+        f"The ± of the {most}, which the TOML lacks, would matter most: {', '.join(effects)}; in "
+        "brackets over the standard error by noise."
+    )
 
 
 def _larger_residuals(outlook: Outlook) -> Iterator[str]:
@@ -129,7 +145,7 @@ def _worth_sentences(insight: Insight) -> Iterator[str]:
 def _table(outlook: Outlook) -> list[str]:
     """Align the expected standard errors, beside those of the faster test where there is one."""
     table = [
-        ["parameter", *outlook.planned.estimates],
+        ["parameter", *(readable(*item).label for item in outlook.planned.estimates.items())],
         ["unit", *(readable(*item).unit for item in outlook.planned.estimates.items())],
     ]  # its columns
     for test in (outlook.planned, outlook.faster):

@@ -122,6 +122,8 @@ def render_report(result: Fit, figures: Mapping[str, Images | None] | None = Non
             visited=_visited(result),
             marks=[MARKS[kind] for kind in MARKS if kind in result.model.split("+")],
             parameters=[readable(name, p) for name, p in result.parameters.items()],
+            systematic=any(p.systematic > 0.0 for p in result.parameters.values()),
+            budget=_budget(result),
             ranged=any(p.range for p in result.parameters.values()),
             rule=RULE,
             points={
@@ -145,6 +147,19 @@ def render_report(result: Fit, figures: Mapping[str, Images | None] | None = Non
             citation=CITATION,
         )
     )
+
+
+def _budget(result: Fit) -> dict[str, list[float]]:
+    """Contributions to each parameter, and all of them combined, over its scale."""
+    if (budget := result.budget) is None:
+        return {}
+    return {
+        name: [
+            value / budget.scales[name]
+            for value in (*(row[source] for source in budget.sources), budget.combined(name))
+        ]
+        for name, row in budget.contributions.items()
+    }
 
 
 def _points(spring: BistableSpring) -> list[Point]:

@@ -14,20 +14,34 @@ SYMBOLS = {
     "eps_c": ("ε", "c"), "kh_plus": ("k", "h+"), "kh_minus": ("k", "h−"), "eta": ("η", ""),
     "height": ("h", ""), "site_eta": ("η", "site"), "time_shift": ("Δt", ""),
     "eps_star": ("ε", "*"), "sigma_plus": ("σ", "+"), "spread_plus": ("s", "+"),
-    "sigma_minus": ("σ", "−"), "spread_minus": ("s", "−"),
+    "sigma_minus": ("σ", "−"), "spread_minus": ("s", "−"), "contact_time": ("t", "0"),
+    "displacement_zero": ("w", "0"), "stress_zero": ("σ", "0"), "acceleration_zero": ("a", "0"),
+    "velocity": ("v", "0"), "striker_mass": ("m", ""),
 }  # fmt: skip
+# What a nuisance parameter is called where people read it.
+LABELS = {
+    "contact_time": "contact time t₀",
+    "displacement_zero": "zero of the motion w₀",
+    "stress_zero": "zero of the stress σ₀",
+    "acceleration_zero": "zero of the acceleration a₀",
+    "velocity": "velocity v₀",
+    "striker_mass": "striker mass m",
+    "time_shift": "time shift Δt",
+}
 
 UNITS = {
     "Pa": ((1e9, "GPa"), (1e6, "MPa"), (1e3, "kPa"), (1.0, "Pa")),
     "s": ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs")),
     "m": ((1.0, "m"), (1e-3, "mm"), (1e-6, "µm")),
+    "kg": ((1.0, "kg"), (1e-3, "g"), (1e-6, "mg")),
+    "m/s^2": ((1e3, "km/s²"), (1.0, "m/s²")),
 }
 
 
 def readable_unit(size: float, unit: str) -> tuple[float, str]:
     """Return factor and name of the unit in which a number of this size reads well.
 
-    `size` is the largest number to show, in `unit`: "Pa", "s" or "m"; any other unit is kept.
+    `size` is the largest number to show, in `unit`, one of `UNITS`; any other unit is kept.
     """
     scales = UNITS.get(unit, ((1.0, unit),))
     return next((scale for scale in scales if abs(size) >= scale[0]), scales[-1])
@@ -47,6 +61,12 @@ class Readable:
     why: str
     method: str = ""
     range: str = ""
+    systematic: str = ""  # with its unit
+
+    @property
+    def label(self) -> str:
+        """What it is called: of a parameter of the springs its name."""
+        return LABELS.get(self.name, self.name)
 
     @property
     def with_error(self) -> str:
@@ -64,7 +84,10 @@ def readable(name: str, p: ParameterEstimate) -> Readable:
 
     It is shown with the digits that its standard error leaves (two of the error), or with four.
     """
-    factor, unit = readable_unit(p.value or p.stderr or 0.0, p.unit)
+    size = p.value or p.stderr or 0.0
+    if name in LABELS:  # its value may be far below its error
+        size = max(abs(p.value), p.stderr or 0.0)
+    factor, unit = readable_unit(size, p.unit)
     value = p.value / factor
     shown, stderr, interval, span = number(value), "", "", ""
     if math.isfinite(value) and p.stderr is not None and 0 < p.stderr < math.inf:
@@ -75,8 +98,11 @@ def readable(name: str, p: ParameterEstimate) -> Readable:
         ends = (float(f"{bound / factor + 0.0:.2g}") for bound in p.range)
         span = " to ".join(f"{end:g}".replace("-", "−") for end in ends)
     unit = {"": "–", "1": "–", "-": "–", "Pa s": "Pa·s", "Pa*s": "Pa·s"}.get(unit, unit)
-    method = p.ci95_method or ""
-    return Readable(name, symbol(name), shown, stderr, interval, unit, p.state, p.why, method, span)
+    scale = f"{p.systematic / factor:.2g}" if p.systematic > 0.0 else ""
+    return Readable(
+        name, symbol(name), shown, stderr, interval, unit, p.state, p.why, p.ci95_method or "",
+        span, scale,
+    )  # fmt: skip
 
 
 def number(value: float | None) -> str:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from foamfit.report.budget_plot import plot_budget
 from foamfit.report.figures import DPI, TWO, image, inches, laid_out
 from foamfit.report.identifiability_plots import plot_insight, plot_profiles
 from foamfit.report.plots import plot_fit, plot_residuals
@@ -86,6 +87,13 @@ def _profiles(result: Fit) -> Figure | None:
     return plot_profiles(result) if there else None
 
 
+def _budget(result: Fit) -> Figure | None:
+    # With these two alone all of it stands in the table of parameters.
+    if (budget := result.budget) is None or not set(budget.sources) - {"noise", "law"}:
+        return None
+    return plot_budget(budget)
+
+
 # In the order in which they are begun: what takes longest first.
 _DRAWN: dict[str, Callable[[Fit, str], Figure | None]] = {
     "fit": lambda result, width: plot_fit(result, width=width),
@@ -93,6 +101,7 @@ _DRAWN: dict[str, Callable[[Fit, str], Figure | None]] = {
     "sensitivities": lambda result, _: _insight(result),
     "residuals": lambda result, _: plot_residuals(result),
     "profiles": lambda result, _: _profiles(result),
+    "budget": lambda result, _: _budget(result),
 }
-# What is plotted in profiles is in profiles.csv.
+# What is plotted in profiles and budget is in profiles.csv and budget.csv.
 _TABLES = ("fit", "sensitivities", "residuals")

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator
 from foamfit.data.measurement import interior_channel
 from foamfit.report.readable import Readable, readable
 from foamfit.results import Fit, Ladder, ParameterEstimate, Rung
+from foamfit.springs.parameters import NUISANCE
 from foamfit.text import aligned, counted, engineering, listed, number, percent, wrapped
 
 CURVES = {
@@ -86,12 +87,16 @@ def _how_well(result: Fit) -> str:
 
 
 def _of_state(result: Fit, state: str) -> dict[str, ParameterEstimate]:
-    return {name: p for name, p in result.parameters.items() if p.state == state}
+    return {name: p for name, p in _of_springs(result).items() if p.state == state}
+
+
+def _of_springs(result: Fit) -> dict[str, ParameterEstimate]:
+    return {name: p for name, p in result.parameters.items() if name not in NUISANCE}
 
 
 def _known(result: Fit) -> str:
     found = _of_state(result, "determined")
-    varied = counted(sum(p.vary for p in result.parameters.values()), "varied parameter")
+    varied = counted(sum(p.vary for p in _of_springs(result).values()), "varied parameter")
     if not found:
         return f"None of the {varied} is determined."
     told = f"{len(found)} of {varied} {'is' if len(found) == 1 else 'are'} determined"
@@ -185,7 +190,8 @@ def _rows(result: Fit) -> list[str]:
 
 def _warnings(result: Fit) -> list[str]:
     """Return the warnings, and what the reader of the file asks to be looked at."""
-    return [*result.warnings, *(n for n in result.measurement.notes if n.startswith("Check:"))]
+    asked = (note for note in result.measurement.notes if note.startswith("Check:"))
+    return list(dict.fromkeys([*result.warnings, *asked]))
 
 
 def _short_warnings(result: Fit) -> Iterator[str]:
@@ -213,7 +219,7 @@ def _table(rows: list[Readable]) -> list[str]:
     span = (lambda text: (text,)) if ranged else (lambda _: ())
     header = ("parameter", "value ± stderr", "unit", "95 % interval", *span("range"), "state")
     cells = [
-        (r.name, r.with_error, r.unit, r.interval, *span(r.range), r.state)
+        (r.label, r.with_error, r.unit, r.interval, *span(r.range), r.state)
         for r in rows
         if r.state != "fixed"
     ]

@@ -106,14 +106,23 @@ class TestFit:
     seed: int
 
     def fit(self) -> Fit:
-        """The result of the test: its curves at the joint fit, its parameters as that has them."""
+        """The result of the test: its curves at the joint fit, its parameters as that has them.
+
+        `systematic` is what the ± of this test's own TOML do to a fit of it alone.
+        """
         self.problem.put(self.values)
         record = SearchRecord(self.seed, 0, time.perf_counter())
         made = conclude(BestPoint(self.problem, self.values), record)
         checklist = tuple(check for check in made.checklist if check.key not in _OF_A_SEARCH)
+        own = {
+            name: replace(one, systematic=made.parameters[name].systematic)
+            if name in made.parameters
+            else one
+            for name, one in self.parameters.items()
+        }
         return replace(
-            made, parameters=self.parameters, notes=(self.note, *made.notes), checklist=checklist,
-            status=status_of(checklist), warnings=warnings_of(checklist),
+            made, parameters=own, notes=(self.note, *made.notes), checklist=checklist,
+            status=status_of(checklist), warnings=warnings_of(checklist), budget=None,
         )  # fmt: skip
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from foamfit.data.energy import EnergyAudit
 from foamfit.data.measurement import INTEGRATED
+from foamfit.data.zeros import CONTRADICTED
 from foamfit.errors import InputError
 from foamfit.fitting.branches import covered, visited
 from foamfit.fitting.curves import check_time_shift
@@ -22,7 +23,7 @@ from foamfit.springs.parameters import BRANCHES, NUISANCE, split_name
 from foamfit.text import engineering, listed, percent
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import AT_LIMIT, WEAK
-from foamfit.trust.time_shift import shift_hint
+from foamfit.trust.time_shift import damping_hint, shift_hint
 
 # A curve was not fitted if it is off by more than this share of its own standard deviation; it is
 # fitted poorly if it is off by more than this share of its range.
@@ -291,6 +292,16 @@ def _bounds(e: Findings) -> _Answer:
 # ---------------------------------------------------------------- the test itself
 
 
+def _flight(e: Findings) -> _Answer:
+    measurement = e.best.problem.measurement
+    if e.objective.drive != "impact" or measurement.displacement is None:
+        return None, "The test has no motion that could tell."
+    wrong = tuple(note for note in measurement.notes if CONTRADICTED in note)
+    if wrong:
+        return False, "See the warning.", wrong
+    return True, "Nothing recorded contradicts it."
+
+
 def _energy(e: Findings) -> _Answer:
     taken, warnings = e.balance.absorbed_over_striker, tuple(e.balance.energy_warnings())
     if taken is None and not warnings:
@@ -334,6 +345,20 @@ def _time_shift(e: Findings) -> _Answer:
     return False, f"The motion seems {told}.", (warning,)
 
 
+def _damping(e: Findings) -> _Answer:
+    if e.objective.drive != "displacement" or not e.best.names:
+        return None, "Only under a driven motion is it left out."
+    found = damping_hint(e.best, [n for n, item in e.estimates.items() if item.stderr is not None])
+    if found is None:
+        return True, "A dashpot would not lower the residuals much."
+    size = engineering(found, "Pa s").replace("Pa s", "Pa·s")
+    warning = (
+        f"A dashpot of about {size}, which was left out, would lower the residuals; fit it by "
+        "--vary s1_eta, else it distorts the other parameters."
+    )
+    return False, f"A dashpot of about {size} would lower the residuals.", (warning,)
+
+
 def _spoken(name: str) -> str:
     return name.replace("_", "-")
 
@@ -341,6 +366,7 @@ def _spoken(name: str) -> str:
 QUESTIONS: dict[str, tuple[str, Callable[[Findings], _Answer]]] = {
     "ended": ("Did the search end by itself?", _ended),
     "followed": ("Does the model follow the curves?", _followed),
+    "velocity": ("Is the striker's velocity that of its motion?", _flight),
     "floor": ("Is the noise floor reached?", _floor),
     "determined": ("Are all parameters determined?", _determined),
     "intervals": ("Are the intervals those that were asked for?", _trusted),
@@ -353,4 +379,5 @@ QUESTIONS: dict[str, tuple[str, Callable[[Findings], _Answer]]] = {
     "energy": ("Does the energy balance hold?", _energy),
     "impulse": ("Does the momentum balance hold?", _impulse),
     "time_shift": ("Are force and motion free of a time shift?", _time_shift),
+    "damping": ("Is the dashpot rightly left out?", _damping),
 }

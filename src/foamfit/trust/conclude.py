@@ -30,6 +30,7 @@ from foamfit.springs.parameters import split_name, unit_of
 from foamfit.text import engineering, listed, percent
 from foamfit.trust import covariance
 from foamfit.trust.best_point import BestPoint
+from foamfit.trust.budget import make_budget
 from foamfit.trust.checklist import MAY_VANISH, Findings, make_checklist, status_of, warnings_of
 from foamfit.trust.identifiability import Insight, look
 from foamfit.trust.residuals.law_error import CurveError
@@ -44,7 +45,7 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
     measurement, specimen = problem.measurement, problem.measurement.specimen
     intervals = Intervals() if intervals is None else intervals
     insight = look(best, _left_over(best)) if best.names else None
-    estimates = _estimates(best, insight, intervals)
+    estimates, budget = make_budget(best, _estimates(best, insight, intervals))
     balance, misfit = audit(measurement), objective.misfit(simulated)
     checklist = make_checklist(Findings(best, estimates, misfit, record, balance, intervals))
     springs = best.values[: len(problem.model.names)]
@@ -87,6 +88,7 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         interior_mass=objective.interior_mass,
         noise=noise_of(best, best.errors if best.names else ()),
         intervals=intervals,
+        budget=budget,
     )
 
 
@@ -283,8 +285,7 @@ def _varied(
         method = "local covariance"
         why += "; its profile is much narrower and was not taken"
     elif name in intervals.ends and (ratio < 1.0 / ASTRAY or ASTRAY < ratio < math.inf):
-        stderr *= ratio
-        why += "; its standard error is that of the interval, as the local one does not hold"
+        why += "; the local standard error does not give it"
     ci95 = (max(ends[0], low), min(ends[1], high))
     return ParameterEstimate(value, stderr, ci95, unit, True, state, why, method, span)
 

@@ -1,4 +1,4 @@
-"""What a time shift between the channels of force and motion would explain."""
+"""What a time shift between force and motion, or a dashpot that was left out, would explain."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from foamfit.arrays import Array
 from foamfit.fitting.problem import Problem
 from foamfit.trust import covariance
 from foamfit.trust.best_point import BestPoint
@@ -23,26 +24,49 @@ def shift_hint(best: BestPoint, determined: list[str]) -> float | None:
     return _shift_of_motion(best.problem) if late is None else late
 
 
+def damping_hint(best: BestPoint, determined: list[str]) -> float | None:
+    """Damping (Pa·s) of an only spring that was left out under a driven motion, if it is plain."""
+    problem, name = best.problem, "s1_eta"
+    held = problem.params[name]
+    alone = problem.objective.drive == "displacement" and len(problem.model.kinds) == 1
+    if not alone or problem.measurement.time is None or held.vary or held.value != 0.0:
+        return None
+    column = problem.linear.slopes(best.values, (name,))[:, 0]
+    size = float(problem.sizes((name,), best.values)[0])
+    eta, error, gained = _one_step(best, determined, column, size)
+    return eta if gained and eta > 4.0 * error else None
+
+
 def _shift_of_residuals(best: BestPoint, determined: list[str]) -> float | None:
     """Time by which the motion is late (s), if one linear step plainly finds it."""
-    problem, objective, residual = best.problem, best.problem.objective, best.residual
-    there = best.simulated
+    problem, objective, there = best.problem, best.problem.objective, best.simulated
     assert problem.measurement.time is not None
     step = float(np.median(np.diff(problem.measurement.time)))
     sides = [
         objective.compare(replace(there, curves=objective.shifted(there, side * step)), best.values)
         for side in (-0.5, 0.5)
     ]
+    late, error, gained = _one_step(best, determined, (sides[1] - sides[0]) / step, step)
+    return late if gained and abs(late) > max(4.0 * error, 0.25 * step) else None
+
+
+def _one_step(
+    best: BestPoint, determined: list[str], column: Array, size: float
+) -> tuple[float, float, bool]:
+    """One linear step of all determined parameters and one that was left out, with its `column`.
+
+    Returned are its value, its standard error, and whether the step takes a fifth of χ².
+    """
+    problem, residual = best.problem, best.residual
     columns = [best.names.index(name) for name in determined]
     own = best.jacobian[:, columns] if columns else np.empty((residual.size, 0))
-    jacobian = np.column_stack([own, (sides[1] - sides[0]) / step])
-    sizes = np.append(problem.sizes(tuple(determined), best.values), step)
+    jacobian = np.column_stack([own, column])
+    sizes = np.append(problem.sizes(tuple(determined), best.values), size)
     move = np.linalg.lstsq(jacobian * sizes, -residual, rcond=1e-10)[0]
     left = residual + jacobian @ (sizes * move)
-    spread = covariance.covariance(jacobian, left, objective.sizes, sizes)
-    late, error = float(move[-1] * step), float(spread.stderr[-1])
+    spread = covariance.covariance(jacobian, left, problem.objective.sizes, sizes)
     gained = float(left @ left) < 0.8 * float(residual @ residual)
-    return late if gained and abs(late) > max(4.0 * error, 0.25 * step) else None
+    return float(move[-1] * size), float(spread.stderr[-1]), gained
 
 
 def _shift_of_motion(problem: Problem) -> float | None:

@@ -1,0 +1,201 @@
+"""What the ± of the TOML does to the parameters, and what their uncertainty is made of.
+
+Height, area, masses and the scales of the channels are no noise: every sample of a test has the
+same error of them. The response of the best point to each is that of Gauss and Newton,
+Δθ = −(JᵀJ)⁺ Jᵀ Δr, with the residual made anew for a test in which that quantity alone differs.
+A stress is taken for a force over the area, and a strain for a motion over the height, whichever of
+them the file has.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from foamfit.arrays import Array
+from foamfit.data.measurement import Measurement, NoiseLevel
+from foamfit.errors import SimulationError
+from foamfit.fitting import nuisance
+from foamfit.fitting.losses import influence
+from foamfit.results import SOURCES, Budget, ParameterEstimate
+from foamfit.springs.parameters import NUISANCE
+from foamfit.trust.best_point import BestPoint
+from foamfit.trust.covariance import AT_LIMIT, SINGULAR
+
+# Largest relative change of a quantity for its derivative: curves have kinks where springs snap.
+STEP = 1e-4
+# Nuisance parameters by what they contribute to.
+_CONTACT = (nuisance.CONTACT_TIME, *nuisance.ZEROS)
+_STRIKER = (*nuisance.STRIKER, nuisance.TIME_SHIFT)
+_SOURCES = {"specimen_mass": "mass", "striker_mass": "mass", "velocity": "velocity", "area": "area"}
+
+
+def responses(best: BestPoint) -> dict[str, Array]:
+    """Change of all parameters (n_values,), SI, by one standard deviation of each quantity.
+
+    The quantities are those of `Measurement.uncertainties` that are not fitted. NaN where the
+    changed test cannot be simulated.
+    """
+    measurement, free = best.problem.measurement, best.problem.free()
+    return {
+        quantity: response(best, quantity, sigma / _value(measurement, quantity))
+        for quantity, sigma in measurement.uncertainties.items()
+        if quantity != "delay" and quantity not in free
+    }
+
+
+def response(best: BestPoint, quantity: str, share: float) -> Array:
+    """Change of all parameters (n_values,), SI, where a quantity is larger by a share of itself."""
+    problem, step = best.problem, min(share, STEP)
+    try:
+        (low, before), (high, after) = (_changed(best, quantity, by) for by in (-step, step))
+    except SimulationError:
+        return np.full(best.values.size, np.nan)
+    moved = 0.5 * (after - before)
+    slope = influence(best.residual[: problem.objective.n_data], problem.objective.loss)[1]
+    root = np.sqrt(np.append(np.maximum(slope, 0.0), np.ones(len(problem.objective.priors))))
+    scaled = best.jacobian * best.sizes * root[:, None]
+    limits = np.array([best.limits(name) for name in best.names]).reshape(-1, 2)
+    there = best.values[[best.index[name] for name in best.names]]
+    # What lies at a limit stays there.
+    held = np.abs(limits - there[:, None]).min(axis=1, initial=np.inf) <= AT_LIMIT * best.sizes
+    scaled[:, held] = 0.0
+    steps = -np.linalg.pinv(scaled, rcond=SINGULAR) @ (root * moved) * best.sizes
+    moves = np.zeros((best.values.size, len(best.names)))
+    moves[[best.index[name] for name in best.names], np.arange(len(best.names))] = 1.0
+    moves = problem.space().follow(best.values, moves, 1e-5 * best.sizes)
+    return np.asarray((0.5 * (high - low) + moves @ steps) * (share / step))
+
+
+def _changed(best: BestPoint, quantity: str, share: float) -> tuple[Array, Array]:
+    """Parameters that are the quantity itself, and the residual, where that is larger by a share.
+
+    Raises SimulationError if the test cannot be simulated so.
+    """
+    problem, values = best.problem, best.values.copy()
+    test = changed(problem.measurement, quantity, share)
+    if quantity.startswith("height"):
+        for i in range(1, len(problem.model.kinds) + 1):
+            name, own = f"s{i}_height", f"height_{i}"
+            if name in best.index and quantity in (own, _height_of(problem.measurement, own)):
+                values[best.index[name]] *= 1.0 + share
+    elif quantity in best.index:
+        values[best.index[quantity]] *= 1.0 + share
+    objective = replace(problem.objective, measurement=test)
+    return values, objective.compare(objective.simulate(values), values)
+
+
+def _height_of(measurement: Measurement, own: str) -> str:
+    """Quantity that a spring's height follows: its own, if the TOML gives that a ±."""
+    return own if own in measurement.uncertainties else "height"
+
+
+def changed(test: Measurement, quantity: str, share: float) -> Measurement:
+    """The same test with one quantity larger by a share of itself, and nothing else changed.
+
+    The noise of a channel, and the error of its zero, change as the channel does.
+    """
+    by, specimen, striker = 1.0 + share, test.specimen, test.striker
+    if quantity == "height":
+        return replace(test, specimen=replace(specimen, height=by * specimen.height))
+    if quantity == "area":
+        test = replace(test, specimen=replace(specimen, area=by * specimen.area))
+        return _scaled(test, "stress", 1.0 / by)
+    if quantity == "specimen_mass" and specimen.mass:
+        return replace(test, specimen=replace(specimen, mass=by * specimen.mass))
+    if quantity == "striker_mass" and striker and striker.mass:
+        test = replace(test, striker=replace(striker, mass=by * striker.mass))
+        return _scaled(test, "stress", by) if test.braked else test
+    if quantity == "velocity" and striker and striker.velocity:
+        return replace(test, striker=replace(striker, velocity=by * striker.velocity))
+    if not quantity.endswith("_scale"):
+        return test
+    channel = quantity.removesuffix("_scale").replace("velocity", "displacement")
+    if channel == "displacement" and "stress" in test.derived:
+        test = _scaled(test, "stress", by)
+    return _scaled(test, channel, by)
+
+
+def _scaled(test: Measurement, channel: str, by: float) -> Measurement:
+    """Multiply a channel, its noise and the error of its zero."""
+    values, noise = getattr(test, channel), test.noise
+    if values is None:
+        return test
+    if (given := getattr(noise, channel, None)) is not None:
+        noise = replace(noise, **{channel: by * given})
+    level: NoiseLevel | None = noise.estimated.get(channel)
+    if level is not None:
+        level = replace(level, sigma=by * level.sigma)
+        noise = replace(noise, estimated=noise.estimated | {channel: level})
+    zeros = test.zeros | {name: by * s for name, s in test.zeros.items() if name == channel}
+    return replace(test, noise=noise, zeros=zeros, **{channel: by * values})
+
+
+def _value(test: Measurement, quantity: str) -> float:
+    """Value of a quantity of the TOML, SI; 1 of a scale, whose ± is a share."""
+    if quantity.startswith("height_"):
+        return (test.specimen.heights or ())[int(quantity.removeprefix("height_")) - 1]
+    owner, name = {
+        "specimen_mass": (test.specimen, "mass"),
+        "striker_mass": (test.striker, "mass"),
+        "velocity": (test.striker, "velocity"),
+    }.get(quantity, (test.specimen, quantity))
+    return float(getattr(owner, name, None) or 1.0)
+
+
+def make_budget(
+    best: BestPoint, estimates: Mapping[str, ParameterEstimate]
+) -> tuple[dict[str, ParameterEstimate], Budget | None]:
+    """Give the estimates their `systematic`, and make the budget; None if nothing is determined."""
+    moved = responses(best)
+    out = dict(estimates)
+    for name, one in estimates.items():
+        if one.stderr is not None or not one.vary:
+            changes = [float(change[best.index[name]]) for change in moved.values()]
+            out[name] = replace(one, systematic=math.hypot(*changes))
+    rows = dict[str, dict[str, float]]()
+    for name, shares in _of_covariance(best):
+        one = out[name]
+        if one.stderr is None or name in NUISANCE:
+            continue
+        row = dict.fromkeys(SOURCES, 0.0)
+        # Where another method made the standard error, its parts are those of the local one.
+        row |= {source: one.stderr * share for source, share in shares.items()}
+        for quantity, change in moved.items():
+            source = _SOURCES.get(quantity, "calibration")
+            source = "height" if quantity.startswith("height") else source
+            row[source] = math.hypot(row[source], float(change[best.index[name]]))
+        if one.range is not None:
+            row["law"] = 0.5 * (one.range[1] - one.range[0]) / 1.96
+        rows[name] = row
+    scales = dict(zip(best.names, best.sizes.tolist(), strict=True))
+    return out, Budget(rows, {name: scales[name] for name in rows}) if rows else None
+
+
+def _of_covariance(best: BestPoint) -> Iterator[tuple[str, dict[str, float]]]:
+    """Give each determined parameter and the parts of its standard error as shares of it.
+
+    Their squares add up to one. The variance without a group of nuisance parameters is the
+    conditional one, in which they are known.
+    """
+    if not best.names:
+        return
+    known = np.isfinite(best.spread.stderr) & (best.spread.stderr > 0.0)
+    names = [name for name, there in zip(best.names, known, strict=True) if there]
+    matrix = best.spread.correlation[np.ix_(known, known)]
+
+    def left(held: tuple[str, ...]) -> Array:
+        at = [i for i, name in enumerate(names) if name in held]
+        across = matrix[:, at]
+        told = np.linalg.pinv(matrix[np.ix_(at, at)], hermitian=True) if at else np.zeros((0, 0))
+        return np.asarray(np.clip(1.0 - np.sum((across @ told) * across, axis=1), 0.0, 1.0))
+
+    striker = left(_STRIKER)
+    noise = np.minimum(left((*_CONTACT, *_STRIKER)), striker)
+    for i, name in enumerate(names):
+        parts = {"noise": noise[i], "contact and zero": striker[i] - noise[i]}
+        parts["velocity"] = 1.0 - striker[i]
+        yield name, {source: math.sqrt(part) for source, part in parts.items()}

@@ -1,0 +1,195 @@
+"""The uncertainty budget and the nuisance parameters, as they are shown."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import fabricated
+import foamfit as ff
+from conftest import AREA, HEIGHT, synthetic_impact, synthetic_loop
+from foamfit.cli import main
+from foamfit.data.describe import describe
+from foamfit.data.energy import audit
+from foamfit.report.budget_plot import plot_budget
+from foamfit.report.page import render_report
+from foamfit.report.readable import readable
+from foamfit.report.result_figures import draw_all
+from foamfit.report.studies.batch import names_of, row_of
+from foamfit.report.summary import conclusions, summary_text
+from foamfit.results import ParameterEstimate
+
+NUISANCE = {
+    "contact_time": (3.2e-6, 1.1e-6, "s", "contact time t₀", "µs"),
+    "displacement_zero": (-2e-9, 4e-6, "m", "zero of the motion w₀", "µm"),
+    "stress_zero": (20.0, 1.5e3, "Pa", "zero of the stress σ₀", "kPa"),
+    "acceleration_zero": (3.0, 0.2, "m/s^2", "zero of the acceleration a₀", "m/s²"),
+    "velocity": (1.752, 0.004, "m/s", "velocity v₀", "m/s"),
+    "striker_mass": (7.01e-3, 2e-5, "kg", "striker mass m", "g"),
+}
+
+
+def with_nuisance() -> ff.FitResult:
+    made = {
+        name: ParameterEstimate(
+            value, error, (value - 2 * error, value + 2 * error), unit, True, "weak", "so"
+        )
+        for name, (value, error, unit, _, _) in NUISANCE.items()
+    }
+    one = fabricated.result()
+    return replace(one, parameters=one.parameters | made, warnings=())
+
+
+@pytest.mark.parametrize("name", NUISANCE)
+def test_a_nuisance_parameter_reads_well(name: str) -> None:
+    *_, label, unit = NUISANCE[name]
+    shown = readable(name, with_nuisance().parameters[name])
+    assert (shown.label, shown.unit) == (label, unit)
+    assert shown.stderr
+    assert "e" not in shown.with_error
+
+
+def test_they_stand_behind_the_springs_by_their_names() -> None:
+    lines = summary_text(with_nuisance()).splitlines()
+    at = {label: i for i, line in enumerate(lines) for *_, label, _ in NUISANCE.values()
+          if line.startswith(f"{label}  ")}  # fmt: skip
+    assert set(at) == {label for *_, label, _ in NUISANCE.values()}
+    last = max(i for i, line in enumerate(lines) if line.startswith("s1_"))
+    assert min(at.values()) > last
+    page = render_report(with_nuisance(), fabricated.no_figures())
+    for name, (*_, label, _) in NUISANCE.items():
+        assert f"<code>{name}</code>" in page
+        assert label in page
+
+
+def test_conclusions_are_about_the_springs_alone() -> None:
+    assert conclusions(with_nuisance()) == conclusions(fabricated.result())
+
+
+def test_in_a_batch_they_are_the_last_columns() -> None:
+    chain = fabricated.chain_result()
+    rows = [row_of("a", "a.csv", with_nuisance()), row_of("b", "b.csv", chain)]
+    names = names_of(rows)
+    assert names[-len(NUISANCE) :] == list(NUISANCE)
+    assert set(names[: -len(NUISANCE)]) == {*fabricated.result().parameters, *chain.parameters}
+
+
+def test_the_report_has_the_budget_as_table_and_picture() -> None:
+    budget = fabricated.budget(area=0.02, contact_and_zero=0.01)
+    one = fabricated.result()
+    estimates = {
+        name: replace(p, systematic=0.02 * abs(p.value)) for name, p in one.parameters.items()
+    }
+    result = replace(one, budget=budget, parameters=estimates)
+    figures = dict(draw_all(result))
+    assert figures["budget"] is not None
+    text = render_report(result, figures)
+    page = text[text.index("Uncertainty budget") :]
+    head, row = (part.split("</tr>")[0] for part in page.split("<tr>")[1:3])
+    assert head.count("<th") == 5  # three sources, combined, and the corner
+    assert "mass" not in head
+    for share in ("1 %", "2 %", "2.4 %"):  # √(1 + 1 + 4)
+        assert f">{share}<" in row
+    assert "± 0.11" in text  # of k0 = 5.5 MPa
+    assert "Systematic is one standard deviation" in text
+
+
+def test_noise_alone_needs_no_budget() -> None:
+    """All of it stands in the table of parameters."""
+    result = fabricated.result(budget=fabricated.budget(law=0.03))
+    figures = dict(draw_all(result))
+    assert figures["budget"] is None
+    text = render_report(result, figures)
+    assert "Uncertainty budget" not in text
+    assert "systematic</th>" not in text
+
+
+def test_bars_are_shares_of_the_variance() -> None:
+    figure = plot_budget(fabricated.budget(area=0.02, contact_and_zero=0.01))
+    shares, totals = figure.axes
+    widths = [[bar.get_width() for bar in bars] for bars in shares.containers]
+    assert np.allclose(np.sum(widths, axis=0), 100.0)
+    assert np.allclose(np.array(widths)[:, 0], [100 / 6, 100 / 6, 400 / 6])
+    assert [bar.get_width() for bar in totals.containers[0]] == pytest.approx([6**0.5] * 2)
+
+
+def test_check_says_which_deviation_would_matter() -> None:
+    def exact(test: object) -> str:
+        text = describe(test, audit(test))
+        return " ".join(text.partition("\nexact ")[2].split())
+
+    _, impact = synthetic_impact()
+    told = exact(impact)
+    assert told.startswith("The TOML states no ± of velocity, striker mass, area and height, which")
+    assert "The ± of the velocity would probably matter most" in told
+    some = replace(impact, uncertainties={"velocity": 0.01, "area": 0.01 * AREA})
+    assert exact(some).startswith("The TOML states no ± of striker mass and height")
+    _, slow = synthetic_loop()
+    assert (
+        "The ± of the area would probably matter most: 1 % of the area is 1 % of every stress"
+        in (exact(slow))
+    )
+    assert exact(replace(slow, uncertainties={"height": 1e-6, "area": 1e-8})) == ""
+
+
+def impact_file(folder: Path, velocity: str, more: str = "") -> Path:
+    """An impact with 80 rows of flight before the contact, in a file."""
+    spring, _ = synthetic_impact()
+    contact = np.linspace(0.0, 0.75e-3, 401)
+    chain = ff.Chain([spring], [HEIGHT], AREA)
+    response = ff.simulate(chain, ff.Impact(7e-3, 2.0), contact)
+    step = contact[1]
+    before = step * np.arange(-80, 0)
+    stress = np.append(np.zeros(80), response.base_stress)
+    motion = np.append(2.0 * before, response.displacement[-1])
+    rng = np.random.default_rng(0)
+    stress += 2e-3 * np.ptp(stress) * rng.standard_normal(stress.size)
+    motion += 5e-4 * np.ptp(motion) * rng.standard_normal(motion.size)
+    table = np.column_stack(
+        [1e3 * (np.append(before, contact) + 1e-3), stress * AREA, 1e3 * motion]
+    )
+    path = folder / "impact.csv"
+    header = "time (ms),force (N),displacement (mm)"
+    np.savetxt(path, table, "%.9g", ",", header=header, comments="")
+    path.with_suffix(".toml").write_text(
+        f'[specimen]\nheight = "{HEIGHT * 1e3} mm"\narea = "{AREA * 1e6} mm^2"\n{more}'
+        f'[striker]\nmass = "7 g"\nvelocity = "{velocity}"\n'
+    )
+    return path
+
+
+def test_a_velocity_that_the_flight_contradicts_is_a_warning(tmp_path: Path) -> None:
+    right, wrong = (
+        ff.fit(ff.read_test(impact_file(tmp_path, v)), model="bistable", starts=4,
+               intervals="local")
+        for v in ("2 m/s", "1.9 m/s")
+    )  # fmt: skip
+    assert not any("velocity" in warning for warning in right.warnings)
+    (told,) = [warning for warning in wrong.warnings if "velocity is given" in warning]
+    assert "moves at 2" in told
+    assert "given as 1.9 m/s" in told
+    assert wrong.status == "warnings"
+    assert summary_text(wrong, verbose=True).count("given as 1.9 m/s") == 1
+    page = render_report(wrong, fabricated.no_figures())
+    assert page.index("given as 1.9 m/s") < page.index("<h2>Parameters")
+
+
+def test_the_outlook_ranks_what_is_taken_for_exact(tmp_path: Path) -> None:
+    def told(path: Path) -> str:
+        done = CliRunner().invoke(main, ["check", str(path), "--model", "bistable"])
+        assert done.exit_code == 0, done.output
+        return " ".join(done.stdout.partition("\nexact ")[2].partition("\n\n")[0].split())
+
+    text = told(impact_file(tmp_path, "2 m/s"))
+    for quantity in ("velocity", "striker mass", "area", "height"):
+        assert f"1 % of the {quantity} moves s1_" in text
+    times = [float(part.split(" times")[0]) for part in text.split("(")[1:]]
+    assert times == sorted(times, reverse=True)
+    area = next(part for part in text.split(", ") if "of the area" in part)
+    assert "by 1 % of its scale" in area  # of whatever stress it is
+    stated = told(impact_file(tmp_path, "2 ± 0.01 m/s"))
+    assert "of the velocity" not in stated

@@ -1,0 +1,278 @@
+"""What the ± of the TOML does to the parameters: against exact scalings and against fits anew."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import foamfit as ff
+from conftest import AREA, HEIGHT, synthetic_impact, synthetic_loop
+from foamfit.data.measurement import Measurement, Noise, Specimen
+from foamfit.fitting.problem import make_problem
+from foamfit.results import SOURCES
+from foamfit.springs.parameters import MICROSCALE_NAMES
+from foamfit.trust.best_point import BestPoint
+from foamfit.trust.budget import responses
+
+SPRING = ff.published["foam-1/model-1"].bistable
+STRESSES = ("s1_k0", "s1_kc", "s1_dsigma", "s1_kh_plus", "s1_kh_minus")
+STRAINS = ("s1_eps_a", "s1_eps_c")
+MICRO = ff.MicroscaleSpring(4.4e5, 4.9e5, 0.29, 1.06e5, 0.44, 6e4, 0.7)
+
+
+def fitted(test: Measurement, **more: Any) -> ff.FitResult:
+    return ff.fit(test, starts=4, intervals="local", **{"model": "bistable"} | more)
+
+
+def moved(best: BestPoint, quantity: str, name: str) -> float:
+    """Change of a parameter by one standard deviation of a quantity, over its value."""
+    return float(responses(best)[quantity][best.index[name]] / best.values[best.index[name]])
+
+
+@pytest.fixture(scope="module")
+def loop() -> BestPoint:
+    """A driven loop without time, at its best point."""
+    _, test = synthetic_loop()
+    one = test.specimen
+    test = replace(
+        test,
+        uncertainties={
+            "area": 0.01 * one.area, "stress_scale": 0.02, "height": 0.01 * one.height,
+            "displacement_scale": 0.01,
+        },
+    )  # fmt: skip
+    found = fitted(test)
+    problem = make_problem(test, "bistable", None, None, None, interior_mass=False)
+    values = problem.vector()
+    for name in problem.model.names:
+        values[problem.index[name]] = found.parameters[name].value
+    return BestPoint(problem, values)
+
+
+@pytest.mark.parametrize(("quantity", "share"), [("area", -0.01), ("stress_scale", 0.02)])
+def test_area_and_scale_of_the_force_scale_all_stresses(loop, quantity, share):
+    for name in STRESSES:
+        assert moved(loop, quantity, name) == pytest.approx(share, rel=1e-4)
+    for name in STRAINS:
+        assert moved(loop, quantity, name) == pytest.approx(0.0, abs=1e-8)
+
+
+def test_height_and_scale_of_the_motion_are_one_and_the_same_strain(loop):
+    """A strain is a motion over a height: of both only the ratio counts."""
+    for name in (*STRESSES, *STRAINS):
+        one, other = (moved(loop, q, name) for q in ("height", "displacement_scale"))
+        assert one == pytest.approx(-other, rel=1e-3)
+
+
+def test_a_dashpot_scales_with_the_area():
+    """η of a driven motion is a stress over a rate."""
+    time = np.linspace(0.0, 2.0, 301)
+    motion = 0.4 * HEIGHT * np.sin(0.5 * np.pi * time)
+    spring = ff.BistableSpring(*SPRING.seven, eta=2e5)
+    chain = ff.Chain([spring], [HEIGHT], AREA)
+    stress = ff.simulate(chain, ff.DisplacementDrive(motion), time).base_stress
+    test = Measurement(
+        "synthetic", None, "", time, stress, motion, Specimen(HEIGHT, AREA), motion="measured",
+        noise=Noise(stress=1e4), uncertainties={"area": 0.01 * AREA},
+    )  # fmt: skip
+    problem = make_problem(test, "bistable", "displacement", None, None, interior_mass=False)
+    problem.params["s1_eta"].set(vary=True, max=1e9)
+    values = problem.vector()
+    values[:8] = [*SPRING.seven, 2e5]
+    best = BestPoint(problem, values)
+    assert "s1_eta" in best.names
+    for name in (*STRESSES, "s1_eta"):
+        assert moved(best, "area", name) == pytest.approx(-0.01, rel=1e-3)
+
+
+def written(folder: Path, *, height: str, area: str, velocity: str = "2 m/s", mass: str = "7 g",
+            noise: float = 1e-4) -> Path:  # fmt: skip
+    """The same impact in a file: a force and a motion, and a TOML."""
+    _, test = synthetic_impact(noise=noise)
+    path = folder / "impact.csv"
+    table = np.column_stack([test.time * 1e3, test.stress * AREA, test.displacement * 1e3])
+    header = "time (ms),force (N),displacement (mm)"
+    np.savetxt(path, table, "%.12g", ",", header=header, comments="")
+    path.with_suffix(".toml").write_text(
+        f'[specimen]\nheight = "{height}"\narea = "{area}"\n'
+        f'[striker]\nmass = "{mass}"\nvelocity = "{velocity}"\n',
+        encoding="utf-8",
+    )
+    return path
+
+
+SIZE = {"height": f"{HEIGHT * 1e3:.12g} mm", "area": f"{AREA * 1e6:.12g} mm^2"}
+
+
+@pytest.mark.parametrize("quantity", ["height", "area"])
+def test_what_a_fit_of_the_changed_toml_gives(tmp_path, quantity):
+    """Through the files: half a percent more, and what `systematic` says of half a percent."""
+    value, unit = SIZE[quantity].split()
+    stated = ff.read_test(written(tmp_path, **SIZE | {quantity: f"{value} {unit} ± 0.5 %"}))
+    first = fitted(stated)
+    larger = f"{1.005 * float(value):.12g} {unit}"
+    again = fitted(ff.read_test(written(tmp_path, **SIZE | {quantity: larger})))
+    for name in (*STRESSES, *STRAINS):
+        one, other = first.parameters[name], again.parameters[name]
+        change = abs(other.value - one.value)
+        assert one.systematic == pytest.approx(change, rel=0.05, abs=0.1 * one.stderr), name
+        assert first.budget.contributions[name][quantity] == one.systematic
+    if quantity == "area":
+        for name in STRESSES:
+            assert first.parameters[name].systematic == pytest.approx(
+                0.005 * abs(first.parameters[name].value), rel=1e-3
+            )
+
+
+def test_what_the_toml_does_not_state_is_in_no_parameter(tmp_path):
+    result = fitted(ff.read_test(written(tmp_path, **SIZE)))
+    assert {p.systematic for p in result.parameters.values()} == {0.0}
+    assert set(result.budget.sources) <= {"noise", "contact and zero", "law"}
+
+
+def test_systematic_is_in_no_interval(tmp_path):
+    plain = fitted(ff.read_test(written(tmp_path, **SIZE)))
+    area = SIZE["area"] + " ± 3 %"
+    stated = fitted(ff.read_test(written(tmp_path, **SIZE | {"area": area})))
+    for name in (*STRESSES, *STRAINS):
+        assert stated.parameters[name].ci95 == pytest.approx(plain.parameters[name].ci95)
+        assert stated.parameters[name].stderr == pytest.approx(plain.parameters[name].stderr)
+
+
+def test_velocity_and_mass_with_a_deviation_are_fitted_within_it(tmp_path):
+    """Both are wrong in the TOML, by less than what it says; the record itself knows better."""
+    path = written(tmp_path, **SIZE, velocity="1.98 ± 0.03 m/s", mass="7.05 ± 0.1 g", noise=0.003)
+    result = fitted(ff.read_test(path))
+    velocity, mass = (result.parameters[name] for name in ("velocity", "striker_mass"))
+    assert velocity.state == mass.state == "determined"
+    assert velocity.value == pytest.approx(2.0, abs=3.0 * velocity.stderr)
+    assert mass.value == pytest.approx(7e-3, abs=3.0 * mass.stderr)
+    assert velocity.stderr < 0.015
+    assert velocity.systematic == mass.systematic == 0.0
+    for name in STRESSES:
+        assert result.budget.contributions[name]["velocity"] > 0.0
+        assert result.budget.contributions[name]["mass"] == 0.0
+
+
+def test_a_force_only_record_leaves_the_velocity_at_its_prior(tmp_path):
+    """Nothing else tells of it, so its standard deviation is that of the TOML."""
+    path = written(tmp_path, **SIZE, velocity="2 ± 0.02 m/s")
+    table = np.loadtxt(path, delimiter=",", skiprows=1)
+    np.savetxt(path, table[:, :2], "%.12g", ",", header="time (ms),force (N)", comments="")
+    result = fitted(ff.read_test(path))
+    velocity = result.parameters["velocity"]
+    assert velocity.value == pytest.approx(2.0, abs=0.03)
+    assert velocity.stderr <= 0.0205
+    held = fitted(ff.read_test(path), params=_held(path))
+    assert not held.params["velocity"].vary
+    assert held.budget.contributions["s1_kc"]["velocity"] > 0.0
+
+
+def _held(path: Path) -> Any:
+    params = ff.make_params(ff.read_test(path), "bistable")
+    params["velocity"].set(value=2.0, vary=False)
+    return params
+
+
+def test_a_force_that_is_mass_times_acceleration_does_not_tell_the_mass(tmp_path):
+    """Then every stress is proportional to the mass, whatever the record says."""
+    path = written(tmp_path, **SIZE, mass="7 g ± 1 %")
+    table = np.loadtxt(path, delimiter=",", skiprows=1)
+    table[:, 1] /= 7e-3
+    header = "time (ms),acceleration (m/s^2),displacement (mm)"
+    np.savetxt(path, table, "%.12g", ",", header=header, comments="")
+    result = fitted(ff.read_test(path))
+    assert "striker_mass" not in result.parameters
+    for name in STRESSES:
+        one = result.parameters[name]
+        assert one.systematic == pytest.approx(0.01 * abs(one.value), rel=1e-3)
+    for name in STRAINS:
+        assert result.parameters[name].systematic < 1e-6
+
+
+def test_the_parts_of_the_noise_add_up_to_the_standard_error():
+    _, test = synthetic_impact()
+    test = replace(test, uncertainties={"velocity": 0.02, "area": 0.01 * AREA})
+    result = fitted(test)
+    for name, row in result.budget.contributions.items():
+        parts = [row[source] for source in ("noise", "contact and zero", "velocity")]
+        assert all(part > 0.0 for part in parts), name
+        assert math.hypot(*parts) == pytest.approx(result.parameters[name].stderr)
+        assert result.budget.combined(name) == pytest.approx(math.hypot(*parts, row["area"]))
+
+
+def test_what_the_contact_adds_is_gone_where_it_is_known():
+    """The noise alone is what a fit with the contact and the zero held says."""
+    _, test = synthetic_impact()
+    free = fitted(test)
+    params = ff.make_params(test, "bistable")
+    for name in ("contact_time", "displacement_zero"):
+        params[name].set(value=0.0, vary=False)
+    held = fitted(test, params=params)
+    for name in (*STRESSES, *STRAINS):
+        alone = free.budget.contributions[name]["noise"]
+        assert alone == pytest.approx(held.parameters[name].stderr, rel=0.15)
+
+
+def test_heights_of_a_chain(tmp_path):
+    """A spring's own ± moves its own strains; the ± of the whole moves those that have none."""
+    time = np.linspace(0.0, 1.0, 201)
+    motion = 4e-3 * np.sin(np.pi * time)
+    chain = ff.Chain([ff.LinearSpring(2e6), MICRO], [4e-3, 6e-3], AREA)
+    stress = ff.simulate(chain, ff.DisplacementDrive(motion), time).base_stress
+    stress += 50.0 * np.random.default_rng(0).standard_normal(time.size)
+    test = Measurement(
+        "synthetic", None, "", time, stress, motion, Specimen(0.01, AREA, heights=(4e-3, 6e-3)),
+        motion="measured", uncertainties={"height": 1e-4, "height_1": 4e-5},
+    )  # fmt: skip
+    problem = make_problem(
+        test, "linear+microscale", "displacement", None, None, interior_mass=False
+    )
+    values = problem.vector()
+    values[:2], values[2:10] = [2e6, 0.0], [getattr(MICRO, short) for short in MICROSCALE_NAMES]
+    found = responses(best := BestPoint(problem, values))
+    assert found["height_1"][best.index["s1_height"]] == pytest.approx(4e-5)
+    assert found["height_1"][best.index["s2_height"]] == 0.0
+    assert found["height"][best.index["s1_height"]] == 0.0
+    assert found["height"][best.index["s2_height"]] == pytest.approx(6e-5)
+    # A linear spring of another height gives the same displacement with another stiffness.
+    assert moved(best, "height_1", "s1_k0") == pytest.approx(0.01, rel=2e-3)
+    assert moved(best, "height_1", "s2_k0") == pytest.approx(0.0, abs=2e-5)
+
+
+def test_it_is_in_the_files(tmp_path):
+    path = written(tmp_path, **SIZE | {"area": SIZE["area"] + " ± 1 %"})
+    result = fitted(ff.read_test(path))
+    folder = result.save(tmp_path / "result")
+    content = json.loads((folder / "fit.json").read_text(encoding="utf-8"))
+    assert set(content["budget"]["s1_kc"]) == set(SOURCES)
+    assert content["budget"]["s1_kc"]["area"] == pytest.approx(
+        content["parameters"]["s1_kc"]["systematic"]
+    )
+    head, *lines = (folder / "parameters.csv").read_text(encoding="utf-8").splitlines()
+    column = head.split(",").index("systematic")
+    systematic = {line.split(",")[0]: float(line.split(",")[column]) for line in lines}
+    assert systematic["s1_kc"] == pytest.approx(0.01 * result.parameters["s1_kc"].value, rel=1e-3)
+    rows = (folder / "budget.csv").read_text(encoding="utf-8").splitlines()
+    assert rows[0].startswith("name,noise,contact and zero,velocity,mass,height,area,")
+    assert len(rows) == 1 + len(result.budget.contributions)
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert "Uncertainty budget" in page
+    assert "contact time t₀" in page
+
+
+def test_a_soft_loss_counts_outliers_as_little_here():
+    _, test = synthetic_impact()
+    stress = test.stress.copy()
+    stress[150] += 5e6
+    test = replace(test, stress=stress, uncertainties={"area": 0.01 * AREA})
+    result = fitted(test, loss="cauchy")
+    for name in STRESSES:
+        one = result.parameters[name]
+        assert one.systematic == pytest.approx(0.01 * abs(one.value), rel=0.02)
