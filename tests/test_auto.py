@@ -631,7 +631,8 @@ def test_undetermined_parameters_of_the_chosen_model_are_named(climbed):
     assert "s1_kc" in sentence
     assert "no model of the ladder has all parameters determined" in sentence
     assert sentence in result.warnings
-    assert result.ladder.chosen.rank <= 3 < result.ladder.chosen.n_vary
+    # k0, eps_a and kh_plus of the spring, contact time and zero of the motion
+    assert result.ladder.chosen.rank <= 5 < result.ladder.chosen.n_vary
     assert any("combinations" in text for text in result.ladder.sentences)
     for name in result.ladder.chosen.not_determined:
         assert result.parameters[name].state == "not determined"

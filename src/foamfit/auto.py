@@ -27,7 +27,7 @@ from foamfit.fitting.search import SearchStoppedError
 from foamfit.one_model import Found, Options, Progress
 from foamfit.results import Fit, Ladder, Rung, rung_name
 from foamfit.springs.model import Model
-from foamfit.springs.parameters import split_name
+from foamfit.springs.parameters import NUISANCE, split_name
 from foamfit.text import counted, percent
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.evidence import (
@@ -100,8 +100,9 @@ def _carry(params: lmfit.Parameters, model: Model, below: Fit | None) -> None:
     if below is None:
         return
     values, was = below.params.valuesdict(), list(Model.parse(below.model).kinds)
-    if "time_shift" in params:
-        params["time_shift"].value = values["time_shift"]
+    for name in NUISANCE:
+        if name in params and params[name].vary:
+            params[name].value = values[name]
     sources: dict[int, int] = {}
     for spring in reversed(range(len(model.kinds))):
         if was and model.kinds[spring] == was[-1]:

@@ -264,7 +264,7 @@ def _search(
         record = replace(record, costs=tuple(costs))
         progress(REFINED, "refinement")
         _refine(problem, tracker)
-        _weigh_motion(problem, tracker)
+        weigh_motion(problem, tracker)
     except STOPPING as error:
         ensure_feasible(tracker, problem.space(), np.random.default_rng(record.seed))
         return replace(record, stopped=what_stopped(error))
@@ -307,7 +307,7 @@ def _refine(problem: Problem, tracker: Tracker) -> None:
         )  # fmt: skip
 
 
-def _weigh_motion(problem: Problem, tracker: Tracker) -> None:
+def weigh_motion(problem: Problem, tracker: Tracker) -> None:
     """Count the residual in the covariance that the motion's own uncertainty gives it, and refine.
 
     That covariance is the one at the best point, so it is made anew there once more.

@@ -19,6 +19,7 @@ from typing import Any
 import pytest
 
 from conftest import synthetic_impact
+from foamfit.fitting.problem import make_params
 from foamfit.one_model import Options, identify, judge
 from foamfit.solve.plan import CLOSED_FORM, SECOND_ORDER, Plan
 from foamfit.trust.intervals import Choice
@@ -134,6 +135,18 @@ def test_a_held_parameter_costs_no_sensitivity(
     assert some + others == every
 
 
+@pytest.mark.parametrize("way", ["fit", "search"])
+def test_contact_and_zero_cost_no_sensitivity(
+    counted: dict[str, dict[str, dict[str, Any]]], way: str
+) -> None:
+    """They are two runs of the curves alone, and none."""
+    known, unknown = (
+        counted["sensitivities"][f"{way}, {what}"] for what in ("0 held", "contact unknown")
+    )
+    assert unknown["columns"] == known["columns"] + 2
+    assert unknown["tangents expanded"] == known["tangents expanded"]
+
+
 def test_a_residual_alone_costs_no_sensitivity(
     counted: dict[str, dict[str, dict[str, Any]]],
 ) -> None:
@@ -143,10 +156,16 @@ def test_a_residual_alone_costs_no_sensitivity(
 # ---------------------------------------------------------------- after the search
 
 
-def test_the_best_point_is_simulated_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One run with all curves (and the stress along the motion), one with sensitivities."""
+@pytest.mark.parametrize("known", [False, True])
+def test_the_best_point_is_simulated_once(monkeypatch: pytest.MonkeyPatch, known: bool) -> None:
+    """One run with all curves (and the stress along the motion), one with sensitivities.
+
+    Two more of the curves tell what the contact time does, where it is unknown.
+    """
     _, measurement = synthetic_impact(samples=101)
-    found = identify(measurement, "bistable", None, Options(starts=2), lambda *_: None)
+    params = make_params(measurement)
+    params["contact_time"].vary = not known
+    found = identify(measurement, "bistable", params, Options(starts=2), lambda *_: None)
     runs: Counter[tuple[str, bool]] = Counter()
     original = Plan.run
 
@@ -159,7 +178,7 @@ def test_the_best_point_is_simulated_once(monkeypatch: pytest.MonkeyPatch) -> No
     result, _ = judge(found, Choice("local"), lambda _: None)
     assert result.parameters["s1_k0"].state == "determined"
     assert runs == {
-        (SECOND_ORDER, False): 1,
+        (SECOND_ORDER, False): 1 if known else 3,
         (CLOSED_FORM, False): 1,
         (SECOND_ORDER, True): 1,
     }

@@ -472,8 +472,8 @@ def test_check_answers_for_a_test_that_is_there(tmp_path: Path) -> None:
     assert "s1_kc: not determined, branch c of spring 1 is not reached." in text
     assert "s1_kc MPa 82.50 not determined 82.50 ± " in text
     # where they are in the file; a plan has the same record in mind
-    assert re.search(r"contact_time µs 62\.58 ± 0\.\d+ determined 62\.6 ± ", text)
-    assert re.search(r"displacement_zero µm −3\.2 ± \d\.\d weak −3\.2 ± ", text)
+    assert re.search(r"contact time t₀ µs 62\.58 ± 0\.\d+ determined 62\.6 ± ", text)
+    assert re.search(r"zero of the motion w₀ µm −3\.2 ± \d\.\d weak −3\.2 ± ", text)
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 

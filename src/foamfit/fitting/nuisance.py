@@ -43,6 +43,11 @@ class Prior:
     sigma: float
 
 
+def is_late(measurement: Measurement, *, time_shift: bool) -> bool:
+    """Whether a time shift is fitted: it was asked for, or the delay of a motion has a ±."""
+    return time_shift or bool(measurement.uncertainties.get("delay"))
+
+
 def names_of(drive: str, *, time_shift: bool) -> tuple[str, ...]:
     """Names of the nuisance parameters under a drive, in the order of the flat vector."""
     return (*UNDER_DRIVE.get(drive, ()), *((TIME_SHIFT,) if time_shift else ()))

@@ -44,7 +44,8 @@ def make_params(
     drive : str, optional
         "impact", "stress" or "displacement"; see `fitting.curves.choose_drive`.
     time_shift : bool
-        Whether the time by which the motion channel is late is a parameter too.
+        Whether the time by which the motion channel is late is a parameter too; where the delay of
+        a motion with its own clock has a ±, it is one in any case.
     relaxation : int
         Relaxation terms of every hysteretic spring of a model that is given by its name.
 
@@ -88,7 +89,8 @@ def make_params(
         vary = short != "eta" or (drive == "impact" and (spring >= 0) == (count == 1))
         params.add(name, value=value, min=low, max=high, vary=vary)
     _add_heights(params, measurement, model)
-    _add_nuisance(params, measurement, scales, drive, time_shift=time_shift)
+    late = nuisance.is_late(measurement, time_shift=time_shift)
+    _add_nuisance(params, measurement, scales, drive, time_shift=late)
     for own in (name.removesuffix("dsigma") for name in model.names if name.endswith("_dsigma")):
         eps_a = params[own + "eps_a"].value
         params[own + "dsigma"].value = -0.2 * params[own + "k0"].value * eps_a / (1.0 - eps_a)
@@ -162,7 +164,7 @@ def _add_nuisance(
         low, high = nuisance.limits_of(name, measurement, drive, scales.duration, ranges)
         origin = measurement.origins.get(name, 0.0)
         vary = name in free and low < high
-        limits = {"min": low + origin, "max": high + origin} if vary else {}
+        limits = {"min": low + origin, "max": high + origin} if low < high else {}
         params.add(name, value=usual[name] + origin, vary=vary, **limits)
 
 
@@ -203,6 +205,11 @@ class Problem:
         return {name: i for i, name in enumerate(self.names)}
 
     @cached_property
+    def origins(self) -> Array:
+        """What was taken off the record, by parameter, SI: values + origins are the file's own."""
+        return np.array([self.measurement.origins.get(name, 0.0) for name in self.names])
+
+    @cached_property
     def linear(self) -> Problem:
         """The same problem without a soft loss, for derivatives of the plain residuals."""
         if self.objective.loss == "linear":
@@ -219,6 +226,18 @@ class Problem:
         params = self.params.copy()
         _counted_from(params, self.measurement.origins, 1.0)
         return params
+
+    def is_exact(self, name: str) -> bool:
+        """Whether the record leaves a nuisance parameter no freedom, and nobody has held it."""
+        one, usual = self.params[name], nuisance.values_of(self.measurement)
+        return not one.vary and one.value == usual.get(name)
+
+    def with_springs(self, vector: Array, own: Array | None = None) -> Array:
+        """Vector with the springs of another test where they vary here, all else its own."""
+        values = self.vector() if own is None else own.copy()
+        free = [self.index[name] for name in self.free() if name not in NUISANCE]
+        values[free] = vector[free]
+        return self.space().complete(values)
 
     def put(self, values: Array) -> None:
         """Write a flat vector into the parameters that vary."""
@@ -344,6 +363,7 @@ def make_problem(
         notes = (f"Interior masses were asked for, but {why}; the fit is the same without them.",)
         interior_mass = False
     chosen = default_weights(measurement, drive, count) if weights is None else dict(weights)
+    time_shift = nuisance.is_late(measurement, time_shift=time_shift)
     objective = Objective(
         measurement, model, drive, chosen,
         interior_mass=interior_mass, time_shift=time_shift, loss=loss,
@@ -356,8 +376,17 @@ def make_problem(
             f"parameter '{unknown[0]}' is not one of the model {model.name}; "
             f"its parameters are {', '.join(wanted)}"
         )
+    limits = {name: (one.min, one.max) for name, one in wanted.items() if name in NUISANCE}
     for name in params:
         wanted[name] = params[name]
+    for name, (low, high) in limits.items():
+        if wanted[name].vary and not math.isfinite(wanted[name].max - wanted[name].min):
+            if not math.isfinite(high - low):
+                raise InputError(
+                    f"{measurement.name}: '{name}' cannot vary, as the {drive} drive of this test "
+                    "has nothing that would show it; leave it fixed"
+                )
+            wanted[name].set(min=low, max=high)
     _counted_from(wanted, measurement.origins, -1.0)
     _check_held(wanted)
     if not any(parameter.vary for parameter in wanted.values()):

@@ -31,7 +31,7 @@ from foamfit.fitting.links import (
     start_of,
 )
 from foamfit.fitting.problem import Problem
-from foamfit.springs.parameters import split_name
+from foamfit.springs.parameters import NUISANCE, split_name
 
 # What a coordinate of the box is relative to, by the short names of the parameters.
 RELATIVE_TO = {"eps_star": ("k0", "kc"), "eps_c": ("eps_a",), "dsigma": ("k0", "eps_a")}
@@ -91,10 +91,11 @@ class Together:
         return tuple(name for name in problem.free() if name in self.own)
 
     def value(self, name: str) -> list[float]:
-        """Values of one parameter, one for each test."""
+        """Values of one parameter, one for each test that has it."""
         return [
             float(values[problem.index[name]])
             for problem, values in zip(self.problems, self.values, strict=True)
+            if name in problem.index
         ]
 
 
@@ -107,7 +108,8 @@ def fit_together(
 ) -> Together:
     """Fit several tests at once, parameters named in `own` for each test, the others for all.
 
-    See `fit_linked`, which this calls.
+    What a record does not say exactly (`fitting.nuisance`) is one of each test in any case. See
+    `fit_linked`, which this calls.
     """
     names = _varying(problems)
     for name in own:
@@ -116,7 +118,7 @@ def fit_together(
                 f"parameter '{name}' cannot be one of each test; it must be one of "
                 f"{', '.join(names)}"
             )
-    kinds = {name: "own" if name in own else "shared" for name in names}
+    kinds = {name: "own" if name in own or name in NUISANCE else "shared" for name in names}
     return fit_linked(problems, Links(kinds), starts, iterations=iterations)
 
 
@@ -132,8 +134,8 @@ def fit_linked(
     Parameters
     ----------
     problems : sequence of Problem
-        Of one model. Drives and noise may differ; a parameter that does not vary in one of them
-        keeps its value there.
+        Of one model. Drives and noise may differ, and with them the nuisance parameters; a
+        parameter that does not vary in one of them keeps its value there.
     links : Links
         What each parameter is to all tests.
     starts : sequence of sequences of (n_values,) arrays
@@ -178,13 +180,13 @@ def _varying(problems: Sequence[Problem]) -> tuple[str, ...]:
     """Names of the parameters that vary in some test; all must be of one model."""
     first = problems[0]
     for problem in problems[1:]:
-        if problem.names != first.names:
+        if problem.model.names != first.model.names:
             raise InputError(
                 f"{problem.measurement.name} has other parameters than {first.measurement.name}; "
                 "tests that are fitted together need one model"
             )
     free = {name for problem in problems for name in problem.free()}
-    return tuple(name for name in first.names if name in free)
+    return tuple(name for name in (*first.model.names, *NUISANCE) if name in free)
 
 
 # ------------------------------------------------------------------------------- coordinates
@@ -313,14 +315,18 @@ class _Layout:
             max(one.height for one in every),
         )
         spaces = [problem.space() for problem in problems]
-        low = np.min([space.low for space in spaces], axis=0)
-        high = np.max([space.high for space in spaces], axis=0)
+        count = len(problems[0].model.names)  # nuisance parameters have limits of their own
+        low = np.min([space.low[:count] for space in spaces], axis=0)
+        high = np.max([space.high[:count] for space in spaces], axis=0)
         tests = list[_Test]()
         for problem, space in zip(problems, spaces, strict=True):
             free = problem.free()
             boxed = tuple(name for name in free if name not in plain)
             here = tuple(name for name in plain if name in free)
-            space = replace(space, scales=scales, low=low, high=high, free=boxed)
+            space = replace(
+                space, scales=scales, free=boxed, low=np.append(low, space.low[count:]),
+                high=np.append(high, space.high[count:]),
+            )  # fmt: skip
             tests.append(_Test(problem, space, linked + mine, here))
         return cls(
             problems,

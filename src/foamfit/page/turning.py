@@ -18,7 +18,7 @@ from foamfit.fitting.search import Tracker, curve_starts, rank, smooth_loop
 from foamfit.one_model import Keywords, Options
 from foamfit.report.readable import readable_unit
 from foamfit.results import law_in_words
-from foamfit.springs.parameters import split_name, unit_of
+from foamfit.springs.parameters import NUISANCE, split_name, unit_of
 from foamfit.springs.spring import BistableSpring
 
 MOST_SAMPLES = 1500  # of a curve that is drawn again at every move
@@ -82,11 +82,17 @@ class Turning:
 
     @property
     def named(self) -> dict[str, float]:
-        """The values (SI) by their names."""
-        return dict(zip(self.problem.names, self.values.tolist(), strict=True))
+        """The values (SI) by their names, in the numbers of the file."""
+        told = self.values + self.problem.origins
+        return dict(zip(self.problem.names, told.tolist(), strict=True))
 
     def _own(self, name: str) -> bool:
-        """Whether a parameter can be turned: it does not follow from others or the specimen."""
+        """Whether a parameter is turned: it does not follow from others or the specimen.
+
+        Nor is it one of the record's own, such as the contact time, which is for a fit to find.
+        """
+        if name in NUISANCE and name != "time_shift":
+            return False
         given = self.problem.measurement.specimen.heights is not None
         if given and split_name(name)[1] == "height":
             return False
@@ -94,11 +100,12 @@ class Turning:
 
     def _at(self, values: Array, moves: Mapping[str, float]) -> Array:
         """Put some values into a vector; what hangs on them by expressions follows."""
-        values = values.copy()
+        values, problem = values.copy(), self.problem
         for name, value in moves.items():
-            if name in self.problem.index and math.isfinite(value):
-                values[self.problem.index[name]] = value
-        complete = self.problem.tied()
+            if name in problem.index and math.isfinite(value):
+                place = problem.index[name]
+                values[place] = value - problem.origins[place]
+        complete = problem.tied()
         return values if complete is None else complete(values)
 
     def turn(self, moves: Mapping[str, float]) -> Drawn:
@@ -214,7 +221,8 @@ def thinned(measurement: Measurement) -> Measurement:
     }
     return replace(
         measurement, time=some(measurement.time), stress=some(measurement.stress),
-        displacement=some(measurement.displacement), outliers=outliers,
+        displacement=some(measurement.displacement), acceleration=some(measurement.acceleration),
+        outliers=outliers, block=1,
         interior={node: values[keep] for node, values in measurement.interior.items()},
         sampled={channel: taken[keep] for channel, taken in measurement.sampled.items()},
     )  # fmt: skip

@@ -197,7 +197,7 @@ def _standing(problem: Problem, values: Array) -> dict[str, Any]:
         "relaxation": problem.model.relaxation,
         "drive": problem.objective.drive,
         "cycle": problem.measurement.cycle,
-        "values": dict(zip(problem.names, values.tolist(), strict=True)),
+        "values": dict(zip(problem.names, (values + problem.origins).tolist(), strict=True)),
         "misfit": misfit,
     }
 

@@ -7,6 +7,8 @@ or no spring (-1) and the onsite damping of the top.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from foamfit.errors import InputError
 
 # Parameters of the kinds of spring, in their order; a linear spring takes what it has of them.
@@ -78,6 +80,12 @@ def names_of(kind: str, relaxation: int = 0) -> tuple[str, ...]:
         return LINEAR_NAMES
     law = BISTABLE_NAMES if kind == "bistable" else MICROSCALE_NAMES
     return law + relaxation_names(relaxation)
+
+
+def springs_first(names: Iterable[str]) -> list[str]:
+    """Return each name once: those of the springs as they come, then the nuisance parameters."""
+    rank = {name: i for i, name in enumerate(NUISANCE)}
+    return sorted(dict.fromkeys(names), key=lambda name: rank.get(name, -1))
 
 
 def split_name(name: str) -> tuple[int, str]:

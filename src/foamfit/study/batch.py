@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Literal, Unpack
 from foamfit.data.toml_file import motion_file
 from foamfit.errors import InputError
 from foamfit.files import is_left, reason, sweep
+from foamfit.fitting import nuisance
 from foamfit.one_model import Keywords, Options
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import BATCH_FILES, MARKS, is_written
@@ -221,7 +222,8 @@ def _checked(recipe: Recipe, options: Options) -> str:
             )
         return "auto"
     model = Model.parse(recipe.model, options.relaxation)
-    names = (*model.names, *(("time_shift",) if options.time_shift else ()))
+    drive = options.drive or "impact"  # which has them all; each test checks its own
+    names = (*model.names, *nuisance.names_of(drive, time_shift=True))
     for name in (*(recipe.fix or ()), *recipe.vary):
         if name not in names:
             raise InputError(

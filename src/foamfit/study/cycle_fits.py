@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from foamfit.api import FitResult
 from foamfit.results import plain
+from foamfit.springs.parameters import NUISANCE, springs_first
 from foamfit.study.shared import Selection
 
 if TYPE_CHECKING:
@@ -50,8 +51,17 @@ class FittedCycles:
 
     @property
     def names(self) -> list[str]:
-        """Names of the parameters of any fit, in their order."""
-        return list(dict.fromkeys(name for one in self.results.values() for name in one.parameters))
+        """Names of the parameters of any fit, in their order, those of the springs first."""
+        return springs_first(name for one in self.results.values() for name in one.parameters)
+
+    @property
+    def varied(self) -> list[str]:
+        """Names of the parameters of the springs that vary in any fit."""
+        fits = [one.parameters for one in self.results.values()]
+        return [
+            name for name in self.names
+            if name not in NUISANCE and any(name in one and one[name].vary for one in fits)
+        ]  # fmt: skip
 
     def rows(self) -> Iterator[list[object]]:
         """Rows of cycles.csv, the header first: SI, one row for each cycle, empty = not there."""
@@ -112,12 +122,13 @@ class FittedCycles:
 
     def _together(self, selection: Selection) -> dict[str, Any]:
         best = selection.best.fits[0]
+        own = [name for name in best.own if name in selection.best.own]
         return {
             "cycles": self.together,
             "effective_samples": selection.n_eff,
-            "own": best.own,
+            "own": own,
             "shared": best.shared,
-            "parameters": {name: best.value(name) for name in best.own}
+            "parameters": {name: best.value(name) for name in own}
             | {name: best.value(name)[0] for name in best.shared},
             "steps": [
                 {

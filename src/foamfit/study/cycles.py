@@ -144,7 +144,9 @@ def _fit_together(found: CycleFits, options: Options, progress: Progress) -> Cyc
         options.problem(fitted[n].measurement, fitted[n].model, fitted[n].params.copy())
         for n in numbers
     ]
-    vectors = [p.vector(fitted[n].params) for p, n in zip(problems, numbers, strict=True)]
+    vectors = [problem.vector() for problem in problems]
+    for problem, values in zip(problems, vectors, strict=True):
+        problem.objective.weigh_motion(values)
     try:
         selection = select_own([Group(tuple(problems), tuple(vectors))], progress=progress)
     except KeyboardInterrupt:  # the fits of the cycles are not given up for it

@@ -20,12 +20,12 @@ from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.links import KINDS, RATES, Links
 from foamfit.fitting.problem import Problem, make_params
 from foamfit.fitting.search import Tracker, descend
-from foamfit.one_model import Options, Progress, identify
+from foamfit.one_model import Options, Progress, identify, weigh_motion
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import check_target
 from foamfit.report.studies.joint import save_joint
 from foamfit.springs.model import Model
-from foamfit.study.joint_estimates import common_covariance, parameter_of
+from foamfit.study.joint_estimates import common_covariance, parameters_of
 from foamfit.study.joint_fit import (
     Alternative,
     JointFit,
@@ -200,17 +200,20 @@ def _params(study: Study, tests: Sequence[Measurement]) -> list[lmfit.Parameters
     every = [make_params(test, model, study.drive) for test in tests]
     for name in (*study.kinds, *study.held):
         where = f"{study.path}: [parameters] {name}"
-        tied = [params[name].expr for params in every if params[name].expr is not None]
+        there = [params[name] for params in every if name in params]
+        if not there:
+            raise InputError(f"{where} is a parameter of none of these tests; leave it out")
+        tied = [one.expr for one in there if one.expr is not None]
         if tied:
             raise InputError(f"{where} follows from others ({tied[0]}); name those instead")
         if name in study.held:
-            for params in every:
-                params[name].set(value=study.held[name], vary=False, min=-math.inf, max=math.inf)
-        elif not any(params[name].vary for params in every):
+            for one in there:
+                one.set(value=study.held[name], vary=False, min=-math.inf, max=math.inf)
+        elif not any(one.vary for one in there):
             if name.endswith("_height"):
                 raise InputError(f"{where} is given by [specimen] heights; leave one of them out")
-            for params in every:
-                params[name].set(vary=True)
+            for one in there:
+                one.set(vary=True)
     return every
 
 
@@ -220,7 +223,7 @@ def _links(study: Study, tests: Sequence[_Test]) -> Links:
     by_rate = [name for name, kind in study.kinds.items() if kind in RATES]
     for name in by_rate:
         where = f'{study.path}: [parameters] {name} = "{study.kinds[name]}"'
-        there = [test for test in tests if test.problem.params[name].vary]
+        there = [test for test in tests if name in test.problem.free()]
         for test in there:
             if test.rate is None:
                 raise InputError(
@@ -233,7 +236,7 @@ def _links(study: Study, tests: Sequence[_Test]) -> Links:
                 '"shared" or "own", or add tests'
             )
     for name, kind in study.kinds.items():
-        there = [test for test in tests if test.problem.params[name].vary]
+        there = [test for test in tests if name in test.problem.free()]
         if kind == "scatter" and len(there) < 2:
             raise InputError(
                 f'{study.path}: [parameters] {name} = "scatter" needs two or more tests in which '
@@ -299,6 +302,8 @@ def _own_fits(
     if len(there) < 2:
         _too_few(study, len(there), refused)
     vectors = [found[t][0] for t in there]
+    for t, own in zip(there, vectors, strict=True):
+        tests[t].problem.objective.weigh_motion(own)
     return [_with_rate(tests[t], own) for t, own in zip(there, vectors, strict=True)], vectors
 
 
@@ -329,9 +334,10 @@ def _own_fit(
     problem = options.problem(measurement, model, params)
     space, tracker = problem.space(), Tracker(problem.objective)
     for start in near:
-        descend(tracker, space, space.encode(_as(problem, start)), STEPS)
+        descend(tracker, space, space.encode(problem.with_springs(start)), STEPS)
     if tracker.best_values is None:
         return _own_fit(measurement, model, params, options, ())
+    weigh_motion(problem, tracker)
     return tracker.best_values, tracker.best_cost / problem.objective.n_data
 
 
@@ -339,15 +345,9 @@ def _starts(problems: Sequence[Problem], vectors: Sequence[Array]) -> list[list[
     """Where the joint fit starts: at the own fits, and at those of single tests for all."""
     n = len(vectors)
     chosen = np.unique(np.linspace(0, n - 1, min(n, ONE_FOR_ALL)).astype(int))
-    return [list(vectors), *([_as(p, vectors[i]) for p in problems] for i in chosen)]
-
-
-def _as(problem: Problem, vector: Array) -> Array:
-    """A vector with the values of another test where this one varies."""
-    values = problem.vector()
-    free = [problem.index[name] for name in problem.free()]
-    values[free] = vector[free]
-    return problem.space().complete(values)
+    pairs = list(zip(problems, vectors, strict=True))
+    one_for_all = ([p.with_springs(vectors[i], own) for p, own in pairs] for i in chosen)
+    return [list(vectors), *one_for_all]
 
 
 # ------------------------------------------------------------------------------- kinds
@@ -394,7 +394,7 @@ def _conclude(
 ) -> JointResult:  # fmt: skip
     """Assemble the result."""
     names = tuple(test.name for test in tests)
-    parameters = {name: parameter_of(fit, names, name) for name in tests[0].problem.names}
+    parameters = parameters_of(fit, names)
     rates = tuple(test.rate for test in tests)
     result = JointResult(
         study=study,

@@ -10,7 +10,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.fitting.box import scale_in_words
 from foamfit.fitting.problem import Problem
-from foamfit.springs.parameters import unit_of
+from foamfit.springs.parameters import NUISANCE, unit_of
 from foamfit.study.joint_fit import JointFit
 from foamfit.study.joint_result import JointParameter, TestValue
 from foamfit.text import counted
@@ -29,19 +29,31 @@ def common_covariance(fit: JointFit) -> tuple[tuple[str, ...], Array]:
     return spread.names, spread.matrix * np.outer(scales, scales)
 
 
+def parameters_of(fit: JointFit, tests: tuple[str, ...]) -> dict[str, JointParameter]:
+    """All parameters of the joint fit, those of the springs first."""
+    problems = fit.found.problems
+    names = (*problems[0].model.names, *NUISANCE)
+    told = [
+        name for name in names
+        if any(name in one.index and not one.is_exact(name) for one in problems)
+    ]  # fmt: skip
+    return {name: parameter_of(fit, tests, name) for name in told}
+
+
 def parameter_of(fit: JointFit, tests: tuple[str, ...], name: str) -> JointParameter:
     """One parameter of the joint fit."""
     found = fit.found
-    kind, values, unit = found.links.kind(name), found.value(name), unit_of(name)
-    there = [t for t, problem in enumerate(found.problems) if problem.params[name].vary]
+    kind, unit = found.links.kind(name), unit_of(name)
+    there = [t for t, problem in enumerate(found.problems) if name in problem.free()]
+    each = _values(fit, tests, name) if kind == "own" or not there else {}
     if not there:
-        value = float(np.median(values))
+        value = float(np.median([one.value for one in each.values()]))
         return JointParameter("fixed", value, unit, state="fixed", why="held fixed")
     if kind == "own":
+        varied = [each[tests[t]].value for t in there]
         return JointParameter(
-            kind, float(np.median([values[t] for t in there])), unit,
-            why="one value for each test; this is their median",
-            tests=_values(fit, tests, name),
+            kind, float(np.median(varied)), unit,
+            why="one value for each test; this is their median", tests=each,
         )  # fmt: skip
     if kind == "scatter":
         return _scattering(fit, tests, name)
@@ -118,13 +130,15 @@ def _judged(
 
 
 def _values(fit: JointFit, tests: tuple[str, ...], name: str) -> dict[str, TestValue]:
-    """A parameter in each test."""
+    """A parameter in each test that leaves it free or holds it, in the numbers of its file."""
     out, found = dict[str, TestValue](), fit.found
     for t, (test, problem) in enumerate(zip(tests, found.problems, strict=True)):
-        values = found.values[t]
+        if name not in problem.index or problem.is_exact(name):
+            continue
+        values, zero = found.values[t], -problem.measurement.origins.get(name, 0.0)
         value = float(values[problem.index[name]])
         if not problem.params[name].vary:
-            out[test] = TestValue(value, None, None, "fixed", "held fixed")
+            out[test] = TestValue(value - zero, None, None, "fixed", "held fixed")
             continue
         branch = fit.point.bests[t].unreached.get(name)
         if branch is not None and found.links.kind(name) == "own":
@@ -132,5 +146,7 @@ def _values(fit: JointFit, tests: tuple[str, ...], name: str) -> dict[str, TestV
             out[test] = TestValue(value, None, None, "not determined", why)
             continue
         error, freedom = fit.covariance.of_test(t, name)
-        out[test] = TestValue(value, *_judged(problem, name, value, error, freedom, values))
+        stderr, ci95, state, why = _judged(problem, name, value, error, freedom, values)
+        ends = None if ci95 is None else (ci95[0] - zero, ci95[1] - zero)
+        out[test] = TestValue(value - zero, stderr, ends, state, why)
     return out

@@ -190,7 +190,9 @@ class JointData:
         """Parameters of one test, as its fit.json has them."""
         problem, values = self.problems[test], self.fit.found.values[test]
         out = dict[str, ParameterEstimate]()
-        for name, value in zip(problem.names, values.tolist(), strict=True):
+        for name, value in zip(problem.names, (values + problem.origins).tolist(), strict=True):
+            if problem.is_exact(name):
+                continue
             one, vary = self.parameters[name], problem.params[name].vary
             if not vary:
                 expr = problem.params[name].expr
@@ -212,7 +214,7 @@ class JointData:
         The covariance is that of shared values, common values of what scatters, and by a law of
         rate of the value at `rate0` and, with ":b", the slope.
         """
-        found, names = self.fit.found, self.problems[0].names
+        found = self.fit.found
         content = {
             "schema": SCHEMA,
             "foamfit": version("foamfit"),
@@ -235,7 +237,7 @@ class JointData:
                     "noise": self.noise[t],
                     "n_data": self.problems[t].objective.n_data,
                     "data_sha256": self.measurements[t].data_sha256,
-                    "values": dict(zip(names, found.values[t].tolist(), strict=True)),
+                    "values": {name: one.value for name, one in self.estimates(t).items()},
                 }
                 for t, name in enumerate(self.tests)
             },

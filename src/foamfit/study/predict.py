@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from numbers import Integral
 from pathlib import Path
 
@@ -14,10 +15,12 @@ from foamfit.data.measurement import Measurement
 from foamfit.data.noise import with_noise
 from foamfit.data.rate import loading_rate
 from foamfit.errors import InputError, SimulationError
-from foamfit.fitting.curves import check_drive, choose_drive
+from foamfit.fitting.curves import check_drive, check_time_shift, choose_drive
 from foamfit.fitting.problem import Problem, make_problem
+from foamfit.fitting.search import Tracker, descend
 from foamfit.report.figures import TWO, inches
 from foamfit.report.studies.prediction import save_prediction
+from foamfit.springs.parameters import unit_of
 from foamfit.study.prediction.identified import HasContent, Source, read_source
 from foamfit.study.prediction.population import NORMAL, Population
 from foamfit.study.prediction.predicted import (
@@ -26,7 +29,7 @@ from foamfit.study.prediction.predicted import (
     PredictedParameter,
     PredictedTest,
 )
-from foamfit.text import counted, listed, percent
+from foamfit.text import counted, engineering, listed, percent
 
 # Draws of the parameters; fewer say nothing of the ends of a 95 % band.
 DRAWS, FEWEST = 400, 40
@@ -35,6 +38,7 @@ RATE_FACTOR = 1.25
 # Draws that are tried for each that is wanted, before the others are given up.
 TRIES = 5
 BAND = (0.025, 0.975)
+ALIGNING = 40  # steps of the fit of what a record does not say exactly
 
 
 class Prediction(PredictedTest):
@@ -62,9 +66,12 @@ def predict(
     """Predict a test that was not fitted.
 
     Height, area, mass and velocity are those of the test, and so is the rate at which laws of rate
-    are evaluated. The 95 % band has four parts: what the result leaves uncertain of the parameters,
-    their scatter between specimens (of a joint result), the noise of the test, and what the law has
-    missed of the fitted tests beyond their noise. The first two are drawn and simulated exactly.
+    are evaluated. What its record does not say exactly, such as the contact time and zeros of an
+    impact, is fitted to it with the springs held as predicted (`PredictedTest.aligned`). The 95 %
+    band has these parts: what the result leaves uncertain of the parameters, their scatter between
+    specimens (of a joint result), the noise of the test, that of a motion that drives, and what the
+    law has missed of the fitted tests beyond their noise. The first two are drawn and simulated
+    exactly.
 
     Parameters
     ----------
@@ -101,17 +108,19 @@ def predict(
     outside = _check_rate(source, measurement, rate, extrapolate, warnings)
     problem = _problem(source, measurement, drive, warnings)
     objective = problem.objective
-    population = Population(source, problem.names, problem.measurement.specimen, rate)
-    point = _point(population, problem, warnings)
+    population = Population(source, problem.model.names, problem.measurement.specimen, rate)
+    springs = _point(population, problem, warnings)
     try:
+        point, aligned = _aligned(problem, springs)
         simulated = objective.simulate(point, everything=True)
     except SimulationError as error:
         raise SimulationError(
             f"{measurement.name} cannot be predicted from {source.where}: {error}"
         ) from None
-    drawn = _draw(population, problem, _limits(problem, point), draws, seed)
+    drawn = _draw(population, problem, point, draws, seed)
+    moved = _by_motion(problem, point)
     curves = {
-        name: _curve(problem, name, simulated.curves[name], drawn, source)
+        name: _curve(problem, name, simulated.curves[name], drawn, source, moved.get(name))
         for name in objective.counted
     }
     _warn(source, population, curves, drawn, draws, warnings)
@@ -125,15 +134,16 @@ def predict(
         seed=int(seed),
         curves=curves,
         misfit=objective.misfit(simulated),
-        parameters=_parameters(population, point, drawn),
+        parameters=_parameters(population, springs, drawn),
         rate=rate,
         fitted_rates=source.rates,
         extrapolated=outside,
         draws=min((len(one.values) for one in drawn.values()), default=0),
         redrawn=sum(one.redrawn for one in set(drawn.values())),
         held=population.held,
-        sentences=(*_of_curves(curves), *_of_trends(population)),
+        sentences=(*_of_curves(curves), *_of_aligned(aligned), *_of_trends(population)),
         warnings=tuple(warnings),
+        aligned=aligned,
     )
 
 
@@ -187,10 +197,15 @@ def _problem(
             f"{source.name} was fitted in the {source.drive} drive; this prediction is in the "
             f"{chosen} drive, with the damping that was found or held there."
         )
-    inside = source.interior_mass and chosen == "impact"
+    inside, late = source.interior_mass and chosen == "impact", source.time_shift
+    if late:
+        try:
+            check_time_shift(measurement, chosen)
+        except InputError:  # it was that of another record
+            late = False
     return make_problem(
         measurement, source.model.name, chosen, None, None, inside,
-        time_shift=source.time_shift, relaxation=source.model.relaxation,
+        time_shift=late, relaxation=source.model.relaxation,
     )  # fmt: skip
 
 
@@ -210,6 +225,27 @@ def _point(population: Population, problem: Problem, warnings: list[str]) -> Arr
         "the test whose values are nearest to them."
     )
     return nearest
+
+
+def _aligned(problem: Problem, springs: Array) -> tuple[Array, dict[str, float]]:
+    """The springs and what of the record fits them best, and that in the numbers of its file.
+
+    Raises SimulationError if the springs cannot be simulated.
+    """
+    params = problem.params.copy()
+    for name, value in zip(problem.model.names, springs.tolist(), strict=True):
+        params[name].set(value=value, vary=False, expr="", min=-math.inf, max=math.inf)
+    held = replace(problem, params=params)
+    point, names = held.vector(), held.free()
+    if not names:
+        return point, {}
+    problem.objective.simulate(point)
+    space, tracker = held.space(), Tracker(problem.objective)
+    descend(tracker, space, space.encode(point), ALIGNING)
+    assert tracker.best_values is not None  # the first point can be simulated
+    point = tracker.best_values
+    told = dict(zip(problem.names, (point + problem.origins).tolist(), strict=True))
+    return point, {name: told[name] for name in names}
 
 
 def _admissible(problem: Problem, values: Array) -> bool:
@@ -233,55 +269,53 @@ class _Drawn:
     redrawn: int
 
 
-Limits = tuple[Array, Array]
-
-
-def _limits(problem: Problem, point: Array) -> Limits:
+def _limits(problem: Problem, point: Array) -> tuple[Array, Array]:
     """Limits of a draw: those of a fit of the test, and the common values.
 
     Far beyond them lie values that no test can show, from what one test left undetermined.
     """
-    params = [problem.params[name] for name in problem.names]
+    params = [problem.params[name] for name in problem.model.names]
+    point = point[: len(params)]
     low, high = np.array([one.min for one in params]), np.array([one.max for one in params])
     return np.minimum(low, point), np.maximum(high, point)
 
 
 def _draw(
-    population: Population, problem: Problem, limits: Limits, draws: int, seed: int
+    population: Population, problem: Problem, point: Array, draws: int, seed: int
 ) -> dict[str, _Drawn]:
-    """Draws of each of the first two parts, and of both together."""
+    """Draws of each of the first two parts, and of both together, about a point."""
     wanted = {"parameters": population.uncertain, "scatter": bool(population.scattering)}
     out = dict[str, _Drawn]()
     for i, (part, there) in enumerate(wanted.items()):
         if there:
             rng = np.random.default_rng([seed, i])
             out[part] = _simulate(
-                population, problem, limits, draws, rng, part == "parameters", part == "scatter"
+                population, problem, point, draws, rng, part == "parameters", part == "scatter"
             )
     if len(out) == 2:
         rng = np.random.default_rng([seed, 2])
-        out["both"] = _simulate(population, problem, limits, draws, rng, True, True)
+        out["both"] = _simulate(population, problem, point, draws, rng, True, True)
     elif out:
         out["both"] = next(iter(out.values()))
     return out
 
 
 def _simulate(
-    population: Population, problem: Problem, limits: Limits, draws: int,
+    population: Population, problem: Problem, point: Array, draws: int,
     rng: np.random.Generator, open_: bool, scatter: bool,
 ) -> _Drawn:  # fmt: skip
     """Draw and simulate until there are so many; what is not admissible is drawn again.
 
     What lies beyond a limit is moved there, as a fit does: to draw it again would leave one side of
-    all other parameters out.
+    all other parameters out. What was aligned stays as it is at the point.
     """
     values, curves = list[Array](), list[dict[str, Array]]()
-    (low, high), objective, tried = limits, problem.objective, 0
+    (low, high), objective, tried = _limits(problem, point), problem.objective, 0
     while len(values) < draws and tried < TRIES * draws:
         tried += 1
         one = np.clip(population.draw(rng, open_=open_, scatter=scatter), low, high)
         try:
-            simulated = objective.simulate(one)
+            simulated = objective.simulate(np.append(one, point[one.size :]))
         except SimulationError:
             continue
         values.append(one)
@@ -294,14 +328,29 @@ def _simulate(
     return _Drawn(values, curves, tried - len(values))
 
 
+def _by_motion(problem: Problem, point: Array) -> dict[str, Array]:
+    """Standard deviation of each curve (n,), SI, by what stays uncertain of a driving motion."""
+    objective, out = problem.objective, dict[str, Array]()
+    changes = objective.by_motion(point)
+    if changes is None:
+        return out
+    parts = np.split(np.linalg.norm(changes, axis=1), np.cumsum(objective.sizes)[:-1])
+    samples = np.arange(objective.time.size)
+    for name, part in zip(objective.counted, parts, strict=True):
+        out[name] = np.interp(samples, objective.kept(name), part / objective.factor(name))
+    return out
+
+
 def _curve(
     problem: Problem, name: str, predicted: Array, drawn: dict[str, _Drawn],
-    source: Source,
+    source: Source, by_motion: Array | None,
 ) -> PredictedCurve:  # fmt: skip
-    """One curve with its band: quantiles of the draws, noise and law error added in quadrature."""
+    """One curve with its band: quantiles of the draws, all other parts added in quadrature."""
     objective = problem.objective
     channel, n = objective.channel(name), predicted.size
-    parts = {part: np.zeros(n) for part in PARTS}
+    parts = {part: np.zeros(n) for part in PARTS if part != "motion" or by_motion is not None}
+    if by_motion is not None:
+        parts["motion"] = NORMAL * by_motion
     ends = {
         part: np.quantile([curves[name] for curves in one.curves], [BAND[0], 0.5, BAND[1]], axis=0)
         for part, one in drawn.items()
@@ -313,7 +362,7 @@ def _curve(
     missed = source.law_error(channel, sigma / float(np.ptp(objective.measured[name])))
     parts["law_error"] = np.full(n, NORMAL * missed * span)
     low, middle, high = ends.get("both", np.tile(predicted, (3, 1)))
-    more = parts["noise"] ** 2 + parts["law_error"] ** 2
+    more = sum(parts[part] ** 2 for part in parts.keys() - {"parameters", "scatter"})
     kept = np.zeros(n, dtype=bool)
     kept[objective.kept(name)] = True
     return PredictedCurve(
@@ -386,11 +435,22 @@ def _of_trends(population: Population) -> list[str]:
     ]
 
 
+def _of_aligned(aligned: dict[str, float]) -> list[str]:
+    """What was fitted of the record."""
+    if not aligned:
+        return []
+    told = [
+        f"{name.replace('_', ' ')} {engineering(value, unit_of(name)).replace('-', '−')}"
+        for name, value in aligned.items()
+    ]
+    return [f"Aligned to the record, with the springs held, and no prediction: {listed(told)}."]
+
+
 def _of_curves(curves: dict[str, PredictedCurve]) -> list[str]:
     """What the prediction says of each curve."""
     out = []
     for curve in curves.values():
-        widths = {part: curve.half_width_of(part) for part in PARTS}
+        widths = {part: curve.half_width_of(part) for part in curve.parts}
         largest = max(widths, key=lambda part: widths[part])
         half = percent(curve.half_width / curve.range)
         out.append(
@@ -403,5 +463,8 @@ def _of_curves(curves: dict[str, PredictedCurve]) -> list[str]:
 
 def _in_words(part: str) -> str:
     """Name of a part of the band."""
-    told = {"scatter": "the scatter between specimens", "law_error": "the error of the law"}
+    told = {
+        "scatter": "the scatter between specimens", "law_error": "the error of the law",
+        "motion": "the noise of the motion",
+    }  # fmt: skip
     return told.get(part, f"the {part}")

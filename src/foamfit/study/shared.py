@@ -16,6 +16,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.together import Together, fit_together
+from foamfit.springs.parameters import NUISANCE
 
 Progress = Callable[[float, str], None]
 
@@ -40,13 +41,20 @@ class Group:
         """Where the fits of the group start: at the own fits, and at that of one test for all."""
         n = len(self.vectors)
         chosen = np.unique(np.linspace(0, n - 1, min(n, MOST_STARTS)).astype(int))
-        return [list(self.vectors), *([self.vectors[i]] * n for i in chosen)]
+        pairs = list(zip(self.problems, self.vectors, strict=True))
+        one_for_all = ([p.with_springs(self.vectors[i], own) for p, own in pairs] for i in chosen)
+        return [list(self.vectors), *one_for_all]
 
     @cached_property
     def n_eff(self) -> int:
         """Effective samples of the curves: see `effective_samples`."""
         pairs = zip(self.problems, self.vectors, strict=True)
         return sum(effective_samples(problem, values) for problem, values in pairs)
+
+    @property
+    def n_alone(self) -> int:
+        """Parameters that vary in all tests where nothing is shared."""
+        return sum(len(problem.free()) for problem in self.problems)
 
     @cached_property
     def alone(self) -> float:
@@ -117,8 +125,9 @@ class Selection:
 def select_own(groups: Sequence[Group], *, progress: Progress | None = None) -> Selection:
     """Choose which parameters each test has of its own, by forward selection.
 
-    Begins with all parameters shared. In each step every shared parameter is tried as an own one,
-    and that of the lowest BIC is taken, as long as BIC falls: BIC = n_eff ln(χ²/n) + k ln(n_eff),
+    Begins with all parameters of the springs shared. In each step every shared parameter is tried
+    as an own one, and that of the lowest BIC is taken, as long as BIC falls:
+    BIC = n_eff ln(χ²/n) + k ln(n_eff),
     summed over the groups, where n_eff is that of `effective_samples`. Parameters compensate each
     other, so that after each step own ones are exchanged for shared ones as long as BIC falls.
 
@@ -141,7 +150,7 @@ def select_own(groups: Sequence[Group], *, progress: Progress | None = None) -> 
         if progress is not None:
             progress(done, what)
 
-    names = groups[0].problems[0].free()
+    names = tuple(name for name in groups[0].problems[0].free() if name not in NUISANCE)
     steps, chosen = [step_of(groups, ())], 0
     rounds = len(names) * (len(names) + 1) / 2
     while len(steps[-1].own) < len(names) and chosen == len(steps) - 1:
@@ -159,9 +168,9 @@ def select_own(groups: Sequence[Group], *, progress: Progress | None = None) -> 
         ]
         steps.append(_exchanged(groups, step_of(groups, found.own, starts), tell))
         chosen += steps[-1].bic < now.bic
-    n_alone = sum(len(names) * len(group.problems) for group in groups)
+    n_alone = sum(group.n_alone for group in groups)
     alone = sum(group.alone for group in groups)
-    bic = sum(_bic(group, group.alone, len(names) * len(group.problems)) for group in groups)
+    bic = sum(_bic(group, group.alone, group.n_alone) for group in groups)
     tell(1.0, "done")
     n_eff = sum(group.n_eff for group in groups)
     return Selection(tuple(steps), chosen, n_eff, alone, n_alone, bic)

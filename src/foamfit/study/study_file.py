@@ -13,6 +13,7 @@ from foamfit.errors import InputError
 from foamfit.fitting.curves import DRIVES
 from foamfit.fitting.links import KINDS
 from foamfit.springs.model import Model
+from foamfit.springs.parameters import NUISANCE
 from foamfit.study.test_files import find_tests
 
 # The kind that evidence chooses, and those that it chooses from.
@@ -141,11 +142,16 @@ def _parameters(path: Path, table: Any, model: Model) -> tuple[dict[str, str], d
     kinds, held = dict[str, str](), dict[str, float]()
     for name, value in table.items():
         where = f"{path}: [parameters] {name}"
-        if name not in model.names:
+        if name not in (*model.names, *NUISANCE):
             raise InputError(
                 f"{where} is not a parameter of the model {model.name}"
                 f"{f' with relaxation = {model.relaxation}' if model.relaxation else ''}; its "
                 f"parameters are {', '.join(model.names)}"
+            )
+        if name in NUISANCE and value in (*KINDS, AUTO) and value != "own":
+            raise InputError(
+                f'{where} = "{value}" cannot be: each test has its own contact, zeros, striker and '
+                f'clock; leave it out, or make it "own" or a number (SI) to hold it at'
             )
         if value in (*KINDS, AUTO):
             kinds[name] = str(value)

@@ -325,7 +325,9 @@ def _impulse(e: Findings) -> _Answer:
 def _time_shift(e: Findings) -> _Answer:
     measurement = e.best.problem.measurement
     if e.objective.time_shift:
-        late = engineering(e.estimates["time_shift"].value, "s").replace("-", "−")
+        if (shift := e.estimates.get("time_shift")) is None or not shift.vary:
+            return None, "The time shift is held."
+        late = engineering(shift.value, "s").replace("-", "−")
         return True, f"The time shift is fitted: {late}."
     force = measurement.outliers.get("stress")
     if force is not None and force.clipped_at is not None:

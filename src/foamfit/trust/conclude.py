@@ -16,7 +16,6 @@ from foamfit.data.describe import noise_sentences
 from foamfit.data.energy import audit
 from foamfit.data.measurement import INTEGRATED, interior_channel
 from foamfit.errors import SimulationError
-from foamfit.fitting import nuisance
 from foamfit.fitting.box import scale_in_words
 from foamfit.fitting.branches import visited
 from foamfit.fitting.curves import MOTION_CURVES
@@ -224,10 +223,9 @@ def _estimates(
 ) -> dict[str, ParameterEstimate]:
     """Value, uncertainty and state of every parameter; also put into lmfit's parameters."""
     out = {}
-    usual = nuisance.values_of(best.problem.measurement)
     for i, name in enumerate(best.problem.names):
-        if not best.problem.params[name].vary and best.values[i] == usual.get(name):
-            continue  # the record leaves it no freedom
+        if best.problem.is_exact(name):
+            continue
         value, parameter, unit = float(best.values[i]), best.problem.params[name], unit_of(name)
         if name in best.names:
             assert insight is not None

@@ -19,7 +19,7 @@ from foamfit.files import write_file
 from foamfit.report.page import environment
 from foamfit.report.readable import readable_unit, symbol
 from foamfit.results import Fit, ParameterEstimate, plain
-from foamfit.springs.parameters import NUISANCE
+from foamfit.springs.parameters import springs_first
 from foamfit.text import aligned, counted, listed, number, percent, wrapped
 
 if TYPE_CHECKING:
@@ -101,8 +101,7 @@ def _cells(p: ParameterEstimate) -> list[Any]:
 
 def names_of(rows: Sequence[Row]) -> list[str]:
     """Names of the parameters of any test, in their order, those of the springs first."""
-    names = dict.fromkeys(name for row in rows for name in row.parameters)
-    return sorted(names, key=lambda name: name in NUISANCE)
+    return springs_first(name for row in rows for name in row.parameters)
 
 
 def table_rows(rows: Sequence[Row]) -> Iterator[list[Any]]:

@@ -76,7 +76,7 @@ def cycles_text(found: FittedCycles) -> str:
 
 
 def _table(found: FittedCycles) -> list[str]:
-    names = [n for n in found.names if any(r.parameters[n].vary for r in found.results.values())]
+    names = found.varied
     rows = [["cycle", "start strain", "misfit", *(name.removeprefix("s1_") for name in names)]]
     for number, one in sorted(found.results.items()):
         off = one.misfit.get("stress_strain") or one.misfit.get("stress_time")
@@ -112,7 +112,7 @@ def plot_cycles(found: FittedCycles, *, width: str = TWO) -> Figure:
     "one" or "two" columns, or a length such as "85 mm".
     """
     results = dict(sorted(found.results.items()))
-    varied = [n for n in found.names if any(r.parameters[n].vary for r in results.values())]
+    varied = found.varied
     panels, wide = 3 + len(varied), inches(width)
     columns = max(abreast(wide, COLUMNS, LEAST), 2)
     rows = 2 + max(0, -(-(panels - 2 * (columns - 2)) // columns))
@@ -211,7 +211,7 @@ def _parameter(ax: Axes, found: FittedCycles, name: str) -> None:
         )  # fmt: skip
     if found.selection is not None:
         best = found.selection.best.fits[0]
-        if name in (*best.shared, *best.own):
+        if name in (*best.shared, *found.selection.best.own):
             values = factor * np.array(best.value(name))
             label = "_fitted together"
             ax.plot(found.together, values, color=VERMILION, linewidth=0.9, zorder=0, label=label)

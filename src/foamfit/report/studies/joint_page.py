@@ -13,6 +13,7 @@ from foamfit.report.page import environment
 from foamfit.report.readable import readable, readable_unit, symbol
 from foamfit.report.studies.joint_text import between
 from foamfit.results import ParameterEstimate, law_in_words
+from foamfit.springs.parameters import NUISANCE
 from foamfit.text import number
 from foamfit.trust.covariance import RULE
 
@@ -62,7 +63,7 @@ def joint_page(found: JointData, picture: bytes, *, linked: bool = True) -> str:
         picture=base64.b64encode(picture).decode("ascii"),
         parameters=[
             _row(name, one) for name, one in found.parameters.items()
-            if one.kind != "fixed" or one.value
+            if name not in NUISANCE and (one.kind != "fixed" or one.value)
         ],
         rule=RULE,
         ranged=any(one.range for one in found.parameters.values()),
@@ -118,6 +119,12 @@ def _noise(level: Mapping[str, Any] | None, factor: float) -> _Cell:
     return _Cell(number(sigma), f"{level['sigma']:.8g}", ", ".join(told))
 
 
+def _unit(one: JointParameter) -> tuple[float, str]:
+    """Factor and unit in which a parameter reads well in all tests."""
+    tests = one.tests or {}
+    return readable_unit(max((abs(at.value) for at in tests.values()), default=0.0), one.unit)
+
+
 def _heads(found: JointData, names: list[str]) -> list[str]:
     heads = ["test", "rate (1/s)", *(f"misfit {CURVES[c]} (%)" for c in _curves(found))]
     heads.append("share of χ² (%)")
@@ -125,7 +132,7 @@ def _heads(found: JointData, names: list[str]) -> list[str]:
     for name in names:
         one = found.parameters[name]
         stem, index = symbol(name)
-        unit = readable_unit(abs(one.value), one.unit)[1]
+        unit = _unit(one)[1]
         heads.append(f"{stem}{index}{f' ({unit})' if unit else ''}")
     return heads
 
@@ -143,7 +150,10 @@ def _cells(found: JointData, t: int, names: list[str], linked: bool) -> Iterator
     for name in names:
         one = found.parameters[name]
         assert one.tests is not None  # such were chosen
-        value, factor = one.tests[test], readable_unit(abs(one.value), one.unit)[0]
+        if (value := one.tests.get(test)) is None:
+            yield _Cell("")
+            continue
+        factor = _unit(one)[0]
         ends = "" if value.ci95 is None else " to ".join(number(e / factor) for e in value.ci95)
         state = "" if value.state in ("determined", "fixed") else value.state
         yield _Cell(number(value.value / factor), f"{value.value:.8g}", ends, state)

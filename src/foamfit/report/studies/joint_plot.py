@@ -13,6 +13,7 @@ from foamfit.fitting.links import RATES, law_values
 from foamfit.report.figures import BLUE, GREY, TWO, VERMILION, abreast, drawing, inches
 from foamfit.report.readable import readable_unit
 from foamfit.report.studies.joint_text import in_unit
+from foamfit.springs.parameters import NUISANCE
 from foamfit.text import percent
 
 if TYPE_CHECKING:
@@ -43,7 +44,10 @@ def plot_joint(found: JointData, *, width: str = TWO) -> Figure:
     between specimens. `width` is "one" or "two" columns, or a length such as "85 mm".
     """
     shown = _shown(found)
-    names = [n for n, one in found.parameters.items() if one.kind not in ("fixed", "shared")]
+    names = [
+        name for name, one in found.parameters.items()
+        if one.kind not in ("fixed", "shared") and name not in NUISANCE
+    ]  # fmt: skip
     shared = [n for n, one in found.parameters.items() if one.kind == "shared"]
     panels, wide = len(names) + bool(shared), inches(width)
     across = abreast(wide, min(LOOPS, max(len(shown), COLUMNS)), LEAST_LOOP)

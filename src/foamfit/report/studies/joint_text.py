@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from foamfit.report.readable import readable_unit
+from foamfit.springs.parameters import NUISANCE
 from foamfit.text import aligned, number, percent, wrapped
 
 if TYPE_CHECKING:
@@ -45,7 +46,9 @@ def parameter_rows(found: JointData) -> list[list[str]]:
             continue
         ends = "" if one.ci95 is None else in_unit(one.ci95, one.unit)
         span = [in_unit(one.range, one.unit) if one.range else ""] if ranged else []
-        rows.append([name, one.kind, in_unit((one.value,), one.unit), ends, *span,
+        # The median of what is of one record alone says nothing.
+        value = "" if name in NUISANCE else in_unit((one.value,), one.unit)
+        rows.append([name, one.kind, value, ends, *span,
                      one.state or "", between(one)])  # fmt: skip
     return rows
 

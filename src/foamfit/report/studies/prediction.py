@@ -38,6 +38,7 @@ COLOURS: dict[str, tuple[str, Any]] = {
     "parameters": (BLUE, "-"),
     "scatter": (INSIDE[1], (0, (5, 1.2))),
     "noise": (INSIDE[2], (0, (2.5, 1.2))),
+    "motion": (VERMILION, (0, (1, 1.2))),
     "law_error": (INSIDE[0], (0, (5, 1.2, 1, 1.2))),
 }
 
@@ -105,10 +106,11 @@ def _rates(found: PredictedTest) -> str:
 
 def _table(found: PredictedTest) -> list[str]:
     """Misfit, share inside and half widths of each curve, over its measured range."""
-    rows = [["curve", "misfit", "inside", "band", *(part.replace("_", " ") for part in COLOURS)]]
+    there = [part for part in COLOURS if any(part in one.parts for one in found.curves.values())]
+    rows = [["curve", "misfit", "inside", "band", *(part.replace("_", " ") for part in there)]]
     for name, curve in found.curves.items():
         off = found.misfit.get(name)
-        widths = [curve.half_width, *(curve.half_width_of(part) for part in COLOURS)]
+        widths = [curve.half_width, *(curve.half_width_of(part) for part in there)]
         rows.append(
             [
                 name,
@@ -206,7 +208,7 @@ def _in_time(above: Axes, below: Axes, found: PredictedTest, curve: PredictedCur
     above.plot(x, curve.predicted / factor, color=VERMILION, linewidth=0.9)
     above.set_ylabel(f"{curve.channel.replace('_', ' ')} ({unit})")
     for part, (colour, dashes) in COLOURS.items():
-        if np.any(curve.parts[part]):
+        if part in curve.parts and np.any(curve.parts[part]):
             style: Any = {"color": colour, "linestyle": dashes, "linewidth": 0.9}
             below.plot(x, curve.parts[part] / factor, **style)
     below.plot(x, 0.5 * (curve.hi - curve.lo) / factor, ":", color="black", linewidth=0.9)
@@ -228,7 +230,7 @@ def _legend(ax: Axes, found: PredictedTest) -> None:
         Line2D([], [], color="black", linestyle=":", label="half width: all"),
     ]
     for part, (colour, dashes) in COLOURS.items():
-        if any(np.any(curve.parts[part]) for curve in found.curves.values()):
+        if any(np.any(curve.parts.get(part, 0.0)) for curve in found.curves.values()):
             handles.append(
                 Line2D(
                     [],

@@ -18,10 +18,11 @@ from foamfit.arrays import Array
 from foamfit.errors import InputError
 from foamfit.fitting.curves import DRIVES
 from foamfit.fitting.links import RATES
+from foamfit.fitting.nuisance import TIME_SHIFT
 from foamfit.report.folder import load_result
 from foamfit.results import SCHEMA
 from foamfit.springs.model import Model
-from foamfit.springs.parameters import split_name
+from foamfit.springs.parameters import NUISANCE, split_name
 
 KINDS = ("shared", "own", "scatter", *RATES, "fixed")
 Pair = tuple[float, float]
@@ -94,6 +95,7 @@ class Source:
     names: tuple[str, ...]
     correlation: Array
     misses: dict[str, tuple[Miss, ...]]  # Of the fitted tests, by channel
+    time_shift: bool = False  # Whether a time shift of the motion was fitted
 
     def law_error(self, channel: str, noise: float) -> float:
         """RMS of what the law missed of the fitted tests beyond their noise, over the range.
@@ -106,11 +108,6 @@ class Source:
             for miss in self.misses.get(channel, ())
         ]
         return math.sqrt(sum(squares) / len(squares)) if squares else 0.0
-
-    @property
-    def time_shift(self) -> bool:
-        """Whether a time shift of the motion was fitted."""
-        return "time_shift" in self.parameters
 
 
 def read_source(result: HasContent | str | Path) -> Source:
@@ -173,9 +170,11 @@ def _source(content: Mapping[str, Any], where: str) -> Source:
         name: None if rate is None else _number(rate, f"{where}: rate")
         for name, rate in (given if joint else {"": single}).items()
     }
+    # What a record does not say exactly is its own, and no other test's.
     parameters = {
         name: _parameter(item, joint, rates, f"{where}: {name}")
         for name, item in content["parameters"].items()
+        if name not in NUISANCE
     }
     for name in model.names:
         if name in parameters:
@@ -183,8 +182,7 @@ def _source(content: Mapping[str, Any], where: str) -> Source:
         if split_name(name)[1] != "eta":
             raise InputError(f"{where} has no parameter {name}, which its model {model.name} has")
         parameters[name] = Identified("fixed", 0.0)
-    known = (*model.names, "time_shift")
-    if unknown := [name for name in parameters if name not in known]:
+    if unknown := [name for name in parameters if name not in model.names]:
         raise InputError(f"{where}: {unknown[0]} is no parameter of its model {model.name}")
     rate0 = content.get("rate0")
     names, correlation = _correlation(content, joint, parameters, where)
@@ -203,6 +201,7 @@ def _source(content: Mapping[str, Any], where: str) -> Source:
         names=names,
         correlation=correlation,
         misses=_misses([one for one in fits if isinstance(one, Mapping)], where),
+        time_shift=TIME_SHIFT in content["parameters"],
     )
 
 
@@ -256,19 +255,22 @@ def _correlation(
     except (TypeError, ValueError):
         matrix = np.empty((0, 0))
     known = isinstance(names, list) and all(
-        isinstance(name, str) and name.removesuffix(":b") in parameters for name in names
+        isinstance(name, str) and name.removesuffix(":b") in (*parameters, *NUISANCE)
+        for name in names
     )
     if not known or matrix.shape != (len(names or ()), len(names or ())):
         raise InputError(
             f"{where}: {key} must have the names of parameters and a square matrix of as many rows"
         )
+    kept = [i for i, name in enumerate(names or ()) if name not in NUISANCE]
+    names, matrix = [(names or ())[i] for i in kept], matrix[np.ix_(kept, kept)]
     if joint:
         with np.errstate(invalid="ignore", divide="ignore"):
             scale = np.sqrt(np.diag(matrix))
             matrix = matrix / np.outer(scale, scale)
     matrix = np.clip(np.where(np.isfinite(matrix), matrix, 0.0), -1.0, 1.0)
     np.fill_diagonal(matrix, 1.0)
-    return tuple(names or ()), 0.5 * (matrix + matrix.T)
+    return tuple(names), 0.5 * (matrix + matrix.T)
 
 
 def _misses(fits: list[Mapping[str, Any]], where: str) -> dict[str, tuple[Miss, ...]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from typing import Any
 
@@ -15,15 +15,15 @@ from foamfit.data.measurement import Measurement
 from foamfit.results import law_in_words, plain
 
 SCHEMA = 1
-# What makes the band, in the order in which it is told.
-PARTS = ("parameters", "scatter", "noise", "law_error")
+# What makes the band, in the order in which it is told; "motion" where a noisy one drives.
+PARTS = ("parameters", "scatter", "noise", "motion", "law_error")
 
 
 @dataclass(frozen=True, eq=False)
 class PredictedCurve:
     """A curve of a test with its 95 % band, one row per sample, Pa or m.
 
-    `parts` has the half width (n,) that each of `PARTS` alone would give the band.
+    `parts` has the half width (n,) that each of `PARTS` that is there would give the band alone.
     """
 
     channel: str  # "stress", "displacement", "displacement_1", …
@@ -53,7 +53,7 @@ class PredictedCurve:
 
     def half_width_of(self, part: str) -> float:
         """Half of the band that a part alone would give, mean over the samples that count."""
-        return float(np.mean(self.parts[part][self.kept]))
+        return float(np.mean(self.parts[part][self.kept])) if part in self.parts else 0.0
 
 
 @dataclass(frozen=True)
@@ -90,6 +90,9 @@ class PredictedTest:
         Draws of the parameters, and those more that were not admissible and were drawn again.
     held : tuple of str
         Parameters that the result leaves undetermined and that were held at their values.
+    aligned : dict of str to float
+        What the record of the test does not say exactly (its contact time, zeros, striker, time
+        shift) was fitted to it with the springs held as predicted: values in its own numbers, SI.
     """
 
     source: str
@@ -110,6 +113,7 @@ class PredictedTest:
     held: tuple[str, ...]
     sentences: tuple[str, ...]
     warnings: tuple[str, ...]
+    aligned: dict[str, float] = field(default_factory=dict)
 
     @property
     def law(self) -> str:
@@ -148,7 +152,7 @@ class PredictedTest:
                     name: {
                         "range": curve.range,
                         "half_width": curve.half_width,
-                        "half_widths": {part: curve.half_width_of(part) for part in PARTS},
+                        "half_widths": {part: curve.half_width_of(part) for part in curve.parts},
                         "n": int(curve.kept.sum()),
                         "unit": curve.unit,
                     }
@@ -156,6 +160,7 @@ class PredictedTest:
                 },
                 "parameters": {name: vars(one) for name, one in self.parameters.items()},
                 "held": self.held,
+                "aligned": self.aligned,
                 "warnings": self.warnings,
                 "sentences": self.sentences,
             }
@@ -180,10 +185,8 @@ class PredictedTest:
             columns[f"predicted {channel} ({unit})"] = curve.predicted
             columns[f"{channel} band low ({unit})"] = curve.lo
             columns[f"{channel} band high ({unit})"] = curve.hi
-            for part in PARTS:
-                columns[f"{channel} half width, {part.replace('_', ' ')} ({unit})"] = curve.parts[
-                    part
-                ]
+            for part, width in curve.parts.items():
+                columns[f"{channel} half width, {part.replace('_', ' ')} ({unit})"] = width
             found, taken = m.outliers.get(channel), m.sampled.get(channel)
             if found is not None and found.left_out.any():
                 columns[f"outliers of {channel} left out"] = found.left_out.astype(int)
