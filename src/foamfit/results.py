@@ -28,6 +28,7 @@ SCHEMA = 1
 SOURCES = (
     "noise", "contact and zero", "velocity", "mass", "height", "area", "calibration", "law",
 )  # fmt: skip
+STATED = ("mass", "height", "area", "calibration")  # by their ± in the TOML, not fitted
 DERIVED_POINTS = ("sigma_a", "sigma_c", "eps_star", "eps_hat_a", "eps_hat_c")
 
 

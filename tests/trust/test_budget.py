@@ -15,6 +15,7 @@ import foamfit as ff
 from conftest import AREA, HEIGHT, synthetic_impact, synthetic_loop
 from foamfit.data.measurement import Measurement, Noise, Specimen
 from foamfit.fitting.problem import make_problem
+from foamfit.report.summary import conclusions
 from foamfit.results import SOURCES
 from foamfit.springs.parameters import MICROSCALE_NAMES
 from foamfit.trust.best_point import BestPoint
@@ -143,6 +144,16 @@ def test_systematic_is_in_no_interval(tmp_path):
     for name in (*STRESSES, *STRAINS):
         assert stated.parameters[name].ci95 == pytest.approx(plain.parameters[name].ci95)
         assert stated.parameters[name].stderr == pytest.approx(plain.parameters[name].stderr)
+
+
+def test_the_summary_says_how_far_it_goes(tmp_path):
+    area = SIZE["area"] + " ± 3 %"
+    stated = fitted(ff.read_test(written(tmp_path, **SIZE | {"area": area})))
+    (told,) = [text for text in conclusions(stated) if "in the TOML" in text]
+    assert told.startswith("The ± of area in the TOML moves s1_k")
+    assert " by 3 %, others by less" in told
+    exact = fitted(ff.read_test(written(tmp_path, **SIZE)))
+    assert not any("in the TOML" in text for text in conclusions(exact))
 
 
 def test_velocity_and_mass_with_a_deviation_are_fitted_within_it(tmp_path):

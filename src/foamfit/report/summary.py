@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 
 from foamfit.data.measurement import interior_channel
 from foamfit.report.readable import Readable, readable
-from foamfit.results import Fit, Ladder, ParameterEstimate, Rung
+from foamfit.results import STATED, Fit, Ladder, ParameterEstimate, Rung
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import aligned, counted, engineering, listed, number, percent, wrapped
 
@@ -58,10 +58,11 @@ def summary_text(result: Fit, *, verbose: bool = False) -> str:
 def conclusions(result: Fit) -> tuple[str, ...]:
     """Say in three sentences how well the model fits, what is known, and what is not.
 
-    Of microscale springs and of relaxation, also what the identified law does.
+    Also what the ± of the TOML add, and of microscale springs and of relaxation what the identified
+    law does.
     """
     law = (*_snapping(result), *_relaxation(result)) if result.status != "failed" else ()
-    return (_how_well(result), _known(result), _unknown(result), *law)
+    return (_how_well(result), _known(result), _unknown(result), *_systematic(result), *law)
 
 
 def misfits(result: Fit) -> dict[str, float | None]:
@@ -127,6 +128,23 @@ def _unknown(result: Fit) -> str:
     if result.insight is None or len(names := list(result.insight.weakest()[1])) < 2:
         return "No varied parameter is weak or not determined."
     return f"No varied parameter is weak; least determined is the combination of {listed(names)}."
+
+
+def _systematic(result: Fit) -> Iterator[str]:
+    """Say how far the ± of the TOML that are not fitted move the springs' parameters."""
+    if (budget := result.budget) is None:
+        return
+    shares = {
+        name: result.parameters[name].systematic / budget.scales[name]
+        for name in budget.contributions
+    }
+    if shares and (largest := max(shares.values())) > 0.0:
+        which = max(shares, key=shares.__getitem__)
+        stated = [one for one in budget.sources if one in STATED]
+        yield (
+            f"The ± of {listed(stated)} in the TOML moves {which} by {percent(largest)}, others by "
+            "less; this is in no interval."
+        )
 
 
 def _of_spring(result: Fit, name: str) -> str:

@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.data.measurement import Measurement, NoiseLevel
+from foamfit.data.measurement import Measurement
 from foamfit.errors import SimulationError
 from foamfit.fitting import nuisance
 from foamfit.fitting.losses import influence
@@ -27,6 +27,8 @@ from foamfit.trust.covariance import AT_LIMIT, SINGULAR
 
 # Largest relative change of a quantity for its derivative: curves have kinks where springs snap.
 STEP = 1e-4
+# Change of a parameter over the largest one, both over their scales, that counts as none.
+ROUNDING = 1e-6
 # Nuisance parameters by what they contribute to.
 _CONTACT = (nuisance.CONTACT_TIME, *nuisance.ZEROS)
 _STRIKER = (*nuisance.STRIKER, nuisance.TIME_SHIFT)
@@ -58,14 +60,16 @@ def response(best: BestPoint, quantity: str, share: float) -> Array:
     slope = influence(best.residual[: problem.objective.n_data], problem.objective.loss)[1]
     root = np.sqrt(np.append(np.maximum(slope, 0.0), np.ones(len(problem.objective.priors))))
     scaled = best.jacobian * best.sizes * root[:, None]
-    limits = np.array([best.limits(name) for name in best.names]).reshape(-1, 2)
-    there = best.values[[best.index[name] for name in best.names]]
+    places = [best.index[name] for name in best.names]
+    limits, there = np.array([*map(best.limits, best.names)]).reshape(-1, 2), best.values[places]
     # What lies at a limit stays there.
     held = np.abs(limits - there[:, None]).min(axis=1, initial=np.inf) <= AT_LIMIT * best.sizes
     scaled[:, held] = 0.0
-    steps = -np.linalg.pinv(scaled, rcond=SINGULAR) @ (root * moved) * best.sizes
+    steps = -np.linalg.pinv(scaled, rcond=SINGULAR) @ (root * moved)
+    rounding = ROUNDING * np.max(np.abs(steps), initial=0.0)
+    steps = np.where(np.abs(steps) > rounding, steps, 0.0) * best.sizes
     moves = np.zeros((best.values.size, len(best.names)))
-    moves[[best.index[name] for name in best.names], np.arange(len(best.names))] = 1.0
+    moves[places, np.arange(len(places))] = 1.0
     moves = problem.space().follow(best.values, moves, 1e-5 * best.sizes)
     return np.asarray((0.5 * (high - low) + moves @ steps) * (share / step))
 
@@ -77,10 +81,11 @@ def _changed(best: BestPoint, quantity: str, share: float) -> tuple[Array, Array
     """
     problem, values = best.problem, best.values.copy()
     test = changed(problem.measurement, quantity, share)
-    if quantity.startswith("height"):
+    if quantity.startswith("height"):  # a spring's own ± goes before that of the whole
+        stated = problem.measurement.uncertainties
         for i in range(1, len(problem.model.kinds) + 1):
             name, own = f"s{i}_height", f"height_{i}"
-            if name in best.index and quantity in (own, _height_of(problem.measurement, own)):
+            if name in best.index and quantity == (own if own in stated else "height"):
                 values[best.index[name]] *= 1.0 + share
     elif quantity in best.index:
         values[best.index[quantity]] *= 1.0 + share
@@ -88,11 +93,6 @@ def _changed(best: BestPoint, quantity: str, share: float) -> tuple[Array, Array
     followed = (problem.objective.motion,) if same else ()
     objective = replace(problem.objective, measurement=test, followed=followed)
     return values, objective.compare(objective.simulate(values), values)
-
-
-def _height_of(measurement: Measurement, own: str) -> str:
-    """Quantity that a spring's height follows: its own, if the TOML gives that a ±."""
-    return own if own in measurement.uncertainties else "height"
 
 
 def changed(test: Measurement, quantity: str, share: float) -> Measurement:
@@ -128,10 +128,9 @@ def _scaled(test: Measurement, channel: str, by: float) -> Measurement:
         return test
     if (given := getattr(noise, channel, None)) is not None:
         noise = replace(noise, **{channel: by * given})
-    level: NoiseLevel | None = noise.estimated.get(channel)
-    if level is not None:
-        level = replace(level, sigma=by * level.sigma)
-        noise = replace(noise, estimated=noise.estimated | {channel: level})
+    if (level := noise.estimated.get(channel)) is not None:
+        estimated = noise.estimated | {channel: replace(level, sigma=by * level.sigma)}
+        noise = replace(noise, estimated=estimated)
     zeros = test.zeros | {name: by * s for name, s in test.zeros.items() if name == channel}
     return replace(test, noise=noise, zeros=zeros, **{channel: by * values})
 
@@ -140,11 +139,8 @@ def _value(test: Measurement, quantity: str) -> float:
     """Value of a quantity of the TOML, SI; 1 of a scale, whose ± is a share."""
     if quantity.startswith("height_"):
         return (test.specimen.heights or ())[int(quantity.removeprefix("height_")) - 1]
-    owner, name = {
-        "specimen_mass": (test.specimen, "mass"),
-        "striker_mass": (test.striker, "mass"),
-        "velocity": (test.striker, "velocity"),
-    }.get(quantity, (test.specimen, quantity))
+    owner = test.striker if quantity in nuisance.STRIKER else test.specimen
+    name = "mass" if quantity.endswith("mass") else quantity
     return float(getattr(owner, name, None) or 1.0)
 
 
