@@ -160,7 +160,6 @@ def make_budget(
         if one.stderr is None or name in NUISANCE:
             continue
         row = dict.fromkeys(SOURCES, 0.0)
-        # Where another method made the standard error, its parts are those of the local one.
         row |= {source: one.stderr * share for source, share in shares.items()}
         for quantity, change in moved.items():
             source = _SOURCES.get(quantity, "calibration")
