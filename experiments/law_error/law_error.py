@@ -307,7 +307,7 @@ displacement = { column = "Gap (um)", counts_down = true }
 
 
 def twins(data: Path, foams: tuple[str, ...] = ()) -> pd.DataFrame:
-    """First cycles of these foams, or of all, by one bistable spring: a row per parameter."""
+    """First cycles of these foams, or of all, by one bistable spring: a row per parameter of it."""
     table = pd.read_csv(data / "shoe-foam-twins" / "specimens.csv", index_col="test")
     sizes = {name: (row.diameter_mm, row.height_mm) for name, row in table.iterrows()} | TWINS
     rows = []
@@ -322,7 +322,7 @@ def twins(data: Path, foams: tuple[str, ...] = ()) -> pd.DataFrame:
             toml.write_text(specimen + (COLUMNS if path == raw else ""))
             result = ff.fit(ff.read_test(path, toml), drive="displacement")
             for parameter, item in result.parameters.items():
-                if item.vary:
+                if item.vary and parameter.startswith("s1_"):  # not of the machine
                     rows.append(
                         {
                             "foam": name.rpartition("-")[0], "specimen": name,

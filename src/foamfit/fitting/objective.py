@@ -42,6 +42,7 @@ from foamfit.springs.spring import LinearSpring, MicroscaleSpring, Spring
 # What a residual is, in units of the curve's scale, where a simulation failed.
 PENALTY = 10.0
 NOWHERE = np.empty(0, np.int64)
+OF_DRIVE = ("those of the drive",)  # nuisance parameters, where none are named
 # Share of a channel's range that estimated noise counts for at least. The law has not followed a
 # measured foam closer than 1 % of its range: noise far below that must not let one channel outweigh
 # the other by what is an error of the model in both.
@@ -94,7 +95,7 @@ class Objective:
     # Whether the vector of parameters ends with how late the motion channel is, s.
     time_shift: bool = False
     # Names of the nuisance parameters that end the vector; by default those of the drive.
-    nuisance: tuple[str, ...] = ()
+    nuisance: tuple[str, ...] = OF_DRIVE
     # (n_data, m): what one standard deviation along each mode of a driving motion does to the
     # residual; the residual is counted in its full covariance, see `weigh`.
     uncertain: Array | None = None
@@ -113,7 +114,8 @@ class Objective:
             raise InputError(
                 f"loss '{self.loss}' is unknown; it must be one of {', '.join(LOSSES)}"
             )
-        self.nuisance = self.nuisance or nuisances.names_of(self.drive, time_shift=self.time_shift)
+        if self.nuisance == OF_DRIVE:
+            self.nuisance = nuisances.names_of(self.drive, time_shift=self.time_shift)
         self.measurement = with_noise(self.measurement)
         self.interior = interior_curves(self.measurement, len(self.model.kinds))
         self.accelerated = self.drive == "impact" and self.measurement.acceleration is not None
