@@ -33,6 +33,7 @@ CURVE_STARTS = 300
 # Searches at most: a second one where a single descent led to the best end, and a third where this
 # still misses more of the curves than noise; twice as many for several hysteretic springs.
 ATTEMPTS = 3
+LOST = 30.0  # times the noise floor of the cost, above which no agreement is believed at once
 AROUND = 200  # points about the best one among which another search begins
 # Share of the box that counts as its edge, and where inside a descent begins again.
 EDGE, INSIDE = 0.02, (0.35, 0.5, 0.65)
@@ -428,10 +429,11 @@ def _off_edges(tracker: Tracker, space: Space) -> list[float]:
 def _settled(tracker: Tracker, ends: list[tuple[float, int]], attempt: int, least: int) -> bool:
     """Whether descents agree on the best end, or none of a second search is better than noise.
 
-    `least` searches are made in any case where the best end misses more of the curves than noise.
+    `least` searches are made in any case where the best end misses more of the curves than noise,
+    and two where it misses far more.
     """
     best, floor = min(ends)[0], tracker.objective.floor
-    if attempt + 1 < least and best > floor:
+    if (attempt + 1 < least and best > floor) or (attempt == 0 and best > LOST * floor):
         return False
     if sum(count for cost, count in ends if cost <= 1.02 * best) > 1:
         return True

@@ -1,0 +1,91 @@
+"""What do contact, zeros and the noise of a motion cost a fit?
+
+Each synthetic record (`experiments/recovery/rig.py`) is fitted twice, in turns: as it stands, and
+with what it does not say exactly taken for exact (contact time and zeros held; the motion as it was
+sampled). The time of a fit over that of the other is the price of what the record leaves open. The
+numbers of the second kind are wrong: it is there for its time alone.
+
+    python experiments/error_vs_runtime/unknowns.py        # prints and writes unknowns.md
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parent / "recovery"))
+
+import rig  # noqa: E402
+
+import foamfit as ff  # noqa: E402
+from foamfit.fitting import objective  # noqa: E402
+from foamfit.fitting.problem import make_params  # noqa: E402
+from foamfit.springs.parameters import NUISANCE  # noqa: E402
+
+SEEDS = range(1, 9)
+RECORDS: dict[str, rig.Impact | rig.Slow] = {
+    "impact that begins at the contact": rig.Impact(samples=500, trimmed=True),
+    "impact from before the contact, any zero": rig.Impact(samples=500),
+    "slow test, microscale, exact motion": rig.Slow(rows=1000, exact=True),
+    "slow test, microscale, 0.3 % noise": rig.Slow(rows=1000),
+    "slow test, microscale with relaxation, 0.3 % noise": rig.Slow(relaxation=1, rows=1000),
+}
+
+
+@contextmanager
+def exact_motion() -> Iterator[None]:
+    """Take every motion for exact, as it was sampled."""
+    usual, objective.EXACT = objective.EXACT, 1.0
+    try:
+        yield
+    finally:
+        objective.EXACT = usual
+
+
+def timed(fit: Callable[[], Any]) -> float:
+    """Processor time of a fit, s."""
+    began = time.process_time()
+    fit()
+    return time.process_time() - began
+
+
+def pair(setup: rig.Impact | rig.Slow, seed: int) -> tuple[float, float]:
+    """Time of the fit of one record, and of the fit that takes it for exact."""
+    slow = isinstance(setup, rig.Slow)
+    record = rig.slow(setup, seed) if slow else rig.impact(setup, seed)
+    with tempfile.TemporaryDirectory() as folder:
+        test = ff.read_test(rig.write(record, Path(folder)))
+    drive = "displacement" if slow else "impact"
+    held = make_params(test, record.model, drive, relaxation=setup.relaxation)
+    for name in NUISANCE:
+        if name in held:
+            held[name].set(vary=False)
+    keywords: dict[str, Any] = {"model": record.model, "relaxation": setup.relaxation}
+    keywords["drive"] = drive
+    ff.fit(test, starts=1, **keywords)  # compiles
+    own = timed(lambda: ff.fit(test, **keywords))
+    with exact_motion():
+        return own, timed(lambda: ff.fit(test, params=held, **keywords))
+
+
+def main() -> None:
+    rows = ["| synthetic record | fit | taken for exact | ratio |", "| --- | --- | --- | --- |"]
+    for name, setup in RECORDS.items():
+        times = [pair(setup, seed) for seed in SEEDS]
+        own, exact = (statistics.median(column) for column in zip(*times, strict=True))
+        ratio = statistics.median(a / b for a, b in times)
+        rows.append(f"| {name} | {own:.2f} s | {exact:.2f} s | {ratio:.2f} |")
+        print(rows[-1], flush=True)
+    told = f"Medians of {len(SEEDS)} records, processor time, fits in turns."
+    (HERE / "unknowns.md").write_text("\n".join([*rows, "", told, ""]), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
