@@ -18,7 +18,7 @@ from foamfit.report.plotted import plotted, table
 from foamfit.report.studies.joint_page import joint_page
 from foamfit.report.studies.joint_plot import plot_joint
 from foamfit.report.studies.joint_text import joint_text
-from foamfit.study.joint_estimates import common_covariance, parameter_of
+from foamfit.study.joint_estimates import common_covariance, parameters_of
 from foamfit.study.joint_fit import Alternative, fit_jointly
 from foamfit.study.joint_result import Alone, JointData
 from foamfit.study.study_file import Study
@@ -62,7 +62,7 @@ def found(tmp_path_factory) -> JointData:
     )  # fmt: skip
     return JointData(
         study=study, seed=0, tests=names, files=(here,) * 3, rates=RATES, rate0=0.1, fit=fit,
-        parameters={name: parameter_of(fit, names, name) for name in problems[0].names},
+        parameters=parameters_of(fit, names),
         covariance=common_covariance(fit),
         evidence=(
             Alternative("s1_sigma_plus", "log rate", True, 10.0, 13, 300.0),

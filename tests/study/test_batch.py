@@ -127,7 +127,9 @@ def test_the_same_numbers_with_any_number_of_processes_and_anywhere(here):
     frame = frames[2].set_index("test")
     assert frame.loc["b", "s1_k0"] == alone.params["s1_k0"].value
     assert names("out2") == ["a", "b", "bad", "c", "summary.csv", "summary.html"]
-    assert names("out2/a") == ["batch.json", "curves.csv", "fit.json", "parameters.csv"]
+    assert names("out2/a") == [
+        "batch.json", "budget.csv", "curves.csv", "fit.json", "parameters.csv",
+    ]  # fmt: skip
     assert frame.loc["bad", "status"] == "refused"
     assert frame.loc["bad", "error"].startswith("tests/bad.csv: ")
     with open("out2/summary.csv", newline="") as file:

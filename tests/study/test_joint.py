@@ -368,7 +368,8 @@ def test_drives_and_noise_mix(tmp_path):
     ]  # fmt: skip
     assert result.parameters["s1_eta"].value == pytest.approx(300.0, rel=0.2)
     assert result.fit.found.value("s1_eta")[1] == 0.0  # it does not vary in the slow loop
-    assert result.fit.found.n_vary == 8
+    # Beside the springs': contact and zero of the impact, and the zero of the slow motion.
+    assert result.fit.found.n_vary == 8 + 3
     assert result.parameters["s1_k0"].value == pytest.approx(5.5e6, rel=0.03)
 
 
@@ -403,6 +404,9 @@ def test_the_command_writes_and_prints(folder, tmp_path, monkeypatch):
     ("parameters", "more", "wanted"),
     [
         ('s1_kx = "shared"', "", "[parameters] s1_kx is not a parameter of the model microscale"),
+        ('contact_time = "shared"', "", 'contact_time = "shared" cannot be: each test has its own'),
+        ('velocity = "auto"', "", 'velocity = "auto" cannot be: each test has its own'),
+        ("velocity = 2", "", "[parameters] velocity is a parameter of none of these tests"),
         ('s1_k0 = "share"', "", "s1_k0 = 'share' must be one of shared, own, scatter"),
         ('s1_k0 = "shared"', 'drive = "pull"', "drive = 'pull' must be one of impact"),
         ('s1_k0 = "shared"', "seed = -1", "seed = -1 must be a whole number from 0 up"),
