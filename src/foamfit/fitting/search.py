@@ -34,6 +34,7 @@ CURVE_STARTS = 300
 # still misses more of the curves than noise; twice as many for several hysteretic springs.
 ATTEMPTS = 3
 LOST = 30.0  # times the noise floor of the cost, above which no agreement is believed at once
+NOISY = 0.005  # noise of a motion, over its range, that is much
 AROUND = 200  # points about the best one among which another search begins
 # Share of the box that counts as its edge, and where inside a descent begins again.
 EDGE, INSIDE = 0.02, (0.35, 0.5, 0.65)
@@ -387,8 +388,11 @@ def search(
             cost, end = descend(tracker, space, point, 60)
             tracker.ends.append(space.decode(end))
             out.append((cost, counts.get(id(point), 1)))
-        out += [(cost, 1) for cost in _off_edges(tracker, space)]
-        if attempt + 1 == attempts or _settled(tracker, out, attempt, attempts // 2):
+        edges = _off_edges(tracker, space)
+        out += [(cost, 1) for cost in edges]
+        if attempt + 1 == attempts or _settled(
+            tracker, out, attempt, max(attempts // 2, 2 if edges else 1)
+        ):
             break
         points = box_starts(space, rng, CURVE_STARTS // 3) + _around_best(tracker, space, rng)
     return sorted(out)
@@ -457,8 +461,9 @@ def _search_loop(
     However this ends, the best point of the loop is handed to the tracker.
     """
     objective = tracker.objective
-    driven = objective.drive == "displacement" and objective.motion is not None
-    followed = objective.motion.at(objective.time) if driven and objective.motion else None
+    followed = None
+    if _is_noisy(objective) and objective.motion is not None:
+        followed = objective.motion.at(objective.time)
     loop = smooth_loop(objective.measurement, followed)
     along = Objective(
         loop, objective.model, "displacement", {"stress_strain": 1.0},
@@ -477,6 +482,16 @@ def _search_loop(
         if inner.best_values is not None:
             tracker.consider(inner.best_values)
     return ends
+
+
+def _is_noisy(objective: Objective) -> bool:
+    """Whether a loop needs the motion without its noise: where it drives, or has much of it."""
+    motion, level = (
+        objective.measurement.displacement,
+        objective.measurement.noise.of("displacement"),
+    )
+    much = motion is not None and level is not None and level.sigma > NOISY * np.ptp(motion)
+    return objective.drive == "displacement" or (objective.drive == "impact" and much)
 
 
 def _scan_vibration(tracker: Tracker, space: Space, start: Array) -> list[tuple[float, Array]]:
