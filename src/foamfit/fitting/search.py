@@ -390,9 +390,8 @@ def search(
             out.append((cost, counts.get(id(point), 1)))
         edges = _off_edges(tracker, space)
         out += [(cost, 1) for cost in edges]
-        if attempt + 1 == attempts or _settled(
-            tracker, out, attempt, max(attempts // 2, 2 if edges else 1)
-        ):
+        least = max(attempts // 2, 2 if edges else 1)
+        if attempt + 1 == attempts or _settled(tracker, out, attempt, least):
             break
         points = box_starts(space, rng, CURVE_STARTS // 3) + _around_best(tracker, space, rng)
     return sorted(out)
@@ -486,12 +485,11 @@ def _search_loop(
 
 def _is_noisy(objective: Objective) -> bool:
     """Whether a loop needs the motion without its noise: where it drives, or has much of it."""
-    motion, level = (
-        objective.measurement.displacement,
-        objective.measurement.noise.of("displacement"),
-    )
-    much = motion is not None and level is not None and level.sigma > NOISY * np.ptp(motion)
-    return objective.drive == "displacement" or (objective.drive == "impact" and much)
+    test = objective.measurement
+    motion, level = test.displacement, test.noise.of("displacement")
+    if objective.drive != "impact" or motion is None or level is None:
+        return objective.drive == "displacement"
+    return bool(level.sigma > NOISY * np.ptp(motion))
 
 
 def _scan_vibration(tracker: Tracker, space: Space, start: Array) -> list[tuple[float, Array]]:
