@@ -349,7 +349,7 @@ def _time_shift(e: Findings) -> _Answer:
 
 def _damping(e: Findings) -> _Answer:
     if e.objective.drive != "displacement" or not e.best.names:
-        return True, "It is left out under a driven motion alone."
+        return None, "Only under a driven motion is it left out."
     found = damping_hint(e.best, [n for n, item in e.estimates.items() if item.stderr is not None])
     if found is None:
         return True, "A dashpot would not lower the residuals much."
