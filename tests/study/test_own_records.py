@@ -201,13 +201,13 @@ def test_a_joint_fit_weighs_each_driving_motion(tmp_path, monkeypatch):
         f"[parameters]{shared}\n"
     )
     found = ff.joint(tmp_path / "study.toml", jobs=1)
-    whole = [problem.objective.uncertain for problem in found.problems]
+    whole = [problem.objective.weighing for problem in found.problems]
     assert all(one is not None for one in whole)
     # What is shared costs no more than noise: both are counted with the same weights.
     statistics = found.statistics
     assert 0.0 < statistics["chisqr"] - statistics["chisqr_alone"] < 40.0
     held = found.problems[0].holding("s1_k0", 1.0)
-    assert held.objective.uncertain is whole[0]
+    assert held.objective.weighing is whole[0]
 
 
 @pytest.mark.parametrize("method", ["bootstrap", "profile"])

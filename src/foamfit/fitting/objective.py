@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import INTEGRATED, Measurement, NoiseLevel
-from foamfit.data.motion import SmoothMotion, follow
+from foamfit.data.motion import SmoothMotion
 from foamfit.data.noise import with_noise
 from foamfit.errors import InputError, SimulationError, as_signalled
 from foamfit.fitting import nuisance as nuisances
+from foamfit.fitting.clock import driving_motion, instants, later
 from foamfit.fitting.curves import (
     ACCELERATION,
     CURVES,
@@ -32,6 +33,7 @@ from foamfit.fitting.curves import (
     interior_curves,
 )
 from foamfit.fitting.losses import LOSSES, soften, softness
+from foamfit.fitting.weighing import Weighing
 from foamfit.solve.plan import Motion, Plan
 from foamfit.solve.plan import plan as make_plan
 from foamfit.springs import kernels
@@ -49,13 +51,9 @@ OF_DRIVE = ("those of the drive",)  # nuisance parameters, where none are named
 MODEL_ERROR = 0.005
 # A spring of a kind, whatever its numbers, where that is more than a linear one to the solver.
 _ANY_SPRING: dict[str, Spring] = {"microscale": MicroscaleSpring(1.0, 1.0, 0.0, 1.0, 1.0, 1.0, 1.0)}
-# A trial that needs more steps than this is too stiff to be worth waiting for.
-MAX_STEPS = 20_000
+MAX_STEPS = 20_000  # a trial that needs more is too stiff to be worth waiting for
 # Standard deviation of normal residuals over the median of their sizes.
 NORMAL = 1.4826
-# Noise of a motion, over its range, that counts as none; most that a smooth motion may leave of the
-# samples, over their noise.
-EXACT, FOLLOWED = 1e-6, 1.5
 # Most instants that are simulated for each sample that averages rows of the file.
 FINEST = 8
 # Steps of differences: of the velocity and the mass, relative, of times over the instants' gap, and
@@ -96,10 +94,8 @@ class Objective:
     time_shift: bool = False
     # Names of the nuisance parameters that end the vector; by default those of the drive.
     nuisance: tuple[str, ...] = OF_DRIVE
-    # (n_data, m): what one standard deviation along each mode of a driving motion does to the
-    # residual; the residual is counted in its full covariance, see `weigh`.
-    uncertain: Array | None = None
-    levels: Array | None = None
+    # The covariance that a driving motion's own uncertainty gives the residual; see `weigh_motion`.
+    weighing: Weighing | None = None
     loss: str = "linear"  # One of `LOSSES`
     followed: tuple[SmoothMotion | None, ...] = ()  # `motion`, if it is known already
     evaluations: int = field(default=0, init=False)  # Sets of parameters that were simulated
@@ -124,10 +120,9 @@ class Objective:
         self._dashpots = np.array([name.endswith("eta") for name in self.model.names])
         self._dashpots[-1] = False  # the onsite damper is none of a spring
         time = self.measurement.time
-        # Of the samples, s; their number where the test has no time.
         self.time = np.arange(self._stress.size, dtype=float) if time is None else time
         self._fine = min(self.measurement.block, FINEST) if self.drive != "stress" else 1
-        self._clock, self._own = _instants(self.time, self._fine), None
+        self._clock, self._own = instants(self.time, self._fine), None
         if self._driven and self.motion is not None and self.motion.turns.size:
             # A motion turns between samples: how far it goes there is what the springs remember.
             own, self._clock = self._clock, np.union1d(self._clock, self.motion.turns)
@@ -149,10 +144,8 @@ class Objective:
         self._kept = {name: self._fitted(name) for name in self.measured}
         self.sizes = tuple(self.kept(name).size for name in self.counted)
         self.n_data = sum(self.sizes)
-        # Worse per sample than any curve that stays within ten ranges.
         self.penalty = max(PENALTY * self.span(name) for name in self.counted)
         self._set_nuisance()
-        self.weigh(self.uncertain, self.levels)
 
     @cached_property
     def motion(self) -> SmoothMotion | None:
@@ -161,21 +154,7 @@ class Objective:
         Where it leaves the samples more than their noise the machine's motion is not that smooth:
         the samples themselves are the better motion.
         """
-        values = self.measurement.displacement
-        level = self.measurement.noise.of("displacement")
-        if values is None or level is None or level.sigma <= EXACT * float(np.ptp(values)):
-            return None
-        if self.followed:
-            return self.followed[0]
-        counts = self.measurement.sampled.get("displacement")
-        found = follow(self.time, values, level, counts)
-        if self.measurement.block > 1 and found.turns.size:
-            # The mean of rows on either side of a turn lies off the motion.
-            gap = float(np.median(np.diff(self.time)))
-            apart = np.abs(self.time[:, None] - found.turns).min(axis=1) > 0.75 * gap
-            counts = apart if counts is None else counts & apart
-            found = follow(self.time, values, level, counts)
-        return found if found.sigma <= FOLLOWED * level.sigma else None
+        return self.followed[0] if self.followed else driving_motion(self.measurement, self.time)
 
     @cached_property
     def _moved(self) -> Array:
@@ -194,28 +173,6 @@ class Objective:
         along = DisplacementDrive(self._moved)
         return {damped: self._scene(along, damped=damped) for damped in (False, True)}
 
-    def weigh(self, uncertain: Array | None, levels: Array | None = None) -> None:
-        """Count residuals in the covariance v + SSᵀ of noise v and of a motion that drives.
-
-        The columns of S (n_data, m) are those of `uncertain`; `levels` (n_data,) are the roots of
-        v. The residual r becomes √v (1 + S'S'ᵀ)^(-1/2) r/√v with S' = S/√v, whose covariance is v
-        again.
-        """
-        self.uncertain, self.levels = uncertain, levels
-        if uncertain is None or levels is None:
-            return
-        left, size, _ = np.linalg.svd(uncertain / levels[:, None], full_matrices=False)
-        self._lean, self._less = left, 1.0 - 1.0 / np.sqrt(1.0 + size**2)
-
-    def _weighed(self, rows: Array) -> Array:
-        """Residuals, or columns of their derivatives, in the covariance of `weigh`."""
-        if self.uncertain is None or self.levels is None:
-            return rows
-        root = self.levels if rows.ndim == 1 else self.levels[:, None]
-        less = self._less if rows.ndim == 1 else self._less[:, None]
-        plain = rows / root
-        return np.asarray(rows - root * (self._lean @ (less * (self._lean.T @ plain))))
-
     def weigh_motion(self, values: Array) -> bool:
         """Weigh residuals by the motion's own uncertainty at a point; False where it has none.
 
@@ -230,7 +187,7 @@ class Objective:
             max(NORMAL * float(np.median(part)), self.noise(name).sigma * self.factor(name), 1e-9)
             for name, part in zip(self.counted, parts, strict=True)
         ]
-        self.weigh(uncertain, np.repeat(levels, self.sizes))
+        self.weighing = Weighing.of(uncertain, np.repeat(levels, self.sizes))
         return True
 
     def by_motion(self, values: Array) -> Array | None:
@@ -248,7 +205,7 @@ class Objective:
     def _moved_by(self, change: Array | float) -> Objective:
         """The same objective with another driving motion, and plain residuals."""
         other = copy(self)
-        other.uncertain = None
+        other.weighing = None
         other._plans = {
             damped: plan._replace(values=plan.values + change)
             for damped, plan in self._plans.items()
@@ -562,7 +519,7 @@ class Objective:
         if late == 0.0 or (self.drive == "impact" and name != "stress_strain"):
             return curves
         if self.drive == "stress":
-            return _later(self.time, curves, late) if name.startswith("displacement") else curves
+            return later(self.time, curves, late) if name.startswith("displacement") else curves
         if name.startswith("displacement"):
             return curves
         when = self.time + late
@@ -634,7 +591,7 @@ class Objective:
         ]
         # A stress near the pole of branch c is as bad as none.
         bounded = np.clip(np.concatenate(parts), -self.penalty, self.penalty)
-        bounded = self._weighed(bounded)
+        bounded = bounded if self.weighing is None else self.weighing(bounded)
         return np.append(bounded, self.off_priors(values)) if self.priors else bounded
 
     @property
@@ -673,7 +630,7 @@ class Objective:
         slopes = np.concatenate(parts, axis=1).T
         residual = self.compare(curves, values)[: self.n_data]
         slopes[np.abs(residual) >= self.penalty] = 0.0
-        slopes = self._weighed(slopes)
+        slopes = slopes if self.weighing is None else self.weighing(slopes)
         if self.loss != "linear":
             slopes *= softness(residual, self.loss)[:, None]
         return np.concatenate([slopes, by_priors]) if self.priors else slopes
@@ -714,7 +671,7 @@ class Objective:
         """Curves as channels show them of which the motion is late by so many seconds."""
         impact, there = self.drive == "impact", curves.curves
         return {
-            name: _later(self.time, curve, late)
+            name: later(self.time, curve, late)
             if impact and name.startswith("displacement")
             else self._late(name, curve, late)
             for name, curve in there.items()
@@ -740,24 +697,3 @@ class Objective:
             return None
         miss = (simulated - measured)[self._kept[name]]
         return float(np.sqrt(np.mean(miss**2)) / np.ptp(measured))
-
-
-def _later(time: Array, curves: Array, late: float) -> Array:
-    """Curves (…, n) seen `late` seconds later, at the samples; straight past their ends."""
-    when = time - late
-    ahead, after = np.minimum(when - time[0], 0.0), np.maximum(when - time[-1], 0.0)
-    first = (curves[..., 1] - curves[..., 0]) / (time[1] - time[0])
-    last = (curves[..., -1] - curves[..., -2]) / (time[-1] - time[-2])
-    rows = [np.interp(when, time, row) for row in np.atleast_2d(curves)]
-    inside = np.reshape(rows, curves.shape)
-    return np.asarray(inside + first[..., None] * ahead + last[..., None] * after)
-
-
-def _instants(time: Array, fine: int) -> Array:
-    """Instants that each sample averages: so many, evenly spread over its share of the clock."""
-    if fine == 1:
-        return time
-    gaps = np.diff(time)
-    widths = np.minimum(np.append(gaps, gaps[-1]), np.append(gaps[0], gaps))
-    offsets = (np.arange(fine) + 0.5) / fine - 0.5
-    return np.asarray((time[:, None] + widths[:, None] * offsets).ravel())

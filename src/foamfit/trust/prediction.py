@@ -47,7 +47,7 @@ def predicted_misfit(best: BestPoint, deadline: float | None = None) -> float:
         If the time (`time.monotonic`) is past the deadline.
     """
     # With counts of its own, and each sample for itself: weighed residuals mix what is held back.
-    problem, objective = best.problem, replace(best.problem.objective, uncertain=None, levels=None)
+    problem, objective = best.problem, replace(best.problem.objective, weighing=None)
     space, tracker = problem.space(), Tracker(objective, deadline)
     block = np.arange(objective.time.size) * BLOCKS // objective.time.size
     of_sample = np.concatenate([block[objective.kept(name)] for name in objective.counted])
