@@ -96,16 +96,21 @@ def test_one_impact_written_in_several_ways_starts_at_one_instant(channels):
         np.testing.assert_allclose(done.displacement, first.displacement, atol=2e-6)
 
 
+@pytest.mark.parametrize("after", [0.0, 0.3])
 @pytest.mark.parametrize("phase", [0.0, 0.5])
 @pytest.mark.parametrize("level", [5e-4, 0.02])
-def test_a_record_that_begins_at_contact_loses_nothing(phase, level):
-    given = record(before=0, phase=phase, level=level)
+def test_a_record_that_begins_at_contact_loses_nothing(phase, level, after):
+    """Where it goes on past the contact its end shows the zero of the stress, else nothing does."""
+    given = record(before=0, phase=phase, level=level, after=after)
     done = run(given)
     assert error(done) == 0.0
-    assert (done.contact, done.zeros, done.sampled) == ("file", {}, {})
-    np.testing.assert_array_equal(done.stress, given.stress[: len(done.stress)])
+    assert (done.contact, done.sampled) == ("file", {})
+    zero, shown = done.origins["stress_zero"], done.zeros.get("stress", 0.0)
+    assert set(done.zeros) == ({"stress"} if after else set())
+    assert abs(zero) <= 3.0 * shown <= 3.0 * 0.25 * level * PEAK
+    np.testing.assert_allclose(done.stress + zero, given.stress[: len(done.stress)], rtol=1e-12)
     np.testing.assert_array_equal(done.displacement, given.displacement[: len(done.stress)])
-    assert done.origins == {"contact_time": 0.0, "stress_zero": 0.0, "displacement_zero": 0.0}
+    assert done.origins == {"contact_time": 0.0, "stress_zero": zero, "displacement_zero": 0.0}
 
 
 def test_a_motion_alone_gives_the_start_of_a_gauge_at_rest():
@@ -157,13 +162,19 @@ def test_zeros_have_the_error_of_their_mean():
         assert abs(np.mean(found)) < 0.6 * np.median(told[name])
 
 
+@pytest.mark.parametrize("after", [0.0, 0.3])
 @pytest.mark.parametrize(("before", "rest"), [(5, 0), (6, 3), (20, 10), (300, 250)])
-def test_few_rows_are_shared_between_zeros_and_contact(before, rest):
-    done = run(record(before=before, phase=0.5, level=1e-4, gauge="rest"))
+def test_few_rows_are_shared_between_zeros_and_contact(before, rest, after):
+    """The zero of the stress is shown by the end of a record where that is of more rows."""
+    done = run(record(before=before, phase=0.5, level=1e-4, gauge="rest", after=after))
     lead = int(np.count_nonzero(done.time < -1e-9))
     assert lead == pytest.approx(before - rest, abs=2)
-    assert ("stress" in done.zeros) == (rest > 0)
-    assert any("file's own zero of the stress stands" in n for n in done.notes) == (rest == 0)
+    by_end = after > 0 and rest < 20
+    assert ("stress" in done.zeros) == (rest > 0 or by_end)
+    assert any("The stress at the end of the record" in n for n in done.notes) == by_end
+    stands = any("file's own zero of the stress stands" in n for n in done.notes)
+    assert stands == (rest == 0 and not by_end)
+    assert abs(done.origins["stress_zero"]) <= 3.0 * done.zeros.get("stress", 0.0)
 
 
 def test_a_rest_that_drifts_owns_up_to_it():

@@ -129,7 +129,11 @@ def test_nothing_is_cut_or_taken_off_where_contact_is_the_first_sample(tmp_path,
         _, truth = recovery.random_case(group.rng(seed), group.samples, group.draw)
         test = read_test(recovery.written(truth, tmp_path))
         assert recovery.cut_before(test) == 0
-        assert not any("taken off" in note for note in test.notes)
+        # but the zero of the stress, where the striker has left at the end
+        taken = [note for note in test.notes if "taken off" in note]
+        assert all(note.startswith("The stress at the end of the record") for note in taken)
+        assert len(taken) == ("stress" in test.zeros)
+        assert abs(test.origins["stress_zero"]) <= 4.0 * test.zeros.get("stress", 0.0)
         width = 1 if len(test.time) > 0.4 * group.samples else round(group.samples / 1000)
         if width == 1:
             kept = slice(len(test.time))
@@ -138,6 +142,23 @@ def test_nothing_is_cut_or_taken_off_where_contact_is_the_first_sample(tmp_path,
         without = replace(Record(truth.time, truth.stress, truth.displacement), displacement=None)
         done = condition(without, truth.specimen, striker=truth.striker)
         assert done.contact == "file"  # by the stress alone
+
+
+@pytest.mark.parametrize("group", range(6))
+def test_the_zero_at_the_end_of_a_record_is_as_far_off_as_it_says(tmp_path, group):
+    """Impacts whose contact ends softly, in white and correlated noise; the true zero is 0."""
+    sys.path.insert(0, str(EXPERIMENTS / "recovery"))
+    import recovery
+
+    group, off = recovery.CLASSES[group], []
+    for seed in range(1, 21):
+        _, truth = recovery.random_case(group.rng(seed), group.samples, group.draw)
+        test = read_test(recovery.written(truth, tmp_path))
+        if "stress" in test.zeros:
+            off.append(test.origins["stress_zero"] / test.zeros["stress"])
+    assert len(off) > 12
+    assert np.max(np.abs(off)) < 3.5
+    assert np.sqrt(np.mean(np.square(off))) < 1.4
 
 
 @pytest.mark.parametrize("off", [-6.0, 6.0])

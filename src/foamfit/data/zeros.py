@@ -17,6 +17,7 @@ from foamfit.data.contact import (
     smooth,
 )
 from foamfit.data.measurement import NoiseLevel, Record, Striker
+from foamfit.data.noise import MIN_REST
 from foamfit.text import engineering, percent
 
 _LEAST_LEAD, _FEWEST = 8, 3  # rows kept before contact; rows that show a zero
@@ -81,7 +82,9 @@ def span_of_impact(record: Record, start: Start, levels: Levels) -> Span:
 def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
     """Level of a force at the end of an impact's record, if it is flat there and the striker left.
 
-    The end grows backwards as long as the rows before it lie at its level within their noise.
+    The end grows backwards as long as the rows before it lie at its level within a standard error:
+    a contact that ends softly presses for long by less than its noise. Of few rows the correlation
+    is not known: their mean counts as one row.
     """
     size = max(8, int(_TAIL * len(values)))
     step, n = max(4, size // 2), size
@@ -93,12 +96,14 @@ def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
         return None
     while n + step < len(values) // 2:
         more = mean_level(values[-n - step : -n], noise)
-        if abs(more.value - level.value) > 2.0 * float(np.hypot(more.error, level.error)):
+        if abs(more.value - level.value) > float(np.hypot(more.error, level.error)):
             break
         n += step
         level = mean_level(values[-n:], noise)
     # The rows next to the end of contact may still press.
     level = mean_level(values[step - n :], noise) if n > 2 * step else level
+    if level.samples < MIN_REST:
+        level = level._replace(error=max(level.error, noise.sigma))
     return level if abs(level.value) < _HIGHEST * float(np.ptp(values)) else None
 
 
