@@ -218,7 +218,7 @@ def test_a_shift_between_force_and_motion_is_warned_of_and_fitted(late):
     assert worst_deviation(result, spring) < 4.0
     assert not [w for w in result.warnings if "--time-shift" in w]
     assert result.params["time_shift"].value == item.value
-    assert "time_shift" in summary_text(result)
+    assert "time shift Δt" in summary_text(result)
 
 
 def test_no_shift_is_warned_of_where_there_is_none():

@@ -19,6 +19,7 @@ from foamfit.data.measurement import Measurement
 from foamfit.fitting import levenberg
 from foamfit.fitting.box import BOX, LAST_STRAIN, Scales, Space, family, is_logarithmic
 from foamfit.fitting.curves import smoothed
+from foamfit.fitting.nuisance import TIME_SHIFT
 from foamfit.fitting.objective import Objective
 from foamfit.springs.law import least_eps_star
 from foamfit.springs.parameters import HYSTERETIC, NUISANCE
@@ -469,13 +470,19 @@ def _search_loop(
         time_shift=objective.time_shift, nuisance=objective.nuisance, loss=objective.loss,
     )  # fmt: skip
     inner = Tracker(along, tracker.deadline, tracker.better)
+    own = space
+    if objective.drive == "impact":  # whose contact and zero show in its curves alone
+        free = [name for name in space.free if name not in NUISANCE or name == TIME_SHIFT]
+        own = replace(space, free=tuple(free))
     try:
-        ranked = rank(inner, space, points + curve_starts(space, loop, rng))
+        points = [own.encode(space.decode(point)) for point in points]
+        ranked = rank(inner, own, points + curve_starts(own, loop, rng))
         points = [point for _, point in ranked]
         ends = []
-        for i, point in enumerate(spread_out(space, points, starts)):
+        for i, point in enumerate(spread_out(own, points, starts)):
             progress(DESCENTS + (ON_CURVES - DESCENTS) * i / starts, "loop")
-            ends.append(descend(inner, space, point, 40))
+            cost, end = descend(inner, own, point, 40)
+            ends.append((cost, space.encode(own.decode(end))))
     finally:
         objective.add_counts(inner.objective)
         if inner.best_values is not None:
