@@ -1,0 +1,164 @@
+"""What a record does not say exactly: priors, rows averaged in blocks, and a motion that drives."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import foamfit as ff
+from conftest import AREA, HEIGHT, synthetic_impact
+from foamfit.data.measurement import Measurement, Noise, Specimen
+from foamfit.fitting.curves import default_weights
+from foamfit.fitting.objective import Objective
+from foamfit.fitting.problem import make_params
+from foamfit.one_model import Found, Options, identify
+from foamfit.springs.model import Model
+
+SPRING = ff.MicroscaleSpring(
+    k0=5.5e5, kc=4e5, eps_star=0.3, sigma_plus=1.1e5, spread_plus=0.4, sigma_minus=7e4,
+    spread_minus=0.6,
+)  # fmt: skip
+OF_SPRING = [SPRING.k0, SPRING.kc, SPRING.eps_star, SPRING.sigma_plus, SPRING.spread_plus,
+             SPRING.sigma_minus, SPRING.spread_minus, 0.0, 0.0]  # fmt: skip
+
+
+def test_a_velocity_with_a_deviation_is_an_unknown_with_that_prior():
+    """It counts as a parameter but its prior as no sample; what it leaves open is in the errors."""
+    spring, test = synthetic_impact()
+    exact = ff.fit(test, starts=4)
+    assert "velocity" not in [name for name, one in exact.parameters.items() if one.vary]
+    stated = replace(test, uncertainties={"velocity": 0.02, "striker_mass": 7e-6})
+    found = ff.fit(stated, starts=4)
+    assert found.statistics["n_data"] == exact.statistics["n_data"]
+    assert found.statistics["n_vary"] == exact.statistics["n_vary"] + 2
+    for name, truth, sigma in (("velocity", 2.0, 0.02), ("striker_mass", 7e-3, 7e-6)):
+        item = found.parameters[name]
+        assert abs(item.value - truth) < 3 * sigma
+        assert 0.0 < item.stderr <= 1.001 * sigma
+    wrong = replace(stated, striker=replace(test.striker, velocity=2.04))
+    off = ff.fit(wrong, starts=4)
+    assert off.parameters["velocity"].value < 2.04 - 0.01  # the motion knows better
+    assert off.parameters["s1_kc"].value == pytest.approx(spring.kc, rel=0.03)
+
+
+def in_blocks(test: Measurement, size: int) -> Measurement:
+    """The same test, so many rows averaged in each sample."""
+
+    def mean(x: np.ndarray) -> np.ndarray:
+        return x.reshape(-1, size).mean(axis=1)
+
+    noise = Noise(*(level / size**0.5 for level in (test.noise.stress, test.noise.displacement)))
+    return replace(
+        test, time=mean(test.time), stress=mean(test.stress), noise=noise, block=size,
+        displacement=mean(test.displacement),
+    )  # fmt: skip
+
+
+def test_an_impact_averaged_in_blocks_fits_the_parameters_of_its_rows():
+    """Means of the curves are compared with means of the rows, kinks and jumps included."""
+    spring, test = synthetic_impact(eta=20.0, samples=500)
+    few = in_blocks(test, 5)
+    clean = in_blocks(replace(synthetic_impact(eta=20.0, samples=500, noise=0.0)[1],
+                              noise=test.noise), 5)  # fmt: skip
+    weights = default_weights(clean, "impact")
+    off = []
+    for made in (clean, replace(clean, block=1)):
+        one = Objective(made, Model.parse("bistable"), "impact", weights)
+        values = [*spring.seven, 20.0, 0.0, *(one.usual[name] for name in one.nuisance)]
+        off.append(np.abs(one.residual(np.array(values))).max())
+    assert off[0] < 2e-3 < 0.05 < off[1]  # one sample in the middle is not the mean
+    whole, averaged = (ff.fit(one, starts=4, intervals="local") for one in (test, few))
+    assert averaged.statistics["n_data"] == 200
+    for name in ("k0", "kc", "eps_a", "eps_c", "kh_plus", "kh_minus", "eta"):
+        one, other = (fit.parameters[f"s1_{name}"] for fit in (whole, averaged))
+        assert abs(one.value - other.value) < one.stderr, name
+        assert other.stderr == pytest.approx(one.stderr, rel=0.35), name
+    for name in ("contact_time", "displacement_zero"):
+        one, other = (fit.parameters[name] for fit in (whole, averaged))
+        assert abs(one.value - other.value) < 2e-6
+
+
+@pytest.fixture(scope="module")
+def driven() -> Objective:
+    """The objective of a slow loop of a microscale spring whose driving motion is noisy."""
+    strain = 0.5 * np.sin(np.pi * np.linspace(0.0, 1.0, 400)) ** 2
+    rng = np.random.default_rng(2)
+    stress, noise = SPRING.stress(strain), 0.002 * 0.5 * HEIGHT
+    test = Measurement(
+        name="synthetic loop", path=None, data_sha256="", time=np.linspace(0.0, 4.0, 400),
+        stress=stress + 1e2 * rng.standard_normal(400),
+        displacement=strain * HEIGHT + noise * rng.standard_normal(400),
+        specimen=Specimen(HEIGHT, AREA), noise=Noise(1e2, noise), motion="measured",
+    )  # fmt: skip
+    return Objective(test, Model.parse("microscale"), "displacement", {"stress_strain": 1.0})
+
+
+def test_a_driving_motion_is_smooth_and_what_is_unsure_of_it_moves_the_residual(driven):
+    """As the law itself, driven by a motion that is off along each of its modes."""
+    motion, time = driven.motion, driven.time
+    clean = 0.5 * HEIGHT * np.sin(np.pi * time / 4.0) ** 2
+    level = driven.measurement.noise.displacement
+    assert np.sqrt(np.mean((motion.at(time) - clean) ** 2)) < 0.4 * level
+    assert motion.turns == pytest.approx([2.0], abs=0.05)
+    values = np.array([*OF_SPRING, *(driven.usual[name] for name in driven.nuisance)])
+    changes = driven.by_motion(values)
+    clock = np.union1d(time, motion.turns)
+    modes = motion.modes(clock)
+    assert changes.shape == (driven.n_data, modes.shape[1])
+    chain, rows = ff.Chain([SPRING], [HEIGHT], AREA), np.searchsorted(clock, time)
+    largest = np.abs(changes).max()
+    for found, mode in zip(changes.T, modes.T, strict=True):
+        sides = [
+            ff.simulate(chain, ff.DisplacementDrive(motion.at(clock) + side * mode), clock)
+            for side in (-0.5, 0.5)
+        ]
+        wanted = (sides[1].base_stress - sides[0].base_stress)[rows]
+        wanted *= driven.factor("stress_strain")
+        np.testing.assert_allclose(found, wanted, atol=1e-4 * largest)
+
+
+def test_residuals_of_a_driven_loop_are_weighed_by_their_full_covariance(driven):
+    """Of noise and of what the motion leaves open: weighed, it is that of the noise alone."""
+    values = np.array([*OF_SPRING, *(driven.usual[name] for name in driven.nuisance)])
+    one = replace(driven)
+    plain, slopes = one.residual(values), one.jacobian(values, np.arange(7))
+    assert one.weigh_motion(values)
+    weighing, uncertain = one.weighing, one.by_motion(values)
+    whole = np.diag(weighing.levels**2) + uncertain @ uncertain.T
+    assert np.sqrt(np.diag(whole) / weighing.levels**2).max() > 1.5
+    left = weighing(weighing(whole).T)
+    np.testing.assert_allclose(left, np.diag(weighing.levels**2), atol=1e-9 * whole.max())
+    np.testing.assert_array_equal(one.residual(values), weighing(plain))
+    np.testing.assert_array_equal(one.jacobian(values, np.arange(7)), weighing(slopes))
+
+
+def test_relaxation_terms_come_back_in_the_order_of_their_times():
+    """Unless one of them is held: then it keeps its place."""
+    time = np.linspace(0.0, 4.0, 120)
+    strain = 0.4 * np.sin(np.pi * time / 4.0) ** 2
+    chain = ff.Chain([replace(SPRING, relaxation=[(0.2, 0.05), (0.1, 1.0)])], [HEIGHT], AREA)
+    run = ff.simulate(chain, ff.DisplacementDrive(strain * HEIGHT), time)
+    test = Measurement(
+        name="synthetic loop", path=None, data_sha256="", time=time, stress=run.base_stress,
+        displacement=strain * HEIGHT, specimen=Specimen(HEIGHT, AREA),
+        noise=Noise(100.0, 1e-12), motion="measured",
+    )  # fmt: skip
+    options = Options(relaxation=2, starts=1)
+    params = make_params(test, "microscale", relaxation=2)
+    for name in ("s1_g2", "s1_g1"):
+        found = identify(test, "microscale", params, options, lambda *_: None)
+        values, index = found.tracker.best_values.copy(), found.problem.index
+        terms = [index[f"s1_{short}"] for short in ("g1", "tau1", "g2", "tau2")]
+        values[terms] = 0.1, 1.0, 0.2, 0.05
+        best = Found(found.problem, found.tracker, found.record)
+        best.tracker.best_values = values
+        ordered = best.best().values[terms]
+        if name == "s1_g2":
+            np.testing.assert_array_equal(ordered, [0.2, 0.05, 0.1, 1.0])
+            residuals = [found.problem.objective.residual(v) for v in (values, best.best().values)]
+            np.testing.assert_allclose(*residuals, atol=1e-6)
+            params["s1_g1"].set(value=0.1, vary=False)
+        else:
+            np.testing.assert_array_equal(ordered, [0.1, 1.0, 0.2, 0.05])
