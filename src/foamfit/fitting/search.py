@@ -32,7 +32,7 @@ PULSE = 16  # evaluations
 DESCENTS, ON_CURVES, REFINED = 0.25, 0.75, 0.95
 CURVE_STARTS = 300
 # Searches at most: a second one where a single descent led to the best end, and a third where this
-# still misses more of the curves than noise; twice as many for several hysteretic springs.
+# still misses more of the curves than noise; one more for several hysteretic springs.
 ATTEMPTS = 3
 LOST = 30.0  # times the noise floor of the cost, above which no agreement is believed at once
 NOISY = 0.005  # noise of a motion, over its range, that is much
@@ -371,7 +371,7 @@ def search(
     points = [space.encode(space.values), *box_starts(space, rng, CURVE_STARTS // 3)]
     out: list[tuple[float, int]] = []
     several = sum(kind in HYSTERETIC for kind in space.model.kinds) > 1
-    attempts = ATTEMPTS * (2 if several else 1)
+    attempts = ATTEMPTS + several
     for attempt in range(attempts):
         counts: dict[int, int] = {}
         if tracker.objective.measurement.displacement is not None:
