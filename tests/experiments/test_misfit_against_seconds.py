@@ -96,17 +96,18 @@ def test_the_derivatives_of_the_problem_serve_in_both_coordinates(coordinates: s
     params = variables.params(point)
     jacobian = variables.jacobian(params)
     moving = [name for name, parameter in params.items() if parameter.vary]
-    assert jacobian.shape == (problem.objective.n_data, len(moving))
+    rows = problem.objective.n_data + len(problem.objective.priors)
+    assert jacobian.shape == (rows, len(moving))
     for column, name in enumerate(moving):
         sides = []
         for sign in (1.0, -1.0):
             moved = params.copy()
-            moved[name].value += sign * 1e-5 * abs(params[name].value)
+            moved[name].value += sign * 1e-5 * (abs(params[name].value) or ZERO[coordinates])
             sides.append((moved[name].value, variables.residual(moved)))
         (up, high), (down, low) = sides
         expected = (high - low) / (up - down)
-        size = max(float(np.abs(expected).max()), 1e-300)
-        np.testing.assert_allclose(jacobian[:, column], expected, rtol=0, atol=2e-3 * size)
+        largest = max(float(np.abs(expected).max()), 1e-300)
+        np.testing.assert_allclose(jacobian[:, column], expected, rtol=0, atol=2e-3 * largest)
 
 
 def test_what_was_recorded_is_drawn_again(

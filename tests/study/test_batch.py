@@ -128,7 +128,7 @@ def test_the_same_numbers_with_any_number_of_processes_and_anywhere(here):
     assert frame.loc["b", "s1_k0"] == alone.params["s1_k0"].value
     assert names("out2") == ["a", "b", "bad", "c", "summary.csv", "summary.html"]
     assert names("out2/a") == [
-        "batch.json", "budget.csv", "curves.csv", "fit.json", "parameters.csv",
+        "batch.json", "curves.csv", "fit.json", "parameters.csv",
     ]  # fmt: skip
     assert frame.loc["bad", "status"] == "refused"
     assert frame.loc["bad", "error"].startswith("tests/bad.csv: ")
