@@ -10,6 +10,7 @@ import pytest
 from scipy.signal import lfilter
 
 from foamfit.data.csv_file import read_test
+from foamfit.data.energy import audit
 from foamfit.data.measurement import Record, Specimen, Striker
 from foamfit.data.noise import with_noise
 from foamfit.data.prepare import condition
@@ -318,3 +319,16 @@ def test_a_striker_that_gravity_still_accelerates_is_told(gravity, told):
     if told:
         assert "m/s per ms" in notes[0]
         assert "no gravity in it" in notes[0]
+
+
+@pytest.mark.parametrize("channels", ["FW", "AW"])
+def test_a_gauge_that_rests_again_does_not_stop_the_striker(channels):
+    """The rebound is read while the gauge still follows it, and the momentum agrees."""
+    given = record(channels, gauge="rest")
+    end = int(np.searchsorted(given.time, DURATION))
+    still = np.where(given.time < DURATION, given.displacement, given.displacement[end])
+    done = run(replace(given, displacement=still, derived=("stress",) * (channels == "AW")))
+    found = audit(done)
+    assert found.rebound_velocity == pytest.approx(2 * BRAKED / OMEGA - VELOCITY, rel=0.12)
+    assert found.impulse_ratio == pytest.approx(1.0, abs=0.06)
+    assert found.absorbed_over_striker == pytest.approx(1.0, abs=0.02)

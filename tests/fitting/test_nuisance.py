@@ -12,7 +12,7 @@ from conftest import AREA, HEIGHT, synthetic_impact
 from foamfit.data.measurement import Measurement, Noise, Specimen
 from foamfit.fitting.curves import default_weights
 from foamfit.fitting.objective import Objective
-from foamfit.fitting.problem import make_params
+from foamfit.fitting.problem import fix_and_vary, make_params
 from foamfit.one_model import Found, Options, identify
 from foamfit.springs.model import Model
 
@@ -41,6 +41,30 @@ def test_a_velocity_with_a_deviation_is_an_unknown_with_that_prior():
     off = ff.fit(wrong, starts=4)
     assert off.parameters["velocity"].value < 2.04 - 0.01  # the motion knows better
     assert off.parameters["s1_kc"].value == pytest.approx(spring.kc, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("fixed", "why"),
+    [
+        ({"velocity": 0.0}, "velocity = 0 is not admissible: it must be positive"),
+        ({"striker_mass": -1.0}, "striker_mass = -1 is not admissible: it must be positive"),
+        ({"contact_time": np.nan}, "contact_time = nan is not admissible: it must be finite"),
+    ],
+)
+def test_held_unknowns_are_refused_by_name_where_they_cannot_be(fixed, why):
+    test = synthetic_impact()[1]
+    params = fix_and_vary(make_params(test), "bistable", fixed, [])
+    with pytest.raises(ff.InputError, match=why):
+        ff.fit(test, params=params)
+
+
+def test_what_is_exact_varies_where_that_is_asked_for():
+    test = synthetic_impact()[1]
+    params = fix_and_vary(make_params(test), "bistable", {"displacement_zero": 0.0}, ["velocity"])
+    found = ff.fit(test, params=params, starts=2)
+    assert found.parameters["displacement_zero"].state == "fixed"
+    item = found.parameters["velocity"]
+    assert abs(item.value - 2.0) < 3 * item.stderr < 0.05
 
 
 def in_blocks(test: Measurement, size: int) -> Measurement:

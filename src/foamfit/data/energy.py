@@ -194,8 +194,10 @@ def _momentum(test: Measurement) -> tuple[float | None, float | None, float | No
     )
     if w is None or not _unloaded(stress):
         return None, impulse, None
-    last = slice(-max(5, len(w) // 20), None)
-    rebound = -line_at(time[last], w[last], time[-1])[1]
+    # A gauge that rests again after contact does not show the striker any more.
+    shown = np.flatnonzero(test.sampled.get("displacement", np.ones(len(w), dtype=np.bool_)))
+    last = shown[-max(5, len(shown) // 20) :]
+    rebound = -line_at(time[last], w[last], time[last[-1]])[1]
     if not (striker.mass and striker.velocity) or test.motion == INTEGRATED:
         return rebound, impulse, None
     return rebound, impulse, striker.mass * (striker.velocity + rebound)
