@@ -102,7 +102,8 @@ def test_the_derivatives_of_the_problem_serve_in_both_coordinates(coordinates: s
         sides = []
         for sign in (1.0, -1.0):
             moved = params.copy()
-            size = abs(params[name].value) or (1.0 if coordinates == "box" else 1e-4)
+            scale = 1.0 if coordinates == "box" else problem.sizes((name,), problem.vector())[0]
+            size = abs(params[name].value) or float(scale)
             moved[name].value += sign * 1e-5 * size
             sides.append((moved[name].value, variables.residual(moved)))
         (up, high), (down, low) = sides
