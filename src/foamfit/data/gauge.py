@@ -180,7 +180,7 @@ def _stress_follows(at: _Samples, before: int, last: int, after: int) -> bool:
 
 
 def _stiffness(at: _Samples, before: int, after: int) -> float:
-    """Smaller slope of the stress along the motion before and after; 0 if there is none, Pa/m."""
+    """Smaller of the stiffnesses before and after, Pa/m; 0 where neither is known."""
     far = _AROUND * abs(float(at.w[after] - at.w[before]))
     slopes = []
     for w, stress in (

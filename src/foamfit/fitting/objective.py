@@ -564,7 +564,7 @@ class Objective:
         times the root of its weight, softened by the loss; outliers are left out. Behind them
         stands a residual for each of the `priors`, over its standard deviation. Parameters that
         cannot be simulated cost a finite penalty and are counted in `failures`. `shift` is taken
-        off before the loss: data that differ by so much from those that were measured.
+        off before the loss, as if the data differed from the measured ones by that amount.
         """
         return soften(self.differences(values) - shift, self.loss, self.n_data)
 

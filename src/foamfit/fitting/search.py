@@ -137,7 +137,7 @@ def smooth_loop(measurement: Measurement, followed: Array | None = None) -> Meas
     else:
         window = max(motion.size // 60, 1) * 2 + 1
         motion = smoothed(motion, window) if window > 3 else motion
-    first = 0 if time is None else int(np.searchsorted(time, 0.0))  # what precedes contact is none
+    first = 0 if time is None else int(np.searchsorted(time, 0.0))  # no loop before contact
     count = min(motion.size - first, LOOP_SAMPLES)
     keep = np.unique(np.linspace(first, motion.size - 1, count).astype(int))
     thinned = None if time is None else time[keep]
