@@ -29,7 +29,6 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import nullcontext, suppress
 from dataclasses import fields, replace
-from itertools import permutations
 from pathlib import Path
 from typing import Any
 
@@ -132,35 +131,15 @@ def over_truth(record: Record, test: Any, chain: ff.Chain) -> float:
 
 
 def fitted(record: Record) -> tuple[Any, Any, dict[str, Any]]:
-    """Write, read and fit a record; return test, result and estimates by the names of the truth.
+    """Write, read and fit a record; return test, result and the estimates of what has a truth.
 
-    Springs in series and relaxation terms have no order: they are named as they are closest to it.
+    The rig numbers springs by the stress at which they begin to snap and relaxation terms by their
+    time, as the fit does.
     """
     with tempfile.TemporaryDirectory() as folder:
         test = ff.read_test(write(record, Path(folder)))
     result = ff.fit(test, model=record.model, relaxation=record.setup.relaxation, seed=0)
-    found, truth = result.parameters, record.truth
-
-    def off(names: dict[str, str]) -> float:
-        sizes = [
-            abs(found[a].value - truth[b]) / abs(truth[b]) for a, b in names.items() if truth[b]
-        ]
-        return float(np.sum(np.minimum(sizes, 1.0)))
-
-    kinds = [("s", len(record.rig.springs)), ("g", record.setup.relaxation)]
-    names = {name: name for name in found if name in truth}
-    for kind, count in kinds:
-        if count > 1:
-            orders = [dict(zip("123", p, strict=False)) for p in permutations("123"[:count])]
-            ways = [{a: renamed(a, kind, order) for a in names} for order in orders]
-            names = min(ways, key=off)
-    return test, result, {b: found[a] for a, b in names.items()}
-
-
-def renamed(name: str, kind: str, order: dict[str, str]) -> str:
-    """Exchange the numbers of springs ("s") or of relaxation terms ("g") in a name."""
-    pattern = r"^()(s)(\d)" if kind == "s" else r"^(.*_)(g|tau)(\d)$"
-    return re.sub(pattern, lambda m: f"{m[1]}{m[2]}{order.get(m[3], m[3])}", name)
+    return test, result, {a: p for a, p in result.parameters.items() if a in record.truth}
 
 
 def sentence(error: Exception) -> str:

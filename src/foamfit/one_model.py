@@ -17,6 +17,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError, as_signalled
+from foamfit.fitting.order import in_order
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.search import (
     REFINED,
@@ -25,11 +26,12 @@ from foamfit.fitting.search import (
     SearchStoppedError,
     Tracker,
     ensure_feasible,
+    exchange_springs,
     search,
+    settle_ends,
     what_stopped,
 )
 from foamfit.results import Fit, Intervals
-from foamfit.springs.parameters import HYSTERETIC, relaxation_names, split_name
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
 from foamfit.trust.covariance import AT_LIMIT
@@ -144,7 +146,8 @@ class Found:
         """The best point, its springs in order, what is within rounding of a limit on it."""
         values = self.tracker.best_values
         assert values is not None  # checked by identify
-        best = BestPoint(self.problem, _ordered(self.problem, values))
+        space = self.problem.space()
+        best = BestPoint(self.problem, in_order(space, self.problem.objective, values))
         return _on_limits(best, self.tracker.best_cost)
 
 
@@ -265,6 +268,10 @@ def _search(
         progress(REFINED, "refinement")
         _refine(problem, tracker)
         weigh_motion(problem, tracker)
+        if exchange_springs(tracker, problem.space()):
+            _refine(problem, tracker)
+            weigh_motion(problem, tracker)
+        settle_ends(tracker, problem.space())
     except STOPPING as error:
         ensure_feasible(tracker, problem.space(), np.random.default_rng(record.seed))
         return replace(record, stopped=what_stopped(error))
@@ -342,62 +349,3 @@ def _on_limits(best: BestPoint, cost: float) -> BestPoint:
         return there if there.cost <= cost + 1e-6 * (1.0 + cost) else best
     except SimulationError:
         return best
-
-
-def _ordered(problem: Problem, values: Array) -> Array:
-    """Order springs that can be exchanged by where they start to snap, the softest at the base.
-
-    Two springs can be exchanged if they are of one kind and the curves stay the same, so never
-    across a mass inside whose displacement is counted; the foam of the paper buckles first at its
-    base.
-    """
-    for kind in HYSTERETIC:
-        values = _ordered_of_kind(problem, values, kind)
-    return _terms_by_time(problem, values)
-
-
-def _terms_by_time(problem: Problem, values: Array) -> Array:
-    """Order the relaxation terms of each spring by their times, unless one of them is held."""
-    model, out = problem.model, values.copy()
-    for spring in range(1, len(model.kinds) + 1):
-        names = [f"s{spring}_{short}" for short in relaxation_names(model.relaxation)]
-        if not names or names[0] not in model.index:
-            continue
-        if all(problem.params[name].vary for name in names):
-            terms = values[[model.index[name] for name in names]].reshape(-1, 2)
-            out[[model.index[name] for name in names]] = terms[np.argsort(terms[:, 1])].ravel()
-    return out
-
-
-def _ordered_of_kind(problem: Problem, values: Array, kind: str) -> Array:
-    """Order the springs of one kind; see `_ordered`."""
-    model = problem.model
-    own = [i for i, other in enumerate(model.kinds) if other == kind]
-    held = [split_name(name) for name in model.names if not problem.params[name].vary]
-    if any(spring in own and short not in ("eta", "height") for spring, short in held):
-        return values
-    nodes = [
-        n for name, n in problem.objective.interior.items() if name in problem.objective.counted
-    ]
-
-    def onset(spring: int) -> float:
-        """σ_a, or the median snap-through stress, Pa."""
-        if kind == "microscale":
-            return float(values[model.index[f"s{spring + 1}_sigma_plus"]])
-        k0, eps_a = (values[model.index[f"s{spring + 1}_{short}"]] for short in ("k0", "eps_a"))
-        return float(k0 * eps_a / (1.0 - eps_a))
-
-    def order(spring: int) -> tuple[int, float]:
-        return sum(node <= spring for node in nodes), onset(spring)
-
-    ranked = sorted(own, key=order)
-    if ranked == own:
-        return values
-    moved, sources = values.copy(), dict(zip(own, ranked, strict=True))
-    for name in model.names:
-        place, short = split_name(name)
-        if place in sources:
-            moved[model.index[name]] = values[model.index[f"s{sources[place] + 1}_{short}"]]
-    before, after = (problem.objective.residual(v) for v in (values, moved))
-    same = np.allclose(before, after, rtol=0.0, atol=1e-9 * max(float(np.max(np.abs(before))), 1.0))
-    return moved if same else values

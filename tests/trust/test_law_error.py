@@ -17,7 +17,8 @@ from conftest import DATA, EXPERIMENTS, needs_data
 from foamfit.api import FitResult
 from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
 from foamfit.fitting.problem import Problem, make_problem
-from foamfit.fitting.search import Loop, Scales, Tracker, read_spring
+from foamfit.fitting.search import Tracker
+from foamfit.fitting.starts import Loop, Scales, read_spring
 from foamfit.one_model import Options, identify, judge
 from foamfit.report.folder import load_result
 from foamfit.report.readable import readable

@@ -1,4 +1,4 @@
-"""The search: start values read from the curve, and descents from the best of many.
+"""The search: descents from the best of many start values.
 
 It moves in the box of `fitting.box`, so that no step leaves what the law admits. It first fits the
 loop (stress along the measured motion, closed form, cheap), then the curves of the drive itself.
@@ -9,34 +9,37 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from itertools import product
 
 import numpy as np
-from scipy.stats import qmc
 
 from foamfit.arrays import Array
-from foamfit.data.measurement import Measurement
 from foamfit.fitting import levenberg
-from foamfit.fitting.box import BOX, LAST_STRAIN, Scales, Space, family, is_logarithmic
-from foamfit.fitting.curves import smoothed
+from foamfit.fitting.box import Space, is_logarithmic
 from foamfit.fitting.nuisance import TIME_SHIFT
 from foamfit.fitting.objective import Objective
-from foamfit.springs.law import least_eps_star
+from foamfit.fitting.order import in_order
+from foamfit.fitting.starts import CURVE_STARTS, box_starts, curve_starts, smooth_loop
+from foamfit.springs.exchange import exchanges
+from foamfit.springs.model import Model
 from foamfit.springs.parameters import HYSTERETIC, NUISANCE
 
 Progress = Callable[[float, str], None]
 
-LOOP_SAMPLES = 240
 PULSE = 16  # evaluations
 # Shares of the time of a search, as measured, at which its parts begin.
 DESCENTS, ON_CURVES, REFINED = 0.25, 0.75, 0.95
-CURVE_STARTS = 300
 # Searches at most: a second one where a single descent led to the best end, and a third where this
 # still misses more of the curves than noise; one more for several hysteretic springs.
 ATTEMPTS = 3
+IN_SERIES = 3  # searches at least for several hysteretic springs
 LOST = 30.0  # times the noise floor of the cost, above which no agreement is believed at once
 NOISY = 0.005  # noise of a motion, over its range, that is much
 AROUND = 200  # points about the best one among which another search begins
+# Minima whose springs exchange properties at most, and descents for each.
+EXCHANGES, EXCHANGED = 8, 16
+# Ends of the search whose cost is above the best by less than so many variances of the noise are
+# settled anew, at most so many; points of the box closer than the last are one minimum.
+NEAR, MINIMA, SAME = 40.0, 24, 0.02
 # Share of the box that counts as its edge, and where inside a descent begins again.
 EDGE, INSIDE = 0.02, (0.35, 0.5, 0.65)
 # Minima of the loop whose cost on the drive's curves is within this factor of the best go on.
@@ -121,185 +124,6 @@ class Tracker:
         return residual
 
 
-# ---------------------------------------------------------------- starts
-
-
-def smooth_loop(measurement: Measurement, followed: Array | None = None) -> Measurement:
-    """Smooth and thin the measured loop, for the first descent only.
-
-    `followed` is the motion without its noise, m, where it is known better.
-    """
-    motion, stress, time = measurement.displacement, measurement.stress, measurement.time
-    assert motion is not None
-    assert stress is not None
-    if followed is not None:
-        motion = followed
-    else:
-        window = max(motion.size // 60, 1) * 2 + 1
-        motion = smoothed(motion, window) if window > 3 else motion
-    first = 0 if time is None else int(np.searchsorted(time, 0.0))  # no loop before contact
-    count = min(motion.size - first, LOOP_SAMPLES)
-    keep = np.unique(np.linspace(first, motion.size - 1, count).astype(int))
-    thinned = None if time is None else time[keep]
-    return replace(
-        measurement, displacement=motion[keep], stress=stress[keep], time=thinned,
-        outliers={}, sampled={}, interior={},  # bridged, and smoothed over
-        acceleration=None, block=1, noise=replace(measurement.noise, displacement=0.0),
-    )  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class Loop:
-    """Loading and unloading stress (Pa) as functions of strain, read from a measured loop."""
-
-    strain: Array
-    stress: Array
-
-    def at(self, strain: float, *, loading: bool) -> float:
-        """Stress (Pa) on the way up to the largest strain, or down from it."""
-        peak = int(np.argmax(self.strain))
-        way = slice(peak + 1) if loading else slice(None, peak - 1 if peak else None, -1)
-        return float(np.interp(strain, np.maximum.accumulate(self.strain[way]), self.stress[way]))
-
-
-def read_spring(loop: Loop, marks: Array, scales: Scales, *, soft: bool = False) -> Array:
-    """Read a bistable spring off a loop, given where on it A1, C1 and C2 are taken to lie.
-
-    `marks` (5,) in [0, 1] are the places of A1, C1 and C2 between their neighbours, and shares of
-    the stress at C2 and of the damping. Returned are k0 … kh_minus, eta (SI): initial slope from
-    A1, k_h+ from A1 to C1, k_c through C1 and C2 (of two such branches the `soft` one, close to its
-    pole, or the stiff one), k_h- from C2 towards rest.
-    """
-    last = float(np.max(loop.strain))
-    eps_a = min((0.02 + 0.85 * marks[0]) * last, 0.9)
-    sigma_a = max(loop.at(eps_a, loading=True), 0.005 * scales.stress)
-    hat_c = eps_a + (0.15 + 1.1 * marks[1]) * max(last - eps_a, 1e-3)  # perhaps never reached
-    seen = min(hat_c, max(last, eps_a + 1e-3))
-    kh_plus = max((loop.at(seen, loading=True) - sigma_a) / (seen - eps_a), 0.0)
-    sigma_hat_c = sigma_a + kh_plus * (hat_c - eps_a)
-    eps_c = eps_a + (0.2 + 0.8 * marks[2]) * (hat_c - eps_a)
-    sigma_c = loop.at(eps_c, loading=False) * (0.5 + marks[3])
-    sigma_c = min(max(sigma_c, 0.02 * sigma_a), 0.98 * sigma_a)
-    kc = _stiffness_between(hat_c - eps_c, sigma_c, sigma_hat_c)
-    return np.array(
-        [
-            sigma_a * (1.0 - eps_a) / eps_a,
-            sigma_c * sigma_hat_c / kc if soft else kc,  # the product of the two
-            sigma_c - sigma_a,
-            eps_a,
-            eps_c,
-            kh_plus,
-            sigma_c / eps_c,
-            0.1 * scales.eta * marks[4] ** 2,
-        ]
-    )
-
-
-def _stiffness_between(rise: float, low: float, high: float) -> float:
-    """k_c of a branch c that rises by a strain `rise` from stress `low` to `high` (Pa).
-
-    The larger root of rise (k+low)(k+high) = k (high-low); the nearest k_c if there is none.
-    """
-    gain = max(high - low, 1e-9 * high)
-    rise = max(rise, 1e-6)
-    b = gain - rise * (low + high)
-    discriminant = b * b - 4.0 * rise * rise * low * high
-    if b <= 0.0 or discriminant < 0.0:
-        return float(np.sqrt(low * high))
-    return float((b + np.sqrt(discriminant)) / (2.0 * rise))
-
-
-def read_microscale(loop: Loop, marks: Array, scales: Scales) -> Array:
-    """Read a microscale spring off a loop, given where on it its snap stresses are taken to lie.
-
-    `marks` (7,) in [0, 1]: the initial slope over that at a twentieth of the largest strain, k_c
-    over the largest stress, the place of ε_* above its least, the strains at which the median
-    micro-springs snap through and back, and the two spreads. Returned are k0 … spread_minus, and a
-    dashpot of zero (SI).
-    """
-    last = float(np.max(loop.strain))
-    first = max(loop.at(0.05 * last, loading=True), 0.002 * scales.stress) / (0.05 * last)
-    k0, kc = first * 10.0 ** (1.2 * marks[0] - 0.4), scales.stress * 10.0 ** (2.3 * marks[1] - 0.5)
-    least = least_eps_star(k0, kc)
-    return np.array(
-        [
-            k0,
-            kc,
-            least + 0.5 * marks[2] * (LAST_STRAIN - least),
-            max(loop.at((0.2 + 0.8 * marks[3]) * last, loading=True), 0.02 * scales.stress),
-            10.0 ** (1.2 * marks[4] - 1.0),
-            max(loop.at((0.2 + 0.7 * marks[5]) * last, loading=False), 0.01 * scales.stress),
-            10.0 ** (1.2 * marks[6] - 1.0),
-            0.0,
-        ]
-    )
-
-
-def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> list[Array]:
-    """Vectors of parameters read off the measured loop, from a Latin hypercube of marks.
-
-    Linear springs take a share of the largest displacement; each hysteretic spring is then read off
-    what is left, with marks of its own.
-    """
-    assert loop.displacement is not None
-    assert loop.stress is not None
-    kinds, index, terms = space.model.kinds, space.model.index, space.model.relaxation
-    count, micro = len(kinds), kinds.count("microscale")
-    relaxing = 2 * terms * sum(kind in HYSTERETIC for kind in kinds)
-    marks = qmc.LatinHypercube(7 * count + 2 * micro + relaxing, rng=rng).random(CURVE_STARTS)
-    starts = []
-    for mark, near_pole in product(marks, (False, True) if "bistable" in kinds else (False,)):
-        values = space.values.copy()
-        heights = np.full(count, space.scales.height / count)
-        if count > 1:
-            given = [index[f"s{i}_height"] for i in range(1, count + 1)]
-            for i, at in enumerate(given):
-                if space.model.names[at] in space.free:
-                    values[at] = heights[i] * (0.3 + 1.4 * mark[7 * i + 5])
-            values = space.complete(values)
-            heights = np.maximum(values[given], 1e-3 * space.scales.height)
-        motion = loop.displacement.copy()
-        for i, kind in enumerate(kinds):
-            if kind not in HYSTERETIC:
-                share = 10.0 ** (-3.0 + 2.7 * mark[7 * i + 6])
-                k0 = heights[i] * space.scales.stress / (share * motion.max())
-                values[index[f"s{i + 1}_k0"]] = k0
-                motion = motion - heights[i] * loop.stress / k0
-        soft = sum(h for h, kind in zip(heights, kinds, strict=True) if kind in HYSTERETIC)
-        own, rest = Loop(motion / (soft or 1.0), loop.stress), iter(mark[7 * count :])
-        for i, kind in enumerate(kinds):
-            if kind not in HYSTERETIC:
-                continue
-            first, places = index[f"s{i + 1}_k0"], mark[7 * i : 7 * i + 5]
-            if kind == "microscale":
-                places = np.append(places, [next(rest), next(rest)])
-                values[first : first + 8] = read_microscale(own, places, space.scales)
-            else:
-                read = read_spring(own, places, space.scales, soft=near_pole)
-                values[first : first + 8] = read
-            for at in range(first + 8, first + 8 + 2 * terms, 2):
-                values[at] = 10.0 ** (1.5 * next(rest) - 1.5)
-                values[at + 1] = space.scales.duration * 10.0 ** (2.0 * next(rest) - 2.5)
-        starts.append(space.encode(values))
-    return starts
-
-
-def box_starts(space: Space, rng: np.random.Generator, count: int) -> list[Array]:
-    """Latin hypercube over the inner part of the box, whatever the curve looks like."""
-    inner = {"kh_plus": (0.0, 4.0), "kh_minus": (0.0, 4.0), "eta": (0.0, 0.3), "g": (0.0, 1.0)}
-    inner |= dict.fromkeys(NUISANCE, (-0.05, 0.05)) | {"time_shift": (-0.3, 0.3)}
-    inner |= {"tau": tuple(np.log([0.002, 1.0]))}
-    inner |= dict.fromkeys(("k0", "kc"), tuple(np.log([0.3, 300.0])))
-    inner |= dict.fromkeys(("sigma_plus", "sigma_minus"), tuple(np.log([0.02, 1.0])))
-    inner |= dict.fromkeys(("spread_plus", "spread_minus"), tuple(np.log([0.05, 2.0])))
-    shorts = [family(short) for _, short, _ in space.coordinates]
-    low, high = np.array([inner.get(short, BOX[short]) for short in shorts]).T
-    return list(low + (high - low) * qmc.LatinHypercube(low.size, rng=rng).random(count))
-
-
-# ---------------------------------------------------------------- descent
-
-
 def _cost(item: tuple[float, Array]) -> float:
     return item[0]
 
@@ -370,7 +194,7 @@ def search(
     progress(0.0, "start values")
     points = [space.encode(space.values), *box_starts(space, rng, CURVE_STARTS // 3)]
     out: list[tuple[float, int]] = []
-    several = sum(kind in HYSTERETIC for kind in space.model.kinds) > 1
+    several = has_several(space.model)
     attempts = ATTEMPTS + several
     for attempt in range(attempts):
         counts: dict[int, int] = {}
@@ -391,11 +215,84 @@ def search(
             out.append((cost, counts.get(id(point), 1)))
         edges = _off_edges(tracker, space)
         out += [(cost, 1) for cost in edges]
-        least = max(attempts // 2, 2 if edges else 1)
+        least = IN_SERIES if several else max(attempts // 2, 2 if edges else 1)
         if attempt + 1 == attempts or _settled(tracker, out, attempt, least):
             break
         points = box_starts(space, rng, CURVE_STARTS // 3) + _around_best(tracker, space, rng)
     return sorted(out)
+
+
+def has_several(model: Model) -> bool:
+    """Whether more than one spring of a chain is hysteretic."""
+    return sum(kind in HYSTERETIC for kind in model.kinds) > 1
+
+
+def exchange_springs(tracker: Tracker, space: Space) -> list[tuple[float, int]]:
+    """Descend from the best points with properties exchanged between springs of one kind.
+
+    Which of two springs in series owns which branch shows in few samples: the loop of the chain
+    hardly changes where they exchange it, so each such exchange has a minimum of its own. Each
+    minimum that other noise could have made the best is exchanged in turn. Returned are the costs
+    of the ends, as by `search`.
+    """
+    if tracker.best_values is None or not has_several(space.model):
+        return []
+    objective, costs = tracker.objective, list[tuple[float, int]]()
+    met, open_ends = [], [(tracker.best_cost, tracker.best_values)]
+    for _ in range(EXCHANGES):
+        open_ends = [end for end in open_ends if end[0] <= tracker.best_cost + _near(objective)]
+        if not open_ends:
+            break
+        at = min(range(len(open_ends)), key=lambda i: open_ends[i][0])
+        values = in_order(space, objective, open_ends.pop(at)[1])
+        met.append(space.encode(values))
+        points = [space.encode(other) for other in exchanges(space.model, values)]
+        for _, point in rank(tracker, space, points)[:EXCHANGED]:
+            cost, end = descend(tracker, space, point, 60)
+            values = in_order(space, objective, space.decode(end))
+            costs.append((cost, 1))
+            if not _among(met, space.encode(values)):
+                met.append(space.encode(values))
+                tracker.ends.append(values)
+                open_ends.append((cost, values))
+    return costs
+
+
+def settle_ends(tracker: Tracker, space: Space) -> None:
+    """Descend once more from the ends of the search that other noise could have made the best.
+
+    What counts may have changed since they were found. Each minimum is kept once, its springs in
+    order. Where the curves miss more than noise all ends stay as they are: an error of the law
+    could make any of them the best.
+    """
+    objective = tracker.objective
+    if tracker.best_values is None or tracker.best_cost > objective.floor:
+        return
+
+    def in_box(values: Array) -> Array:
+        return space.encode(in_order(space, objective, values))
+
+    settled, met = list[Array](), [in_box(tracker.best_values)]
+    for cost, point in rank(tracker, space, [in_box(values) for values in tracker.ends]):
+        if cost > tracker.best_cost + _near(objective) or len(settled) == MINIMA:
+            break
+        if _among(met, point):
+            continue
+        end = in_box(space.decode(descend(tracker, space, point, 60)[1]))
+        if not _among(met, end):
+            met.append(end)
+            settled.append(space.decode(end))
+    tracker.ends = settled
+
+
+def _near(objective: Objective) -> float:
+    """Rise of the cost that other noise could make up for, with a wide margin."""
+    return NEAR * objective.floor / objective.n_data
+
+
+def _among(points: list[Array], point: Array) -> bool:
+    """Whether a point of the box is one of these."""
+    return any(float(np.max(np.abs(point - other))) < SAME for other in points)
 
 
 def _around_best(tracker: Tracker, space: Space, rng: np.random.Generator) -> list[Array]:
@@ -414,12 +311,14 @@ def _around_best(tracker: Tracker, space: Space, rng: np.random.Generator) -> li
 def _off_edges(tracker: Tracker, space: Space) -> list[float]:
     """Descend from the best point with what lies at an edge of the box moved inside; the costs.
 
-    A stiffness that few samples show may run to an edge and stay there while all else is found.
+    A stiffness that few samples show may run to an edge and stay there while all else is found. In
+    a chain that misses far more than noise any stiffness may have run far off.
     """
     low, high = space.box
     best = space.encode(tracker.best_values) if tracker.best_values is not None else low
     span, costs = high - low, []
     edges = (best - low < EDGE * span) | (high - best < EDGE * span)
+    edges |= len(space.model.kinds) > 1 and tracker.best_cost > tracker.objective.floor
     for at in np.flatnonzero(edges & [is_logarithmic(short) for _, short, _ in space.coordinates]):
         for share in INSIDE:
             start = best.copy()
@@ -433,11 +332,14 @@ def _off_edges(tracker: Tracker, space: Space) -> list[float]:
 def _settled(tracker: Tracker, ends: list[tuple[float, int]], attempt: int, least: int) -> bool:
     """Whether descents agree on the best end, or none of a second search is better than noise.
 
-    `least` searches are made in any case where the best end misses more of the curves than noise,
-    and two where it misses far more.
+    `least` searches are made in any case where the best end misses more of the curves than noise or
+    springs are in series, and two where it misses far more.
     """
     best, floor = min(ends)[0], tracker.objective.floor
-    if (attempt + 1 < least and best > floor) or (attempt == 0 and best > LOST * floor):
+    several = has_several(tracker.objective.model)
+    if attempt + 1 < least and (several or best > floor):
+        return False
+    if attempt == 0 and best > LOST * floor:
         return False
     if sum(count for cost, count in ends if cost <= 1.02 * best) > 1:
         return True

@@ -14,7 +14,8 @@ from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.errors import SimulationError
 from foamfit.fitting.problem import Problem
-from foamfit.fitting.search import Tracker, curve_starts, rank, smooth_loop
+from foamfit.fitting.search import Tracker, rank
+from foamfit.fitting.starts import curve_starts, smooth_loop
 from foamfit.one_model import Keywords, Options
 from foamfit.report.readable import readable_unit
 from foamfit.results import law_in_words

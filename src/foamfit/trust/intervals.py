@@ -112,34 +112,55 @@ def evaluations_of(best: BestPoint, choice: Choice) -> float:
 def _with_minima(
     best: BestPoint, made: Intervals, minima: Sequence[Array], tracker: Tracker
 ) -> Intervals:
-    """Intervals that hold the other minima which other noise could have made the best.
-
-    Beside an error of the law two minima differ by more than noise. Of the difference of their
-    costs the noise e makes 2 eᵀd, with d the difference of their residuals.
-    """
-    if not best.misfits or made.better is not None:
+    """Intervals that hold the other minima which other noise could have made the best."""
+    if made.better is not None:
         return made
     ends, methods = dict(made.ends), dict(made.methods)
-    here = best.soft
+    halves_at = _law_halves if best.misfits else _halves
     for point in minima:
-        residual = tracker.consider(point)
-        apart = (residual - here)[:, None]
-        objective = best.problem.objective
-        noise = zip(best.spread.noise, parts(objective.sizes), strict=True)
-        spread = sum(float(process.forms(apart[p])[0]) for process, p in noise)
-        spread += float(np.sum(apart[objective.n_data :] ** 2))
-        chance = 2.0 * math.sqrt(spread)
-        if float(residual @ residual) - best.cost > 1.96 * chance:
-            continue
-        for name in best.known:
-            half = best.halves[best.names.index(name)]
+        halves = halves_at(best, point, tracker)
+        for column, name in enumerate(best.names):
+            if name not in best.known or not math.isfinite(halves[column]):
+                continue
             value, there = best.values[best.index[name]], point[best.index[name]]
+            half = best.halves[column]
             low, high = ends.get(name, (value - half, value + half))
-            wider = min(low, there - half), max(high, there + half)
+            wider = min(low, there - halves[column]), max(high, there + halves[column])
             if wider[1] - wider[0] > (1.0 + PLACED) * (high - low):
                 ends[name] = wider
                 methods[name] = "other minima"
     return replace(made, ends=ends, methods=methods)
+
+
+def _law_halves(best: BestPoint, point: Array, tracker: Tracker) -> Array:
+    """What the values at another minimum are uncertain by beside an error of the law, (k,).
+
+    There two minima differ by more than noise: of the difference of their costs the noise e makes
+    2 eᵀd, with d the difference of their residuals. NaN where it could not have made this the best.
+    """
+    residual = tracker.consider(point)
+    apart = (residual - best.soft)[:, None]
+    objective = best.problem.objective
+    noise = zip(best.spread.noise, parts(objective.sizes), strict=True)
+    spread = sum(float(process.forms(apart[p])[0]) for process, p in noise)
+    spread += float(np.sum(apart[objective.n_data :] ** 2))
+    near = float(residual @ residual) - best.cost <= 1.96 * 2.0 * math.sqrt(spread)
+    return best.halves if near else np.full(best.halves.shape, np.nan)
+
+
+def _halves(best: BestPoint, point: Array, tracker: Tracker) -> Array:
+    """Halves of the local intervals at another minimum, (k,), as far as its cost is in the cut.
+
+    The cost is taken for a parabola about that minimum too; NaN where it is above the cut.
+    """
+    residual = tracker.consider(point)
+    rises = (float(residual @ residual) - best.cost) / best.spread.inflation
+    left = 1.0 - rises / best.quantiles**2
+    if not np.any(left > 0.0):
+        return np.full(left.shape, np.nan)
+    there = BestPoint(best.problem, point, best.names)
+    with np.errstate(invalid="ignore"):
+        return np.where(left > 0.0, there.halves * np.sqrt(left), np.nan)
 
 
 def _elsewhere(best: BestPoint, minima: Sequence[Array], tracker: Tracker) -> NDArray[np.bool_]:
