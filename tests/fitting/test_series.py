@@ -1,0 +1,95 @@
+"""Two bistable springs in series: starts off their loop, exchanges between them, other minima."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import foamfit as ff
+from foamfit.data.measurement import Measurement, Specimen
+from foamfit.fitting.starts import Loop
+from foamfit.springs.exchange import exchanges
+from foamfit.springs.model import Model
+
+SOFT = ff.BistableSpring(2.0e6, 9e7, -9e4, 0.055, 0.22, 6e5, 1.1e5)
+STIFF = ff.BistableSpring(1.2e6, 3e7, -6e4, 0.20, 0.50, 3e5, 2.2e5)
+
+
+def common_loop():
+    """Synthetic loop of both in series: displacement (m), stress (Pa)."""
+    chain = ff.Chain([SOFT, STIFF], [0.005, 0.005], 4.5e-5)
+    motion = 0.0037 * np.concatenate([np.linspace(0, 1, 300), np.linspace(1, 0, 300)[1:]])
+    time = np.linspace(0.0, 4.0, motion.size)
+    found = ff.simulate(chain, ff.DisplacementDrive(motion), time)
+    return motion, time, found.base_stress
+
+
+def test_the_kinks_of_a_loop_are_the_stresses_at_which_its_springs_snap():
+    motion, _, stress = common_loop()
+    at_a1, at_c1, at_c2, at_a2 = Loop(motion / 0.01, stress).kinks
+    for spring in (SOFT, STIFF):
+        for kinks, snap in ((at_a1, spring.sigma_a), (at_c2, spring.sigma_c)):
+            assert np.min(np.abs(kinks[:, 1] / snap - 1.0)) < 0.05
+    assert len(at_c1)
+    assert len(at_a2)
+
+
+@pytest.mark.parametrize("law", ["bistable", "microscale"])
+def test_an_exchange_keeps_the_stresses_at_which_springs_snap(law):
+    model = Model.parse(f"{law}+{law}")
+    values = np.ones(len(model.names))
+    springs = (
+        [SOFT.seven, STIFF.seven]
+        if law == "bistable"
+        else [(1e6, 3e6, 0.5, 2e5, 0.3, 8e4, 0.5), (2e6, 4e6, 0.6, 4e5, 0.2, 2e5, 0.4)]
+    )
+    for i, seven in enumerate(springs, start=1):
+        first = model.index[f"s{i}_k0"]
+        values[first : first + 7] = seven
+    places = [model.index[f"s{i}_k0"] for i in (1, 2)]
+
+    def snaps(vector):
+        if law == "microscale":
+            return sorted(float(vector[first + 3]) for first in places)
+        return sorted(float(vector[f] * vector[f + 3] / (1 - vector[f + 3])) for f in places)
+
+    def stiffnesses(vector):
+        return sorted(float(vector[first]) for first in places)
+
+    made = list(exchanges(model, values))
+    assert len(made) == 63  # 2⁷ subsets of seven properties, each with the one that it leaves
+    assert len({tuple(vector) for vector in made}) == 63
+    for vector in made:
+        assert snaps(vector) == pytest.approx(snaps(values))
+        assert stiffnesses(vector) == pytest.approx(stiffnesses(values))
+
+
+def test_springs_of_different_laws_exchange_nothing():
+    model = Model.parse("bistable+microscale")
+    assert not list(exchanges(model, np.ones(len(model.names))))
+
+
+def test_intervals_of_two_springs_hold_the_truth():
+    """With 0.2 % noise; the default search finds the best minimum and tells of the others."""
+    motion, time, stress = common_loop()
+    rng = np.random.default_rng(3)
+    test = Measurement(
+        name="synthetic loop of two springs",
+        path=None,
+        data_sha256="",
+        time=time,
+        stress=stress + 0.002 * np.ptp(stress) * rng.standard_normal(stress.size),
+        displacement=motion,
+        specimen=Specimen(0.01, 4.5e-5, (0.005, 0.005)),
+        motion="measured",
+    )
+    result = ff.fit(test, model="bistable+bistable", drive="displacement", seed=0)
+    names = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
+    held = []
+    for number, spring in ((1, SOFT), (2, STIFF)):
+        for name, true in zip(names, spring.seven, strict=True):
+            item = result.parameters[f"s{number}_{name}"]
+            if item.ci95 is not None:
+                held.append(item.ci95[0] <= true <= item.ci95[1])
+    assert len(held) >= 10
+    assert np.mean(held) >= 0.85
