@@ -203,7 +203,7 @@ def test_a_move_is_counted_in_standard_errors(monkeypatch: pytest.MonkeyPatch) -
 
 def test_a_minimum_that_the_search_missed_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     name = "microscale, 300 rows, 0.3 %"
-    wrong = Found(rigs.make("slow", name, 2), {}, 0.0)
+    wrong = Found(rigs.make("slow", name, 2), 0.0)
     monkeypatch.setattr(ff, "fit", lambda *_, **__: wrong)
     rows = pd.DataFrame(rigs.run_test("slow", name, 1))
     table = rigs.coverage(rows.assign(error=None), "class")
