@@ -125,14 +125,21 @@ def synthetic_loop(noise: float = 0.005) -> tuple[ff.BistableSpring, Measurement
     strain = np.concatenate([np.linspace(0, 0.38, 200), np.linspace(0.38, 0.02, 200)[1:]])
     stress = spring.stress(strain)
     rng = np.random.default_rng(1)
-    measurement = Measurement(
+    noisy = stress + noise * np.ptp(stress) * rng.standard_normal(stress.size)
+    return spring, loop_measurement(noisy, strain * HEIGHT, Specimen(HEIGHT, AREA))
+
+
+def loop_measurement(
+    stress: np.ndarray, motion: np.ndarray, specimen: Specimen, time: np.ndarray | None = None
+) -> Measurement:
+    """A measured loop: stress (Pa) along a motion (m), with its time (s) or without."""
+    return Measurement(
         name="synthetic loop",
         path=None,
         data_sha256="",
-        time=None,
-        stress=stress + noise * np.ptp(stress) * rng.standard_normal(stress.size),
-        displacement=strain * HEIGHT,
-        specimen=Specimen(HEIGHT, AREA),
+        time=time,
+        stress=stress,
+        displacement=motion,
+        specimen=specimen,
         motion="measured",
     )
-    return spring, measurement

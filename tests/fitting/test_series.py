@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import foamfit as ff
-from foamfit.data.measurement import Measurement, Specimen
+from conftest import loop_measurement
+from foamfit.data.measurement import Specimen
 from foamfit.fitting.starts import Loop
 from foamfit.springs.exchange import exchanges
 from foamfit.springs.model import Model
@@ -73,16 +74,8 @@ def test_intervals_of_two_springs_hold_the_truth():
     """With 0.2 % noise; the default search finds the best minimum and tells of the others."""
     motion, time, stress = common_loop()
     rng = np.random.default_rng(3)
-    test = Measurement(
-        name="synthetic loop of two springs",
-        path=None,
-        data_sha256="",
-        time=time,
-        stress=stress + 0.002 * np.ptp(stress) * rng.standard_normal(stress.size),
-        displacement=motion,
-        specimen=Specimen(0.01, 4.5e-5, (0.005, 0.005)),
-        motion="measured",
-    )
+    noisy = stress + 0.002 * np.ptp(stress) * rng.standard_normal(stress.size)
+    test = loop_measurement(noisy, motion, Specimen(0.01, 4.5e-5, heights=(0.005, 0.005)), time)
     result = ff.fit(test, model="bistable+bistable", drive="displacement", seed=0)
     names = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
     held = []

@@ -167,7 +167,8 @@ def corners(strain: Array, stress: Array, count: int) -> Array:
 def _stiffness_between(rise: float, low: float, high: float) -> float:
     """k_c of a branch c that rises by a strain `rise` from stress `low` to `high` (Pa).
 
-    The larger root of rise (k+low)(k+high) = k (high-low); the nearest k_c if there is none.
+    It is the larger root k of rise (k+low)(k+high) = k (high-low). Where that equation has no root,
+    k = √(low high) comes closest to it.
     """
     gain = max(high - low, 1e-9 * high)
     rise = max(rise, 1e-6)
