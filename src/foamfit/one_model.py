@@ -17,6 +17,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError, as_signalled
+from foamfit.fitting.minima import exchange_springs, scan_places, settle_ends
 from foamfit.fitting.order import in_order
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.search import (
@@ -26,9 +27,8 @@ from foamfit.fitting.search import (
     SearchStoppedError,
     Tracker,
     ensure_feasible,
-    exchange_springs,
+    has_several,
     search,
-    settle_ends,
     what_stopped,
 )
 from foamfit.results import Fit, Intervals
@@ -42,8 +42,8 @@ Progress = Callable[[float, str], None]
 # Called with the problem and the best point so far, many times a second; it must be quick.
 Watch = Callable[[Problem, Array], None]
 
-# Descents of the search for each spring.
-STARTS = 16
+# Descents of the search for each spring, and for each of several hysteretic springs in series.
+STARTS, STARTS_IN_SERIES = 16, 48
 # Refits of the bootstrap and steps of the Markov chain.
 DRAWS = {"bootstrap": 500, "mcmc": 2000}
 # Evaluations that the default spends on profiles, and on ranges, over those of the search; and how
@@ -158,7 +158,8 @@ def identify(
     """Search and refine; see `foamfit.fit` for the arguments and the errors."""
     began = time.perf_counter()
     problem = options.problem(measurement, model, params)
-    starts = STARTS * len(problem.model.kinds) if options.starts is None else options.starts
+    each = STARTS_IN_SERIES if has_several(problem.model) else STARTS
+    starts = each * len(problem.model.kinds) if options.starts is None else options.starts
     deadline = None if options.max_time is None else time.monotonic() + options.max_time
     better = None if options.watch is None else partial(options.watch, problem)
     tracker = Tracker(problem.objective, deadline, better)
@@ -268,7 +269,7 @@ def _search(
         progress(REFINED, "refinement")
         _refine(problem, tracker)
         weigh_motion(problem, tracker)
-        if exchange_springs(tracker, problem.space()):
+        if exchange_springs(tracker, problem.space()) or scan_places(tracker, problem.space()):
             _refine(problem, tracker)
             weigh_motion(problem, tracker)
         settle_ends(tracker, problem.space())

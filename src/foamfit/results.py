@@ -133,6 +133,8 @@ class Intervals:
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()  # Why they are not, or hardly, what was asked for
     better: Array | None = None  # A point of lower cost: the fit should go on from there
+    # Values, far outside of the interval, at minima that are hardly worse than the best.
+    elsewhere: dict[str, float] = field(default_factory=dict)
     # Ends of the ranges that the error of the law leaves open; none where there is no such error.
     ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
 

@@ -50,7 +50,7 @@ _OPTIONS = (
     click.option(
         "--starts",
         type=click.IntRange(min=1),
-        help="Descents of the search. Default: 16 per spring.",
+        help="Descents of the search. Default: 16 per spring, 48 if several are hysteretic.",
     ),
     click.option(
         "--max-time", type=float, metavar="SECONDS", help="Then the best so far is taken."

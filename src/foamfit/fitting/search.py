@@ -17,9 +17,7 @@ from foamfit.fitting import levenberg
 from foamfit.fitting.box import Space, is_logarithmic
 from foamfit.fitting.nuisance import TIME_SHIFT
 from foamfit.fitting.objective import Objective
-from foamfit.fitting.order import in_order
 from foamfit.fitting.starts import CURVE_STARTS, box_starts, curve_starts, smooth_loop
-from foamfit.springs.exchange import exchanges
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import HYSTERETIC, NUISANCE
 
@@ -35,11 +33,6 @@ IN_SERIES = 3  # searches at least for several hysteretic springs
 LOST = 30.0  # times the noise floor of the cost, above which no agreement is believed at once
 NOISY = 0.005  # noise of a motion, over its range, that is much
 AROUND = 200  # points about the best one among which another search begins
-# Minima whose springs exchange properties at most, and descents for each.
-EXCHANGES, EXCHANGED = 8, 16
-# Ends of the search whose cost is above the best by less than so many variances of the noise are
-# settled anew, at most so many; points of the box closer than the last are one minimum.
-NEAR, MINIMA, SAME = 40.0, 24, 0.02
 # Share of the box that counts as its edge, and where inside a descent begins again.
 EDGE, INSIDE = 0.02, (0.35, 0.5, 0.65)
 # Minima of the loop whose cost on the drive's curves is within this factor of the best go on.
@@ -225,74 +218,6 @@ def search(
 def has_several(model: Model) -> bool:
     """Whether more than one spring of a chain is hysteretic."""
     return sum(kind in HYSTERETIC for kind in model.kinds) > 1
-
-
-def exchange_springs(tracker: Tracker, space: Space) -> list[tuple[float, int]]:
-    """Descend from the best points with properties exchanged between springs of one kind.
-
-    Which of two springs in series owns which branch shows in few samples: the loop of the chain
-    hardly changes where they exchange it, so each such exchange has a minimum of its own. Each
-    minimum that other noise could have made the best is exchanged in turn. Returned are the costs
-    of the ends, as by `search`.
-    """
-    if tracker.best_values is None or not has_several(space.model):
-        return []
-    objective, costs = tracker.objective, list[tuple[float, int]]()
-    met, open_ends = [], [(tracker.best_cost, tracker.best_values)]
-    for _ in range(EXCHANGES):
-        open_ends = [end for end in open_ends if end[0] <= tracker.best_cost + _near(objective)]
-        if not open_ends:
-            break
-        at = min(range(len(open_ends)), key=lambda i: open_ends[i][0])
-        values = in_order(space, objective, open_ends.pop(at)[1])
-        met.append(space.encode(values))
-        points = [space.encode(other) for other in exchanges(space.model, values)]
-        for _, point in rank(tracker, space, points)[:EXCHANGED]:
-            cost, end = descend(tracker, space, point, 60)
-            values = in_order(space, objective, space.decode(end))
-            costs.append((cost, 1))
-            if not _among(met, space.encode(values)):
-                met.append(space.encode(values))
-                tracker.ends.append(values)
-                open_ends.append((cost, values))
-    return costs
-
-
-def settle_ends(tracker: Tracker, space: Space) -> None:
-    """Descend once more from the ends of the search that other noise could have made the best.
-
-    What counts may have changed since they were found. Each minimum is kept once, its springs in
-    order. Where the curves miss more than noise all ends stay as they are: an error of the law
-    could make any of them the best.
-    """
-    objective = tracker.objective
-    if tracker.best_values is None or tracker.best_cost > objective.floor:
-        return
-
-    def in_box(values: Array) -> Array:
-        return space.encode(in_order(space, objective, values))
-
-    settled, met = list[Array](), [in_box(tracker.best_values)]
-    for cost, point in rank(tracker, space, [in_box(values) for values in tracker.ends]):
-        if cost > tracker.best_cost + _near(objective) or len(settled) == MINIMA:
-            break
-        if _among(met, point):
-            continue
-        end = in_box(space.decode(descend(tracker, space, point, 60)[1]))
-        if not _among(met, end):
-            met.append(end)
-            settled.append(space.decode(end))
-    tracker.ends = settled
-
-
-def _near(objective: Objective) -> float:
-    """Rise of the cost that other noise could make up for, with a wide margin."""
-    return NEAR * objective.floor / objective.n_data
-
-
-def _among(points: list[Array], point: Array) -> bool:
-    """Whether a point of the box is one of these."""
-    return any(float(np.max(np.abs(point - other))) < SAME for other in points)
 
 
 def _around_best(tracker: Tracker, space: Space, rng: np.random.Generator) -> list[Array]:

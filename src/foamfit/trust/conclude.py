@@ -256,7 +256,7 @@ def _varied(
 ) -> ParameterEstimate:
     """Estimate of a parameter that was varied and whose branch was reached."""
     (low, high), column = best.limits(name), best.names.index(name)
-    value, unit = float(best.values[best.index[name]]), unit_of(name)
+    problem, value, unit = best.problem, float(best.values[best.index[name]]), unit_of(name)
     stderr, half = float(best.spread.stderr[column]), float(best.halves[column])
     local = (value - half, value + half)
     # Percentiles of refits, or of a chain, may all lie to one side of the best point.
@@ -273,8 +273,12 @@ def _varied(
     if span is not None:  # of a point a little off, if that was improved last
         span = min(span[0], value), max(span[1], value)
     state, why = state_of(name, value, ends, insight, (low, high), span)
-    if state == "determined" and best.problem.objective.interior_mass:
+    if state == "determined" and problem.objective.interior_mass:
         state, why = "weak", "the vibration of the interior mass leaves other minima; " + why
+    elif state == "determined" and name in intervals.elsewhere:
+        there = intervals.elsewhere[name] + problem.measurement.origins.get(name, 0.0)
+        told = engineering(there, unit) if unit else f"{there:.3g}"
+        state, why = "weak", f"it is {told} at a minimum that fits almost as well; {why}"
     if not 0.5 * (ends[1] - ends[0]) <= covariance.NOTHING * best.sizes[column]:
         return ParameterEstimate(value, None, None, unit, True, state, why, range=span)
     if name in intervals.doubtful:

@@ -31,6 +31,9 @@ METHODS = ("auto", "local", "profile", "bootstrap", "mcmc")
 REFITS, ENOUGH_DRAWS = 9, 40
 # Evaluations of a refit, and its slopes.
 EVALUATIONS, SLOPES = 6.0, 0.6
+# A minimum is hardly worse than the best within this factor of the 95 % cut, of standard errors:
+# noise makes so much of a difference in three tests of a thousand.
+HARDLY_WORSE = 1.5
 Announce = Callable[[str], None]
 
 
@@ -94,7 +97,8 @@ def assess(
     far[_elsewhere(best, minima, tracker)] = np.inf
     order = sorted(known, key=lambda name: -far[best.names.index(name)])
     bent = [name for name in order if far[best.names.index(name)] > BENT]
-    return _with_minima(best, _by_profiles(best, bent, minima, tracker, budget), minima, tracker)
+    made = _with_minima(best, _by_profiles(best, bent, minima, tracker, budget), minima, tracker)
+    return replace(made, elsewhere=_hardly_worse(best, made, minima, tracker))
 
 
 def evaluations_of(best: BestPoint, choice: Choice) -> float:
@@ -130,6 +134,28 @@ def _with_minima(
                 ends[name] = wider
                 methods[name] = "other minima"
     return replace(made, ends=ends, methods=methods)
+
+
+def _hardly_worse(
+    best: BestPoint, made: Intervals, minima: Sequence[Array], tracker: Tracker
+) -> dict[str, float]:
+    """Values further outside of an interval than it is wide at minima that are hardly worse."""
+    out: dict[str, float] = {}
+    for point in minima if not best.misfits else ():
+        residual = tracker.consider(point)
+        rise = (float(residual @ residual) - best.cost) / best.spread.inflation
+        for column, name in enumerate(best.names):
+            if (
+                name not in best.known
+                or rise[column] > (HARDLY_WORSE * best.quantiles[column]) ** 2
+            ):
+                continue
+            value, there = best.values[best.index[name]], float(point[best.index[name]])
+            half = best.halves[column]
+            low, high = made.ends.get(name, (value - half, value + half))
+            if max(low - there, there - high) > high - low:
+                out.setdefault(name, there)
+    return out
 
 
 def _law_halves(best: BestPoint, point: Array, tracker: Tracker) -> Array:

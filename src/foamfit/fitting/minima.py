@@ -1,0 +1,134 @@
+"""Minima of the cost near the best one, which the search from start values may miss.
+
+Which spring of a chain owns which property, and where A1 or ε_* lies, may show in few samples: the
+cost then has several minima that differ by little. What is found here makes the best point better,
+or says what else the test leaves open.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from foamfit.arrays import Array
+from foamfit.fitting.box import Space
+from foamfit.fitting.objective import Objective
+from foamfit.fitting.order import in_order
+from foamfit.fitting.search import Tracker, descend, has_several, rank
+from foamfit.springs.exchange import exchanges
+from foamfit.springs.parameters import NUISANCE
+
+# Minima whose springs exchange properties at most, and descents for each.
+EXCHANGES, EXCHANGED = 8, 16
+# Ends of the search whose cost is above the best by less than so many variances of the noise are
+# settled anew, at most so many; points of the box closer than the last are one minimum.
+NEAR, MINIMA, SAME = 40.0, 24, 0.02
+# Strains at which branches begin, which are scanned. Steps of a scan: share of the box, the most to
+# each side, and the rise of the cost, in variances of what is left of the curves, at which it ends.
+PLACES = ("eps_a", "eps_star")
+STEP, STEPS, TOO_HIGH = 0.06, 12, 150.0
+
+
+def scan_places(tracker: Tracker, space: Space) -> bool:
+    """Descend from points whose ε_a or ε_* is moved step by step; say whether one is better.
+
+    At each step the other parameters of the springs follow, then all are free. Springs in series
+    are left to `exchange_springs`.
+    """
+    if tracker.best_values is None or has_several(space.model):
+        return False
+    best, cost, met = tracker.best_values, tracker.best_cost, [space.encode(tracker.best_values)]
+    left = max(cost, tracker.objective.floor) / tracker.objective.n_data
+    for column, (place, short, _) in enumerate(space.coordinates):
+        if short not in PLACES:
+            continue
+        held = {space.names[place], *NUISANCE}
+        free = tuple(name for name in space.free if name not in held)
+        for step in (STEP, -STEP):
+            at, values = space.encode(best)[column], best
+            for _ in range(STEPS):
+                at += step * (space.box[1] - space.box[0])[column]
+                if not space.box[0][column] < at < space.box[1][column]:
+                    break
+                point = space.encode(values)
+                point[column] = at
+                values = space.decode(point)
+                fixed = replace(space, values=values, free=free)
+                rise, point = descend(tracker, fixed, fixed.encode(values), 30, enough=1e-4)
+                if rise > cost + TOO_HIGH * left:
+                    break
+                values = fixed.decode(point)
+                end = descend(tracker, space, space.encode(values), 60)[1]
+                if not _among(met, end):
+                    met.append(end)
+                    tracker.ends.append(space.decode(end))
+    return tracker.best_cost < cost
+
+
+def exchange_springs(tracker: Tracker, space: Space) -> list[tuple[float, int]]:
+    """Descend from the best points with properties exchanged between springs of one kind.
+
+    Which of two springs in series owns which branch shows in few samples: the loop of the chain
+    hardly changes where they exchange it, so each such exchange has a minimum of its own. Each
+    minimum that other noise could have made the best is exchanged in turn. Returned are the costs
+    of the ends, as by `search`.
+    """
+    if tracker.best_values is None or not has_several(space.model):
+        return []
+    objective, costs = tracker.objective, list[tuple[float, int]]()
+    met, open_ends = [], [(tracker.best_cost, tracker.best_values)]
+    for _ in range(EXCHANGES):
+        open_ends = [end for end in open_ends if end[0] <= tracker.best_cost + _near(objective)]
+        if not open_ends:
+            break
+        at = min(range(len(open_ends)), key=lambda i: open_ends[i][0])
+        values = in_order(space, objective, open_ends.pop(at)[1])
+        met.append(space.encode(values))
+        points = [space.encode(other) for other in exchanges(space.model, values)]
+        for _, point in rank(tracker, space, points)[:EXCHANGED]:
+            cost, end = descend(tracker, space, point, 60)
+            values = in_order(space, objective, space.decode(end))
+            costs.append((cost, 1))
+            if not _among(met, space.encode(values)):
+                met.append(space.encode(values))
+                tracker.ends.append(values)
+                open_ends.append((cost, values))
+    return costs
+
+
+def settle_ends(tracker: Tracker, space: Space) -> None:
+    """Descend once more from the ends of the search that other noise could have made the best.
+
+    What counts may have changed since they were found. Each minimum is kept once, its springs in
+    order. Where the curves miss more than noise all ends stay as they are: an error of the law
+    could make any of them the best.
+    """
+    objective = tracker.objective
+    if tracker.best_values is None or tracker.best_cost > objective.floor:
+        return
+
+    def in_box(values: Array) -> Array:
+        return space.encode(in_order(space, objective, values))
+
+    settled, met = list[Array](), [in_box(tracker.best_values)]
+    for cost, point in rank(tracker, space, [in_box(values) for values in tracker.ends]):
+        if cost > tracker.best_cost + _near(objective) or len(settled) == MINIMA:
+            break
+        if _among(met, point):
+            continue
+        end = in_box(space.decode(descend(tracker, space, point, 60)[1]))
+        if not _among(met, end):
+            met.append(end)
+            settled.append(space.decode(end))
+    tracker.ends = settled
+
+
+def _near(objective: Objective) -> float:
+    """Rise of the cost that other noise could make up for, with a wide margin."""
+    return NEAR * objective.floor / objective.n_data
+
+
+def _among(points: list[Array], point: Array) -> bool:
+    """Whether a point of the box is one of these."""
+    return any(float(np.max(np.abs(point - other))) < SAME for other in points)
