@@ -58,7 +58,7 @@ def fit(
     seed : int
         Same test and seed give the same numbers.
     starts : int, optional
-        Descents of the search; by default 16 for each spring.
+        Descents of the search; by default 16 for each spring, 48 if several are hysteretic.
     max_time : float, optional
         Seconds after which the best point so far is the result.
     weights : mapping, optional
