@@ -332,7 +332,7 @@ def test_a_microscale_spring_that_relaxes_is_found():
     assert chosen.name == "microscale with relaxation"
     assert (chosen.relaxation, result.relaxation) == (1, 1)
     assert not result.ladder.by_prediction
-    assert chosen.why.startswith("its residuals are structureless")
+    assert chosen.why.startswith("its residuals are random")
     assert result.params["s1_g1"].value == pytest.approx(0.5, rel=0.1)
     assert result.params["s1_tau1"].value == pytest.approx(0.2, rel=0.15)
     assert chosen.predicted_misfit == pytest.approx(0.003, rel=0.3)
@@ -360,7 +360,7 @@ def test_where_no_model_reaches_the_noise_prediction_decides(monkeypatch):
     assert row["gain"] == pytest.approx(1.0 - row["predicted_misfit"] / simpler["predicted_misfit"])
     assert f"{100 * row['gain']:.0f} % less than {simpler['model']};" in ladder.chosen.why
     assert any("AICc and BIC do not hold" in sentence for sentence in ladder.sentences)
-    assert any(text.startswith("No model reaches the noise: the res") for text in result.warnings)
+    assert any(text.startswith("With every model systematic res") for text in result.warnings)
 
 
 @pytest.mark.parametrize("given", [None, 0.004])
@@ -466,7 +466,7 @@ def test_chains_of_microscale_springs_need_one_that_follows_the_curves(microscal
 def test_a_drive_without_dampers_has_one_rung_for_each_model():
     result = ff.fit(synthetic_loop()[1], model="auto", starts=4)
     assert [(rung.model, rung.damping) for rung in result.ladder.rungs] == [("bistable", "none")]
-    assert result.ladder.ended == "the residuals are structureless"
+    assert result.ladder.ended == "the residuals are random"
     assert result.status == "ok"
 
 
@@ -502,7 +502,7 @@ def test_outliers_leave_the_ladder_standing():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(auto, "LADDER", groups("bistable"))
         result = ff.fit(replace(test, stress=stress, outliers=spikes), model="auto", starts=4)
-    assert any("have a structure" in text for text in result.warnings)
+    assert any("systematic residuals remain" in text for text in result.warnings)
 
 
 # ---------------------------------------------------------------- interruption
@@ -614,9 +614,11 @@ def test_ranges_are_made_of_the_chosen_model_alone(wavy, monkeypatch):
 
 
 def test_what_remains_is_said(climbed):
-    warning = next(text for text in climbed.warnings if text.startswith("No model reaches"))
-    assert "residuals of stress_strain have a structure of" in warning
-    size = float(warning.split("structure of ")[1].split(" %")[0])
+    warning = next(
+        text for text in climbed.warnings if text.startswith("With every model systematic")
+    )
+    assert "those of stress_strain are" in warning
+    size = float(warning.split("stress_strain are ")[1].split(" %")[0])
     assert size == pytest.approx(5 / np.sqrt(2), rel=0.25)  # what the springs follow of it is less
     assert climbed.ladder.ended == "there are no richer ones that this test allows"
 
@@ -694,7 +696,7 @@ def loop_file(tmp_path, monkeypatch):
 def test_the_command_writes_to_auto(loop_file, tmp_path):
     done = run("fit", loop_file, "--model", "auto", "--starts", 4)
     assert done.exit_code == 0, done.output
-    assert "chosen of 1 model tried: bistable: its residuals are structureless" in done.stdout
+    assert "chosen of 1 model tried: bistable: its residuals are random" in done.stdout
     assert "no richer model was tried" in done.stdout
     folder = tmp_path / "fits" / "loop" / "auto"
     content = json.loads((folder / "fit.json").read_text())

@@ -3,7 +3,7 @@
 Models are fitted from the simplest up, each without damping and then with it. They are compared by
 AICc and BIC with the effective numbers of samples and of parameters where one of them comes to the
 noise, else by how well they predict what they were not fitted to (`trust.evidence`). The comparison
-ends where the residuals are structureless, or where two groups of models in a row bring no gain.
+ends where the residuals are random, or where two groups of models in a row bring no gain.
 """
 
 from __future__ import annotations
@@ -152,7 +152,7 @@ def compare_models(
             if state.stopped:
                 break
             if any(one.structureless for one in tried[below:]):
-                ended = "the residuals are structureless"
+                ended = "the residuals are random"
                 break
             if len(tried) > below:
                 idle = 0 if _has_gained(tried, below) else idle + 1
@@ -357,7 +357,7 @@ def _conclude(
         )
     if tried[best].states("not determined"):
         warned.append(_undetermined(tried, decision))
-    if not any(rung.structureless for rung in tried):
+    if result.at_noise is False and not any(rung.structureless for rung in tried):
         warned.append(_structure_left(tried, best))
     ladder = Ladder(
         rungs=tuple(_rung(i, tried, decision) for i in range(len(tried))),
@@ -425,7 +425,7 @@ def _why(i: int, tried: Sequence[Tried], decision: Decision) -> str:
     if decision.by_prediction:
         return _why_by_prediction(i, tried, decision)
     if i == best:
-        reason = "its residuals are structureless" if one.structureless else "best supported"
+        reason = "its residuals are random" if one.structureless else "best supported"
         richer = f"lowers AICc and BIC by {MARGIN:g}" if len(tried) > 1 else "was tried"
         richer = "was tried" if one.varied >= max(each.varied for each in tried) else richer
         return f"{reason}, and no richer model {richer}"
@@ -467,7 +467,7 @@ def _choice_sentences(tried: Sequence[Tried], decision: Decision, ended: str) ->
     best, found = decision.best, decision.criteria
     one = tried[best]
     if one.structureless:
-        reason = "it is the simplest whose residuals are structureless"
+        reason = "it is the simplest whose residuals are random"
     elif not decision.by_prediction:
         reason = "the evidence supports it best"
     elif any(each.predicted is None for each in tried):
@@ -485,9 +485,9 @@ def _choice_sentences(tried: Sequence[Tried], decision: Decision, ended: str) ->
         )
     if decision.by_prediction:
         said.append(
-            "What is left is more than noise, so AICc and BIC do not hold. Each model was fitted "
-            f"to the test without one of {BLOCKS} blocks in time, in turn, and predicted that "
-            f"block; each further parameter must lower this predicted misfit by {percent(SHARE)}."
+            "With every model systematic residuals remain, so AICc and BIC do not hold. Each was "
+            f"fitted without one of {BLOCKS} blocks in time, in turn, and predicted that block; "
+            f"each further parameter must lower this predicted misfit by {percent(SHARE)}."
         )
         return said
     if found[best].rank < one.varied:
@@ -530,10 +530,9 @@ def _structure_left(tried: Sequence[Tried], best: int) -> str:
     one = tried[best]
     worst = int(np.argmin([min(runs_test(part), neighbours_test(part)) for part in one.curves]))
     found = find_structure(one.curves[worst], one.places[worst])
-    size, noise = found.size / one.spans[worst], found.noise / one.spans[worst]
     told = (
-        f"No model reaches the noise: the residuals of {one.counted[worst]} have a structure of "
-        f"{percent(size)} of the range (noise {percent(noise)}), {percent(found.share)} of it on "
+        f"With every model systematic residuals remain: those of {one.counted[worst]} are "
+        f"{percent(found.size / one.spans[worst])} of the range, {percent(found.share)} of them on "
         f"{found.place}."
     )
     if found.bent > BENT and found.straight:

@@ -388,6 +388,11 @@ class Fit:
         return {f"s{i}": one for i, one in springs if isinstance(one, MicroscaleSpring)}
 
     @property
+    def at_noise(self) -> bool | None:
+        """Whether the residuals are at the estimated noise; None where that is not known."""
+        return next((check.answer for check in self.checklist if check.key == "noise"), None)
+
+    @property
     def law(self) -> str:
         """The model and its relaxation in words."""
         return law_in_words(self.model, self.relaxation)

@@ -55,7 +55,13 @@ def one_spring() -> Fit:
             warnings=(floor, weak),
             checklist=(
                 Check("followed", "Does the model follow the curves?", True, "1.2 % and 0.4 %."),
-                Check("floor", "Is the noise floor reached?", False, "1.60 and 1.02.", (floor,)),
+                Check(
+                    "noise",
+                    "Are the residuals at the estimated noise?",
+                    False,
+                    "1.60 and 1.02.",
+                    (floor,),
+                ),
                 Check("determined", "Are all parameters determined?", False, "5 of 7.", (weak,)),
             ),
             notes=("Noise of stress 30 kPa, given.",),
@@ -87,7 +93,7 @@ def auto() -> Fit:
 
     rungs = (
         rung("bistable", "without", 1738.2, -301.2, "BIC +12.0, AICc +14.0"),
-        rung("linear+bistable", "none", 979.9, -313.2, "its residuals are structureless"),
+        rung("linear+bistable", "none", 979.9, -313.2, "its residuals are random"),
     )
     ladder = Ladder(
         rungs=rungs, n_eff=986.4, noise_from="linear+bistable", ended="the test is told",

@@ -294,7 +294,7 @@ def test_the_result_says_what_was_decided(tmp_path):
         best.problem.objective.measured["stress_strain"]
     )
     assert told["law_error"] == pytest.approx(missed, rel=0.1)
-    (check,) = [check for check in result.checklist if check.key == "structure"]
+    (check,) = [check for check in result.checklist if check.key == "noise"]
     assert check.answer is False
     assert "the law misses" in check.warnings[0]
     folder = FitResult(**vars(result)).save(tmp_path / "out")

@@ -82,9 +82,8 @@ def _how_well(result: Fit) -> str:
         return "There is no measured curve to compare with."
     if result.status == "failed":
         return f"No acceptable fit: the model misses {told.replace(' to ', ' by ')} of the range."
-    floor = next((check.answer for check in result.checklist if check.key == "floor"), None)
-    rest = {True: ", which is the noise", False: ", which is more than the noise", None: ""}[floor]
-    return f"The model follows {told} of the range{rest}."
+    rest = {True: ", at the estimated noise", False: "; systematic residuals remain", None: ""}
+    return f"The model follows {told} of the range{rest[result.at_noise]}."
 
 
 def _of_state(result: Fit, state: str) -> dict[str, ParameterEstimate]:

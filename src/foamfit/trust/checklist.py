@@ -29,8 +29,8 @@ from foamfit.trust.time_shift import damping_hint, shift_hint
 # fitted poorly if it is off by more than this share of its range.
 UNACCEPTABLE = 0.5
 POOR = 0.05
-# Residuals over noise up to which the noise floor counts as reached: a stated noise is seldom known
-# better than to a tenth, an estimated one to a half.
+# Residuals over noise up to which they count as noise: a stated noise is seldom known better than
+# to a tenth, an estimated one to a half.
 STATED, ESTIMATED = 1.1, 1.5
 # Autocorrelation time, samples, from which on residuals count as structured.
 STRUCTURED = 5.0
@@ -145,9 +145,40 @@ def _followed(e: Findings) -> _Answer:
     return not warnings, f"Misfit over range: {told}.", tuple(warnings), fatal
 
 
-def _floor(e: Findings) -> _Answer:
-    """Residuals against the noise of each curve, with the scatter that a chi-square has itself."""
-    objective, told, warnings = e.objective, [], []
+def _at_noise(e: Findings) -> _Answer:
+    """Whether the residuals are noise: their size, an error of the law, and their correlation.
+
+    This is the one verdict about the noise; `Fit.at_noise` has its answer.
+    """
+    told, warnings = _over_noise(e)
+    missed = _missed(e)
+    longest = max(e.tau, default=1.0)
+    if missed:
+        told.append(f"error of the law, RMS over range: {', '.join(missed)}")
+        warnings = [
+            f"The residuals are systematic: the law misses {' and '.join(missed)} of the range. "
+            "The 95 % intervals cover noise only; the range includes this error."
+        ]
+    elif longest > STRUCTURED:
+        warnings.append(
+            f"The residuals are correlated over {longest:.0f} samples; the intervals account for "
+            "it."
+        )
+    if not missed and longest >= 1.05:
+        told.append(f"correlated over {longest:.2g} samples")
+    known = any(e.objective.noise(name).sigma > 0.0 for name in e.objective.counted)
+    if not (warnings or (told and known)):
+        return None, "The noise is neither stated nor estimated."
+    found = "; ".join(told)
+    return not warnings, f"{found[0].upper()}{found[1:]}.", tuple(warnings)
+
+
+def _over_noise(e: Findings) -> tuple[list[str], list[str]]:
+    """Residuals over the noise of each curve, and a warning where they are more than noise.
+
+    A chi-square scatters by itself, which counts for them.
+    """
+    objective, ratios, warnings = e.objective, [], []
     for i, (name, rms) in enumerate(objective.rms(e.best.residual).items()):
         noise, stated = objective.noise(name).sigma, objective.noise(name).given
         if noise <= 1e-9 * objective.scale[name]:  # there is none to be seen
@@ -155,45 +186,25 @@ def _floor(e: Findings) -> _Answer:
         tau = e.tau[i] if e.tau else 1.0
         scatter = 3.0 * math.sqrt(tau / (2.0 * objective.sizes[i]))
         source = "stated" if stated else "estimated"
-        told.append(f"{_spoken(name)} {rms / noise:.2f} ({source})")
+        ratios.append(f"{_spoken(name)} {rms / noise:.2f} ({source})")
         if rms > ((STATED if stated else ESTIMATED) + scatter) * noise:
             warnings.append(
                 f"The residuals of {name} are {rms / noise:.1f} times the {source} noise: the "
                 "model does not follow all that was measured."
             )
-    if not told:
-        return None, "The noise is neither stated nor estimated."
-    return not warnings, f"Residuals over noise: {', '.join(told)}.", tuple(warnings)
+    return ([f"residuals over noise: {', '.join(ratios)}"] if ratios else []), warnings
 
 
-def _structure(e: Findings) -> _Answer:
+def _missed(e: Findings) -> list[str]:
+    """Curves of which the law misses more than noise, and by how much of their range."""
     if not e.tau:
-        return None, "No parameter varies whose branch was reached."
+        return []
     objective = e.objective
-    missed = [
+    return [
         f"{_spoken(name)} {percent(error.law / objective.factor(name) / spread)}"
         for name, error in zip(objective.counted, e.best.errors, strict=True)
         if error.found and (spread := float(np.ptp(objective.measured[name])))
     ]
-    longest = max(e.tau)
-    if missed:
-        found = f"Error of the law, RMS over range: {', '.join(missed)}."
-        warning = (
-            f"The residuals have structure that is no noise: the law misses {' and '.join(missed)} "
-            "of the range. The 95 % intervals hold the noise alone; the range tells what this "
-            "error leaves open."
-        )
-        return False, found, (warning,)
-    if longest < 1.05:
-        return True, "Their autocorrelation is that of white noise."
-    found = f"Noise correlated over {longest:.2g} samples."
-    if longest <= STRUCTURED:
-        return True, found
-    warning = (
-        f"The residuals have structure: noise correlated over {longest:.0f} samples; the intervals "
-        "account for it."
-    )
-    return False, found, (warning,)
 
 
 # ---------------------------------------------------------------- the parameters
@@ -369,13 +380,12 @@ QUESTIONS: dict[str, tuple[str, Callable[[Findings], _Answer]]] = {
     "ended": ("Did the search end by itself?", _ended),
     "followed": ("Does the model follow the curves?", _followed),
     "velocity": ("Is the striker's velocity that of its motion?", _flight),
-    "floor": ("Is the noise floor reached?", _floor),
+    "noise": ("Are the residuals at the estimated noise?", _at_noise),
     "determined": ("Are all parameters determined?", _determined),
     "intervals": ("Are the intervals those that were asked for?", _trusted),
     "visited": ("Was every branch of every spring visited?", _visited),
     "bounds": ("Are all parameters off their bounds?", _bounds),
     "agree": ("Do several starts agree?", _agree),
-    "structure": ("Are the residuals free of structure?", _structure),
     "vibration": ("Is the cost free of the minima that a vibrating mass makes?", _vibration),
     "simulated": ("Could most trials be simulated?", _simulated),
     "energy": ("Does the energy balance hold?", _energy),
