@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import os
 import re
 import sys
@@ -140,15 +141,18 @@ def test_nothing_is_shown_and_nothing_watched_without_a_terminal(
 
 @pytest.mark.usefixtures("quick")
 def test_a_sentence_in_between_does_not_run_into_the_line(
-    terminal: Terminal, monkeypatch: pytest.MonkeyPatch
+    terminal: Terminal, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
+    caplog.set_level(logging.WARNING, logger="foamfit")  # a quiet command may have silenced it
     monkeypatch.setattr(sys, "stderr", terminal.stream)
     with progress_line(False, "fit") as line:
         line.progress(0.5, "loop")
         line.tell("72 refits, about 3 s")
+        logging.getLogger("foamfit.solve").warning("foamfit: compiling the solver")
         line.progress(0.6, "intervals")
     told = terminal.read()
     assert re.search(r"\r +\rfoamfit: 72 refits, about 3 s\r?\n", told)
+    assert re.search(r"foamfit: compiling the solver\r?\n", told)
     assert shown(told)[-1].startswith("fit: intervals")
 
 

@@ -77,3 +77,16 @@ def test_lines_keep_their_width_and_their_words() -> None:
     assert lines[1].startswith(" " * 12 + "word")
     assert lines[-1] == " " * 10 + "end"
     assert aligned([("a", "bb"), ("ccc", "d")], right=[1]) == ["a    bb", "ccc   d"]
+
+
+@pytest.mark.parametrize(("columns", "most"), [("200", 100), ("80", 80), ("44", 44), ("3", 40)])
+def test_text_and_tables_fit_the_terminal(
+    columns: str, most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Columns for which a line has no room follow below, beside the first one."""
+    monkeypatch.setenv("COLUMNS", columns)
+    rows = [["parameter", *"abcdefghij"], *([name, *["1234567 MPa"] * 10] for name in ("k0", "kc"))]
+    lines = aligned(rows)
+    assert max(map(len, [*lines, *wrapped("word " * 60)])) <= most
+    assert sum(line.count("1234567 MPa") for line in lines) == 20
+    assert all(line.startswith(("parameter", "k0", "kc")) for line in lines if line)

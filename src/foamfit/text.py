@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 import re
+import shutil
 import textwrap
 from collections.abc import Iterable, Sequence
 
-WIDTH = 100  # characters of a line
+# Characters of a line: those of the terminal, but not more or fewer than these.
+WIDTH, NARROWEST = 100, 40
 _NO_BREAK = "\u00a0"  # a space at which no line ends
 _PREFIXES = {9: "G", 6: "M", 3: "k", 0: "", -3: "m", -6: "µ", -9: "n"}
 
@@ -63,11 +65,17 @@ def listed(items: Iterable[str]) -> str:
     return f"{', '.join(others)} and {last}" if others else last
 
 
-def wrapped(text: str, indent: int = 2, width: int = WIDTH) -> list[str]:
+def line_width() -> int:
+    """Characters of a line of the terminal, `WIDTH` at most and where there is no terminal."""
+    return max(min(shutil.get_terminal_size((WIDTH, 24)).columns, WIDTH), NARROWEST)
+
+
+def wrapped(text: str, indent: int = 2, width: int | None = None) -> list[str]:
     """Break a paragraph into lines; all but the first are indented by so many spaces.
 
     No line begins with the % of a number.
     """
+    width = width or line_width()
     whole = re.sub(r"(?<=\d) %", f"{_NO_BREAK}%", text)
     lines = textwrap.wrap(whole, width, subsequent_indent=" " * indent)
     return [line.replace(f"{_NO_BREAK}%", " %") for line in lines]
@@ -76,17 +84,23 @@ def wrapped(text: str, indent: int = 2, width: int = WIDTH) -> list[str]:
 def aligned(rows: Sequence[Sequence[str]], gap: str = "  ", right: Iterable[int] = ()) -> list[str]:
     """Make lines of equal columns from rows of cells.
 
-    The columns whose numbers are in `right` are aligned to the right below the first row, which is
-    the header; all others to the left.
+    The columns whose numbers are in `right` are aligned to the right, all others to the left. The
+    first row is the header. Columns that the line has no room for follow in a table of
+    their own below, which begins with the first column again.
     """
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    right, lines = set(right), []
-    for row in rows:
-        cells = [
-            cell.rjust(width) if i in right and row is not rows[0] else cell.ljust(width)
-            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ]
-        lines.append(gap.join(cells).rstrip())
+    right, blocks = set(right), [[0]]
+    for i, width in enumerate(widths[1:], start=1):
+        taken = sum(widths[j] + len(gap) for j in blocks[-1])
+        if taken + width > line_width() and len(blocks[-1]) > 1:
+            blocks.append([0])
+        blocks[-1].append(i)
+    lines = list[str]()
+    for block in blocks:
+        lines += [""] if lines else []
+        for row in rows:
+            cells = (f"{row[i]:{'>' if i in right else '<'}{widths[i]}}" for i in block)
+            lines.append(gap.join(cells).rstrip())
     return lines
 
 

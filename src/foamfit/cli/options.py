@@ -87,14 +87,14 @@ def compiling(
     """Compile at first use, beside the body; it calls what is given before it simulates."""
     import logging
 
-    from foamfit.solve import precompile
+    from foamfit.solve import cache, precompile
 
     if quiet:  # what is compiled later is announced by the log
         logging.getLogger("foamfit").setLevel(logging.ERROR)
 
     def tell() -> None:
         if not quiet:
-            say("foamfit: compiling the solver, once after installation", err=True)
+            say(f"foamfit: {cache.compiling('the solver')}", err=True)
 
     with precompile.at_first_use(model, relaxation, tell) as finish:
         yield finish

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 import sys
@@ -42,6 +43,18 @@ class Progress:
         """Print a sentence on stderr, unless nothing is to be said."""
         if self.says:
             say(f"foamfit: {told}", err=True)
+
+
+class _Above(logging.Handler):
+    """Prints what foamfit logs above a line of progress, not into it."""
+
+    def __init__(self, line: ProgressLine) -> None:
+        super().__init__(logging.WARNING)
+        self.line = line
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print one sentence."""
+        self.line.tell(record.getMessage().removeprefix("foamfit: "))
 
 
 class ProgressLine(Progress):
@@ -184,8 +197,11 @@ def progress_line(
     if quiet or sys.stderr is None or not sys.stderr.isatty():
         yield Progress(says)
         return
-    line = ProgressLine(sys.stderr, name, limit)
+    line, log = ProgressLine(sys.stderr, name, limit), logging.getLogger("foamfit")
+    above = _Above(line)
+    log.addHandler(above)
     try:
         yield line
     finally:
+        log.removeHandler(above)
         line.close()

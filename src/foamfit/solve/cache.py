@@ -31,7 +31,18 @@ def announce(function: Any, what: str) -> None:
     """Log, once in a process, that `function` is about to be compiled, unless it has been."""
     made = getattr(function, "signatures", True)  # where numba is switched off there are none
     if not made and not compiled(function.__name__):
-        _LOG.warning("foamfit: compiling %s, once after installation", what)
+        _LOG.warning("foamfit: %s", compiling(what))
+
+
+@functools.cache
+def _first() -> str:
+    return ", once after installation"
+
+
+def compiling(what: str) -> str:
+    """Say that something is compiled, and to the first who asks that it is only done once."""
+    once = "" if _first.cache_info().currsize else _first()
+    return f"compiling {what}{once}"
 
 
 def compiled(name: str = "integrate") -> bool:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from foamfit.springs.chain import Chain
 from foamfit.springs.parameters import KINDS
 from foamfit.springs.spring import BistableSpring, LinearSpring, Spring
+from foamfit.text import aligned, wrapped
 
 MPA, MM, MG = 1e6, 1e-3, 1e-6
 
@@ -136,48 +137,54 @@ published: dict[str, PublishedSet] = _Sets(
 
 def table() -> str:
     """Return the published sets and their derived points as text, in the paper's units."""
-    lines = ["Published parameter sets (Thevamaran, Fraternali & Daraio 2014, Tables 2 and 3)", ""]
-    head = ("set", "spring", "k0", "ds/s_a", "eta", "eps_a", "eps_c", "h", "kh+/k0", "kh-/k0")
-    widths = (16, 12, 8, 8, 9, 7, 7, 7, 7, 7, 6)
-    lines.append(_line((*head, "kc/k0"), widths))
-    lines.append(_line(("", "", "MPa", "", "Pa s", "", "", "mm", "", "", ""), widths))
+    head = ["set", "spring", "k0", "ds/s_a", "eta", "eps_a", "eps_c", "h", "kh+/k0", "kh-/k0",
+            "kc/k0"]  # fmt: skip
+    sets = [head, ["", "", "MPa", "", "Pa s", "", "", "mm", "", "", ""]]
+    points = ["sigma_a", "sigma_c", "eps_star", "eps_hat_a", "eps_hat_c", "sigma_hat_c"]
+    derived = [["set", *points], ["", "MPa", "MPa", "", "", "", "MPa"]]
+    ratios = list[str]()
     for item in published.values():
         for spring, height in zip(item.chain.springs, item.chain.heights, strict=True):
-            lines.append(_line(_published_row(item, spring, height), widths))
-    lines += ["", "Derived points of the bistable springs", ""]
-    points = ("sigma_a", "sigma_c", "eps_star", "eps_hat_a", "eps_hat_c", "sigma_hat_c")
-    columns = (16, 12, 12, 12, 12, 12, 12)
-    lines.append(_line(("set", *points), columns))
-    lines.append(_line(("", "MPa", "MPa", "", "", "", "MPa"), columns))
-    for item in published.values():
-        cells = [item.name]
-        for point in points:
-            value = getattr(item.bistable, point)
-            scale = MPA if point.startswith("sigma") else 1.0
-            cells.append("none" if value is None else f"{value / scale:.6f}")
-        lines.append(_line(tuple(cells), columns))
-    lines += ["", "Damping ratio eta/(2 H sqrt(rho kc)), rho = m_striker/(A H)", ""]
-    for item in published.values():
+            sets.append(_published_row(item, spring, height))
+        values = {point: getattr(item.bistable, point) for point in points}
+        scaled = [None if v is None else v / (MPA if "sigma" in p else 1.0)
+                  for p, v in values.items()]  # fmt: skip
+        derived.append([item.name, *("none" if v is None else f"{v:.6f}" for v in scaled)])
         ratio = item.damping_ratio_by_formula()
         if ratio is not None and item.damping_ratio is not None:
             agrees = math.isclose(ratio, item.damping_ratio, rel_tol=2e-3)
             told = "agrees" if agrees else "does not follow from the paper's own table"
-            lines.append(f"{item.name:<16}{ratio:.3g}   (paper {item.damping_ratio}: {told})")
-    return "\n".join(lines)
+            text = f"{item.name}: {ratio:.3g} (paper {item.damping_ratio}: {told})"
+            ratios += wrapped(text)
+    return "\n".join(
+        [
+            *wrapped("Published sets (Thevamaran, Fraternali & Daraio 2014, Tables 2 and 3)"),
+            *("", *aligned(sets, right=range(2, len(head)))),
+            *("", "Derived points of the bistable springs"),
+            *("", *aligned(derived, right=range(1, len(derived[0])))),
+            *("", *wrapped("Damping ratio eta/(2 H sqrt(rho kc)), rho = m_striker/(A H)")),
+            *("", *ratios),
+        ]
+    )
 
 
-def _line(cells: tuple[str, ...], widths: tuple[int, ...]) -> str:
-    """Set the cells of a row right-aligned, the first one left-aligned."""
-    rest = (f"{cell:>{width}}" for cell, width in zip(cells[1:], widths[1:], strict=True))
-    return f"{cells[0]:<{widths[0]}}{''.join(rest)}".rstrip()
-
-
-def _published_row(item: PublishedSet, spring: Spring, height: float) -> tuple[str, ...]:
+def _published_row(item: PublishedSet, spring: Spring, height: float) -> list[str]:
     h = f"{height / MM:.3f}"
     if not isinstance(spring, BistableSpring):
-        kind = KINDS[spring.kind]
-        return (item.name, kind, f"{spring.k0 / MPA:g}", "", "", "", "", h, "", "", "")
-    return (
+        return [
+            item.name,
+            KINDS[spring.kind],
+            f"{spring.k0 / MPA:g}",
+            "",
+            "",
+            "",
+            "",
+            h,
+            "",
+            "",
+            "",
+        ]
+    return [
         item.name,
         "bistable",
         f"{spring.k0 / MPA:g}",
@@ -189,4 +196,4 @@ def _published_row(item: PublishedSet, spring: Spring, height: float) -> tuple[s
         f"{spring.kh_plus / spring.k0:.3g}",
         f"{spring.kh_minus / spring.k0:.3g}",
         f"{spring.kc / spring.k0:.3g}",
-    )
+    ]
