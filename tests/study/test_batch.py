@@ -709,3 +709,13 @@ def test_models_with_other_parameters_leave_cells_empty():
     head, first, second = table_rows([one, other])
     assert dict(zip(head, first, strict=True))["s1_kc"] is None
     assert dict(zip(head, second, strict=True))["s1_kc_state"] == "weak"
+
+
+def test_the_page_of_a_batch_shows_the_range_that_a_state_goes_by(tmp_path: Path) -> None:
+    """A parameter is not determined by its range, however narrow its interval is."""
+    cell = [2e5, 1e3, 1.98e5, 2.02e5, "not determined", "Pa", 0.4e5, 7.1e5]
+    rows = [Row(name, f"{name}.csv", "ok", parameters={"s1_kc": cell}) for name in "ab"]
+    write_page(rows, tmp_path, "two tests")
+    page = (tmp_path / "summary.html").read_text()
+    assert "198 to 202; range 40 to 710" in page
+    assert page.split('class="ranges"')[1].split('d="')[1].startswith("M225")

@@ -50,7 +50,7 @@ class Row:
     """What a batch knows of one test, or of one cycle of it; `test` is its folder.
 
     `parameters` holds value, standard error, lower and upper end of the 95 % interval (SI), state
-    and unit of each.
+    and unit of each, and lower and upper end of its range where it has one.
     """
 
     test: str
@@ -93,7 +93,7 @@ def row_of(test: str, file: str, result: Fit) -> Row:
 
 
 def _cells(p: ParameterEstimate) -> list[Any]:
-    return [p.value, p.stderr, *(p.ci95 or (None, None)), p.state, p.unit]
+    return [p.value, p.stderr, *(p.ci95 or (None, None)), p.state, p.unit, *(p.range or ())]
 
 
 # ------------------------------------------------------------------------------- the table
@@ -235,7 +235,8 @@ class Column:
     symbol: tuple[str, str]
     unit: str
     factor: float
-    strip: str  # path of SVG: the intervals of all tests side by side
+    ranges: str  # path of SVG: the ranges of all tests side by side
+    strip: str  # and their intervals
     dots: str  # the values that are determined
     unsure: str  # and those that are not
     ends: tuple[str, str]  # of the strip's axis
@@ -290,17 +291,17 @@ def _columns(rows: Sequence[Row]) -> Iterator[Column]:
             y = STRIP_HEIGHT * (high - min(max(value, low), high)) / (high - low)
             return round(y, 1)
 
-        bars, dots, unsure = list[str](), list[str](), list[str]()
+        ranges, bars, dots, unsure = list[str](), list[str](), list[str](), list[str]()
         for i, cell in there:
             x = round((i + 0.5) * STRIP_WIDTH / len(rows), 1)
-            if cell[2] is not None and cell[3] is not None:
-                bars.append(f"M{x:g} {pixel(cell[2]):g}V{pixel(cell[3]):g}")
+            for ends, lines in ((cell[6:8], ranges), (cell[2:4], bars)):
+                if ends and ends[0] is not None:
+                    lines.append(f"M{x:g} {pixel(ends[0]):g}V{pixel(ends[1]):g}")
             mark = f"M{x:g} {pixel(cell[0]):g}h0"
             (unsure if cell[4] in ("weak", "not determined") else dots).append(mark)
-        ends = number(high / factor), number(low / factor)
-        yield Column(
-            name, symbol(name), unit, factor, "".join(bars), "".join(dots), "".join(unsure), ends
-        )
+        band, line, dot, grey = map("".join, (ranges, bars, dots, unsure))
+        axis = number(high / factor), number(low / factor)
+        yield Column(name, symbol(name), unit, factor, band, line, dot, grey, axis)
 
 
 def _cell(row: Row, column: Column) -> tuple[str, str, str, str]:
@@ -308,8 +309,11 @@ def _cell(row: Row, column: Column) -> tuple[str, str, str, str]:
     found = row.parameters.get(column.name)
     if found is None or found[0] is None:
         return "", "", "", ""
-    value, _, low, high, state, _ = found
-    interval = ""
-    if low is not None and high is not None:
-        interval = f"{low / column.factor:.4g} to {high / column.factor:.4g}".replace("-", "−")
-    return f"{value / column.factor:.4g}".replace("-", "−"), f"{value:.6g}", interval, state
+    value, _, low, high, state, _, *span = found
+
+    def shown(*ends: float) -> str:
+        return " to ".join(f"{end / column.factor:.4g}" for end in ends).replace("-", "−")
+
+    interval = "" if low is None or high is None else shown(low, high)
+    interval += f"; range {shown(*span)}" if span else ""
+    return shown(value), f"{value:.6g}", interval, state

@@ -233,8 +233,10 @@ def _list(ax: Axes, found: JointData, names: list[str], *, stacked: bool) -> Non
     lines = [["shared by all tests", "", ""]]
     for name in names:
         one = found.parameters[name]
-        half = None if one.ci95 is None else 0.5 * (one.ci95[1] - one.ci95[0])
-        error = f"±{percent(half / abs(one.value))}" if half and one.value else one.state or ""
+        widths = [ends[1] - ends[0] for ends in (one.ci95, one.range) if ends is not None]
+        half = 0.5 * max(widths, default=0.0)  # what its state goes by
+        error = f"±{percent(half / abs(one.value))}" if half and one.value else ""
+        error += f" {one.state or ''}" if one.state != "determined" else ""
         value = in_unit((one.value,), one.unit)
         if stacked:
             lines += [[_title(found, name), "", ""], [f"   {value} {error}", "", ""]]
