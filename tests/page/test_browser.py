@@ -259,6 +259,25 @@ def test_firefox_drops_fits_turns_and_saves(playwright, served, tmp_path):
     browser.close()
 
 
+def test_another_file_keeps_nothing_of_the_one_before(window):
+    """Its specimen is that of its own TOML, or is filled in; what was typed is offered."""
+    page = window
+    height, rest = page.get_by_label("Specimen height"), page.get_by_label("Further TOML")
+    load(page)
+    api.expect(height).to_have_value("1.19 mm")
+    offer = page.get_by_role("button", name="Fill in as for the file before")
+    api.expect(offer).to_be_hidden()
+    choose(page, ("other.csv", TEST.read_text()))
+    api.expect(height).to_have_value("")
+    api.expect(rest).to_have_value("")
+    api.expect(page.get_by_text("height", exact=False).first).to_be_visible()
+    api.expect(page.get_by_role("button", name="Fit", exact=True)).to_be_disabled()
+    offer.click()
+    api.expect(height).to_have_value("1.19 mm")
+    api.expect(offer).to_be_hidden()
+    page.get_by_label("s1_k0", exact=True).wait_for()
+
+
 def test_two_windows_do_not_mix(window, served):
     other = window.context.new_page()
     other.goto(served.address)

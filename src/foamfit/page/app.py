@@ -102,8 +102,8 @@ class Window:
         self.template = pn.Template((TEMPLATES / "page.html").read_text(encoding="utf-8"))
         wide: dict[str, Any] = {"sizing_mode": "stretch_width", "margin": 0}
         parts = {
-            "test": pn.Column(self.upload, self.chosen, *self.quantities.values(), self.rest,
-                              self.check, self.problem, **wide),
+            "test": pn.Column(self.upload, self.chosen, self.as_before, *self.quantities.values(),
+                              self.rest, self.check, self.problem, **wide),
             "model": pn.Column(*(self.options[name].widget for name in self.options
                                  if name not in FOLDED), **wide),
             "more": pn.Column(*(self.options[name].widget for name in FOLDED), **wide),
@@ -146,6 +146,8 @@ class Window:
             name="Further TOML: name, [columns], [noise], [window]", rows=4, max_length=20_000,
             placeholder='[columns]\nforce = { column = "Load", unit = "kN" }', **style,
         )  # fmt: skip
+        self.as_before = button(name="Fill in as for the file before", visible=False, **style)
+        self._before: tuple[dict[str, str], str] = {}, ""
         self.check = button(name="Check the test", **style)
         lists = {"model": [*MODELS], "relaxation": [*range(RELAXATIONS)]}
         self.options = {
@@ -193,6 +195,7 @@ class Window:
         self.upload.on_msg(self._received)
         self.chosen.param.watch(self._choose, "value")
         self.check.on_click(self._check)
+        self.as_before.on_click(self._fill_as_before)
         self.run.on_click(self._run)
         self.stop.on_click(self._stop)
         self.back.on_click(self._back)
@@ -266,7 +269,10 @@ class Window:
         self._read()
 
     def _read(self) -> None:
-        """Fill in what a dropped TOML says, and check."""
+        """Fill in what a dropped TOML says, nothing for another file without one, and check.
+
+        What was filled in for the file before is of its specimen; it is offered.
+        """
         try:
             found = self.desk.dropped_toml()
         except InputError as error:
@@ -276,11 +282,31 @@ class Window:
         if self.desk.worker is None:  # what is shown of a fit is of another test
             self._hide_result("There is no fit yet.")
             self.curves.held, self.cycle.value = {}, ""
+        offered = found is None and self.desk.replaced
+        if offered:
+            self._before = self._given()
+            found = {}, ""
+        self.as_before.visible = offered and any((*self._before[0].values(), self._before[1]))
+        self.desk.replaced = False
         if found is not None:
-            quantities, rest = found
-            for name, field in self.quantities.items():
-                field.value = quantities.get(name, "")
-            self.rest.value = rest
+            self._fill(*found)
+        self._filling = False
+        self._check()
+
+    def _given(self) -> tuple[dict[str, str], str]:
+        """The quantities and the further TOML as they are filled in."""
+        given = {name: field.value or "" for name, field in self.quantities.items()}
+        return given, self.rest.value or ""
+
+    def _fill(self, quantities: Mapping[str, str], rest: str) -> None:
+        for name, field in self.quantities.items():
+            field.value = quantities.get(name, "")
+        self.rest.value = rest
+
+    def _fill_as_before(self, event: Any) -> None:
+        """Take what was filled in for the file before, which was offered."""
+        self._filling, self.as_before.visible = True, False
+        self._fill(*self._before)
         self._filling = False
         self._check()
 
@@ -290,8 +316,7 @@ class Window:
 
     def _check(self, event: Any = None) -> None:
         """Check the test as it is filled in, and show what is understood or wrong."""
-        given = {name: field.value or "" for name, field in self.quantities.items()}
-        rest, cycle = self.rest.value or "", self.cycle.value or ""
+        (given, rest), cycle = self._given(), self.cycle.value or ""
         self.run.disabled = True
         self._asked[PREPARING] += 1  # what is being prepared is of the test as it was
         self._beside(READING, lambda: self.desk.check(given, rest, cycle), self._show_checked)

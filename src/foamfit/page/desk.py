@@ -90,6 +90,7 @@ class Desk:
         self.folder = folder
         folder.mkdir(mode=0o700)
         self.csv: Path | None = None
+        self.replaced = False  # whether the file has taken the place of another, not read since
         self.measurement: Measurement | None = None
         self.worker: Worker | None = None
         self._fits = 0
@@ -123,6 +124,7 @@ class Desk:
         place = self.folder / "test"
         shutil.rmtree(place, ignore_errors=True)
         place.mkdir()
+        self.replaced = self.csv is not None
         self.csv, self.measurement, self.worker = place / name, None, None
         self.csv.write_bytes(content)
         return name
