@@ -7,7 +7,7 @@ loop (stress along the measured motion, closed form, cheap), then the curves of 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -35,6 +35,7 @@ NOISY = 0.005  # noise of a motion, over its range, that is much
 AROUND = 200  # points about the best one among which another search begins
 # Share of the box that counts as its edge, and where inside a descent begins again.
 EDGE, INSIDE = 0.02, (0.35, 0.5, 0.65)
+STEEP = np.geomspace(1.0, 1000.0, 7)  # k_c over the largest stress at which it begins again
 # Minima of the loop whose cost on the drive's curves is within this factor of the best go on.
 PROMISING = 100.0
 # Factors by which the stiffness that an interior mass vibrates on is changed, and their inverses.
@@ -244,14 +245,39 @@ def _off_edges(tracker: Tracker, space: Space) -> list[float]:
     span, costs = high - low, []
     edges = (best - low < EDGE * span) | (high - best < EDGE * span)
     edges |= len(space.model.kinds) > 1 and tracker.best_cost > tracker.objective.floor
+    starts = []
     for at in np.flatnonzero(edges & [is_logarithmic(short) for _, short, _ in space.coordinates]):
         for share in INSIDE:
             start = best.copy()
             start[at] = low[at] + share * span[at]
-            cost, end = descend(tracker, space, start, 60)
-            tracker.ends.append(space.decode(end))
-            costs.append(cost)
+            starts.append(start)
+    if tracker.best_cost > tracker.objective.floor:
+        starts += _other_kc(space, space.decode(best))
+    for start in starts:
+        cost, end = descend(tracker, space, start, 60)
+        tracker.ends.append(space.decode(end))
+        costs.append(cost)
     return costs
+
+
+def _other_kc(space: Space, values: Array) -> Iterator[Array]:
+    """Points with another k_c whose branch c passes through the same strain at the largest stress.
+
+    A steep branch c shows in few samples: where k_c alone changes it misses them altogether.
+    """
+    top, index = space.scales.stress, space.model.index
+    for spring, kind in enumerate(space.model.kinds, start=1):
+        name, place = f"s{spring}_kc", {"bistable": "eps_c", "microscale": "eps_star"}.get(kind)
+        if place is None or name not in space.free or f"s{spring}_{place}" not in space.free:
+            continue
+        k0, kc, dsigma, eps_a = values[index[f"s{spring}_k0"] :][:4]
+        low = k0 * eps_a / (1.0 - eps_a) + dsigma if kind == "bistable" else 0.0
+        for other in top * STEEP:
+            moved = values.copy()
+            moved[index[name]] = other
+            rises = [top / (k + top) - low / (k + low) for k in (kc, other)]
+            moved[index[f"s{spring}_{place}"]] += rises[0] - rises[1]
+            yield space.encode(moved)
 
 
 def _settled(tracker: Tracker, ends: list[tuple[float, int]], attempt: int, least: int) -> bool:
