@@ -75,7 +75,7 @@ def test_what_matches_nothing_is_named(here, pattern):
     with pytest.raises(InputError) as error:
         find_tests(["monday", pattern])
     assert str(error.value).startswith(f"{pattern}: the ")
-    assert "a test is a table that ends in .csv, .txt, .tsv or .dat" in str(error.value)
+    assert "a test is a table that ends in .csv, .txt, .tsv, .dat, .gz or .xlsx" in str(error.value)
 
 
 def test_a_name_with_brackets_is_a_file_where_there_is_one(here):

@@ -20,7 +20,7 @@ from foamfit.report.folder import (
 )
 from foamfit.text import listed
 
-ENDINGS = (".csv", ".txt", ".tsv", ".dat")
+ENDINGS = (".csv", ".txt", ".tsv", ".dat", ".gz", ".xlsx")
 WANTED = f"a test is a table that ends in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}"
 # Stems of tables that say what the specimens are, beside the tests.
 _SPECIMENS = ("specimen", "specimens")
