@@ -375,13 +375,13 @@ def _one_of(
         notes.append(f"The {first} is the {second} {operation} {by}.")
         return two / ratio
     slope = float(np.dot(two, one) / np.dot(one, one)) / ratio
-    apart = percent(float(np.max(np.abs(two / ratio - one)) / np.ptp(one)))
+    apart = percent(max(1e-5, float(np.max(np.abs(two / ratio - one)) / np.ptp(one))))
     if abs(slope - 1) > 0.03:
         agree = f"{slope:.3g} times what it gives with {by} of the specimen; they are inconsistent"
         notes.append(f"Check: the {first} is used, but the {second} is {agree}.")
     else:
-        told = f"The {first} is used rather than the {second}, and they agree"
-        notes.append(f"{told}: they differ by up to {apart} of the range.")
+        told = f"The {first} is used rather than the {second}, and they agree to"
+        notes.append(f"{told} {apart} of the range.")
     return one
 
 

@@ -324,7 +324,7 @@ def read_numbers(
 def _refuse_thousands(table: Table, column: int, values: Array) -> None:
     """Refuse numbers whose decimal sign may separate thousands: 998 is followed by 1.002."""
     size = np.abs(values)
-    large = (size >= 100) & (size == np.round(size))
+    large = (size >= 10) & (size == np.round(size))
     small = size != np.round(size)
     if not (large.any() and small.any() and size.max() < 1000 and size[small].min() >= 1):
         return

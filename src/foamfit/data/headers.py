@@ -109,7 +109,7 @@ def parse_header(text: str) -> Header:
     if len(text) > LONGEST:  # a title or a comment
         return Header(text)
     bracket = re.fullmatch(r"(.*)[(\[{]([^()\[\]{}]*)[)\]}]", text)
-    bracket = bracket or re.fullmatch(r"(.+) / (\S+)", text)
+    bracket = bracket or re.fullmatch(r"(.+) (?:/|in) (\S+)", text)
     if bracket:
         name, unit = bracket[1], bracket[2].strip()
         words = _words(f"{name} ({unit})")
