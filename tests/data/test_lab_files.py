@@ -281,12 +281,23 @@ def test_a_scale_and_a_sensitivity(tmp_path, entry, told):
     assert told in test.notes[0]
 
 
+def test_the_sensitivity_of_an_accelerometer(tmp_path):
+    # Fabricated: 1 kg is braked by at most 200 N, 20.394 g of standard gravity at 10 mV/g.
+    millivolts = 10 * FORCE / 9.80665
+    lines = ["Time (ms),Channel A,displacement (mm)", *rows(TIME, millivolts, MOTION)]
+    entry = '[columns]\nacceleration = { column = "Channel A", scale = "10 mV/g"'
+    toml = SPECIMEN + STRIKER + entry
+    refused(write(tmp_path, lines, toml + " }\n"), 'unit = "mV", scale = "10 mV/g"')
+    test = read_test(write(tmp_path, lines, toml + ', unit = "mV" }\n'))
+    assert test.stress.max() == pytest.approx(2e6, rel=1e-4)
+
+
 # ------------------------------------------------------------------------ packed and workbooks
 
 PLAIN = ["time (s),force (N),displacement (mm)", *rows(TIME, FORCE, MOTION)]
 
 
-def test_a_gzip_file(tmp_path):
+def test_a_gzip_file(tmp_path, monkeypatch):
     path = write(tmp_path, PLAIN)
     packed = tmp_path / "test.csv.gz"
     packed.write_bytes(gzip.compress(path.read_bytes()))
@@ -295,6 +306,9 @@ def test_a_gzip_file(tmp_path):
     assert test.name == "test"
     packed.write_bytes(packed.read_bytes()[:-20])
     refused(packed, "no whole gzip file")
+    monkeypatch.setattr("foamfit.data.layouts._LARGEST", 1000)
+    packed.write_bytes(gzip.compress(path.read_bytes()))
+    refused(packed, "unpacks to more than")
 
 
 def workbook(folder, sheets, toml=SPECIMEN):

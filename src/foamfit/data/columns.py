@@ -121,7 +121,8 @@ def si_factor(table: Table, channel: str, k: int, given: Column | None) -> float
     if unit is None and in_si(channel, "", given.scale_unit) is None:
         usual, more = channel_of(channel).unit, ""
         if given.scale_unit:
-            usual = given.scale_unit.rpartition("/")[2]
+            over, _, under = given.scale_unit.rpartition("/")
+            usual = under if in_si(channel, under) is None else over  # N/mV, or mV/N of a sensor
             more = f', scale = "{given.scale:g} {given.scale_unit}"'
         raise InputError(
             f"{where} has no unit; write it in the header like '{right}' or in [columns] like "

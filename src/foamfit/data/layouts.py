@@ -15,6 +15,7 @@ from foamfit.data.measurement import MIN_ROWS
 from foamfit.errors import InputError
 from foamfit.text import listed
 
+_LARGEST = 1 << 30  # bytes that a .gz may unpack to
 _FEW = 20  # lines of numbers that show where the columns of a table stand
 _TOKEN = re.compile(r"\S+")
 _NAME = re.compile(r"[^\s(\[]+(?:\s?[(\[][^)\]]*[)\]])?")  # a word, with its unit in brackets
@@ -36,9 +37,13 @@ def unpacked(path: Path, raw: bytes, sheet: str | None) -> bytes:
     """Return the text in the bytes of a file: of a .gz what it holds, of an .xlsx one sheet."""
     if raw.startswith(b"\x1f\x8b"):
         try:
-            raw = gzip.decompress(raw)
+            raw = gzip.GzipFile(fileobj=io.BytesIO(raw)).read(_LARGEST + 1)
         except (OSError, EOFError, zlib.error) as error:
             raise InputError(f"{path}: is no whole gzip file ({error}); pack it again.") from None
+        if len(raw) > _LARGEST:
+            raise InputError(
+                f"{path}: unpacks to more than {_LARGEST >> 20} MB; cut it to the test."
+            )
     if raw.startswith(b"PK\x03\x04"):
         return _sheet(path, raw, sheet)
     if sheet is not None:
