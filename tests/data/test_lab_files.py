@@ -444,6 +444,13 @@ def test_thousands_are_not_read_as_decimals(tmp_path, sep, decimal):
     refused(path, "without separators, 1000,5" if decimal == "," else "must be a number")
 
 
+def test_three_decimals_are_no_thousands(tmp_path):
+    body = rows(TIME, FORCE, MOTION + 10)
+    body = [f"{row.rpartition(',')[0]},{w:.3f}" for row, w in zip(body, MOTION + 10, strict=True)]
+    test = read_test(write(tmp_path, [PLAIN[0], *body]))
+    assert test.displacement.max() == pytest.approx(4e-3, rel=1e-3)
+
+
 @pytest.mark.parametrize(
     ("lines", "toml", "words"),
     [

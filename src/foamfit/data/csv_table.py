@@ -324,18 +324,18 @@ def read_numbers(
 def _refuse_thousands(table: Table, column: int, values: Array) -> None:
     """Refuse numbers whose decimal sign may separate thousands: 998 is followed by 1.002."""
     size = np.abs(values)
-    large = (size >= 10) & (size == np.round(size))
-    small = size != np.round(size)
-    if not (large.any() and small.any() and size.max() < 1000 and size[small].min() >= 1):
+    part = size[size != np.round(size)]
+    if not part.size or part.min() < 1 or size.max() >= 1000:
         return
     sign = table.decimal
     cells = [cells[column].strip() for _, cells in table.rows() if column < len(cells)]
+    whole = [cell for cell in cells if re.fullmatch(r"[+-]?[1-9]\d{1,2}", cell)]
     parted = [cell for cell in cells if sign in cell]
-    if parted and all(re.fullmatch(rf"[+-]?[1-9]\d{{0,2}}\{sign}\d{{3}}", cell) for cell in parted):
+    if whole and all(re.fullmatch(rf"[+-]?[1-9]\d{{0,2}}\{sign}\d{{3}}", cell) for cell in parted):
         raise InputError(
             f"{table.path}: column {table.name(column)}: {parted[0]!r} beside numbers like "
-            f"'{size[large].max():.0f}' seems to separate thousands; write the numbers with a "
-            "decimal point and without separators."
+            f"{whole[-1]!r} seems to separate thousands; write the numbers with a decimal point "
+            "and without separators."
         )
 
 
