@@ -100,9 +100,10 @@ def _motions(folder: Path) -> set[Path]:
 
 def _is_test(path: Path) -> bool:
     """Whether a file is taken where it is not named itself."""
-    if path.suffix.lower() not in ENDINGS or path.stem.lower() in _SPECIMENS:
+    plain = path.with_suffix("") if path.suffix.lower() == ".gz" else path  # no .tar.gz
+    if plain.suffix.lower() not in ENDINGS or plain.stem.lower() in _SPECIMENS:
         return False
-    if path.name.startswith("."):
+    if path.name.startswith((".", "~$")):
         return False
     is_result = path.name in _WRITTEN and any(
         (path.parent / mark).is_file() for mark in (*MARKS, "summary.html")
