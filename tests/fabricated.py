@@ -9,12 +9,13 @@ import lmfit
 import numpy as np
 
 from foamfit.api import FitResult
-from foamfit.data.measurement import Measurement, Specimen, Striker
+from foamfit.data.measurement import ASKED, Measurement, Specimen, Striker
 from foamfit.report.result_figures import Images
 from foamfit.results import SOURCES, Budget, Curves, ParameterEstimate, Switch
 from foamfit.springs.chain import Chain
 from foamfit.springs.parameters import MICROSCALE_NAMES
 from foamfit.springs.spring import BistableSpring, LinearSpring, MicroscaleSpring
+from foamfit.trust.checklist import input_first
 
 HEIGHT, AREA = 1.19e-3, 1.9635e-5
 SPRING = BistableSpring(
@@ -156,7 +157,10 @@ def result(**changed: Any) -> FitResult:
         ),
         "switches": switches,
     }  # fmt: skip
-    return FitResult(**(given | changed))
+    given |= changed
+    asked = [note for note in given["measurement"].notes if note.startswith(ASKED)]
+    given["warnings"] = input_first((*given["warnings"], *asked))
+    return FitResult(**given)
 
 
 def budget(**shares: float) -> Budget:

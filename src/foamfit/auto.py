@@ -30,6 +30,7 @@ from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE, split_name
 from foamfit.text import counted, percent
 from foamfit.trust.best_point import BestPoint
+from foamfit.trust.checklist import input_first
 from foamfit.trust.evidence import (
     MARGIN,
     SHARE,
@@ -373,7 +374,7 @@ def _conclude(
     return replace(
         result,
         status="warnings" if warned and result.status == "ok" else result.status,
-        warnings=(*warned, *result.warnings),
+        warnings=input_first((*warned, *result.warnings)),
         ladder=ladder,
         stopped=stopped or result.stopped,
         runtime_s=took,

@@ -66,6 +66,14 @@ def test_each_file_is_taken_once_and_in_order(here):
     assert names("a.csv", base=here / "monday") == ["a"]
 
 
+def test_packed_tables_and_workbooks_are_tests(here):
+    for name in ("d.csv.gz", "e.xlsx", "~$e.xlsx", "f.tar.gz", "specimens.csv.gz"):
+        (here / "tuesday" / name).write_bytes(b"x")
+    found = {path.name for _, path in find_tests("tuesday/*", base=here)}
+    assert {"d.csv.gz", "e.xlsx"} <= found
+    assert not {"~$e.xlsx", "f.tar.gz", "specimens.csv.gz"} & found
+
+
 def test_a_file_that_is_not_there_is_left_to_its_reader(here):
     assert names("monday/none.csv") == ["none"]
 
@@ -75,7 +83,7 @@ def test_what_matches_nothing_is_named(here, pattern):
     with pytest.raises(InputError) as error:
         find_tests(["monday", pattern])
     assert str(error.value).startswith(f"{pattern}: the ")
-    assert "a test is a table that ends in .csv, .txt, .tsv or .dat" in str(error.value)
+    assert "a test is a table that ends in .csv, .txt, .tsv, .dat, .gz or .xlsx" in str(error.value)
 
 
 def test_a_name_with_brackets_is_a_file_where_there_is_one(here):

@@ -211,9 +211,10 @@ def _tell_result(result: FitResult, as_json: bool, quiet: bool, verbose: bool) -
 
 def _result_folder(out: Path | None, test: Path, specimen: Path | None, model: str) -> Path:
     """Return the folder for a result, which must not be one that would be lost."""
+    from foamfit.data.toml_file import toml_beside
     from foamfit.report.folder import check_target
 
-    folder = Path("fits", test.stem, model) if out is None else out
+    folder = Path("fits", toml_beside(test).stem, model) if out is None else out
     check_target(folder)
-    spare(folder, (test, specimen or test.with_suffix(".toml")))
+    spare(folder, (test, specimen or toml_beside(test)))
     return folder

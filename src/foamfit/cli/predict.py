@@ -78,12 +78,13 @@ def predict(
     """
     check_open(as_json)
     from foamfit.data.csv_file import read_test
+    from foamfit.data.toml_file import toml_beside
     from foamfit.report.studies.prediction import check_replaceable
     from foamfit.study.prediction.identified import read_source
 
-    folder = Path("predictions", test.stem) if out is None else out
+    folder = Path("predictions", toml_beside(test).stem) if out is None else out
     check_replaceable(folder)
-    spare(folder, (test, specimen or test.with_suffix(".toml"), result))
+    spare(folder, (test, specimen or toml_beside(test), result))
     read_source(result)  # a wrong path is told before anything is compiled
     with compiling(quiet or as_json) as compile_rest:
         measurement = read_test(test, specimen, cycle)

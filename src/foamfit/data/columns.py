@@ -12,10 +12,11 @@ from foamfit.data.measurement import Striker, interior_channel, interior_node
 from foamfit.data.toml_file import Column, Settings
 from foamfit.data.units import is_unit
 from foamfit.errors import InputError
-from foamfit.text import percent
+from foamfit.text import listed, percent
 
 _NONE = Column("")
 _MOTIONS = "displacement", "strain"
+TWINS = {"stress": "force", "force": "stress", "displacement": "strain", "strain": "displacement"}
 # What stress and displacement are read from, the first that there is.
 _SOURCES = {"stress": ("stress", "force", "acceleration"), "displacement": _MOTIONS}
 
@@ -26,15 +27,7 @@ def assign_columns(table: Table, given: dict[str, Column], toml: Path | None) ->
     strained = "strain" in given or any(h.rank("strain") is not None for h in table.headers)
     for channel in _channels(table, given):
         if channel in given:
-            name = given[channel].column
-            places = [k for k, h in enumerate(table.headers) if h.is_named(name)]
-            if len(places) != 1:
-                raise InputError(
-                    f"{toml}: [columns] {channel}: column {name!r} is "
-                    f"{'twice' if places else 'nowhere'} in {table.path.name}, which has "
-                    f"{table.listed}."
-                )
-            found[channel] = places[0]
+            found[channel] = _place(table, channel, given[channel].column, toml)
             continue
         ranks = {k: r for k, h in enumerate(table.headers) if (r := h.rank(channel)) is not None}
         if interior_node(channel):  # a column that the TOML calls the top is not inside
@@ -43,9 +36,11 @@ def assign_columns(table: Table, given: dict[str, Column], toml: Path | None) ->
         best = [k for k, r in ranks.items() if r == min(ranks.values())]
         if len(best) > 1 and channel == "time":
             best = _clear_time(table, best)
+        if len(best) > 1 and TWINS.get(channel) in given:
+            continue
         if len(best) > 1:
-            both = " and ".join(repr(table.headers[k].text) for k in best)
-            entry = f'{channel} = {{ column = "{table.headers[best[0]].text}" }}'
+            both = " and ".join(map(table.name, best))
+            entry = f"{channel} = {{ column = {_quoted(table, best[0])} }}"
             more = f", or write {entry} in [columns] of {toml.name}" if toml else ""
             raise InputError(
                 f"{table.path}: columns {both} could both be the {channel}; keep one{more}."
@@ -53,11 +48,40 @@ def assign_columns(table: Table, given: dict[str, Column], toml: Path | None) ->
         if best and not (ranks[best[0]] == WEAK and strained):
             found[channel] = best[0]
     # A channel that the TOML names replaces its twin that only a header names.
-    for one, other in (("stress", "force"), _MOTIONS):
-        for named, twin in ((one, other), (other, one)):
-            if named in given and twin not in given:
-                found.pop(twin, None)
+    for named, twin in TWINS.items():
+        if named in given and twin not in given:
+            found.pop(twin, None)
+    # A true stress needs the cross-section that no file has.
+    stress = found.get("stress")
+    if "stress" not in given and "force" in found and stress is not None:
+        true = table.headers[stress].measure("stress")
+        found = {c: k for c, k in found.items() if c != "stress" or not true}
     return found
+
+
+def _place(table: Table, channel: str, column: str | int, toml: Path | None) -> int:
+    """Place of a column that the TOML gives by its header or its number."""
+    count = len(table.headers)
+    if isinstance(column, int):
+        if column > count:
+            wrong = f"column {column} is not in {table.path.name}, which has {count} columns"
+            raise InputError(f"{toml}: [columns] {channel}: {wrong}.")
+        return column - 1
+    places = [k for k, h in enumerate(table.headers) if h.is_named(column)]
+    if len(places) == 1:
+        return places[0]
+    more = f"nowhere in {table.path.name}, which has {table.listed}"
+    if places:
+        numbers = " or ".join(str(k + 1) for k in places)
+        more = f"twice in {table.path.name}; give its number, column = {numbers}"
+    raise InputError(f"{toml}: [columns] {channel}: column {column!r} is {more}.")
+
+
+def _quoted(table: Table, k: int) -> str:
+    """A column as [columns] names it: by its header, or by its number where others are equal."""
+    text = table.headers[k].text
+    alone = table.header_row and [h.text for h in table.headers].count(text) == 1
+    return f'"{text}"' if alone else str(k + 1)
 
 
 def _channels(table: Table, given: dict[str, Column]) -> list[str]:
@@ -69,27 +93,40 @@ def _channels(table: Table, given: dict[str, Column]) -> list[str]:
 
 def _clear_time(table: Table, columns: list[int]) -> list[int]:
     """Of several columns that could be the time keep the one that never goes back, if it is one."""
-    numbers, _ = read_numbers(table, {str(k): k for k in columns})
+    try:
+        numbers, _ = read_numbers(table, {str(k): k for k in columns})
+    except InputError:  # tests of different lengths, side by side
+        return columns
     steps = {k: np.diff(numbers[str(k)]) for k in columns}
     onward = [k for k, step in steps.items() if step.size and step.min() >= 0.0 < step.max()]
     return onward if len(onward) == 1 else columns
 
 
-def si_factor(table: Table, channel: str, header: Header, given: Column | None) -> float:
-    """Return what the numbers of a column are multiplied by to be SI."""
+def si_factor(table: Table, channel: str, k: int, given: Column | None) -> float:
+    """Return what the numbers of column `k` are multiplied by to be SI."""
+    header = table.headers[k]
     if channel == "cycle":  # counted; pint takes "Cycles" in a header for a unit of angle
         return 1.0
-    right, where = example(channel), f"{table.path}: column {header.text!r}"
+    right, where = example(channel), f"{table.path}: column {table.name(k)}"
+    if header.measure(channel) and channel == "stress":
+        raise InputError(
+            f"{where} is a {header.measure(channel)} stress, which needs the cross-section of each "
+            "instant; give the force or the nominal (engineering) stress."
+        )
     given = given or _NONE
     unit = given.unit if given.unit is not None else header.unit
     over = header.text.partition("/")[2].strip()  # Weg/mm, which only the TOML calls displacement
     if unit is None and over and in_si(channel, over, given.scale_unit) is not None:
         unit = over
-    if unit is None and not given.scale_unit and channel != "strain":
-        usual = channel_of(channel).unit
+    if unit is None and in_si(channel, "", given.scale_unit) is None:
+        usual, more = channel_of(channel).unit, ""
+        if given.scale_unit:
+            over, _, under = given.scale_unit.rpartition("/")
+            usual = under if in_si(channel, under) is None else over  # N/mV, or mV/N of a sensor
+            more = f', scale = "{given.scale:g} {given.scale_unit}"'
         raise InputError(
             f"{where} has no unit; write it in the header like '{right}' or in [columns] like "
-            f'{channel} = {{ column = "{header.text}", unit = "{usual}" }}.'
+            f'{channel} = {{ column = {_quoted(table, k)}, unit = "{usual}"{more} }}.'
         )
     unit = unit or ""
     if not is_unit(unit, any_case=True):
@@ -97,12 +134,25 @@ def si_factor(table: Table, channel: str, header: Header, given: Column | None) 
     if given.unit is not None:
         _check_unit(channel, header, given.unit, where)
     one = in_si(channel, unit, given.scale_unit)
+    if is_sensitivity(channel, unit, given):
+        one = in_si(channel, unit, f"1/({given.scale_unit})")
+        assert one is not None
+        one /= given.scale**2
     if one is None:
         raise InputError(
             f"{where} cannot be read as {channel}: its unit {unit!r} is of another kind; "
             f"write it like '{right}' or give a scale in [columns]."
         )
     return given.scale * one * (-1.0 if given.counts_down else 1.0)
+
+
+def is_sensitivity(channel: str, unit: str, given: Column) -> bool:
+    """Whether a scale is that of a sensor, "4 mV/N", by which its reading is divided."""
+    return (
+        in_si(channel, unit, given.scale_unit) is None
+        and bool(given.scale_unit)
+        and (in_si(channel, unit, f"1/({given.scale_unit})") is not None)
+    )
 
 
 def _check_unit(channel: str, header: Header, given: str, where: str) -> None:
@@ -126,9 +176,10 @@ def needed_columns(table: Table, columns: dict[str, int], settings: Settings) ->
     forced = bool(has & {"stress", "force"})
     braked = bool(has & {"acceleration", "velocity"} or (has & set(_MOTIONS) and striker.velocity))
     if not forced and not ("time" in has and braked and striker.mass):
+        entries = _entries(table, has, "force", "displacement", "time")
         raise InputError(
             f"{table.path}: no column is a stress or a force (there are {table.listed}); name one "
-            'like \'stress (MPa)\', or write force = { column = "…", unit = "N" } in [columns]; '
+            f"like 'stress (MPa)', or write {entries} in [columns]; "
             "with a time and the [striker] mass an acceleration or a velocity will do, and with "
             "its velocity a displacement."
         )
@@ -140,19 +191,49 @@ def needed_columns(table: Table, columns: dict[str, int], settings: Settings) ->
         return {c: k for c, k in columns.items() if c not in helping}
     for channel in has & helping - set(settings.columns):
         try:  # these only help, so one whose unit does not say what it is can be left
-            si_factor(table, channel, table.headers[columns[channel]], None)
+            si_factor(table, channel, columns[channel], None)
         except InputError:
             has.remove(channel)
     sources = "velocity" in has or (striker.velocity and (striker.mass or "acceleration" in has))
     if "time" not in has or not sources:
-        timed = "" if "time" in has else 'time = { column = "…", unit = "s" } there, and '
+        timed = "" if "time" in has else f"{_entries(table, has, 'time')} there, and "
         raise InputError(
             f"{table.path}: no column is a displacement or a strain (there are {table.listed}); "
-            "name one like 'displacement (mm)', or write displacement = { column = \"…\", unit = "
-            f'"mm" }} in [columns], or give {timed}the [striker] mass and velocity to integrate '
-            "the motion."
+            f"name one like 'displacement (mm)', or write {_entries(table, has, 'displacement')} "
+            f"in [columns], or give {timed}the [striker] mass and velocity to integrate the motion."
         )
     return {c: k for c, k in columns.items() if c in has}
+
+
+def _entries(table: Table, has: set[str], *channels: str) -> str:
+    """Entries of [columns] for channels that the file seems to lack, by units of its headers."""
+    entries = []
+    for channel in channels:
+        fits = (
+            k for k, header in enumerate(table.headers)
+            if header.unit and in_si(channel, header.unit) is not None
+            and all(header.rank(other) is None for other in CHANNELS)
+        )  # fmt: skip
+        k = next(fits, None)
+        column = '"…"' if k is None else _quoted(table, k)
+        unit = f', unit = "{channel_of(channel).unit}"' if k is None else ""
+        entries += [f"{channel} = {{ column = {column}{unit} }}"] if channel not in has else []
+    return listed(entries)
+
+
+def left_out(table: Table, needed: dict[str, int]) -> dict[str, int]:
+    """Columns that could have been read instead of those that are: the twins and other times."""
+    found: dict[str, int] = {}
+    for channel in (c for c in needed if c in {"time", *TWINS}):
+        twin = TWINS.get(channel, channel)
+        ranks = {
+            k: rank
+            for k, header in enumerate(table.headers)
+            if k not in needed.values() and (rank := header.rank(twin)) is not None
+        }
+        if ranks and (twin not in needed or channel == "time"):
+            found[twin] = min(ranks, key=lambda k: ranks[k])
+    return found
 
 
 def scale_spreads(columns: dict[str, int], given: dict[str, Column]) -> dict[str, float]:
@@ -200,9 +281,10 @@ def read_note(table: Table, needed: dict[str, int], columns: dict[str, Column]) 
         given, header = columns.get(channel, _NONE), table.headers[k]
         by = f"{given.scale:.6g} {given.scale_unit}".strip()
         own = (given.unit or header.unit or "").casefold()
-        part = f"{channel} from {header.text!r}" + (f" in {given.unit}" if given.unit else "")
+        part = f"{channel} from {table.name(k)}" + (f" in {given.unit}" if given.unit else "")
         by += f" ± {percent(given.spread)}" if given.spread else ""
-        part += f" times {by}" if by != "1" else ""
+        inverse = is_sensitivity(channel, given.unit or header.unit or "", given)
+        part += f" {'over the sensitivity' if inverse else 'times'} {by}" if by != "1" else ""
         part += ", counting down" if given.counts_down else ""
         if channel == "force" and own in WEIGHTS:
             part += f" ({WEIGHTS[own]}: the weight of that mass)"
@@ -218,7 +300,7 @@ def sign_advice(
     """Say what makes a channel positive that is negative in compression; see `check_signs`."""
     channel = next(c for c in _SOURCES.get(channel, (channel,)) if c in columns)
     given, motion = entries.get(channel, _NONE), channel.startswith("displacement")
-    entry = f'{channel} = {{ column = "{table.headers[columns[channel]].text}"'
+    entry = f"{channel} = {{ column = {_quoted(table, columns[channel])}"
     by = f'"{-given.scale:g} {given.scale_unit}"' if given.scale_unit else f"{-given.scale:g}"
     wrong = "is negative in compression; it must be positive"
     right = f"write {entry}, scale = {by} }}"

@@ -20,7 +20,9 @@ from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.data.columns import (
+    TWINS,
     assign_columns,
+    left_out,
     motion_columns,
     needed_columns,
     read_note,
@@ -43,7 +45,7 @@ from foamfit.data.measurement import (
 from foamfit.data.noise import with_noise
 from foamfit.data.outliers import fresh_samples
 from foamfit.data.prepare import condition, stress_of_motion
-from foamfit.data.toml_file import Column, Settings, read_settings
+from foamfit.data.toml_file import Column, Settings, read_bytes, read_settings, toml_beside
 from foamfit.errors import InputError
 from foamfit.text import engineering, percent
 
@@ -76,9 +78,10 @@ def read_test(
         Where the file, its TOML or what they hold cannot be used.
     """
     path = Path(path)
-    text = read_text(path, "the CSV file of a test")
-    toml = Path(specimen) if specimen is not None else path.with_suffix(".toml")
+    read_bytes(path, "give the CSV file of a test", 0)  # missed before its TOML is
+    toml = Path(specimen) if specimen is not None else toml_beside(path)
     settings = read_settings(toml, path, channels=CHANNELS)
+    text = read_text(path, "the CSV file of a test", settings.sheet)
     window = settings.window if cycle is None else replace(settings.window, cycle=cycle)
     table = find_table(text, {column.column for column in settings.columns.values()})
     columns = assign_columns(table, settings.columns, toml)
@@ -123,7 +126,7 @@ def read_history(path: Path, channel: str) -> tuple[Array, Array]:
     for name, k in columns.items():
         header = table.headers[k]
         in_si = Column(header.text, CHANNELS[name].si) if header.unit is None else None
-        numbers[name] = numbers[name] * si_factor(table, name, header, in_si)
+        numbers[name] = numbers[name] * si_factor(table, name, k, in_si)
     return numbers["time"], numbers[channel]
 
 
@@ -186,6 +189,12 @@ def _record(
     """Read the channels that are needed, in SI, and say what was read from where."""
     needed = needed_columns(table, columns, settings)
     numbers, rows, dropped, notes = _channels(table, needed, settings.columns, settings)
+    notes += _compare(table, needed, numbers, settings)
+    if settings.striker is not None and "time" not in numbers:
+        notes.append(
+            "Check: there is a [striker], but no column is a time, so that this is taken for a "
+            "slow test and the striker is not used; name the time in [columns]."
+        )
     record = _to_record(numbers, settings, notes)
     return replace(record, numbers=rows, dropped=tuple(dropped)), tuple(notes)
 
@@ -195,25 +204,80 @@ def _channels(
 ) -> tuple[dict[str, Array], NDArray[np.int64], list[Dropped], list[str]]:
     """Channels of a table in SI, the numbers of their rows, the rows left out, and notes."""
     headers = table.headers
-    factors = {c: si_factor(table, c, headers[k], given.get(c)) for c, k in needed.items()}
+    factors = {c: si_factor(table, c, k, given.get(c)) for c, k in needed.items()}
     numbers, empty = read_numbers(table, needed)
     count = len(next(iter(numbers.values())))
     if count < MIN_ROWS:
         raise InputError(f"{table.path}: has fewer than {MIN_ROWS} rows; a test needs more.")
+    converted = list[str]()
     for channel, values in numbers.items():
         name = headers[needed[channel]].text
         if np.ptp(values) == 0:
             raise InputError(f"{table.path}: column {name!r} is constant; a {channel} must vary.")
-        numbers[channel] = values * factors[channel]
-    notes = [read_note(table, needed, given), *_announced(table, count)]
-    rows, dropped = table.row_numbers(count), list[Dropped]()
+        measure = headers[needed[channel]].measure(channel)
+        numbers[channel] = _nominal(table.path, measure, values * factors[channel])
+        if measure:
+            converted.append(f"The strain is converted from the {measure} strain {name!r}.")
+    notes = [read_note(table, needed, given), *converted, *_announced(table, count)]
+    rows, dropped = table.row_numbers(count, empty), list[Dropped]()
     if empty.size:
-        dropped.append(Dropped.of(empty, "no cell of it holds anything"))
+        dropped.append(Dropped.of(empty, "nothing in the columns that are read"))
     if "time" in numbers:
         if settings.duplicates == "average":
             numbers, rows = _averaged(numbers, rows, dropped, notes)
         _check_time(table, numbers["time"], headers[needed["time"]].text, rows)
     return numbers, rows, dropped, notes
+
+
+def _nominal(path: Path, measure: str, strain: Array) -> Array:
+    """Engineering strain of one of another measure, all positive in compression."""
+    if measure == "logarithmic":
+        return 1.0 - np.exp(-strain)
+    if measure and strain.max() >= 0.5:
+        raise InputError(
+            f"{path}: the {measure} strain reaches {strain.max():.3g}; in compression it stays "
+            "below 0.5, so that the column must hold another strain or have another unit."
+        )
+    return 1.0 - np.sqrt(1.0 - 2.0 * strain) if measure else strain
+
+
+def _compare(
+    table: Table, needed: dict[str, int], numbers: dict[str, Array], settings: Settings
+) -> list[str]:
+    """Compare what is read with the columns that could have been read instead.
+
+    InputError if an impact has two clocks that do not agree.
+    """
+    notes = list[str]()
+    as_used = {"force": 1 / settings.specimen.area, "strain": settings.specimen.height}
+    for channel, k in left_out(table, needed).items():
+        try:
+            values = read_numbers(table, {channel: k})[0][channel]
+            values = values * si_factor(table, channel, k, None)
+            values = _nominal(table.path, table.headers[k].measure(channel), values)
+        except InputError:  # it could not have been read
+            continue
+        used = TWINS.get(channel, channel)
+        one, name = numbers[used] * as_used.get(used, 1.0), table.name(k)
+        if len(values) != len(one) or (channel == "time" and "time" in settings.columns):
+            continue
+        if channel != "time":
+            other = (values - values[0]) * as_used.get(channel, 1.0)
+            other = one[0] + other * np.sign(np.dot(other, one - one[0]))
+            by = percent(float(np.max(np.abs(other - one)) / np.ptp(one)))
+            notes.append(
+                f"The {channel} {name} is left out; it differs by up to {by} of the range."
+            )
+        elif np.diff(values).min() > 0 and np.ptp(values - one) > np.median(np.diff(one)):
+            both = f"columns {table.name(needed['time'])} and {name} are times that differ"
+            by = engineering(float(np.ptp(values - one)), "s")
+            if settings.striker is not None:
+                raise InputError(
+                    f"{table.path}: {both} by {by}; name the right one in [columns], or put a "
+                    "motion with its own clock into a file of its own ([motion])."
+                )
+            notes.append(f"Check: {both} by {by}; the first is used.")
+    return notes
 
 
 def _to_record(numbers: dict[str, Array], settings: Settings, notes: list[str]) -> Record:
@@ -293,6 +357,8 @@ def _check_time(table: Table, time: Array, name: str, rows: NDArray[np.int64]) -
         if time[i] == time[i - 1]:
             more = ' (in a test, [data] duplicates = "average" averages rows with the same stamp)'
             wrong = "repeats"
+        elif len(back) > len(time) / 2:
+            more = "; as the record runs backwards, turn the order of its rows round"
         where = f"{table.path}: row {rows[i]}, column {name!r}"
         raise InputError(f"{where}: time {wrong}; it must increase from row to row{more}.")
 
@@ -309,11 +375,13 @@ def _one_of(
         notes.append(f"The {first} is the {second} {operation} {by}.")
         return two / ratio
     slope = float(np.dot(two, one) / np.dot(one, one)) / ratio
+    apart = percent(max(1e-5, float(np.max(np.abs(two / ratio - one)) / np.ptp(one))))
     if abs(slope - 1) > 0.03:
         agree = f"{slope:.3g} times what it gives with {by} of the specimen; they are inconsistent"
         notes.append(f"Check: the {first} is used, but the {second} is {agree}.")
     else:
-        notes.append(f"The {first} is used rather than the {second}, and they agree.")
+        told = f"The {first} is used rather than the {second}, and they agree to"
+        notes.append(f"{told} {apart} of the range.")
     return one
 
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.data.headers import CHANNELS, Header, parse_header
+from foamfit.data.layouts import blanks_as_tabs, scope_of, unpacked
 from foamfit.data.measurement import MIN_ROWS
 from foamfit.data.toml_file import LONGEST, read_bytes
 from foamfit.data.units import is_unit
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _HEAD_ROWS = 400
+_SEPARATORS = "\t", ";", "|", ","
 _NUMBER = re.compile(
     r"[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|nan|inf(?:inity)?)", re.IGNORECASE | re.ASCII
 )
@@ -44,7 +46,10 @@ class Text:
 
 @dataclass(frozen=True)
 class Table(Text):
-    """The text of a file, and where its numbers are, before they are read."""
+    """The text of a file, and where its numbers are, before they are read.
+
+    A file without headers has the `header_row` 0. `clock` is that of `layouts.Scope`.
+    """
 
     separator: str
     decimal: str
@@ -52,43 +57,58 @@ class Table(Text):
     header_cells: tuple[str, ...]  # as they stand in the file
     first_row: int  # rows above the numbers
     headers: tuple[Header, ...]
+    clock: tuple[float, float] | None = None
 
     @property
     def listed(self) -> str:
         """The headers, in quotation marks."""
         return ", ".join(repr(h.text) for h in self.headers if h.text)
 
+    def name(self, column: int) -> str:
+        """A header in quotation marks, with its number where others are equal."""
+        text = self.headers[column].text
+        alone = sum(header.text == text for header in self.headers) == 1
+        return repr(text) if alone else f"{text!r} (number {column + 1})"
+
     def rows(self) -> Iterator[tuple[int, list[str]]]:
         """Yield (row number in the file, cells) of the rows that are not blank."""
+        return (row for row in self._lines() if any(cell.strip() for cell in row[1]))
+
+    def _lines(self) -> Iterator[tuple[int, list[str]]]:
         file = io.BytesIO(self.raw)
         lines = io.TextIOWrapper(file, self.encoding, errors="replace", newline="")
-        for number, cells in _cells(self.path, lines, self.separator):
-            if number > self.first_row and any(cell.strip() for cell in cells):
-                yield number, cells
+        rows = _cells(self.path, lines, self.separator)
+        return (row for row in rows if row[0] > self.first_row)
 
     def body(self) -> bytes:
         """Return the rows below the header."""
         return self.raw.split(b"\n", self.first_row)[-1] if self.first_row else self.raw
 
-    def row_numbers(self, count: int) -> NDArray[np.int64]:
-        """Return the row numbers in the file of its `count` samples."""
+    def row_numbers(self, count: int, empty: Iterable[int] = ()) -> NDArray[np.int64]:
+        """Return the row numbers in the file of its `count` samples, without the `empty` rows."""
         body = self.body().rstrip()
         if body.count(b"\n") + 1 == count:  # without a blank line
             return np.arange(count, dtype=np.int64) + self.first_row + 1
-        return np.fromiter((number for number, _ in self.rows()), np.int64, count)
+        gone = set(empty)
+        numbers = (number for number, _ in self.rows() if number not in gone)
+        return np.fromiter(numbers, np.int64, count)
 
-    def empty_rows(self) -> NDArray[np.int64]:
-        """Return the numbers of the rows that have separators, but nothing between them."""
-        empty = re.compile(rb'[\s"%s]+' % re.escape(self.separator).encode())
-        lines = self.body().split(b"\n")
-        found = [i for i, line in enumerate(lines) if line.strip(b"\r") and empty.fullmatch(line)]
-        return np.array(found, dtype=np.int64) + self.first_row + 1
+    def empty_rows(self, columns: Iterable[int]) -> NDArray[np.int64]:
+        """Return the numbers of the rows that have separators, but nothing in some columns."""
+        wanted = list(columns)
+        found = [
+            row
+            for row, cells in self._lines()
+            if len(cells) > 1 and not any(cells[k].strip() for k in wanted if k < len(cells))
+        ]
+        return np.array(found, dtype=np.int64)
 
 
-def read_text(path: Path, wanted: str) -> Text:
-    """Read a file as text; `wanted` says what the path must be."""
+def read_text(path: Path, wanted: str, sheet: str | None = None) -> Text:
+    """Read a file as text; `wanted` says what the path must be, `sheet` which of a workbook."""
     raw = read_bytes(path, f"give {wanted}")
     sha256 = hashlib.sha256(raw).hexdigest()
+    raw = unpacked(path, raw, sheet)
     if not raw.strip():
         raise InputError(f"{path}: the file is empty; it must hold a header and rows of numbers.")
     if raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
@@ -97,7 +117,7 @@ def read_text(path: Path, wanted: str) -> Text:
     if b"\n" not in raw:
         raw = raw.replace(b"\r", b"\n")
     if b"\0" in raw:
-        raise InputError(f"{path}: is a binary file; it must be a text table (CSV).")
+        raise InputError(f"{path}: is a binary file; it must be a text table (CSV) or .xlsx.")
     try:
         raw.decode()
     except UnicodeDecodeError:
@@ -105,11 +125,30 @@ def read_text(path: Path, wanted: str) -> Text:
     return Text(path, raw, "utf-8", sha256)
 
 
-def find_table(text: Text, names: set[str]) -> Table:
-    """Find separator, header row and decimal sign; `names` are column names given in the TOML."""
+def find_table(text: Text, names: set[str | int]) -> Table:
+    """Find separator, header row and decimal sign; `names` are the columns given in the TOML."""
     path, lines = text.path, io.TextIOWrapper(io.BytesIO(text.raw), text.encoding, newline=None)
     head = [line.rstrip("\r\n") for line, _ in zip(lines, range(_HEAD_ROWS), strict=False)]
-    separator, grid, i = _header_row(path, head, names)
+    grids = {s: [cells for _, cells in _cells(path, head, s)] for s in _SEPARATORS}
+    whole = path, text.raw, text.encoding, text.sha256
+    scope = scope_of(grids[","])
+    if scope is not None:
+        headers, first = tuple(map(parse_header, scope.headers)), scope.rows
+        row, cells = (1, tuple(c.strip() for c in grids[","][0])) if first else (0, ())
+        return Table(*whole, ",", ".", row, cells, first, headers, scope.clock)
+    found = _header_row(grids, {n for n in names if isinstance(n, str)})
+    if found is None or not any(map(_is_sample, grids[found[0]][found[1] :])):
+        rows = (sum(map(_is_sample, grid)) > 2 for grid in grids.values())
+        tabbed = None if any(rows) else blanks_as_tabs(text.raw.decode(text.encoding))
+        if tabbed is not None:
+            return find_table(Text(path, tabbed.encode(), "utf-8", text.sha256), names)
+    separator, i = found or _above_numbers(path, grids, names)
+    grid = grids[separator]
+    if i < 0:  # no header
+        first = next(k for k, cells in enumerate(grid) if _is_sample(cells))
+        headers = tuple(Header(f"column {k}") for k in range(1, len(grid[first]) + 1))
+        decimal = _decimal_sign(path, grid[first:], len(headers), separator)
+        return Table(*whole, separator, decimal, 0, (), first, headers)
     above = [k for k, cells in enumerate(grid[:i], 1) if _holds_numbers(cells)]
     if len(above) >= MIN_ROWS:
         where = f"rows {above[0]} to {above[-1]} hold numbers above the header in row {i + 1}"
@@ -124,8 +163,8 @@ def find_table(text: Text, names: set[str]) -> Table:
     if not body:
         raise InputError(f"{path}: has a header in row {i + 1} but no rows of numbers below it.")
     decimal = _decimal_sign(path, body, len(texts), separator)
-    cells, whole = tuple(cell.strip() for cell in grid[i]), (path, text.raw, text.encoding)
-    return Table(*whole, text.sha256, separator, decimal, i + 1, cells, first, headers)
+    cells = tuple(cell.strip() for cell in grid[i])
+    return Table(*whole, separator, decimal, i + 1, cells, first, headers)
 
 
 def _cells(path: Path, lines: Iterable[str], separator: str) -> Iterator[tuple[int, list[str]]]:
@@ -139,22 +178,50 @@ def _cells(path: Path, lines: Iterable[str], separator: str) -> Iterator[tuple[i
         raise InputError(f"{path}: {cell}; the file must be a text table (CSV).") from None
 
 
-def _header_row(path: Path, lines: list[str], names: set[str]) -> tuple[str, list[list[str]], int]:
-    """Separator, cells and place of the row that names most channels."""
-    best: tuple[int, str, list[list[str]], int] = (0, ",", [], 0)
-    for separator in ("\t", ";", ","):
-        grid, numbers = [cells for _, cells in _cells(path, lines, separator)], False
+def _header_row(grids: dict[str, list[list[str]]], names: set[str]) -> tuple[str, int] | None:
+    """Separator and place of the row that names most channels, if one names any."""
+    best, found = 0, None
+    for separator, grid in grids.items():
+        numbers = False
         for i, cells in enumerate(grid):
             # On a tie the last row wins: titles and instrument settings stand above the header.
             # Below rows of numbers it is another header, which `_refuse_cells` will meet.
             score = _score(cells, names)
-            if score > best[0] or (score and score == best[0] and not numbers):
-                best, numbers = (score, separator, grid, i), False
+            if score > best or (score and score == best and not numbers):
+                best, found, numbers = score, (separator, i), False
             numbers = numbers or _holds_numbers(cells)
-    if not best[0]:
-        example = "time (ms), stress (MPa), displacement (mm)"
-        raise InputError(f"{path}: no row names the columns; the first must be like '{example}'.")
-    return best[1:]
+    return found
+
+
+def _above_numbers(
+    path: Path, grids: dict[str, list[list[str]]], names: set[str | int]
+) -> tuple[str, int]:
+    """Separator and place of the row above the numbers, -1 where that names no columns.
+
+    Without it the TOML must give the columns by their numbers.
+    """
+    for separator, grid in grids.items():
+        rows = [k for k, cells in enumerate(grid) if _is_sample(cells)]
+        if len(rows) < 3 or len({len(grid[k]) for k in rows[:3]}) > 1:
+            continue
+        above = [k for k in range(rows[0]) if sum(c.strip() != "" for c in grid[k]) > 1]
+        if above and _unit_row(grid, above[-1] - 1)[0] == above[-1] + 1:
+            above.pop()
+        if above and above[-1] >= rows[0] - 3:
+            return separator, above[-1]
+        if any(isinstance(name, int) for name in names):
+            return separator, -1
+        entries = ", ".join(
+            f'{c} = {{ column = {k}, unit = "{CHANNELS[c].unit}" }}'
+            for k, c in enumerate(("time", "force", "displacement"), 1)
+        )
+        shown = ", ".join(grid[rows[0]])[:LONGEST]
+        raise InputError(
+            f"{path}: no row names the columns above row {rows[0] + 1}, {shown!r}; give their "
+            f"numbers in [columns], like {entries}."
+        )
+    example = "time (ms), stress (MPa), displacement (mm)"
+    raise InputError(f"{path}: no row names the columns; the first must be like '{example}'.")
 
 
 def _score(cells: list[str], names: set[str]) -> int:
@@ -176,6 +243,11 @@ def _holds_numbers(cells: list[str]) -> bool:
     return len(full) > 1 and all(map(_is_number, full))
 
 
+def _is_sample(cells: list[str]) -> bool:
+    """Whether a row may be a sample: two numbers at least, and less of anything else."""
+    return 2 * sum(map(_is_number, cells)) > max(sum(c.strip() != "" for c in cells), 3)
+
+
 def _decimal_sign(path: Path, body: list[list[str]], width: int, separator: str) -> str:
     """Comma or point; where the comma separates cells too, the numbers stand in quotation marks."""
     values = [value.strip() for row in body for value in row[:width]]
@@ -195,15 +267,28 @@ def _decimal_sign(path: Path, body: list[list[str]], width: int, separator: str)
 def _unit_row(grid: list[list[str]], i: int) -> tuple[int, list[str]]:
     """First row of numbers, and the headers with the units of the row beneath, if there is one."""
     texts = list(grid[i])
-    below = [cell.strip().strip("()[]") for cell in grid[i + 1]] if i + 1 < len(grid) else []
+    said = {cells[0].strip().casefold(): cells[1:] for cells in grid[:i] if len(cells) > 1}
+    above = [*said.get("horizontal units", [])[:1], *said.get("vertical units", [])]
+    for k, unit in enumerate(above[: len(texts)]):  # of a Tektronix MSO
+        if unit.strip() and parse_header(texts[k]).unit is None:
+            texts[k] = f"{texts[k].strip()} ({unit.strip()})"
+    first = _below_rule(grid, i + 1)
+    below = [cell.strip().strip("()[]") for cell in grid[first]] if first < len(grid) else []
     units = [cell for cell in below if cell]
     known = [unit for unit in units if is_unit(unit, any_case=True) and not _is_number(unit)]
     if not known or 2 * len(known) < len(units) or any(map(_is_number, units)):
-        return i + 1, texts
+        return first, texts
     for k, unit in enumerate(below[: len(texts)]):
-        if unit and texts[k].strip() and parse_header(texts[k]).unit is None:
+        own = parse_header(texts[k]).unit
+        if unit and texts[k].strip() and (own is None or not texts[k].strip().endswith((")", "]"))):
             texts[k] = f"{texts[k].strip()} ({unit})"
-    return i + 2, texts
+    return _below_rule(grid, first + 1), texts
+
+
+def _below_rule(grid: list[list[str]], i: int) -> int:
+    """Skip a row of dashes."""
+    rule = i < len(grid) and re.fullmatch(r"[-=+:|\s]*[-=]{3}[-=+:|\s]*", "".join(grid[i]))
+    return i + 1 if rule else i
 
 
 def read_numbers(
@@ -217,8 +302,8 @@ def read_numbers(
     try:
         frame = _frame(table, columns, table.body())
     except ValueError as error:
-        _refuse_cells(table, columns)
-        empty = table.empty_rows()
+        empty = table.empty_rows(columns.values())
+        _refuse_cells(table, columns, set(empty))
         if not empty.size:
             raise InputError(f"{table.path}: is no regular table ({error}).") from None
         lines = table.body().split(b"\n")
@@ -229,7 +314,29 @@ def read_numbers(
     too_many = frame[str(len(table.headers))].astype(bool).any()
     if too_many or not all(np.isfinite(values).all() for values in numbers.values()):
         _refuse_cells(table, columns)
+    for channel, values in numbers.items():
+        _refuse_thousands(table, columns[channel], values)
+        if table.clock is not None and columns[channel] == 0:
+            numbers[channel] = table.clock[0] + table.clock[1] * values
     return numbers, empty
+
+
+def _refuse_thousands(table: Table, column: int, values: Array) -> None:
+    """Refuse numbers whose decimal sign may separate thousands: 998 is followed by 1.002."""
+    size = np.abs(values)
+    part = size[size != np.round(size)]
+    if not part.size or part.min() < 1 or size.max() >= 1000:
+        return
+    sign = table.decimal
+    cells = [cells[column].strip() for _, cells in table.rows() if column < len(cells)]
+    whole = [cell for cell in cells if re.fullmatch(r"[+-]?[1-9]\d{1,2}", cell)]
+    parted = [cell for cell in cells if sign in cell]
+    if whole and all(re.fullmatch(rf"[+-]?[1-9]\d{{0,2}}\{sign}\d{{3}}", cell) for cell in parted):
+        raise InputError(
+            f"{table.path}: column {table.name(column)}: {parted[0]!r} beside numbers like "
+            f"{whole[-1]!r} seems to separate thousands; write the numbers with a decimal point "
+            "and without separators."
+        )
 
 
 def _frame(table: Table, columns: dict[str, int], body: bytes) -> pd.DataFrame:
@@ -252,8 +359,8 @@ def _frame(table: Table, columns: dict[str, int], body: bytes) -> pd.DataFrame:
     )
 
 
-def _refuse_cells(table: Table, columns: dict[str, int]) -> None:
-    """Find the first bad cell, row by row, and name it."""
+def _refuse_cells(table: Table, columns: dict[str, int], empty: Iterable[int] = ()) -> None:
+    """Find the first bad cell, row by row, and name it; `empty` rows have none."""
     count = len(table.headers)
     for row, cells in table.rows():
         where = f"{table.path}: row {row}"
@@ -263,7 +370,7 @@ def _refuse_cells(table: Table, columns: dict[str, int]) -> None:
         if any(cell.strip() for cell in cells[count:]):
             many = f"has {len(cells)} cells, but the header has {count}"
             raise InputError(f"{where} {many}; every row must have as many as the header.")
-        for k in columns.values():
+        for k in columns.values() if row not in empty else ():
             cell = cells[k].strip() if k < len(cells) else ""
             wrong = _wrong(cell, table.decimal)
             if wrong:
@@ -278,7 +385,8 @@ def _wrong(cell: str, decimal: str) -> str:
         return f"{cell!r}, but others have a decimal comma; all must have the same decimal sign"
     text = cell.replace(",", ".") if decimal == "," else cell
     if not _NUMBER.fullmatch(text):
-        plain = re.sub(r"(?<=\d)[_' ,\u2009\u202f](?=\d{3})", "", cell)  # digits in groups
+        groups = ". " if decimal == "," else ","
+        plain = re.sub(rf"(?<=\d)[_' {groups}\u2009\u202f](?=\d{{3}})", "", cell)
         hint = f" without separators, {plain}" if plain != cell and _is_number(plain) else ""
         shown = repr(cell if len(cell) <= LONGEST else cell[:LONGEST] + " …")
         return f"{shown}; it must be a number{hint}"

@@ -74,7 +74,10 @@ class EnergyAudit:
                 "mass, velocity, force and motion do not agree, or the record ends too early."
             )
         if self.dissipated_fraction is not None and self.dissipated_fraction < -0.02:
-            found.append("Check: the loop gives out more energy than it takes up.")
+            found.append(
+                "Check: the loop gives out more energy than it takes up; either the record runs "
+                "backwards, or force and motion are swapped."
+            )
         return found
 
     def impulse_warnings(self) -> list[str]:

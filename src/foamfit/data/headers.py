@@ -22,20 +22,40 @@ class Channel(NamedTuple):
 
 
 CHANNELS = {
-    "time": Channel("s", "ms", ("time", "t")),
-    "stress": Channel("Pa", "MPa", ("stress", "sigma")),
-    "force": Channel("N", "N", ("force", "load", "f")),
-    "displacement": Channel("m", "mm", ("displacement", "disp")),
-    "strain": Channel("", "%", ("strain", "eps", "epsilon")),
-    "acceleration": Channel("m/s**2", "m/s^2", ("acceleration", "accel", "deceleration")),
-    "velocity": Channel("m/s", "m/s", ("velocity", "speed")),
+    "time": Channel("s", "ms", ("time", "t", "zeit", "prüfzeit", "testzeit", "versuchszeit")),
+    "stress": Channel("Pa", "MPa", ("stress", "sigma", "druckspannung", "spannung")),
+    "force": Channel(
+        "N", "N", ("force", "load", "f", "kraft", "standardkraft", "prüfkraft", "druckkraft")
+    ),
+    "displacement": Channel(
+        "m", "mm",
+        ("displacement", "disp", "weg", "standardweg", "verschiebung", "stauchung", "compression"),
+    ),
+    "strain": Channel("", "%", ("strain", "eps", "epsilon", "dehnung", "stauchung", "compression")),
+    "acceleration": Channel(
+        "m/s**2", "m/s^2", ("acceleration", "accel", "deceleration", "beschleunigung")
+    ),
+    "velocity": Channel("m/s", "m/s", ("velocity", "speed", "geschwindigkeit")),
     "cycle": Channel("", "", ()),  # the number of the cycle, where [columns] names such a column
-}
+}  # fmt: skip
 _WORDS = {word for channel in CHANNELS.values() for word in channel.words}
+# Words that several quantities go by: the unit decides which it is.
+_BY_UNIT = {"spannung", "stauchung", "compression"}
 # Words that name the displacement where nothing better does: a machine's travel, or a gap.
 _MOTION = {"extension", "gap", "travel", "stroke", "deflection", "crosshead", "position"}
+_MOTION |= {"traversenweg", "kolbenweg"}
 # With one of these beside it a channel's name means something else.
 _OTHER = {"std", "sd", "dev", "error", "err", "noise", "uncertainty", "rate", "specific", "energy"}
+_OTHER |= {"transverse", "transversal", "lateral", "radial", "hoop", "circumferential", "poisson"}
+_OTHER |= {"width", "diameter", "volumetric", "shear", "quer", "almansi", "kirchhoff"}
+# Words for strains and stresses that are not those of engineers.
+_LOGARITHMIC = {"true", "logarithmic", "log", "ln", "hencky", "wahre", "wahr", "logarithmische"}
+_MEASURES = {
+    "strain": {"logarithmic": _LOGARITHMIC | {"natural"}, "Green–Lagrange": {"green", "lagrange"}},
+    "stress": {"true (Cauchy)": _LOGARITHMIC | {"cauchy"}},
+}
+# What in brackets is no unit.
+_ASIDE = _WORDS | _OTHER | _LOGARITHMIC | {"green", "lagrange", "cauchy", "natural"}
 # Units of mass that as those of a force mean a weight.
 WEIGHTS = {"lb": "lbf", "lbs": "lbf", "kg": "kgf", "kgs": "kgf"}
 
@@ -48,16 +68,28 @@ class Header:
     words: tuple[str, ...] = ()
     unit: str | None = None
 
+    def measure(self, channel: str) -> str:
+        """Which strain or stress it names, "" for that of engineers."""
+        named = _MEASURES.get(channel, {}).items()
+        return next((measure for measure, words in named if words & set(self.words)), "")
+
     def rank(self, channel: str) -> int | None:
         """How well it names a channel: 0 is best, None not at all."""
+        rank = self._rank(channel)
+        return rank if rank is None or not self.measure(channel) else rank + 4
+
+    def _rank(self, channel: str) -> int | None:
         words, node = channel_of(channel).words, interior_node(channel)
         numbers = [word for word in self.words if word.isdecimal()]
         if [int(number) for number in numbers] != ([] if node is None else [node]):
             return None  # displacement_1 is inside the specimen
         rest = [word for word in self.words if word not in numbers]
+        named = [w for w in rest if w in _WORDS and len(w) > 1]
+        named = [w for w in named if w not in _BY_UNIT] or named
+        if set(named) & _BY_UNIT and (self.unit is None or in_si(channel, self.unit) is None):
+            return None
         if len(rest) == 1 and rest[0] in words:
             return 0 if rest[0] == words[0] else 1
-        named = [w for w in rest if w in _WORDS and len(w) > 1]
         if _OTHER & set(rest) or not all(word in words for word in named):
             return None
         if named:
@@ -67,7 +99,8 @@ class Header:
     def is_named(self, name: str) -> bool:
         """Whether a column name in the TOML means it: with its unit or without."""
         bare = self.text.split("(")[0].split("[")[0]
-        return name.casefold().split() in (t.casefold().split() for t in (self.text, bare))
+        most = re.sub(r"[(\[][^(\[]*$", "", self.text)
+        return name.casefold().split() in (t.casefold().split() for t in (self.text, bare, most))
 
 
 def parse_header(text: str) -> Header:
@@ -76,27 +109,46 @@ def parse_header(text: str) -> Header:
     if len(text) > LONGEST:  # a title or a comment
         return Header(text)
     bracket = re.fullmatch(r"(.*)[(\[{]([^()\[\]{}]*)[)\]}]", text)
-    bracket = bracket or re.fullmatch(r"(.+) / (\S+)", text)
+    bracket = bracket or re.fullmatch(r"(.+) (?:/|in) (\S+)", text)
     if bracket:
-        return Header(text, _words(bracket[1]), bracket[2].strip())
+        name, unit = bracket[1], bracket[2].strip()
+        words = _words(f"{name} ({unit})")
+        if not is_unit(unit, any_case=True):  # stress [MPa] (true), strain (Displacement)
+            inner, aside = parse_header(name), {*_words(unit)}
+            if inner.unit is not None or aside & _ASIDE:
+                return Header(text, words, inner.unit)
+        return Header(text, _words(name), unit)
     tokens = re.split(r"[\s_]+", text)
     for i in range(1, len(tokens)):
         rest = tokens[i:]
         if rest[0].lower() in _WORDS or rest[0].isdigit():
             continue
         unit = "/".join(token for token in rest if token.lower() != "per")  # m_s2, N_per_kg
-        if is_unit(unit, any_case=True):
-            return Header(text, _words(" ".join(tokens[:i])), unit)
+        over = Header(text, _words(" ".join(tokens[:i])), unit)
+        if is_unit(unit, any_case=True) and (len(unit) > 1 or unit == "V" or _fits(over)):
+            return over  # the A of "Channel A" is no ampere
     name, _, unit = (part.strip() for part in text.partition("/"))
     over = Header(text, _words(name), unit)
-    if unit and any(over.rank(c) is not None and in_si(c, unit) is not None for c in CHANNELS):
-        return over
-    return Header(text, _words(text))
+    return over if unit and _fits(over) else Header(text, _words(text))
+
+
+def _fits(header: Header) -> bool:
+    """Whether the unit is one of a channel that the words name."""
+    unit = header.unit or ""
+    return any(header.rank(c) is not None and in_si(c, unit) is not None for c in CHANNELS)
 
 
 def _words(name: str) -> tuple[str, ...]:
-    """Words of a name, in small letters: Force(Linear:Load) has three."""
-    return tuple(word for word in re.split(r"[\s_:;()]+", name.lower()) if word)
+    """Words of a name, in small letters; in brackets a channel only says where another is from."""
+
+    def aside(bracket: re.Match[str]) -> str:
+        return " ".join(("", *(w for w in _split(bracket[0]) if w not in _WORDS), ""))
+
+    return tuple(_split(re.sub(r"[(\[{][^()\[\]{}]*[)\]}]", aside, name)))
+
+
+def _split(name: str) -> list[str]:
+    return [word for word in re.split(r"[\s_:;.,()\[\]{}\-–]+", name.lower()) if word]
 
 
 def channel_of(name: str) -> Channel:
@@ -115,4 +167,6 @@ def in_si(channel: str, unit: str, times: str = "") -> float | None:
         unit = "standard_gravity"
     if channel == "force":
         unit = WEIGHTS.get(unit.casefold(), unit)
+    if channel == "acceleration":  # mV/g
+        times = re.sub(r"\bg\b", "standard_gravity", times)
     return factor(unit, channel_of(channel).si, times=times)

@@ -14,6 +14,8 @@ from foamfit.arrays import Array
 
 MIN_ROWS = 10  # samples of a test
 
+ASKED = "Check:"  # begins a note on what is probably wrong with the input
+
 # Where a motion comes from; the second is no measurement of its own.
 MEASURED, INTEGRATED = "measured", "integrated from force"
 

@@ -64,6 +64,15 @@ from foamfit.data.zeros import (
 from foamfit.errors import InputError
 from foamfit.text import engineering, percent
 
+# What tests of specimens have, in SI; beyond it a unit is wrong, seldom the specimen.
+_USUAL = {
+    "height": (1e-5, 1.0, "m"),
+    "area": (1e-10, 1.0, "m²"),
+    "peak strain": (1e-4, 1.0, ""),
+    "peak stress": (10.0, 1e9, "Pa"),
+    "modulus (peak stress over peak strain)": (10.0, 1e11, "Pa"),
+    "duration": (1e-6, 1e7, "s"),
+}
 _MAX_ROWS, _BLOCKS = 1500, 1000  # above so many samples they are averaged in so many blocks
 
 
@@ -350,6 +359,7 @@ def checks(record: Record, specimen: Specimen, striker: Striker, motion: str) ->
     if strain >= 1:
         cause = "the unit of displacement or strain" if motion == MEASURED else "the striker"
         raise InputError(f"strain reaches {strain:.3g}, beyond one; check height and {cause}.")
+    notes += _unusual(record, specimen, strain)
     for node, values in record.interior.items():
         name, most = interior_channel(node), float(values.max())
         if most >= height:
@@ -372,6 +382,23 @@ def checks(record: Record, specimen: Specimen, striker: Striker, motion: str) ->
     density = (specimen.mass or 0.0) / (specimen.area * height)
     if specimen.mass and not 1 < density < 3000:
         notes.append(f"Check: mass and volume give a density of {density:.3g} kg/m³.")
+    return notes
+
+
+def _unusual(record: Record, specimen: Specimen, strain: float) -> list[str]:
+    """Question what is outside of `_USUAL`."""
+    stress = float(record.stress.max())
+    duration = 1.0 if record.time is None else float(np.ptp(record.time))
+    moduli = stress / strain if strain > 0 else 1e3
+    values = specimen.height, specimen.area, strain, stress, moduli, duration
+    notes = []
+    for value, (name, (low, high, unit)) in zip(values, _USUAL.items(), strict=True):
+        if not low <= value <= high:
+            shown, least, most = (f"{v:.4g} {unit}".strip() for v in (value, low, high))
+            notes.append(
+                f"Check: the {name} is {shown}, but tests of specimens have {least} to {most}; "
+                "check the units (mm or Mm, mN or MN)."
+            )
     return notes
 
 

@@ -1,10 +1,11 @@
 """The TOML beside a test: specimen, striker, columns, noise, window and data, checked and in SI.
 
-[columns] names the column of a channel where its header does not: ``column``, ``unit``, ``scale``
-(a number, or a quantity such as "4444.4 N/V"; negative turns a sign round) and, for displacements,
-``counts_down = true`` (a gap or a position that gets smaller in compression). [data] ``duplicates``
-is "average" (neighbouring rows with one time stamp make one sample) or "refuse". A quantity may
-have a standard deviation, "1.75 ± 0.01 m/s"; `Measurement.uncertainties` says of which it is used.
+[columns] names the column of a channel where its header does not: ``column`` (its header or its
+number), ``unit``, ``scale`` (a number, or a quantity such as "4444.4 N/V"; negative turns a sign
+round) and, for displacements, ``counts_down = true`` (a gap or a position that gets smaller in
+compression). [data] ``duplicates`` is "average" (neighbouring rows with one time stamp make one
+sample) or "refuse", ``sheet`` that of a workbook. A quantity may have a standard deviation, "1.75 ±
+0.01 m/s"; `Measurement.uncertainties` says of which it is used.
 [motion] names a ``file`` that has the motion by a clock of its own, relative to the TOML, the
 ``delay`` of that clock, and in [motion.columns] its columns.
 """
@@ -63,7 +64,7 @@ _SECTIONS = {
         "end": _Quantity("s", "2 ms"),
         "cycle": _Quantity("", "1"),
     },
-    "data": {"duplicates": _Quantity("", "average")},
+    "data": {"duplicates": _Quantity("", "average"), "sheet": _Quantity("", "Sheet1")},
 }
 _SCALE = "4444.4 N/V"
 # What is read from the file of [motion], beside displacements of masses inside.
@@ -74,10 +75,11 @@ MOTION_CHANNELS = "time", "displacement", "strain", "velocity"
 class Column:
     """What [columns] says of one channel; one that `counts_down` gets smaller in compression.
 
-    `spread` is the standard deviation of the scale over the scale, 0 for an exact one.
+    `column` is a header or the number of a column, from 1. `spread` is the standard deviation of
+    the scale over the scale, 0 for an exact one.
     """
 
-    column: str
+    column: str | int
     unit: str | None = None
     scale: float = 1.0
     scale_unit: str = ""
@@ -111,8 +113,15 @@ class Settings:
     window: Window
     columns: dict[str, Column] = field(default_factory=dict)
     duplicates: str = "average"
+    sheet: str | None = None
     uncertainties: dict[str, float] = field(default_factory=dict)
     motion: Motion | None = None
+
+
+def toml_beside(test: Path) -> Path:
+    """Return the TOML beside a test, which shares its name: that of a.csv.gz is a.toml."""
+    packed = test.suffix.lower() == ".gz"
+    return (test.with_suffix("") if packed else test).with_suffix(".toml")
 
 
 def read_bytes(path: Path, otherwise: str, most: int = -1) -> bytes:
@@ -172,7 +181,9 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
         check_keys(f"{path}: [{section}]", table, keys)
         values[section] = {k: _value(path, section, k, v, spreads) for k, v in table.items()}
     return Settings(
-        name=_name(path, document["name"]) if "name" in document else printable(test.stem),
+        name=_name(path, document["name"])
+        if "name" in document
+        else printable(toml_beside(test).stem),
         specimen=_specimen(path, values["specimen"], spreads),
         striker=Striker(**values["striker"]) if values["striker"] else None,
         noise=Noise(**values["noise"]),
@@ -205,7 +216,9 @@ def _value(path: Path, section: str, key: str, value: Any, spreads: dict[str, fl
         raise InputError(f"{where} = {value!r} must be one of average, refuse.")
     if key == "heights" and (not isinstance(value, list) or not value):
         raise InputError(f'{where} must be a list like ["0.700 mm", "0.490 mm"], base first.')
-    if key in ("cycle", "duplicates"):
+    if key == "sheet" and not isinstance(value, str):
+        raise InputError(f'{where} = {value!r} must be a name, like "Sheet1".')
+    if key in ("cycle", "duplicates", "sheet"):
         return value
     given = value if key == "heights" else [value]
     numbers = []
@@ -280,8 +293,12 @@ def _columns(
     columns: dict[str, Column] = {}
     for channel, spec in table.items():
         where = f"{path}: [{name}] {channel}"
-        if not isinstance(spec, dict) or not isinstance(spec.get("column"), str):
-            raise InputError(f'{where} must be like {{ column = "Load", unit = "V" }}.')
+        column = spec.get("column") if isinstance(spec, dict) else None
+        if not (isinstance(column, str) or (type(column) is int and column > 0)):
+            raise InputError(
+                f'{where} must be like {{ column = "Load", unit = "V" }}, or with a number, '
+                "column = 2."
+            )
         motion = channel == "displacement" or interior_node(channel) is not None
         check_keys(where, spec, ["column", "unit", "scale", *(["counts_down"] if motion else [])])
         down = spec.get("counts_down", False)
@@ -300,5 +317,5 @@ def _columns(
                 f"{where}: scale = {scale!r} has a ±, which has no meaning there; give it without."
             )
         spread = (sigma or 0.0) / abs(parts[0])
-        columns[channel] = Column(spec["column"], unit, *parts, down, spread)
+        columns[channel] = Column(column, unit, *parts, down, spread)
     return columns

@@ -24,6 +24,7 @@ from foamfit.data.csv_table import find_table, read_text
 from foamfit.data.describe import describe
 from foamfit.data.energy import audit
 from foamfit.data.measurement import Measurement
+from foamfit.data.toml_file import toml_beside
 from foamfit.errors import InputError
 from foamfit.page.worker import Job, Worker, parsed
 from foamfit.report.comparison import compare
@@ -33,7 +34,7 @@ from foamfit.text import listed
 LARGEST = 64 * 1024 * 1024  # bytes of a file that is dropped
 LONGEST = 80  # characters of the name of a file
 BUSY = "A fit is running; stop it before anything of the test is changed."
-TABLES = (".csv", ".txt", ".tsv", ".dat")
+TABLES = (".csv", ".txt", ".tsv", ".dat", ".gz", ".xlsx")
 # Rows and columns of a file that are shown around a cell that is wrong.
 AROUND, ACROSS, CELL = 2, 8, 24
 
@@ -138,7 +139,7 @@ class Desk:
             raise InputError(too_large(csv.name))
         self.receive(f"{csv.stem}.csv" if csv.suffix.lower() not in TABLES else csv.name,
                      csv.read_bytes())  # fmt: skip
-        toml = csv.with_suffix(".toml")
+        toml = toml_beside(csv)
         if toml.is_file():
             (self.folder / "dropped.toml").write_bytes(toml.read_bytes())
 

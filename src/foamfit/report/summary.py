@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 
-from foamfit.data.measurement import interior_channel
+from foamfit.data.measurement import ASKED, interior_channel
 from foamfit.report.readable import Readable, readable
 from foamfit.results import STATED, Fit, Ladder, ParameterEstimate, Rung
 from foamfit.springs.parameters import NUISANCE
@@ -205,17 +205,13 @@ def _rows(result: Fit) -> list[str]:
     return lines
 
 
-def _warnings(result: Fit) -> list[str]:
-    """Return the warnings, and what the reader of the file asks to be looked at."""
-    asked = (note for note in result.measurement.notes if note.startswith("Check:"))
-    return list(dict.fromkeys([*result.warnings, *asked]))
-
-
 def _short_warnings(result: Fit) -> Iterator[str]:
-    """Give the warnings but those of the states, as many as fit, and how many more there are."""
+    """Give all on the input; of the others, but those of the states, as many as fit."""
     said = [w for check in result.checklist if check.key == "determined" for w in check.warnings]
-    warnings = [warning for warning in _warnings(result) if warning not in said]
-    given = 0
+    warnings = [warning for warning in result.warnings if warning not in said]
+    asked = [warning for warning in warnings if warning.startswith(ASKED)]
+    yield from _paragraphs(f"warning: {warning}" for warning in asked)
+    warnings, given = warnings[len(asked) :], 0
     for i, warning in enumerate(warnings):
         lines = wrapped(f"warning: {warning}")
         if i and given + len(lines) > WARNING_LINES:
@@ -258,7 +254,7 @@ def _details(result: Fit, rows: list[Readable]) -> Iterator[str]:
         yield from (*wrapped(result.insight.sentence()), "")
     yield from _paragraphs(f"rows: {text}" for text in result.measurement.rows.sentences())
     yield from _paragraphs(f"note: {text}" for text in result.notes)
-    yield from _paragraphs(f"warning: {text}" for text in _warnings(result))
+    yield from _paragraphs(f"warning: {text}" for text in result.warnings)
 
 
 def ladder_cells(ladder: Ladder) -> list[tuple[str, ...]]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Literal, Unpack
 
-from foamfit.data.toml_file import motion_file
+from foamfit.data.toml_file import motion_file, toml_beside
 from foamfit.errors import InputError
 from foamfit.files import is_left, reason, sweep
 from foamfit.fitting import nuisance
@@ -342,7 +342,7 @@ class _Run:
     def _begin(self, name: str, path: Path) -> None:
         """Take the stored rows of a test, or have it fitted."""
         made = self.batch
-        toml = path.with_suffix(".toml") if made.toml is None else made.toml
+        toml = toml_beside(path) if made.toml is None else made.toml
         folder = made.out / name
         try:
             data, settings, camera = path.read_bytes(), _bytes(toml), motion_file(toml)

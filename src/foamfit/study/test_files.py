@@ -20,7 +20,7 @@ from foamfit.report.folder import (
 )
 from foamfit.text import listed
 
-ENDINGS = (".csv", ".txt", ".tsv", ".dat")
+ENDINGS = (".csv", ".txt", ".tsv", ".dat", ".gz", ".xlsx")
 WANTED = f"a test is a table that ends in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}"
 # Stems of tables that say what the specimens are, beside the tests.
 _SPECIMENS = ("specimen", "specimens")
@@ -100,9 +100,10 @@ def _motions(folder: Path) -> set[Path]:
 
 def _is_test(path: Path) -> bool:
     """Whether a file is taken where it is not named itself."""
-    if path.suffix.lower() not in ENDINGS or path.stem.lower() in _SPECIMENS:
+    plain = path.with_suffix("") if path.suffix.lower() == ".gz" else path  # no .tar.gz
+    if plain.suffix.lower() not in ENDINGS or plain.stem.lower() in _SPECIMENS:
         return False
-    if path.name.startswith("."):
+    if path.name.startswith((".", "~$")):
         return False
     is_result = path.name in _WRITTEN and any(
         (path.parent / mark).is_file() for mark in (*MARKS, "summary.html")

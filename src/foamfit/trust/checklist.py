@@ -11,7 +11,7 @@ from itertools import chain, groupby
 import numpy as np
 
 from foamfit.data.energy import EnergyAudit
-from foamfit.data.measurement import INTEGRATED
+from foamfit.data.measurement import ASKED, INTEGRATED
 from foamfit.data.zeros import CONTRADICTED
 from foamfit.errors import InputError
 from foamfit.fitting.branches import covered, visited
@@ -79,8 +79,13 @@ def status_of(checklist: Iterable[Check]) -> str:
 
 
 def warnings_of(checklist: Iterable[Check]) -> tuple[str, ...]:
-    """Warnings of a fit, in the order of its checklist."""
-    return tuple(warning for check in checklist for warning in check.warnings)
+    """Warnings of a fit, in the order of its checklist but what is wrong with the input first."""
+    return input_first(warning for check in checklist for warning in check.warnings)
+
+
+def input_first(warnings: Iterable[str]) -> tuple[str, ...]:
+    """Each warning once, what `foamfit check` finds wrong before all others."""
+    return tuple(sorted(dict.fromkeys(warnings), key=lambda text: not text.startswith(ASKED)))
 
 
 def make_checklist(findings: Findings) -> tuple[Check, ...]:
@@ -313,6 +318,12 @@ def _flight(e: Findings) -> _Answer:
     return True, "Nothing recorded contradicts it."
 
 
+def _input(e: Findings) -> _Answer:
+    notes = e.best.problem.measurement.notes
+    asked = tuple(n for n in notes if n.startswith(ASKED) and CONTRADICTED not in n)
+    return not asked, "See the warnings." if asked else "Nothing stands out.", asked
+
+
 def _energy(e: Findings) -> _Answer:
     taken, warnings = e.balance.absorbed_over_striker, tuple(e.balance.energy_warnings())
     if taken is None and not warnings:
@@ -379,6 +390,7 @@ def _spoken(name: str) -> str:
 QUESTIONS: dict[str, tuple[str, Callable[[Findings], _Answer]]] = {
     "ended": ("Did the search end by itself?", _ended),
     "followed": ("Does the model follow the curves?", _followed),
+    "input": ("Is the input as it should be?", _input),
     "velocity": ("Is the striker's velocity that of its motion?", _flight),
     "noise": ("Are the residuals at the estimated noise?", _at_noise),
     "determined": ("Are all parameters determined?", _determined),

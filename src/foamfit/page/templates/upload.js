@@ -7,7 +7,7 @@ export function render({ model, el }) {
   label.htmlFor = "file";
   const input = document.createElement("input");
   Object.assign(input, { type: "file", id: "file", multiple: true });
-  input.accept = ".csv,.txt,.tsv,.dat,.toml";
+  input.accept = ".csv,.txt,.tsv,.dat,.gz,.xlsx,.toml";
   const told = document.createElement("p");
   told.setAttribute("role", "status");
   zone.append(label, input, told);

@@ -1,0 +1,523 @@
+"""Files as testing machines and oscilloscopes write them.
+
+The layouts are those of the instruments; all values in them are fabricated.
+"""
+
+import gzip
+import sys
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from foamfit.cli import main
+from foamfit.data.csv_file import read_test
+from foamfit.errors import InputError
+
+SPECIMEN = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\n'
+COLUMNS = SPECIMEN + "[columns]\n"
+STRIKER = '[striker]\nmass = "1 kg"\nvelocity = "1 m/s"\n'
+N = 161
+TIME = np.linspace(0, 30, N)  # s
+LOOP = np.sin(np.linspace(0, np.pi, N))
+TURN = np.arange(N) > N // 2
+FORCE = 200 * LOOP * np.where(TURN, LOOP, 1.0)  # N, 2 MPa at most; unloading lies below
+MOTION = 4 * LOOP  # mm
+
+
+def rows(*columns, sep=",", decimal=".", form=".6f"):
+    lines = (sep.join(format(v, form) for v in row) for row in zip(*columns, strict=True))
+    return [line.replace(".", decimal) for line in lines]
+
+
+def write(folder, lines, toml=SPECIMEN, name="test.csv", encoding="utf-8"):
+    path = folder / name
+    path.write_bytes(("\r\n".join(lines) + "\r\n").encode(encoding))
+    (folder / "test.toml").write_text(toml, encoding="utf-8")
+    return path
+
+
+def expect(test, time=TIME[-1]):
+    """Check that it is the fabricated loop."""
+    assert test.stress.max() == pytest.approx(2e6, rel=1e-5)
+    assert test.displacement.max() == pytest.approx(4e-3, rel=1e-5)
+    assert (None if test.time is None else test.time[-1]) == pytest.approx(time)
+
+
+def refused(path, *words):
+    with pytest.raises(InputError) as caught:
+        read_test(path)
+    message = str(caught.value)
+    assert "\n" not in message
+    for word in words:
+        assert word in message
+
+
+def asked(test):
+    return [note for note in test.notes if note.startswith("Check:")]
+
+
+# ------------------------------------------------------------------------- testing machines
+
+
+def test_bluehill_universal(tmp_path):
+    head = [
+        "Results Table 1",
+        "",
+        '"Time","Displacement","Force","Compressive strain (Displacement)","Compressive stress"',
+        '"(s)","(mm)","(kN)","(%)","(MPa)"',
+    ]
+    body = rows(TIME, MOTION, FORCE / 1e3, 10 * MOTION, FORCE / 100, form=".9f")
+    lines = [*head, *('"' + row.replace(",", '","') + '"' for row in body)]
+    test = read_test(write(tmp_path, lines))
+    expect(test)
+    assert "strain from 'Compressive strain (Displacement) (%)'" in test.notes[0]
+    named = 'strain = { column = "Compressive strain (Displacement)" }\n'
+    test = read_test(write(tmp_path, lines, COLUMNS + named))
+    expect(test)
+    assert "displacement from" not in test.notes[0]
+    assert any("displacement 'Displacement (mm)' is left out; it differs" in n for n in test.notes)
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "utf-8", "utf-16"])
+@pytest.mark.parametrize(
+    ("header", "units", "columns"),
+    [
+        ("Prüfzeit;Standardkraft;Standardweg", "s;N;mm", (TIME, FORCE, MOTION)),
+        ("Prüfzeit;Druckspannung;Stauchung", "s;N/mm²;%", (TIME, FORCE / 100, 10 * MOTION)),
+        ("Prüfzeit;Druckspannung;Stauchung", "s;MPa;mm", (TIME, FORCE / 100, MOTION)),
+        ("Zeit in s;Kraft in N;Weg in mm", None, (TIME, FORCE, MOTION)),
+    ],
+)
+def test_a_german_testing_machine(tmp_path, encoding, header, units, columns):
+    head = ["Prüfprotokoll;Druckversuch", "Prüfer;Mustermann", "", header]
+    lines = [*head, *([units] if units else []), *rows(*columns, sep=";", decimal=",")]
+    expect(read_test(write(tmp_path, lines, encoding=encoding)))
+
+
+@pytest.mark.parametrize("unit", ["V", ""])
+def test_a_german_voltage_is_no_stress(tmp_path, unit):
+    lines = [f"Zeit (s);Spannung ({unit});Weg (mm)", *rows(TIME, FORCE, MOTION, sep=";")]
+    refused(write(tmp_path, lines), "no column is a stress or a force", "Spannung")
+
+
+# ------------------------------------------------------------------------------- separators
+
+
+@pytest.mark.parametrize("decimal", [".", ","])
+@pytest.mark.parametrize(
+    "head",
+    [
+        ["time (s)  force (N)  displacement (mm)"],
+        ["time (s) force (N) displacement (mm)"],
+        ["# time_s force_N displacement_mm"],
+        ["Compression test of a foam", "", "Time      Force     Displacement", "s N mm"],
+        ["Time      Force     Displacement", "(s)       (N)       (mm)", "-----     -----   ----"],
+    ],
+)
+def test_columns_may_be_separated_by_blanks(tmp_path, head, decimal):
+    lines = [*head, *rows(TIME, FORCE, MOTION, sep="   ", decimal=decimal)]
+    test = read_test(write(tmp_path, lines))
+    expect(test)
+    assert test.rows.rows == N
+
+
+def test_columns_of_fixed_width(tmp_path):
+    width = "{:>10}{:>18}{:>22}{:>8}"
+    head = [
+        width.format("Test time", "Standard force", "Top displacement", "Cycles"),
+        width.format("(s)", "(N)", "(mm)", ""),
+    ]
+    body = [
+        width.format(f"{t:.2f}", f"{f:.5f}", f"{w:.6f}", 1)
+        for t, f, w in zip(TIME, FORCE, MOTION, strict=True)
+    ]
+    path = write(tmp_path, [*head, *body])
+    expect(read_test(path))
+    gap = [*body[:20], body[20][:10] + 18 * " " + body[20][28:], *body[21:]]
+    refused(write(tmp_path, [*head, *gap]), "row 23", "'Standard force (N)' is empty")
+
+
+@pytest.mark.parametrize("rule", [[], ["|------:|------|------|"]])
+def test_columns_may_be_separated_by_bars(tmp_path, rule):
+    body = [f"| {row} |" for row in rows(TIME, FORCE, MOTION, sep=" | ")]
+    lines = ["| time (s) | force (N) | displacement (mm) |", *rule, *body]
+    expect(read_test(write(tmp_path, lines)))
+
+
+@pytest.mark.parametrize("sep", [",", ";", "\t", " ", "|"])
+def test_without_headers_columns_have_numbers(tmp_path, sep):
+    lines = rows(FORCE, TIME, MOTION, sep=sep)
+    refused(write(tmp_path, lines), "no row names the columns", "time = { column = 1, unit")
+    toml = COLUMNS + (
+        'time = { column = 2, unit = "s" }\nforce = { column = 1, unit = "N" }\n'
+        'displacement = { column = 3, unit = "mm" }\n'
+    )
+    test = read_test(write(tmp_path, lines, toml))
+    expect(test)
+    assert "force from 'column 1' in N" in test.notes[0]
+    assert test.rows.rows == N
+    refused(write(tmp_path, lines, toml.replace("3", "7")), "column 7", "has 3 columns")
+    refused(write(tmp_path, lines, toml.replace("= 3", "= 0")), "column = 2")
+    refused(write(tmp_path, lines, toml.replace("N", "mm")), "'column 1'", "another kind")
+
+
+def test_a_header_that_is_not_understood_is_quoted_with_the_lines_that_help(tmp_path):
+    lines = ["Aika [s],Voima [N],Siirtymä [mm]", *rows(TIME, FORCE, MOTION)]
+    helping = (
+        'force = { column = "Voima [N]" }', 'displacement = { column = "Siirtymä [mm]" }',
+        'time = { column = "Aika [s]" }',
+    )  # fmt: skip
+    refused(write(tmp_path, lines), "there are 'Aika [s]', 'Voima [N]'", *helping)
+    expect(read_test(write(tmp_path, lines, COLUMNS + "\n".join(helping))))
+    lines[0] = "Aika,Voima,Siirtymä"
+    refused(write(tmp_path, lines), "'Voima'", 'force = { column = "…", unit = "N" }')
+
+
+def test_tests_side_by_side_are_chosen_by_number(tmp_path):
+    short = rows(TIME, FORCE, MOTION)
+    long = rows(*(np.interp(np.linspace(0, 30, N + 9), TIME, v) for v in (TIME, FORCE / 2, MOTION)))
+    body = [f"{a},{b}" for a, b in zip(short + 9 * [",,"], long, strict=True)]
+    name = "Time (s),Force (N),Displacement (mm)"
+    lines = ["Specimen 1,,,Specimen 2,,", f"{name},{name}", *body]
+    refused(write(tmp_path, lines), "'Time (s)' (number 1)", "(number 4)", "time = { column = 1 }")
+
+    def chosen(first):
+        names = ("time", "force", "displacement")
+        return COLUMNS + "".join(f"{c} = {{ column = {k} }}\n" for k, c in enumerate(names, first))
+
+    test = read_test(write(tmp_path, lines, chosen(1)))
+    expect(test)
+    assert (test.rows.rows, test.rows.used) == (N + 9, N)
+    assert "nothing in the columns" in test.rows.dropped[0].why
+    test = read_test(write(tmp_path, lines, chosen(4)))
+    assert test.stress.max() == pytest.approx(1e6, rel=1e-2)
+    assert "force from 'Force (N)' (number 5)" in test.notes[0]
+    twice = COLUMNS + 'time = { column = 1 }\nforce = { column = "Force (N)" }\n'
+    refused(write(tmp_path, lines, twice), "'Force (N)' is twice", "column = 2 or 5")
+
+
+# ------------------------------------------------------------------------------ oscilloscopes
+
+VOLTS = FORCE / 100  # V at 100 N/V
+SCALED = (
+    'force = { column = "%s", scale = "100 N/V" }\n'
+    'displacement = { column = "%s", scale = "10 mm/V" }\n'
+)
+
+
+def test_picoscope(tmp_path):
+    head = ["Time,Channel A,Channel B", "(ms),(V),(mV)", ""]
+    lines = [*head, *rows(TIME, VOLTS, 100 * MOTION)]
+    test = read_test(write(tmp_path, lines, COLUMNS + SCALED % ("Channel A", "Channel B")))
+    expect(test, TIME[-1] / 1e3)
+    assert "force from 'Channel A (V)' times 100 N/V" in test.notes[0]
+    refused(write(tmp_path, lines), "no column is a stress or a force", "'Channel A (V)'")
+
+
+@pytest.mark.parametrize("name", ["Channel A", "Kanal C", "CH F", "Input K"])
+def test_the_name_of_a_channel_is_no_unit(tmp_path, name):
+    lines = [f"Time (s),{name},displacement (mm)", *rows(TIME, VOLTS, MOTION)]
+    entry = f'force = {{ column = "{name}", scale = "100 N/V"'
+    refused(
+        write(tmp_path, lines, COLUMNS + entry + " }\n"), "has no unit", entry.split(",")[0], '"V"'
+    )
+    expect(read_test(write(tmp_path, lines, COLUMNS + entry + ', unit = "V" }\n')))
+
+
+def test_keysight(tmp_path):
+    head = ["x-axis,1,2", "second,Volt,Volt"]
+    lines = [*head, *rows(TIME / 1e3, VOLTS, MOTION / 10, form="+.9E")]
+    for one, two in (("1", "2"), ("1 (Volt)", "2 (Volt)")):
+        test = read_test(write(tmp_path, lines, COLUMNS + SCALED % (one, two)))
+        expect(test, TIME[-1] / 1e3)
+
+
+@pytest.mark.parametrize("end", ["", ","])
+def test_rigol(tmp_path, end):
+    head = ["X,CH1,CH2,Start,Increment" + end, "Sequence,VOLT,VOLT,-1.0e-03,5.0e-04" + end]
+    lines = [*head, *(row + ",," for row in rows(np.arange(N), VOLTS, MOTION / 10))]
+    test = read_test(write(tmp_path, lines, COLUMNS + SCALED % ("CH1", "CH2")))
+    expect(test, (N - 1) * 5e-4)
+    assert test.origins["contact_time"] == pytest.approx(-1e-3)
+
+
+def test_tds(tmp_path):
+    said = [
+        "Record Length,1.610000e+02", "Sample Interval,5.0e-04", "Trigger Point,1.0e+01", ",", ",",
+        ",", "Source,CH1", "Vertical Units,V", "Vertical Scale,5.0e-01", "Vertical Offset,0.0e+00",
+        "Horizontal Units,s", "Horizontal Scale,2.5e-04", "Pt Fmt,Y", "Yzero,0.0e+00",
+        "Probe Atten,1.0e+00", "Model Number,TDS2014", "Serial Number,C000000", "Firmware,v22.01",
+    ]  # fmt: skip
+    body = rows(TIME / 1e3, VOLTS, form="013.9f")
+    left = said + [","] * (N - len(said))
+    lines = [f"{a},,{b}," for a, b in zip(left, body, strict=True)]
+    toml = COLUMNS + 'force = { column = "CH1", scale = "100 N/V" }\n'
+    test = read_test(write(tmp_path, lines, toml + STRIKER))
+    assert test.stress.max() == pytest.approx(2e6, rel=1e-5)
+    assert test.time[-1] == pytest.approx(TIME[-1] / 1e3, rel=0.05)
+    assert test.rows.rows == N
+
+
+def test_tektronix_mso(tmp_path):
+    head = ["Model,MSO54", "Horizontal Units,s", "Vertical Units,V,mV", "Record Length,161", ""]
+    lines = [*head, "TIME,CH1,CH2", *rows(TIME / 1e3, VOLTS, 100 * MOTION, form=".9f")]
+    expect(read_test(write(tmp_path, lines, COLUMNS + SCALED % ("CH1", "CH2"))), TIME[-1] / 1e3)
+
+
+@pytest.mark.parametrize(
+    ("entry", "told"),
+    [
+        ('unit = "mV", scale = "0.5 N/mV"', "times 0.5 N/mV"),
+        ('unit = "mV", scale = "2 mV/N"', "over the sensitivity 2 mV/N"),
+        ('unit = "mV", scale = "0.002 V/N"', "over the sensitivity 0.002 V/N"),
+    ],
+)
+def test_a_scale_and_a_sensitivity(tmp_path, entry, told):
+    lines = ["Time (s),Load cell,displacement (mm)", *rows(TIME, 2 * FORCE, MOTION)]
+    toml = COLUMNS + f'force = {{ column = "Load cell", {entry} }}\n'
+    test = read_test(write(tmp_path, lines, toml))
+    expect(test)
+    assert told in test.notes[0]
+
+
+def test_the_sensitivity_of_an_accelerometer(tmp_path):
+    # Fabricated: 1 kg is braked by at most 200 N, 20.394 g of standard gravity at 10 mV/g.
+    millivolts = 10 * FORCE / 9.80665
+    lines = ["Time (ms),Channel A,displacement (mm)", *rows(TIME, millivolts, MOTION)]
+    entry = '[columns]\nacceleration = { column = "Channel A", scale = "10 mV/g"'
+    toml = SPECIMEN + STRIKER + entry
+    refused(write(tmp_path, lines, toml + " }\n"), 'unit = "mV", scale = "10 mV/g"')
+    test = read_test(write(tmp_path, lines, toml + ', unit = "mV" }\n'))
+    assert test.stress.max() == pytest.approx(2e6, rel=1e-4)
+
+
+# ------------------------------------------------------------------------ packed and workbooks
+
+PLAIN = ["time (s),force (N),displacement (mm)", *rows(TIME, FORCE, MOTION)]
+
+
+def test_a_gzip_file(tmp_path, monkeypatch):
+    path = write(tmp_path, PLAIN)
+    packed = tmp_path / "test.csv.gz"
+    packed.write_bytes(gzip.compress(path.read_bytes()))
+    test = read_test(packed)
+    expect(test)
+    assert test.name == "test"
+    packed.write_bytes(packed.read_bytes()[:-20])
+    refused(packed, "no whole gzip file")
+    monkeypatch.setattr("foamfit.data.layouts._LARGEST", 1000)
+    packed.write_bytes(gzip.compress(path.read_bytes()))
+    refused(packed, "unpacks to more than")
+
+
+def workbook(folder, sheets, toml=SPECIMEN):
+    openpyxl = pytest.importorskip("openpyxl")
+    book = openpyxl.Workbook()
+    book.remove(book.active)
+    for name, lines in sheets.items():
+        sheet = book.create_sheet(name)
+        for line in lines:
+            sheet.append(line)
+    book.save(folder / "test.xlsx")
+    (folder / "test.toml").write_text(toml)
+    return folder / "test.xlsx"
+
+
+HEAD = [["Druckversuch\nan Schaum"], [], ["Prüfzeit", "Kraft\n[N]", "Weg"], ["s", None, "mm"]]
+CELLS = [*HEAD, *([t, f, w] for t, f, w in zip(TIME, FORCE, MOTION, strict=True))]
+
+
+def test_a_workbook(tmp_path):
+    test = read_test(workbook(tmp_path, {"Ergebnisse": [["Probe", "Fmax"], [1, 200]], "1": CELLS}))
+    expect(test)
+    assert test.rows.rows == N
+    two = {"Probe 1": CELLS, "Probe 2": [*HEAD, *([a, b / 2, c] for a, b, c in CELLS[4:])]}
+    refused(workbook(tmp_path, two), "2 sheets", "'Probe 2'", '[data] sheet = "Probe 1"')
+    chosen = SPECIMEN + '[data]\nsheet = "Probe 2"\n'
+    assert read_test(workbook(tmp_path, two, chosen)).stress.max() == pytest.approx(1e6, rel=1e-5)
+    refused(
+        workbook(tmp_path, two, chosen.replace("e 2", "e 3")), "no sheet 'Probe 3'", "'Probe 1'"
+    )
+    path = write(tmp_path, PLAIN, chosen)
+    refused(path, "no Excel workbook", "leave [data] sheet out")
+    (tmp_path / "test.xlsx").write_bytes(b"PK\x03\x04 no workbook")
+    refused(tmp_path / "test.xlsx", "no Excel workbook that can be read")
+
+
+def test_a_workbook_without_the_extra(tmp_path, monkeypatch):
+    path = workbook(tmp_path, {"1": CELLS})
+    monkeypatch.setitem(sys.modules, "openpyxl", None)
+    out = CliRunner().invoke(main, ["check", str(path)])
+    assert out.exit_code == 1
+    assert 'pip install "foamfit[excel]"' in out.stderr
+    assert out.stderr.count("\n") == 1
+
+
+# ---------------------------------------------------------------------------- never silently
+
+STRAIN = MOTION / 10
+
+
+def strained(folder, header, strain, stress=FORCE / 100, toml=SPECIMEN):
+    lines = [f"time (s),{header}", *rows(TIME, stress, strain, form=".12f")]
+    return write(folder, lines, toml)
+
+
+@pytest.mark.parametrize(
+    ("name", "strain", "measure"),
+    [
+        ("true strain", -np.log(1 - STRAIN), "logarithmic"),
+        ("Strain (true)", -np.log(1 - STRAIN), "logarithmic"),
+        ("Strain [%] (logarithmic)", -100 * np.log(1 - STRAIN), "logarithmic"),
+        ("Hencky strain (%)", -100 * np.log(1 - STRAIN), "logarithmic"),
+        ("log. strain", -np.log(1 - STRAIN), "logarithmic"),
+        ("wahre Dehnung", -np.log(1 - STRAIN), "logarithmic"),
+        ("Green-Lagrange strain (%)", 50 * (1 - (1 - STRAIN) ** 2), "Green–Lagrange"),
+    ],
+)
+def test_other_strains_are_converted_and_said(tmp_path, name, strain, measure):
+    test = read_test(strained(tmp_path, f"stress (MPa),{name}", strain))
+    expect(test)
+    assert any(f"converted from the {measure} strain" in note for note in test.notes)
+
+
+def test_strains_that_cannot_be_are_refused(tmp_path):
+    path = strained(tmp_path, "stress (MPa),Green strain", 2 * STRAIN)
+    refused(path, "Green–Lagrange strain reaches 0.8", "below 0.5")
+    path = strained(tmp_path, "stress (MPa),true strain", np.log(1 - STRAIN))
+    refused(path, 'strain = { column = "true strain", scale = -1 }')
+    path = strained(tmp_path, "stress (MPa),Almansi strain", STRAIN)
+    refused(path, "no column is a displacement or a strain", "'Almansi strain'")
+
+
+@pytest.mark.parametrize(
+    "name", ["true stress (MPa)", "Cauchy stress (MPa)", "Stress (true) (MPa)"]
+)
+def test_a_true_stress_is_refused_or_left_for_the_force(tmp_path, name):
+    path = strained(tmp_path, f"{name},strain", STRAIN)
+    refused(path, repr(name), "true (Cauchy) stress", "nominal (engineering) stress")
+    lines = [
+        f"time (s),{name},force (N),strain",
+        *rows(TIME, FORCE / 60, FORCE, STRAIN),
+    ]
+    test = read_test(write(tmp_path, lines))
+    expect(test)
+    assert repr(name) in test.notes[0].partition("not used")[2]
+
+
+@pytest.mark.parametrize(
+    "name", ["Transverse strain (%)", "Lateral strain", "Strain (radial)", "Strain 2 (transverse)"]
+)
+def test_a_transverse_strain_is_not_the_axial_one(tmp_path, name):
+    path = strained(tmp_path, f"stress (MPa),{name}", STRAIN)
+    refused(path, "no column is a displacement or a strain", repr(name))
+    lines = [f"time (s),stress (MPa),{name},Extension (mm)"]
+    path = write(tmp_path, [*lines, *rows(TIME, FORCE / 100, STRAIN / 2, MOTION)])
+    expect(read_test(path))
+
+
+def test_two_clocks_with_a_striker(tmp_path):
+    head = "time (ms),force (N),camera time (ms),displacement (mm)"
+    for other, same in ((TIME + 3.0, True), (1.02 * TIME, False), (TIME % 7, True)):
+        path = write(tmp_path, [head, *rows(TIME, FORCE, other, MOTION)], SPECIMEN + STRIKER)
+        if same:  # only its origin is another, or it is no clock
+            assert not any("times that differ" in note for note in read_test(path).notes)
+            continue
+        refused(path, "'time (ms)' and 'camera time (ms)'", "differ by 600 µs", "[motion]")
+        slow = read_test(write(tmp_path, path.read_text().splitlines()))
+        assert any("times that differ" in note for note in asked(slow))
+        entry = '[columns]\ntime = { column = "time (ms)" }\n'
+        read_test(write(tmp_path, path.read_text().splitlines(), SPECIMEN + STRIKER + entry))
+
+
+@pytest.mark.parametrize(("sep", "decimal"), [(",", "."), (";", "."), (";", ",")])
+def test_thousands_are_not_read_as_decimals(tmp_path, sep, decimal):
+    force = [f"{f:,.0f}".replace(",", decimal) for f in 6 * FORCE]
+    cells = zip((f"{t:.1f}".replace(".", decimal) for t in TIME), force, rows(MOTION), strict=True)
+    body = [sep.join((t, f, w.replace(".", decimal))) for t, f, w in cells]
+    path = write(tmp_path, [f"time (s){sep}force (N){sep}displacement (mm)", *body])
+    refused(path, "'force (N)'", "separate thousands")
+    full = [sep.join((t, f"1.{i:03d}{decimal}5", w)) for i, (t, _, w) in enumerate(
+        row.split(sep) for row in body)]  # fmt: skip
+    path = write(tmp_path, [f"time (s){sep}force (N){sep}displacement (mm)", *full])
+    refused(path, "without separators, 1000,5" if decimal == "," else "must be a number")
+
+
+def test_three_decimals_are_no_thousands(tmp_path):
+    body = rows(TIME, FORCE, MOTION + 10)
+    body = [f"{row.rpartition(',')[0]},{w:.3f}" for row, w in zip(body, MOTION + 10, strict=True)]
+    test = read_test(write(tmp_path, [PLAIN[0], *body]))
+    assert test.displacement.max() == pytest.approx(4e-3, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("lines", "toml", "words"),
+    [
+        (PLAIN, ('"10 mm"', '"10 Mm"'), ["height is 1e+07 m", "peak strain is 4e-10"]),
+        (PLAIN, ("mm^2", "Mm^2"), ["area is 1e+14 m²", "peak stress is 2e-12 Pa"]),
+        (PLAIN, ("mm^2", "um^2"), ["peak stress is 2e+12 Pa", "modulus"]),
+        ([PLAIN[0].replace("(N)", "(MN)"), *PLAIN[1:]], ("", ""), ["peak stress is 2e+12 Pa"]),
+        ([PLAIN[0].replace("(N)", "(uN)"), *PLAIN[1:]], ("", ""), ["peak stress is 2 Pa"]),
+        ([PLAIN[0].replace("(mm)", "(nm)"), *PLAIN[1:]], ("", ""), ["peak strain is 4e-07"]),
+        ([PLAIN[0].replace("(s)", "(Ms)"), *PLAIN[1:]], ("", ""), ["duration is 3e+07 s"]),
+        ([PLAIN[0].replace("(s)", "(ns)"), *PLAIN[1:]], ("", ""), ["duration is 3e-08 s"]),
+    ],
+)
+def test_a_unit_that_is_far_off_is_questioned(tmp_path, lines, toml, words):
+    told = asked(read_test(write(tmp_path, lines, SPECIMEN.replace(*toml))))
+    for word in words:
+        assert any(word in note for note in told), told
+
+
+def test_a_usual_test_is_not_questioned(tmp_path):
+    assert asked(read_test(write(tmp_path, PLAIN))) == []
+
+
+def test_a_record_that_runs_backwards(tmp_path):
+    refused(write(tmp_path, [PLAIN[0], *PLAIN[:0:-1]]), "runs backwards", "order of its rows")
+    header, *body = (line.partition(",")[2] for line in PLAIN)
+    out = CliRunner().invoke(main, ["check", str(write(tmp_path, [header, *body[::-1]]))])
+    assert "the record runs backwards" in " ".join(out.stdout.split())
+    half = body[: N // 2][::-1]
+    test = read_test(write(tmp_path, [header, *half]))
+    assert any("starts under load" in note for note in asked(test))
+
+
+def test_force_and_motion_swapped(tmp_path):
+    lines = ["time (s),force (N),displacement (mm)", *rows(TIME, 50 * MOTION, FORCE / 50)]
+    out = CliRunner().invoke(main, ["check", str(write(tmp_path, lines))])
+    assert "force and motion are swapped" in " ".join(out.stdout.split())
+
+
+# ---------------------------------------------------------------------- what check finds wrong
+
+
+@pytest.mark.parametrize(
+    ("header", "factor", "told"),
+    [
+        ("strain (%)", 10.1, "they agree to 1 % of the range"),
+        ("strain (%)", 12.0, "Check: the displacement is used, but the strain is 1.2 times"),
+    ],
+)
+def test_strain_and_displacement_are_compared(tmp_path, header, factor, told):
+    lines = [f"{PLAIN[0]},{header}", *rows(TIME, FORCE, MOTION, factor * MOTION)]
+    test = read_test(write(tmp_path, lines))
+    expect(test)
+    assert any(told in note for note in test.notes)
+
+
+def test_the_travel_that_is_left_out_is_compared_with_the_strain(tmp_path):
+    lines = ["time (s),force (N),strain (%),Extension (mm)"]
+    lines += rows(TIME, FORCE, 10 * MOTION, 7 - 1.1 * MOTION)
+    test = read_test(write(tmp_path, lines))
+    expect(test)
+    told = "The displacement 'Extension (mm)' is left out; it differs by up to 10 % of the range."
+    assert told in test.notes
+
+
+def test_a_striker_without_a_time_is_warned_of(tmp_path):
+    lines = [line.partition(",")[2] for line in PLAIN]
+    test = read_test(write(tmp_path, lines, SPECIMEN + STRIKER))
+    expect(test, None)
+    assert any("there is a [striker], but no column is a time" in n for n in asked(test))
