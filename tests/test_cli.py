@@ -438,9 +438,10 @@ def test_refuses_rows(here: Path, row: str, words: tuple[str, ...]) -> None:
         ((2, -4), ("displacement", "scale = -1")),
         ((2, 40), ("strain reaches 4", "height")),
         ((0, 4), ("'stress (MPa)' is constant",)),
+        ((1e290, 4), ("'stress (MPa)' is up to 1e+290", "unit", "scale")),
     ],
 )
-def test_refuses_values(here: Path, factors: tuple[int, int], words: tuple[str, ...]) -> None:
+def test_refuses_values(here: Path, factors: tuple[float, float], words: tuple[str, ...]) -> None:
     rows = [f"{i},{factors[0] * y},{factors[1] * y}" for i, y in enumerate(LOOP)]
     refused(here, "fit", write(here, rows=rows), words=("test.csv", *words))
 
@@ -452,6 +453,12 @@ def test_refuses_values(here: Path, factors: tuple[int, int], words: tuple[str, 
         ("[specimen\n", (), ("test.toml", "no valid TOML", "line 1")),
         ('[specimen]\narea = "1 mm^2"\n', (), ("test.toml", "height is missing", '"1.19 mm"')),
         (SPECIMEN.replace('"10', '"-10'), (), ("test.toml", "height", "must be positive")),
+        (SPECIMEN.replace("100 mm", "1e300 mm"), (), ("test.toml", "area", "1e-30 and 1e+30")),
+        (
+            SPECIMEN + '[columns]\nstress = { column = "stress (MPa)", scale = 1e300 }\n',
+            (),
+            ("test.toml", "stress: scale", "1e-30 and 1e+30"),
+        ),
         (
             SPECIMEN + STRIKER.replace('"1 m/s', '"0 m/s'),
             ("--drive", "impact"),
@@ -490,7 +497,13 @@ def test_refuses_tomls(
         (["--fix", "s1_eta=0", "--vary", "s1_eta"], ("'s1_eta'", "both fixed and varied")),
         (["--model", "linear+bistable", "--fix", "s2_height=1e-3"], ("s2_height", "s1_height")),
         (["--fix", "s1_eps_a=2"], ("s1_eps_a = 2", "between 0 and 1")),
+        (["--fix", "s1_k0=1e300"], ("s1_k0 = 1e+300", "less than 1e+30")),
         (["--starts", "0"], ("'--starts'", "x>=1")),
+        (["--starts", "1000000000"], ("starts = 1000000000", "from 1 to 10000")),
+        (["--relaxation", "999"], ("relaxation = 999", "from 0 (none) to 10")),
+        (["--model", "+".join(["linear"] * 99)], ("99 springs", "20 at most")),
+        (["--bootstrap", "1000000000"], ("too many", "1000000")),
+        (["--cycle", "1,99"], ("no cycle 99", "1 to 1")),
         (["--seed", "-1"], ("'--seed'", "x>=0")),
         (["--max-time", "-1"], ("max_time", "positive")),
         (["--max-time", "soon"], ("'--max-time'", "'soon'")),
@@ -516,6 +529,11 @@ def test_refuses_calls_of_fit(here: Path, args: list[str], words: tuple[str, ...
         (["--verbose"], ("--verbose", "foamfit --help")),
         (["check", "none.csv"], ("none.csv", "no such file")),
         (["check", "."], ("directory",)),
+        (["fit", "."], ("directory", "CSV")),
+        (["fit", "/dev/zero"], ("/dev/zero", "device")),
+        (["check", RECONSTRUCTION, "--specimen", "/dev/zero"], ("/dev/zero", "device")),
+        (["compare", "/dev/zero"], ("/dev/zero", "device")),
+        (["batch", "NOTHING"], ("NOTHING", "no such file", ".csv")),
         (["check", RECONSTRUCTION, "--model", "rubber"], ("model 'rubber'",)),
         (
             ["check", RECONSTRUCTION, "--model", "bistable", "--published", "none"],
@@ -608,6 +626,13 @@ def test_simulate_keeps_the_history_that_drives_it(here: Path) -> None:
 def test_simulate_writes_two_files_or_none(here: Path) -> None:
     path = scene(here, PUBLISHED + IMPACT)
     refused(here, "simulate", path, "--out", "a.png", "--plot", "a.png", words=("a.png", "two"))
+
+
+def test_a_json_that_is_nested_too_deeply_is_no_defect(here: Path) -> None:
+    (here / "deep").mkdir()
+    (here / "deep" / "fit.json").write_text("[" * 100_000 + "]" * 100_000)
+    refused(here, "compare", "deep", words=("deep", "no", "JSON"))
+    refused(here, "fit", write(here), "--out", "deep", words=("deep", "no foamfit result"))
 
 
 def test_compare_and_fit_keep_what_they_read(here: Path, fitted: tuple[Path, Result]) -> None:

@@ -7,11 +7,13 @@ writes to the same place.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import platform
 import re
 import shutil
+import stat
 import tempfile
 import time
 from collections.abc import Iterable, Iterator
@@ -26,6 +28,7 @@ _TOKEN = uuid4().hex[:8]
 # Where it cannot be told whether a process lives, what is older than this, s, has been left behind:
 # to write a folder takes seconds.
 _ABANDONED = 86400.0
+_LARGEST = 2**30  # bytes of a file that is read whole
 
 
 def check_file(path: Path) -> None:
@@ -42,6 +45,21 @@ def check_file(path: Path) -> None:
             raise InputError(f"{path} cannot be written: permission denied")
     except (OSError, RuntimeError) as error:  # a name that is too long, a link to itself
         raise InputError(f"{path} cannot be written: {reason(error)}") from None
+
+
+def read_whole(path: Path, most: int | None = None) -> bytes:
+    """Read a file or a pipe, or its first bytes; OSError for one without end.
+
+    While that is read no signal is heard.
+    """
+    with path.open("rb") as file:
+        mode = os.fstat(file.fileno()).st_mode
+        if stat.S_ISCHR(mode) or stat.S_ISBLK(mode):
+            raise OSError(errno.EINVAL, "it is a device, no file")
+        raw = file.read(_LARGEST + 1 if most is None else most)
+    if len(raw) > _LARGEST:
+        raise OSError(errno.EFBIG, f"it has more than {_LARGEST} bytes")
+    return raw
 
 
 def write_file(path: str | Path, content: bytes) -> None:

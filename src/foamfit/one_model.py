@@ -42,8 +42,9 @@ Progress = Callable[[float, str], None]
 # Called with the problem and the best point so far, many times a second; it must be quick.
 Watch = Callable[[Problem, Array], None]
 
-# Descents of the search for each spring, and for each of several hysteretic springs in series.
-STARTS, STARTS_IN_SERIES = 16, 48
+# Descents of the search for each spring, for each of several hysteretic springs in series, and at
+# most in all.
+STARTS, STARTS_IN_SERIES, MOST_STARTS = 16, 48, 10_000
 # Refits of the bootstrap and steps of the Markov chain.
 DRAWS = {"bootstrap": 500, "mcmc": 2000}
 # Evaluations that the default spends on profiles, and on ranges, over those of the search; and how
@@ -102,12 +103,15 @@ class Options:
 
     def __post_init__(self) -> None:
         """Refuse what is of no use."""
-        for name, value, least in (("seed", self.seed, 0), ("starts", self.starts, 1)):
-            whole = isinstance(value, Integral) and int(value) >= least
+        for name, value, (least, most) in (
+            ("seed", self.seed, (0, math.inf)), ("starts", self.starts, (1, MOST_STARTS)),
+        ):  # fmt: skip
+            whole = isinstance(value, Integral) and least <= int(value) <= most
             if not whole and (name == "seed" or value is not None):
+                up = "up" if most == math.inf else f"to {most}"
                 raise InputError(
-                    f"{name} = {value!r} is not admissible; it must be a whole number, at least "
-                    f"{least}"
+                    f"{name} = {value!r} is not admissible; it must be a whole number from {least} "
+                    f"{up}"
                 )
         limit = self.max_time
         if limit is not None and not (isinstance(limit, Real) and float(limit) > 0):

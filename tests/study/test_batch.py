@@ -237,6 +237,15 @@ def test_a_test_that_became_unreadable_loses_its_old_result(here, tried):
 # ------------------------------------------------------------------------- what goes wrong
 
 
+@posix
+def test_a_broken_link_is_a_row(here, tried):
+    (here / "tests/gone.csv").symlink_to("nowhere.csv")
+    (here / "tests/loop.csv").symlink_to("loop.csv")
+    rows = again().set_index("file")["error"]
+    assert "no such file" in rows["tests/gone.csv"]
+    assert "symbolic links" in rows["tests/loop.csv"]
+
+
 def test_a_defect_is_a_row_and_ends_nothing(here, tried, monkeypatch):
     def fit(test, **options):
         if test.name == "b":

@@ -482,3 +482,14 @@ def test_a_full_disk_leaves_what_was_there(found, tmp_path, monkeypatch):
         found.save(tmp_path / "out", jobs=1)
     assert (tmp_path / "out" / "joint.json").read_text() == before
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_one_number_may_be_all_that_is_fitted(tmp_path):
+    study = write_study(tmp_path, 's1_k0 = "shared"').read_text()
+    (tmp_path / "study.toml").write_text(study.replace('"microscale"', '"linear"'))
+    for i in range(2):
+        write_test(tmp_path, f"t{i}", seed=i)
+    k0 = ff.joint(tmp_path / "study.toml", jobs=1).parameters["s1_k0"]
+    assert k0.kind == "shared"
+    assert k0.ci95[0] < k0.value < k0.ci95[1]
+    assert k0.range[0] < k0.value < k0.range[1]

@@ -75,7 +75,19 @@ def test_packed_tables_and_workbooks_are_tests(here):
 
 
 def test_a_file_that_is_not_there_is_left_to_its_reader(here):
-    assert names("monday/none.csv") == ["none"]
+    assert names("monday/none.csv", "monday/a.csv") == ["a", "none"]
+    with pytest.raises(InputError, match=r"monday/none\.csv: no such file or folder"):
+        find_tests("monday/none.csv")
+
+
+def test_a_broken_link_is_left_to_its_reader_and_a_folder_is_none(here):
+    (here / "monday/gone.csv").symlink_to("nowhere.csv")
+    (here / "monday/loop.csv").symlink_to("loop.csv")
+    (here / "monday/folder.csv").mkdir()
+    for pattern in ("monday", "monday/*.csv"):
+        found = [path.name for _, path in find_tests(pattern)]
+        assert [name for name in found if name != "b.txt"] == ["a.csv", "gone.csv", "loop.csv"]
+    assert names("monday/loop.csv") == ["loop"]
 
 
 @pytest.mark.parametrize("pattern", ["monday/z*.csv", "monday/*.png", "none/**/*.csv", "empty"])

@@ -79,7 +79,7 @@ def fit(
     """
     check_open(as_json)
     hush = quiet or as_json
-    model = _model_name(model)
+    model = _model_name(model, search["relaxation"])
     options = search | {"cycle": cycle, "model": model, "fix": fix, "vary": vary}
     with (
         compiling(hush, model, search["relaxation"]) as compile_rest,
@@ -134,8 +134,13 @@ def fit_as_asked(
     model = _model_name(options["model"])
     alone, several = cycles_of(options["cycle"])
     measurement = read_test(test, specimen, alone)
+    for number in set(several or ()).difference(measurement.cycles):
+        last = f"its cycles are {min(measurement.cycles)} to {max(measurement.cycles)}"
+        raise InputError(f"--cycle {options['cycle']}: {test} has no cycle {number}; {last}")
     from foamfit import api
+    from foamfit.one_model import Options
 
+    Options(**search)  # refuses what is not admissible before anything is compiled
     params = params_of(measurement, model, search, fix, vary)
     # With several cycles the limit is that of each.
     with begin(search["max_time"] if several is None else None) as news:
@@ -150,11 +155,11 @@ def fit_as_asked(
         )  # fmt: skip
 
 
-def _model_name(model: str) -> str:
+def _model_name(model: str, relaxation: int = 0) -> str:
     """Return a model's name without spaces; InputError if it is none."""
     from foamfit.springs.model import Model
 
-    return "auto" if model.strip() == "auto" else Model.parse(model).name
+    return "auto" if model.strip() == "auto" else Model.parse(model, relaxation).name
 
 
 def _save(

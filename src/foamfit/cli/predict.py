@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     help="Predict a rate outside the fitted ones by more than a factor of 1.25, too.",
 )  # fmt: skip
 @click.option(
-    "--draws", type=click.IntRange(min=40), default=400, show_default=True, metavar="N",
+    "--draws", type=click.IntRange(40, 100_000), default=400, show_default=True, metavar="N",
     help="Draws of the parameters for the band.",
 )  # fmt: skip
 @click.option(

@@ -46,6 +46,7 @@ from foamfit.data.noise import with_noise
 from foamfit.data.outliers import fresh_samples
 from foamfit.data.prepare import condition, stress_of_motion
 from foamfit.data.toml_file import Column, Settings, read_bytes, read_settings, toml_beside
+from foamfit.data.units import LARGEST
 from foamfit.errors import InputError
 from foamfit.text import engineering, percent
 
@@ -216,6 +217,11 @@ def _channels(
             raise InputError(f"{table.path}: column {name!r} is constant; a {channel} must vary.")
         measure = headers[needed[channel]].measure(channel)
         numbers[channel] = _nominal(table.path, measure, values * factors[channel])
+        if not 1.0 / LARGEST < np.max(np.abs(numbers[channel])) < LARGEST:
+            raise InputError(
+                f"{table.path}: column {name!r} is up to {np.max(np.abs(values)):.3g} in the file, "
+                f"which is no {channel}; correct its numbers, its unit or its scale."
+            )
         if measure:
             converted.append(f"The strain is converted from the {measure} strain {name!r}.")
     notes = [read_note(table, needed, given), *converted, *_announced(table, count)]

@@ -30,6 +30,7 @@ from foamfit.data.units import (
     split_uncertain,
 )
 from foamfit.errors import InputError
+from foamfit.files import read_whole
 from foamfit.terminal import printable
 
 _LARGEST = 1_000_000  # characters of a TOML
@@ -120,15 +121,14 @@ class Settings:
 
 def toml_beside(test: Path) -> Path:
     """Return the TOML beside a test, which shares its name: that of a.csv.gz is a.toml."""
-    packed = test.suffix.lower() == ".gz"
-    return (test.with_suffix("") if packed else test).with_suffix(".toml")
+    plain = test.with_suffix("") if test.suffix.lower() == ".gz" else test
+    return plain.parent / f"{plain.stem}.toml"
 
 
-def read_bytes(path: Path, otherwise: str, most: int = -1) -> bytes:
+def read_bytes(path: Path, otherwise: str, most: int | None = None) -> bytes:
     """Read a file, its first bytes if `most` are given; `otherwise` says what would be right."""
     try:
-        with path.open("rb") as file:
-            return file.read(most)
+        return read_whole(path, most)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; {otherwise}.") from None
     except OSError as error:
@@ -137,10 +137,9 @@ def read_bytes(path: Path, otherwise: str, most: int = -1) -> bytes:
 
 def load_toml(path: Path, otherwise: str) -> dict[str, Any]:
     """Load a TOML file; `otherwise` says what it is needed for where there is none."""
-    raw = read_bytes(path, otherwise, _LARGEST + 1)
+    raw = read_bytes(path, otherwise)
     if len(raw) > _LARGEST:
-        size = path.stat().st_size
-        raise InputError(f"{path}: has {size} characters; a TOML must have {_LARGEST} at most.")
+        raise InputError(f"{path}: has {len(raw)} characters; a TOML must have {_LARGEST} at most.")
     try:
         text = raw.decode("utf-8-sig")
         if _DOTTED.search(text):  # tomllib takes a time that grows with the square of their number

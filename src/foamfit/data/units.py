@@ -12,6 +12,8 @@ from foamfit.errors import InputError
 _USUAL = ["s", "ms", "us", "m", "cm", "mm", "um", "N", "kN", "mN", "Pa", "kPa", "MPa", "GPa"]
 _USUAL += ["m/s", "mm/s", "m/s^2", "V", "mV"]
 _QUANTITY = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*")
+# No quantity of a test is larger in SI, or smaller than its inverse; its square is still a number.
+LARGEST = 1e30
 _PLUS_MINUS = re.compile(r"±|\+/[-−]")
 
 
@@ -138,4 +140,7 @@ def _in_si(text: str, si: str) -> float | str:
         return "has an unknown unit"
     if not one.check(_unit(si).dimensionality):
         return "is of another kind"
-    return number * float(one.to(si or "dimensionless").magnitude)
+    in_si = number * float(one.to(si or "dimensionless").magnitude)
+    if in_si and not 1.0 / LARGEST < abs(in_si) < LARGEST:
+        return f"must be between {1.0 / LARGEST:g} and {LARGEST:g} in SI"
+    return in_si

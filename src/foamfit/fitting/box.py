@@ -186,7 +186,7 @@ class Space:
     @cached_property
     def box(self) -> tuple[Array, Array]:
         """Lowest and highest coordinates, (n_free,) each."""
-        pairs = np.array([BOX[family(short)] for _, short, _ in self.coordinates])
+        pairs = np.array([BOX[family(short)] for _, short, _ in self.coordinates]).reshape(-1, 2)
         return pairs[:, 0], pairs[:, 1]
 
     def _unit(self, short: str) -> float:

@@ -12,6 +12,7 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
+from foamfit.data.units import LARGEST
 from foamfit.errors import InputError
 from foamfit.fitting import nuisance
 from foamfit.fitting.box import LAST_STRAIN, Scales, Space, family, is_share
@@ -333,6 +334,8 @@ def _check_held(params: lmfit.Parameters) -> None:
             wanted, fine = "finite", bool(np.isfinite(value))
         if is_share(short):
             wanted, fine = "zero or positive", value >= 0.0
+        if abs(value) > LARGEST:
+            wanted, fine = f"less than {LARGEST:g} (SI)", False
         if not fine:
             raise InputError(f"{name} = {value:g} is not admissible: it must be {wanted}")
 

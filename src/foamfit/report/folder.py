@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement, interior_channel
 from foamfit.errors import InputError
-from foamfit.files import reason, replacing
+from foamfit.files import read_whole, reason, replacing
 from foamfit.report.figures import TWO
 from foamfit.report.page import render_report
 from foamfit.report.result_figures import Mapped, draw_all
@@ -140,7 +140,7 @@ def _is_of_fit(path: Path) -> bool:
     """Whether a fit.json is that of a fit, of this version or another one."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):  # neither UTF-8 nor JSON
+    except (OSError, ValueError, RecursionError):  # neither UTF-8 nor JSON
         return False
     return isinstance(content, dict) and {"schema", "foamfit"} <= content.keys()
 
@@ -154,13 +154,13 @@ def load_result(folder: str | Path) -> dict[str, Any]:
     if path.is_dir():
         path = path / "fit.json"
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(read_whole(path))
     except OSError as error:
         raise InputError(
             f"{folder} is not a result folder: {path.name} cannot be read "
             f"({error.strerror or error})"
         ) from error
-    except ValueError as error:  # neither UTF-8 nor JSON
+    except (ValueError, RecursionError) as error:  # neither UTF-8 nor JSON, or nested too deeply
         raise InputError(f"{path} is not valid JSON: {error}") from error
     if not isinstance(content, dict) or "schema" not in content:
         raise InputError(f"{path} is not the result of a fit (it has no schema number)")

@@ -223,7 +223,7 @@ def _draw_information(
     left.set_title("where the information comes from (%)", loc="left", fontsize=7.5, pad=4)
     left.set_yticks(range(k), insight.names)
     labels = ["flight" if " " in branch else branch for _, branch in parts]
-    longest = max(map(len, labels))
+    longest = max(map(len, labels), default=0)
     left.set_xticks(range(len(parts)), labels, rotation=90 if longest > 6 else 0)
     for curve in dict.fromkeys(curve for curve, _ in parts):
         at = [c for c, part in enumerate(parts) if part[0] == curve]

@@ -20,6 +20,9 @@ from foamfit.springs.chain import Chain
 from foamfit.springs.parameters import HYSTERETIC, KINDS, direction, names_of
 from foamfit.springs.spring import BistableSpring, LinearSpring, MicroscaleSpring, Spring
 
+# Relaxation terms of a spring, and springs of a chain: no test tells so many apart.
+MOST_TERMS, MOST_SPRINGS = 10, 20
+
 
 @dataclass(frozen=True)
 class Model:
@@ -43,13 +46,19 @@ class Model:
         Raises
         ------
         InputError
-            If a spring in it is unknown, or the number of relaxation terms is none.
+            If a spring in it is unknown, or there are too many of them or of relaxation terms.
         """
-        if type(relaxation) is not int or relaxation < 0:
-            raise InputError(f"relaxation = {relaxation!r} must be a whole number, 0 = none")
+        if type(relaxation) is not int or not 0 <= relaxation <= MOST_TERMS:
+            raise InputError(
+                f"relaxation = {relaxation!r} must be a whole number from 0 (none) to {MOST_TERMS}"
+            )
         if not isinstance(name, str):
             raise InputError(f"model = {name!r} must be a text like 'linear+bistable'")
         kinds = tuple(part.strip() for part in name.split("+"))
+        if len(kinds) > MOST_SPRINGS:
+            raise InputError(
+                f"a model of {len(kinds)} springs; it must have {MOST_SPRINGS} at most"
+            )
         for kind in kinds:
             if kind not in KINDS:
                 raise InputError(

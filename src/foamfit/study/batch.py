@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Literal, Unpack
 
 from foamfit.data.toml_file import motion_file, toml_beside
 from foamfit.errors import InputError
-from foamfit.files import is_left, reason, sweep
+from foamfit.files import is_left, read_whole, reason, sweep
 from foamfit.fitting import nuisance
 from foamfit.one_model import Keywords, Options
 from foamfit.report.figures import TWO, inches
@@ -345,7 +345,7 @@ class _Run:
         toml = toml_beside(path) if made.toml is None else made.toml
         folder = made.out / name
         try:
-            data, settings, camera = path.read_bytes(), _bytes(toml), motion_file(toml)
+            data, settings, camera = read_whole(path), _bytes(toml), motion_file(toml)
             motion = None if camera is None else _bytes(camera)
         except OSError:  # who reads the test says it better
             data, settings, motion = b"", None, None

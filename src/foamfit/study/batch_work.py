@@ -131,7 +131,13 @@ def stored(folder: Path, wanted: str, recipe: Recipe) -> tuple[Row, ...] | None:
             row | {"sketch": row["sketch"] and Sketch(**row["sketch"])} for row in content["rows"]
         ]
         return tuple(Row(**row) for row in rows)
-    except (OSError, ValueError, KeyError, TypeError):  # none, or of another version
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        RecursionError,
+    ):  # none, or of another version
         return None
 
 

@@ -51,16 +51,24 @@ def find_tests(
     Raises
     ------
     InputError
-        If a glob matches no test, or a folder has none; the message names it.
+        If a glob matches no test, a folder has none, or nothing is there at all; the message names
+        it. One of several that is not there is left to who reads it, as a broken link is.
     """
     given = [patterns] if isinstance(patterns, str | Path) else list(patterns)
     if not given:
         raise InputError("no test is named; give files, folders or globs")
-    found = {path.resolve(): path for one in given for path in _matches(one, Path(base))}
+    found = {_whole(path): path for one in given for path in _matches(one, Path(base))}
     paths = sorted(found.values())
     if not paths:
         raise InputError(f"{listed(map(str, given))}: a TOML is no test; name the tables beside it")
+    if not any(map(os.path.lexists, paths)):
+        raise InputError(f"{listed(map(str, given))}: no such file or folder; {WANTED}")
     return list(zip(_names(paths), paths, strict=True))
+
+
+def _whole(path: Path) -> Path:
+    """Absolute path of a file without links; `resolve` refuses one that leads to itself."""
+    return Path(os.path.realpath(path))
 
 
 def _matches(pattern: str | Path, base: Path) -> list[Path]:
@@ -76,9 +84,7 @@ def _matches(pattern: str | Path, base: Path) -> list[Path]:
         return [] if path.suffix.lower() == ".toml" else [path]
     hits = [Path(hit) for hit in glob.glob(str(path), recursive=True)]
     motions = {path for folder in {hit.parent for hit in hits} for path in _motions(folder)}
-    there = [
-        hit for hit in hits if hit.is_file() and _is_test(hit) and hit.resolve() not in motions
-    ]
+    there = [hit for hit in hits if _is_test(hit) and _whole(hit) not in motions]
     there += [inner for hit in hits if hit.is_dir() for inner in _tests_in(hit)]
     if not there:
         why = "matches no file" if not hits else "matches no test"
@@ -87,19 +93,21 @@ def _matches(pattern: str | Path, base: Path) -> list[Path]:
 
 
 def _tests_in(folder: Path) -> list[Path]:
-    files = [path for path in folder.iterdir() if path.is_file() and _is_test(path)]
+    files = [path for path in folder.iterdir() if _is_test(path)]
     motions = _motions(folder) if files else set()
-    return [path for path in files if path.resolve() not in motions]
+    return [path for path in files if _whole(path) not in motions]
 
 
 def _motions(folder: Path) -> set[Path]:
     """Files that TOMLs in a folder name as the motion of a test."""
     found = map(motion_file, folder.glob("*.toml"))
-    return {Path(os.path.realpath(path)) for path in found if path is not None}
+    return {_whole(path) for path in found if path is not None}
 
 
 def _is_test(path: Path) -> bool:
     """Whether a file is taken where it is not named itself."""
+    if not path.is_file() and (path.is_dir() or not path.is_symlink()):
+        return False  # a broken link is left to who reads it
     plain = path.with_suffix("") if path.suffix.lower() == ".gz" else path  # no .tar.gz
     if plain.suffix.lower() not in ENDINGS or plain.stem.lower() in _SPECIMENS:
         return False
@@ -113,7 +121,7 @@ def _is_test(path: Path) -> bool:
 
 def _names(paths: list[Path]) -> Iterator[str]:
     """Name each file by its stem, and by as many parents as tell it from the others."""
-    wholes = [path.resolve() for path in paths]
+    wholes = [_whole(path) for path in paths]
     beside = Counter((whole.parent, whole.stem.casefold()) for whole in wholes)
     stems = [
         w.stem if beside[w.parent, w.stem.casefold()] == 1 else w.name.replace(".", "-")

@@ -27,8 +27,8 @@ from foamfit.trust.residuals.noise_process import parts
 # share at the end of its local interval.
 BENT = 0.15
 METHODS = ("auto", "local", "profile", "bootstrap", "mcmc")
-# Refits of an average profile, for the announcement; draws that percentiles need.
-REFITS, ENOUGH_DRAWS = 9, 40
+# Refits of an average profile, for the announcement; draws that percentiles need, and at most.
+REFITS, ENOUGH_DRAWS, MOST_DRAWS = 9, 40, 1_000_000
 # Evaluations of a refit, and its slopes.
 EVALUATIONS, SLOPES = 6.0, 0.6
 # A minimum is hardly worse than the best within this factor of the 95 % cut, of standard errors:
@@ -53,10 +53,11 @@ class Choice:
                 f"intervals '{self.method}' is unknown; it must be one of {', '.join(METHODS)}"
             )
         least = {"bootstrap": 40, "mcmc": 100}.get(self.method, 0)
-        if self.draws < least:
+        if not least <= self.draws <= MOST_DRAWS:
+            wrong = "few" if self.draws < least else "many"
             raise InputError(
-                f"{self.draws} draws are too few for intervals by {self.method}; "
-                f"it must be at least {least}"
+                f"{self.draws} draws are too {wrong} for intervals by {self.method}; "
+                f"it must be at {f'least {least}' if wrong == 'few' else f'most {MOST_DRAWS}'}"
             )
         if self.method == "mcmc":
             check_emcee()
