@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import signal
 from dataclasses import replace
+from functools import partial
 
 import lmfit
 import numpy as np
@@ -16,6 +18,7 @@ import foamfit as ff
 import foamfit.report.figures
 import foamfit.report.page
 from conftest import AREA, HEIGHT, small_pictures, synthetic_impact, synthetic_loop
+from foamfit import one_model
 from foamfit.cli import main
 from foamfit.data.measurement import Measurement, Outliers
 from foamfit.fitting.curves import default_weights
@@ -318,6 +321,21 @@ def test_a_stopped_fit_is_marked_everywhere(tmp_path, monkeypatch):
     text = comparison_text(compare([tmp_path / "stopped"], "foam-1/model-1"))
     assert "stopped by the time limit)" in text.splitlines()[0]
     assert "not the end of a fit" in " ".join(text.split())
+
+
+def test_sigterm_keeps_the_best_so_far(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    small_pictures(monkeypatch)
+    end = partial(signal.raise_signal, signal.SIGTERM)
+    monkeypatch.setattr(one_model, "settle_ends", lambda *_: end())  # when the search is over
+    call = ["fit", str(fabricated_csv(tmp_path)), "--starts", "2", "--out", "stopped"]
+    out = CliRunner().invoke(main, call)
+    assert (out.exit_code, out.stderr) == (0, "")
+    assert "stopped by SIGTERM" in out.stdout.splitlines()[0]
+    assert load_result(tmp_path / "stopped")["stopped"] == "SIGTERM"
+    monkeypatch.setattr(one_model, "make_problem", lambda *_, **__: end())
+    out = CliRunner().invoke(main, [*call, "--quiet"])
+    assert (out.exit_code, out.stderr.strip()) == (143, "foamfit: ended by SIGTERM")
 
 
 def test_the_figure_of_a_stopped_fit_says_so():

@@ -23,7 +23,7 @@ from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.box import is_share
 from foamfit.fitting.curves import choose_drive
 from foamfit.fitting.problem import make_params
-from foamfit.fitting.search import SearchStoppedError
+from foamfit.fitting.search import SearchStoppedError, what_stopped
 from foamfit.one_model import Found, Options, Progress
 from foamfit.results import Fit, Ladder, Rung, rung_name
 from foamfit.springs.model import Model
@@ -161,10 +161,10 @@ def compare_models(
                 ended = f"{WITHOUT_GAIN} groups of richer models in a row brought no gain"
                 break
         stopped = state.stopped
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
         if not tried:
             raise
-        stopped = "Ctrl-C"
+        stopped = what_stopped(error)
     if not tried:
         raise SimulationError(f"{measurement.name}: no model could be tried: {'; '.join(skipped)}")
     best = choose(tried).best

@@ -197,8 +197,8 @@ def judge(
                 found.tracker.pulse = _pulse(found, best, choice, progress)
                 best, record, intervals = _assess(found, best, choice, announce)
             return _finish(found, best, record, intervals)
-    except KeyboardInterrupt:  # what was found is not given up for a late Ctrl-C
-        record = replace(found.record, stopped="Ctrl-C")
+    except KeyboardInterrupt as error:  # what was found is not given up for a late Ctrl-C
+        record = replace(found.record, stopped=what_stopped(error))
         return _finish(found, found.best(), record, Intervals())
 
 

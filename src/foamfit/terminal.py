@@ -87,11 +87,14 @@ def drop_output() -> None:
     os.close(nowhere)
 
 
-class TerminatedError(BaseException):
-    """The process is asked to end, by the signal `number`: SIGTERM, or its terminal has gone."""
+class TerminatedError(KeyboardInterrupt):
+    """The process is asked to end, by the signal `number`: SIGTERM, or its terminal has gone.
+
+    As Ctrl-C it keeps what was found. Its text is the name of the signal.
+    """
 
     def __init__(self, number: int) -> None:
-        super().__init__(number)
+        super().__init__(signal.Signals(number).name)
         self.number = number
 
 

@@ -89,6 +89,13 @@ def test_one_cycle_has_nothing_to_be_together_with(record):
     )
 
 
+def test_a_cycle_that_the_record_lacks_is_a_wrong_call(record, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    told = CliRunner().invoke(main, ["fit", str(record), "--cycle", "1,99"])
+    assert (told.exit_code, told.stdout, list(tmp_path.iterdir())) == (1, "", [])
+    assert "has no cycle 99; its cycles are 1 to 3" in told.stderr
+
+
 @pytest.mark.parametrize("at", ["reading", "fit", "together"])
 def test_ctrl_c_keeps_what_was_found(record, monkeypatch, at):
     from foamfit.study import cycles

@@ -65,8 +65,8 @@ def fit(
     cycles.json: what changes from cycle to cycle, by one fit of them together.
 
     Exit code 0: a fit was made; 1: the input or the call is wrong; 2: no acceptable fit was found
-    (what was found is written); 70: a defect of foamfit; 130 and 143: ended by Ctrl-C before
-    anything was found, and by SIGTERM.
+    (what was found is written); 70: a defect of foamfit; 130 and 143: ended by Ctrl-C or
+    SIGTERM before anything was found, as these too give the best so far.
 
     \b
     Examples:

@@ -37,10 +37,11 @@ class _Group(click.Group):
             _leave(WRONG, _one_sentence(error))
         except (InputError, SimulationError) as error:
             _leave(WRONG, str(error))
-        except (click.Abort, KeyboardInterrupt):
+        except (click.Abort, KeyboardInterrupt) as error:  # the first is what click makes of these
+            first = error.__cause__ or error
+            if isinstance(first, TerminatedError):
+                _leave(SIGNALLED + first.number, f"ended by {first}")
             _leave(SIGNALLED + signal.SIGINT, "interrupted by Ctrl-C")
-        except TerminatedError as error:
-            _leave(SIGNALLED + error.number, f"ended by {signal.Signals(error.number).name}")
         except Exception as error:
             if os.environ.get("FOAMFIT_TRACEBACK"):
                 raise

@@ -52,7 +52,7 @@ STOPPING = (SearchStoppedError, KeyboardInterrupt)
 
 def what_stopped(error: BaseException) -> str:
     """Say what has raised one of `STOPPING`."""
-    return "the time limit" if isinstance(error, SearchStoppedError) else "Ctrl-C"
+    return "the time limit" if isinstance(error, SearchStoppedError) else str(error) or "Ctrl-C"
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class SearchRecord:
     # Final costs of the descents on the drive's curves, best first, and how many descents on the
     # loop led to each.
     costs: tuple[tuple[float, int], ...] = ()
-    stopped: str | None = None  # What ended it before its time: "the time limit", "Ctrl-C"
+    stopped: str | None = None  # What ended it early: "the time limit", "Ctrl-C", "SIGTERM"
 
     @property
     def agreeing(self) -> int:

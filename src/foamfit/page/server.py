@@ -30,7 +30,7 @@ from foamfit.errors import InputError
 from foamfit.page.app import Window
 from foamfit.page.desk import LARGEST, Desk, too_large
 from foamfit.page.first_use import FirstUse
-from foamfit.terminal import TerminatedError, say
+from foamfit.terminal import say
 
 HOST = "127.0.0.1"
 UNUSED = 20_000  # ms after which the desk of a closed window is removed
@@ -197,7 +197,7 @@ def serve(test: Path | None, port: int, browser: bool) -> None:
         finally:
             page.close()
 
-    with suppress(KeyboardInterrupt, TerminatedError):
+    with suppress(KeyboardInterrupt):
         asyncio.run(run())
 
 

@@ -14,6 +14,7 @@ from foamfit.api import FitResult, fit
 from foamfit.data.csv_file import read_test
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError
+from foamfit.fitting.search import what_stopped
 from foamfit.one_model import Keywords, Options, Progress
 from foamfit.report.figures import TWO, inches
 from foamfit.report.studies.cycles import save_cycles
@@ -24,7 +25,6 @@ from foamfit.trust.intervals import Announce
 
 # Cycles that are fitted together at most; of more the first and others at equal ratios are taken.
 MOST_TOGETHER = 6
-CTRL_C = "not fitted, because Ctrl-C ended the command before"
 
 Params = Callable[[Measurement], lmfit.Parameters | None]
 
@@ -93,7 +93,7 @@ def fit_cycles(
     if not wanted:
         raise InputError("no cycle is named; name one or leave cycles out for all")
     results, refused = dict[int, FitResult](), dict[int, str]()
-    share = 0.7 if together and len(wanted) > 1 else 1.0
+    share, stopped = 0.7 if together and len(wanted) > 1 else 1.0, None
     for i, number in enumerate(wanted):
 
         def told(done: float, what: str, i: int = i, number: int = number) -> None:
@@ -105,24 +105,21 @@ def fit_cycles(
             results[number] = fit(
                 test, model=model, params=given, progress=told, tell=tell, **options
             )
+            stopped = results[number].stopped
         except (InputError, SimulationError) as error:
             refused[number] = str(error)
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as error:
             if not results:
                 raise
-            refused[number] = CTRL_C
-        if refused.get(number) is CTRL_C or _interrupted(results.get(number)):
-            refused |= dict.fromkeys(wanted[i + 1 :], CTRL_C)
+            stopped = what_stopped(error)
+        if stopped not in (None, "the time limit"):
+            why = f"not fitted, because {stopped} ended the command before"
+            refused |= {left: why for left in wanted[i:] if left not in results}
             break
     found = CycleFits(first.name, model, first.cycles, results, refused)
     if not together:
         return found
     return _fit_together(found, chosen, lambda done, what: report(share + 0.3 * done, what))
-
-
-def _interrupted(result: FitResult | None) -> bool:
-    """Whether Ctrl-C has ended a fit; what it had found is its result."""
-    return result is not None and result.stopped == "Ctrl-C"
 
 
 def _fit_together(found: CycleFits, options: Options, progress: Progress) -> CycleFits:
@@ -149,8 +146,9 @@ def _fit_together(found: CycleFits, options: Options, progress: Progress) -> Cyc
         problem.objective.weigh_motion(values)
     try:
         selection = select_own([Group(tuple(problems), tuple(vectors))], progress=progress)
-    except KeyboardInterrupt:  # the fits of the cycles are not given up for it
-        return replace(found, sentences=("The fit of the cycles together was ended by Ctrl-C.",))
+    except KeyboardInterrupt as error:  # the fits of the cycles are not given up for it
+        told = f"The fit of the cycles together was ended by {what_stopped(error)}."
+        return replace(found, sentences=(told,))
     together = replace(found, selection=selection, together=numbers)
     return replace(together, sentences=tuple(_sentences(together, selection)))
 
