@@ -17,6 +17,7 @@ import pytest
 from click.testing import CliRunner
 
 import fabricated
+import foamfit.api
 import foamfit.report.figures
 import foamfit.report.folder
 import foamfit.results
@@ -43,8 +44,8 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def names(folder: Path) -> list[str]:
-    return sorted(path.name for path in folder.iterdir())
+def names(folder: Path | str) -> list[str]:
+    return sorted(path.name for path in Path(folder).iterdir())
 
 
 def gone() -> int:
@@ -207,6 +208,63 @@ def test_a_full_disk_loses_no_numbers(here: Path, monkeypatch: pytest.MonkeyPatc
     assert "s1_k0" in result.stdout
     assert "written to" not in result.stdout
     assert result.stderr == "foamfit: the result cannot be written to r: No space left on device\n"
+
+
+TABLES = ["curves.csv", "fit.json", "parameters.csv"]
+CALL = ("fit", str(RECONSTRUCTION), "--starts", "1", "--max-time", "0.1", "--out", "r")
+
+
+def test_what_cannot_be_written_is_tried_before_the_fit(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a file system that says that it may be written, and may not."""
+
+    def denied(path: Path, *_: object, **__: object) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(foamfit.api, "fit", lambda *_, **__: pytest.fail("it was fitted"))
+    monkeypatch.setattr(Path, "mkdir", denied)
+    result = CliRunner().invoke(main, CALL)
+    assert (result.exit_code, result.stdout, names(here)) == (1, "", [])
+    assert "cannot be written to r: Operation not permitted" in result.stderr
+
+
+def test_what_cannot_be_written_in_the_end_is_saved_beside(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def denied(_: object, folder: Path, **__: object) -> None:
+        if folder.name == "r":
+            raise InputError("the result cannot be written to r: No space; choose another folder")
+        save_result(*(_, folder), **__)
+
+    save_result = foamfit.report.folder.save_result
+    monkeypatch.setattr(foamfit.report.folder, "save_result", denied)
+    result = CliRunner().invoke(main, [*CALL, "--no-report"])
+    (saved,) = names(here)
+    assert result.exit_code == 1
+    assert result.stderr.endswith(f"to r: No space; it is in {saved} instead\n")
+    assert load_result(saved)["model"] == "bistable"
+
+
+def test_a_report_that_fails_loses_no_numbers(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object, **__: object) -> str:
+        raise ZeroDivisionError("of a figure")
+
+    monkeypatch.setattr(foamfit.report.folder, "render_report", fail)
+    result = CliRunner().invoke(main, CALL)
+    assert (result.exit_code, "of a figure" in result.stderr) == (70, True)
+    assert load_result("r")["model"] == "bistable"
+    assert names(here / "r") == TABLES
+
+
+def test_without_a_report_there_are_tables_alone(here: Path) -> None:
+    result = CliRunner().invoke(main, [*CALL, "--no-report"])
+    assert result.exit_code in (0, 2)
+    assert result.stdout.endswith("\nwritten to r\n")
+    assert names(here / "r") == TABLES
+    assert names(fabricated.result().save("s", report=False)) == TABLES
+    result = CliRunner().invoke(main, [*CALL, "--no-report", "--open"])
+    assert "--open and --no-report exclude each other" in result.stderr
 
 
 def test_a_file_keeps_its_link_its_mode_and_a_device_what_it_is(here: Path) -> None:

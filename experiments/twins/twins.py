@@ -85,7 +85,7 @@ def fit_each(folder: Path) -> pd.DataFrame:
     """Fit every cycle of every test on its own; rows of summary.csv with specimen and cycle."""
     found = ff.batch(
         folder, out=folder / "runs", model="microscale", relaxation=1, drive="displacement",
-        cycle="all", intervals="local", figure_width=None,
+        cycle="all", intervals="local", report=False,
     )  # fmt: skip
     split = found["test"].str.extract(r"^(?P<specimen>.*)_raw(?:/cycle-(?P<cycle>\d+))?$")
     return pd.concat([split, found.drop(columns=["test", "file"])], axis=1)

@@ -19,13 +19,14 @@ from foamfit.trust.intervals import Announce
 class FitResult(Fit):
     """Everything that a fit found, and how it is written; its fields are those of `results.Fit`."""
 
-    def save(self, folder: str | Path, *, figure_width: str = TWO) -> Path:
+    def save(self, folder: str | Path, *, report: bool = True, figure_width: str = TWO) -> Path:
         """Write the result folder whole, as `report.folder.save_result` does; returns it.
 
-        Its figure is "one" or "two" columns wide, or as wide as a length ("85 mm").
+        Without `report` it has neither report.html nor figures. Its figure is "one" or "two"
+        columns wide, or as wide as a length ("85 mm").
         """
         inches(figure_width)  # refuses what is no width
-        return save_result(self, folder, width=figure_width)
+        return save_result(self, folder, report=report, width=figure_width)
 
 
 def fit(
@@ -104,7 +105,7 @@ def fit(
         )
     if params is not None and not isinstance(params, lmfit.Parameters):
         raise InputError("params must be lmfit.Parameters, as foamfit.make_params returns them")
-    chosen = Options(**options)
+    chosen = Options.of("fit", options)
     progress, tell = progress or (lambda *_: None), tell or (lambda _: None)
     if model == "auto":
         if params is not None:

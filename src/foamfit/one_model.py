@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 import time
 import warnings
@@ -9,7 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from numbers import Integral, Real
-from typing import TypedDict
+from typing import Any, TypedDict
 
 import lmfit
 import numpy as np
@@ -100,6 +101,15 @@ class Options:
     intervals: str = "auto"
     draws: int | None = None
     watch: Watch | None = None
+
+    @classmethod
+    def of(cls, function: str, given: Mapping[str, Any]) -> Options:
+        """Take the keywords of a function; TypeError names it and one that it does not have."""
+        for name in given.keys() - cls.__dataclass_fields__.keys():
+            near = difflib.get_close_matches(name, cls.__dataclass_fields__, 1)
+            meant = f"; did you mean {near[0]!r}?" if near else ""
+            raise TypeError(f"{function}() got an unexpected keyword argument {name!r}{meant}")
+        return cls(**given)
 
     def __post_init__(self) -> None:
         """Refuse what is of no use."""

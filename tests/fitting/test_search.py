@@ -186,8 +186,10 @@ def test_wrong_calls_are_refused(options, message):
 
 
 def test_an_unknown_option_is_a_type_error_that_names_it():
-    with pytest.raises(TypeError, match="unexpected keyword argument 'start'"):
-        ff.fit(synthetic_loop()[1], start=3)
+    wrong = r"\(\) got an unexpected keyword argument 'start'; did you mean 'starts'\?"
+    for function, given in ((ff.fit, synthetic_loop()[1]), (ff.fit_cycles, "x"), (ff.batch, "x")):
+        with pytest.raises(TypeError, match=f"^{function.__name__}{wrong}"):
+            function(given, start=3)
 
 
 def test_keywords_and_options_are_one_list_and_all_are_documented():

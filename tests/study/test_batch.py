@@ -88,7 +88,7 @@ def tried(monkeypatch):
 
 
 def again(**changed):
-    given = {"out": "out", "specimen": "foam.toml", "executor": Inline(), "figure_width": None}
+    given = {"out": "out", "specimen": "foam.toml", "executor": Inline(), "report": False}
     return ff.batch("tests", **(given | changed))
 
 
@@ -117,7 +117,7 @@ def stamps(out):
 def test_the_same_numbers_with_any_number_of_processes_and_anywhere(here):
     frames = {}
     for jobs in (1, 2, 4):
-        call = {"out": f"out{jobs}", "specimen": "foam.toml", "figure_width": None, "jobs": jobs}
+        call = {"out": f"out{jobs}", "specimen": "foam.toml", "report": False, "jobs": jobs}
         frames[jobs] = ff.batch("tests", **call, **QUICK)
     again(out="inline", **QUICK)
     made = numbers("out1")
@@ -143,29 +143,29 @@ def test_the_same_numbers_with_any_number_of_processes_and_anywhere(here):
 
 def test_reports_are_there_unless_they_are_not_wanted(here, tried, monkeypatch):
     without_pictures(monkeypatch)
-    again(figure_width=None)
+    again(report=False)
     assert len(tried) == 3
-    again(figure_width="two")  # the reports are missing
+    again(report=True, figure_width="two")  # the reports are missing
     assert len(tried) == 6
     assert {"report.html", "fit.png", "fit.pdf"} <= set(names("out/a"))
     assert 'href="a/report.html"' in Path("out/summary.html").read_text()
-    again(figure_width=None)
+    again(report=False)
     assert len(tried) == 6
 
 
 def test_figures_of_another_width_are_made_again_where_there_are_any(here, tried, monkeypatch):
     without_pictures(monkeypatch)
-    again(figure_width="two")
+    again(report=True, figure_width="two")
     assert len(tried) == 3
-    again(figure_width="177.8 mm")  # two columns
-    again(figure_width=None)
+    again(report=True, figure_width="177.8 mm")  # two columns
+    again(report=False)
     assert len(tried) == 3
-    again(figure_width="one")
+    again(report=True, figure_width="one")
     assert len(tried) == 6
-    again(figure_width="3.25 in")
+    again(report=True, figure_width="3.25 in")
     assert len(tried) == 6
     with pytest.raises(ff.InputError, match="the width of figures = 'narrow'"):
-        again(figure_width="narrow")
+        again(report=True, figure_width="narrow")
 
 
 def test_a_cycle_is_a_row_and_its_folder_is_in_that_of_the_test(here, monkeypatch):

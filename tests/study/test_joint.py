@@ -149,7 +149,7 @@ def test_joint_json_says_everything(found):
 
 def test_joint_json_tells_the_noise_by_which_each_test_is_weighted(found, tmp_path, monkeypatch):
     without_pictures(monkeypatch)
-    found.save(tmp_path / "out", jobs=1, reports=False)
+    found.save(tmp_path / "out", jobs=1, report=False)
     content = json.loads((tmp_path / "out" / "joint.json").read_text())
     for name, test in content["tests"].items():
         (curve, level), *more = test["noise"].items()
@@ -471,7 +471,7 @@ def test_a_law_of_rate_needs_two_rates(tmp_path):
 
 def test_a_full_disk_leaves_what_was_there(found, tmp_path, monkeypatch):
     without_pictures(monkeypatch)
-    found.save(tmp_path / "out", jobs=1, reports=False)
+    found.save(tmp_path / "out", jobs=1, report=False)
     before = (tmp_path / "out" / "joint.json").read_text()
 
     def full(*_, **__):

@@ -18,13 +18,14 @@ from foamfit.cli.group import NOT_ACCEPTABLE, main
 from foamfit.cli.options import (
     CYCLE,
     FILE,
+    NO_REPORT,
     OPEN,
     SPECIMEN,
     WIDTH,
     check_open,
     compiling,
     cycles_of,
-    open_if_asked,
+    tell_written,
 )
 from foamfit.cli.progress import duration
 from foamfit.errors import InputError
@@ -52,7 +53,7 @@ PATIENCE = 10
     "--scheduler", metavar="ADDRESS", help="A running Dask scheduler, as tcp://127.0.0.1:8786."
 )
 @click.option("--fresh", is_flag=True, help="Fit everything again, what is done already too.")
-@click.option("--no-report", is_flag=True, help="No report.html, fit.png and fit.pdf of each fit.")
+@NO_REPORT
 @fit_options
 @WIDTH
 @OPEN
@@ -113,12 +114,11 @@ def batch(
         say(json.dumps([dict(zip(head, row, strict=True)) for row in cells], allow_nan=False))
     elif not quiet:
         say(summary_words(rows))
-        say(f"\nwritten to {found.out}: open {found.out / 'summary.html'}")
+    tell_written(found.out / "summary.html", quiet or as_json)
     wrong = sum(not row.has_fit for row in rows)
     if wrong:
         told = f"{wrong} of {len(rows)} tests {'has' if wrong == 1 else 'have'} no acceptable fit"
         say(f"foamfit: {told}; see {found.out / 'summary.csv'}", err=True)
-    open_if_asked(found.out / "summary.html")
     return NOT_ACCEPTABLE if wrong else 0
 
 

@@ -17,17 +17,17 @@ from foamfit.cli.group import NOT_ACCEPTABLE, main
 from foamfit.cli.options import (
     CYCLE,
     FILE,
+    NO_REPORT,
     OPEN,
     SPECIMEN,
     TEST,
     WIDTH,
-    Drawers,
     check_open,
     compiling,
     cycles_of,
     drawing_beside,
-    open_if_asked,
     spare,
+    tell_written,
 )
 from foamfit.cli.progress import Progress, progress_line
 from foamfit.errors import InputError
@@ -46,6 +46,7 @@ OF_ONE_MODEL, WAYS = ("cycle", "model", "fix", "vary"), ("profile", "bootstrap",
 @SPECIMEN
 @CYCLE
 @click.option("--out", type=FILE, help="Result folder. Default: fits/<test>/<model>.")
+@NO_REPORT
 @fit_options
 @WIDTH
 @OPEN
@@ -56,7 +57,7 @@ OF_ONE_MODEL, WAYS = ("cycle", "model", "fix", "vary"), ("profile", "bootstrap",
 )
 def fit(
     test: Path, specimen: Path | None, cycle: str | None, model: str, out: Path | None,
-    fix: dict[str, float], vary: tuple[str, ...], figure_width: str,
+    fix: dict[str, float], vary: tuple[str, ...], no_report: bool, figure_width: str,
     as_json: bool, quiet: bool, verbose: bool, **search: Any,
 ) -> int:  # fmt: skip
     """Identify the parameters of TEST.csv and write a result folder.
@@ -77,7 +78,7 @@ def fit(
         foamfit fit TEST.csv --drive displacement --out results/today --figure-width one
         foamfit fit TEST.csv --model linear+bistable --fix s1_k0=60e6
     """
-    check_open(as_json)
+    check_open(as_json, no_report)
     hush = quiet or as_json
     model = _model_name(model, search["relaxation"])
     options = search | {"cycle": cycle, "model": model, "fix": fix, "vary": vary}
@@ -89,16 +90,18 @@ def fit(
 
         def begin(limit: float | None) -> AbstractContextManager[Progress]:
             compile_rest()
-            drawers.begin()
+            if not no_report:
+                drawers.begin()
             return progress_line(hush, "fit", limit, says=not quiet)
 
         found = fit_as_asked(test, specimen, options, begin)
-        save = partial(_save, found, folder, figure_width, drawers, hush)
+        drawn = {"report": not no_report, "width": figure_width, "mapped": drawers.map}
+        save = partial(_save, found, folder, hush, drawn)
         from foamfit.results import Fit
 
         if not isinstance(found, Fit):
             code = _tell_cycles(found, folder, save, as_json, quiet)
-            open_if_asked(folder / "cycles.png")
+            tell_written(folder / "cycles.png", hush)
             return code
         try:
             save()
@@ -106,9 +109,7 @@ def fit(
             _tell_result(found, as_json, quiet, verbose)
             raise
     _tell_result(found, as_json, quiet, verbose)
-    if not quiet and not as_json:
-        say(f"\nwritten to {folder}: open {folder / 'report.html'}")
-    open_if_asked(folder / "report.html")
+    tell_written(folder / "report.html", hush)
     if found.status == "failed":
         say(f"foamfit: no acceptable fit was found; see {folder}", err=True)
         return NOT_ACCEPTABLE
@@ -162,20 +163,20 @@ def _model_name(model: str, relaxation: int = 0) -> str:
     return "auto" if model.strip() == "auto" else Model.parse(model, relaxation).name
 
 
-def _save(
-    found: FitResult | CycleFits, folder: Path, width: str, drawers: Drawers, silent: bool
-) -> None:
+def _save(found: FitResult | CycleFits, folder: Path, silent: bool, drawn: dict[str, Any]) -> None:
     """Write the folder; the line on the terminal says so."""
-    from foamfit.report.folder import save_result
+    from foamfit.report import folder as results
     from foamfit.report.studies.cycles import save_cycles
     from foamfit.results import Fit
 
+    save = (
+        partial(results.save_result, found)
+        if isinstance(found, Fit)
+        else partial(save_cycles, found)
+    )
     with progress_line(silent, "fit") as shown, without_ctrl_c():
         shown.progress(1.0, "writing the report")
-        if isinstance(found, Fit):
-            save_result(found, folder, width=width, mapped=drawers.map)
-        else:
-            save_cycles(found, folder, width=width, mapped=drawers.map)
+        results.save_somewhere(save, folder, **drawn)
 
 
 def _tell_cycles(
@@ -194,8 +195,6 @@ def _tell_cycles(
     finally:  # the numbers are not lost with the folder
         if as_json or not quiet:
             say(shown)
-    if not quiet and not as_json:
-        say(f"\nwritten to {folder}: open {folder / 'cycles.png'}")
     good = [n for n, one in found.results.items() if one.status != "failed"]
     if not good:
         say(f"foamfit: no acceptable fit of any cycle was found; see {folder}", err=True)
@@ -217,9 +216,9 @@ def _tell_result(result: FitResult, as_json: bool, quiet: bool, verbose: bool) -
 def _result_folder(out: Path | None, test: Path, specimen: Path | None, model: str) -> Path:
     """Return the folder for a result, which must not be one that would be lost."""
     from foamfit.data.toml_file import toml_beside
-    from foamfit.report.folder import check_target
+    from foamfit.report.folder import try_target
 
     folder = Path("fits", toml_beside(test).stem, model) if out is None else out
-    check_target(folder)
+    try_target(folder)
     spare(folder, (test, specimen or toml_beside(test)))
     return folder

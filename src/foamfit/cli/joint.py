@@ -12,12 +12,13 @@ import click
 from foamfit.cli.group import NOT_ACCEPTABLE, main
 from foamfit.cli.options import (
     FILE,
+    NO_REPORT,
     OPEN,
     WIDTH,
     check_open,
     compiling,
-    open_if_asked,
     spare,
+    tell_written,
 )
 from foamfit.cli.progress import progress_line
 from foamfit.errors import InputError
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
 @click.option(
     "--seed", type=click.IntRange(min=0), help="Same tests and seed, same numbers. Default: 0."
 )
-@click.option("--no-report", is_flag=True, help="Write no report and no figures of single tests.")
+@NO_REPORT
 @WIDTH
 @OPEN
 @click.option("--json", "as_json", is_flag=True, help="Print joint.json on stdout, nothing else.")
@@ -69,10 +70,10 @@ def joint(
     Also: seed, cycle, starts, and [specimens] with a TOML for single tests: new-heel-1 = "a.toml".
     """
     check_open(as_json)
-    from foamfit.report.folder import check_target
+    from foamfit.report.folder import save_somewhere, try_target
 
     folder = Path("fits", study.stem) if out is None else out
-    check_target(folder)
+    try_target(folder)
     from foamfit.study.study_file import read_study
 
     read = read_study(study)
@@ -90,16 +91,14 @@ def joint(
         try:
             with progress_line(quiet or as_json, "joint fit") as shown, without_ctrl_c():
                 shown.progress(1.0, "writing the reports")
-                result.save(
-                    folder, jobs=jobs, reports=not no_report, figure_width=figure_width
-                )  # fmt: skip
+                save_somewhere(
+                    result.save, folder, report=not no_report, jobs=jobs, figure_width=figure_width
+                )
         except InputError:  # the numbers are not lost with the folder
             _tell(result, as_json, quiet)
             raise
     _tell(result, as_json, quiet)
-    if not quiet and not as_json:
-        say(f"\nwritten to {folder}: open {folder / 'joint.html'}")
-    open_if_asked(folder / "joint.html")
+    tell_written(folder / "joint.html", quiet or as_json)
     if result.status == "failed":
         say(f"foamfit: no acceptable fit was found; see {folder}", err=True)
         return NOT_ACCEPTABLE

@@ -47,6 +47,9 @@ WIDTH = click.option(
     "--figure-width", metavar="one|two|LENGTH", default="two", show_default=True, callback=_width,
     help='Width of figures: one column (3.25 in), two (7 in), or a length as "85 mm".',
 )  # fmt: skip
+NO_REPORT = click.option(
+    "--no-report", is_flag=True, help="Tables alone: no report and no figures of each fit."
+)
 _OPENING = "foamfit.open"  # whether the command of a context is to open what it writes
 
 
@@ -149,14 +152,17 @@ def drawing_beside() -> Iterator[Drawers]:
         drawers.stop()
 
 
-def check_open(as_json: bool) -> None:
-    """Refuse --open, as a browser may print, where nothing but JSON is to be printed."""
-    if click.get_current_context().meta[_OPENING] and as_json:
-        raise InputError("--open and --json exclude each other; leave one of them out")
+def check_open(as_json: bool, no_report: bool = False) -> None:
+    """Refuse --open where JSON alone is printed (a browser may print too), or no page is made."""
+    for option, given in (("json", as_json), ("no-report", no_report)):
+        if click.get_current_context().meta[_OPENING] and given:
+            raise InputError(f"--open and --{option} exclude each other; leave one of them out")
 
 
-def open_if_asked(page: Path) -> None:
-    """With --open open a file in the browser, or say in a sentence that there is none."""
+def tell_written(page: Path, silent: bool) -> None:
+    """Say where a result is and which page of it to look at; with --open open that."""
+    if not silent:
+        say(f"\nwritten to {page.parent}" + (f": open {page}" if page.is_file() else ""))
     if not click.get_current_context().meta[_OPENING]:
         return
     import webbrowser

@@ -12,14 +12,15 @@ import click
 from foamfit.cli.group import main
 from foamfit.cli.options import (
     FILE,
+    NO_REPORT,
     OPEN,
     SPECIMEN,
     TEST,
     WIDTH,
     check_open,
     compiling,
-    open_if_asked,
     spare,
+    tell_written,
 )
 from foamfit.errors import InputError
 from foamfit.terminal import say, without_ctrl_c
@@ -53,6 +54,7 @@ if TYPE_CHECKING:
     help="Same result, test and seed, same numbers.",
 )  # fmt: skip
 @click.option("--out", type=FILE, help="Folder. Default: predictions/<test>.")
+@NO_REPORT
 @WIDTH
 @OPEN
 @click.option(
@@ -61,8 +63,8 @@ if TYPE_CHECKING:
 @click.option("--quiet", is_flag=True, help="Print nothing.")
 def predict(
     result: Path, test: Path, specimen: Path | None, cycle: int | None, drive: str | None,
-    extrapolate: bool, draws: int, seed: int, out: Path | None, figure_width: str,
-    as_json: bool, quiet: bool,
+    extrapolate: bool, draws: int, seed: int, out: Path | None, no_report: bool,
+    figure_width: str, as_json: bool, quiet: bool,
 ) -> int:  # fmt: skip
     """Predict TEST.csv from RESULT: the folder of a fit or of a joint fit, or its JSON.
 
@@ -76,14 +78,16 @@ def predict(
         foamfit predict fits/TEST/microscale OTHER.csv
         foamfit predict joint/new-heel OTHER.csv --cycle 2 --out predictions/second
     """
-    check_open(as_json)
+    check_open(as_json, no_report)
     from foamfit.data.csv_file import read_test
     from foamfit.data.toml_file import toml_beside
+    from foamfit.report.folder import save_somewhere, try_target
     from foamfit.report.studies.prediction import check_replaceable
     from foamfit.study.prediction.identified import read_source
 
     folder = Path("predictions", toml_beside(test).stem) if out is None else out
     check_replaceable(folder)
+    try_target(folder)
     spare(folder, (test, specimen or toml_beside(test), result))
     read_source(result)  # a wrong path is told before anything is compiled
     with compiling(quiet or as_json) as compile_rest:
@@ -96,14 +100,12 @@ def predict(
         )
         try:
             with without_ctrl_c():
-                found.save(folder, figure_width=figure_width)
+                save_somewhere(found.save, folder, report=not no_report, figure_width=figure_width)
         except InputError:  # the numbers are not lost with the folder
             _tell(found, as_json, quiet)
             raise
     _tell(found, as_json, quiet)
-    if not quiet and not as_json:
-        say(f"\nwritten to {folder}: open {folder / 'prediction.png'}")
-    open_if_asked(folder / "prediction.png")
+    tell_written(folder / "prediction.png", quiet or as_json)
     return 0
 
 

@@ -6,9 +6,12 @@ import csv
 import json
 import os
 import re
+import tempfile
+import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, NoReturn
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement, interior_channel
@@ -18,9 +21,6 @@ from foamfit.report.figures import TWO
 from foamfit.report.page import render_report
 from foamfit.report.result_figures import Mapped, draw_all
 from foamfit.results import SCHEMA, Curves, Fit, Intervals, ParameterEstimate, plain
-
-if TYPE_CHECKING:
-    pass
 
 # All that `save_result` may write, and what `studies.cycles.save_cycles` writes beside the folders
 # of the cycles.
@@ -40,16 +40,24 @@ MARKS = ("fit.json", "cycles.json", "joint.json", "batch.json", "prediction.json
 _FILES = (*RESULT_FILES, *CYCLES_FILES, *JOINT_FILES, *PREDICTION_FILES, "batch.json")
 
 
-def save_result(result: Fit, folder: str | Path, *, width: str = TWO, mapped: Mapped = map) -> Path:
+class _TriedError(Exception):
+    """Ends what only tries whether a folder can be written."""
+
+
+def save_result(
+    result: Fit, folder: str | Path, *, report: bool = True, width: str = TWO, mapped: Mapped = map
+) -> Path:
     """Write the result folder whole, replacing an older one at the end.
 
     It is made with its parents; InputError if something else stands there (see `check_target`) or
     it cannot be written, and nothing is changed then. ``profiles.csv`` is written where there are
     profiles, ``ladder.csv`` where there is a ladder, ``budget.csv`` where the budget says more
-    than the parameters. `width` and `mapped` are those of the figures, see
+    than the parameters. Without `report` there are tables alone; for `width` and `mapped` see
     `foamfit.report.result_figures.draw_all`. Returns the folder.
     """
-    return save_whole(folder, lambda fresh: write_result(result, fresh, width=width, mapped=mapped))
+    return save_whole(
+        folder, lambda fresh: write_result(result, fresh, pages=report, width=width, mapped=mapped)
+    )
 
 
 def save_whole(folder: str | Path, write: Callable[[Path], None], *, swept: bool = False) -> Path:
@@ -68,6 +76,47 @@ def save_whole(folder: str | Path, write: Callable[[Path], None], *, swept: bool
             f"the result cannot be written to {folder}: {reason(error)}; choose another folder"
         ) from error
     return folder
+
+
+def try_target(folder: str | Path) -> None:
+    """Raise InputError unless a result can be written to `folder`: it is begun, and undone."""
+
+    def undo(_: Path) -> NoReturn:
+        raise _TriedError
+
+    with suppress(_TriedError):
+        save_whole(folder, undo, swept=True)
+
+
+def save_somewhere(
+    save: Callable[..., object], folder: Path, *, report: bool = True, **options: Any
+) -> None:
+    """Call `save` with a folder, whether there is to be a `report`, and its options.
+
+    Where `folder` cannot be written the result goes beside it, into the current directory or among
+    temporary files. Where the report fails, which is a defect, the numbers are saved all the same.
+
+    Raises
+    ------
+    InputError
+        If `folder` cannot be written; the message names the other one.
+    """
+    try:
+        save(folder, report=report, **options)
+        return
+    except InputError as error:
+        told = str(error)
+    except Exception:
+        with suppress(Exception):
+            save(folder, report=False, **options)
+        raise
+    for place in (folder.parent, Path(), Path(tempfile.gettempdir())):
+        other = place / f"{folder.resolve().name}-{time.strftime('%Y%m%d-%H%M%S')}"
+        with suppress(InputError):
+            save(other, report=report, **options)
+            told = f"{told.removesuffix('; choose another folder')}; it is in {other} instead"
+            break
+    raise InputError(told)
 
 
 def check_target(folder: str | Path) -> None:

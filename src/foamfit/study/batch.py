@@ -104,7 +104,8 @@ def batch(
     cycle: Cycles = None,
     fix: Mapping[str, float] | None = None,
     vary: Sequence[str] = (),
-    figure_width: str | None = TWO,
+    report: bool = True,
+    figure_width: str = TWO,
     progress: Progress | None = None,
     **options: Unpack[Keywords],
 ) -> pd.DataFrame:
@@ -138,10 +139,11 @@ def batch(
         row of the summary.
     fix, vary : optional
         Parameters to hold at a value (SI), and to vary though they are held by default.
-    figure_width : str or None
-        "one" or "two" columns, or a length such as "85 mm"; None for neither report nor figures of
-        each fit. A test whose figures have another width is fitted again, as its curves are not
-        kept.
+    report : bool
+        Whether each fit has a report and figures.
+    figure_width : str
+        "one" or "two" columns, or a length such as "85 mm". A test whose figures have another
+        width is fitted again, as its curves are not kept.
     progress : callable, optional
         Told the `State` after each test.
     options
@@ -157,9 +159,7 @@ def batch(
     InputError
         If the call is wrong, or a result cannot be written, as to a full disk.
     """
-    recipe = Recipe(
-        model, {}, _cycles(cycle), fix, tuple(vary), figure_width is not None, figure_width or TWO
-    )
+    recipe = Recipe(model, {}, _cycles(cycle), fix, tuple(vary), report, figure_width)
     found = run(
         tests, recipe, out=out, executor=executor, jobs=jobs, fresh=fresh, specimen=specimen,
         progress=progress, **options,
@@ -180,7 +180,7 @@ def run(
     **options: Unpack[Keywords],
 ) -> Batch:
     """Do what `batch` says, and return all that is known of it."""
-    chosen = Options(**options)
+    chosen = Options.of("batch", options)
     recipe = replace(recipe, model=_checked(recipe, chosen), options=vars(chosen))
     if jobs is not None and not (isinstance(jobs, Integral) and jobs >= 1):
         raise InputError(f"jobs = {jobs!r} is not admissible; it must be a whole number from 1 up")

@@ -32,15 +32,15 @@ Params = Callable[[Measurement], lmfit.Parameters | None]
 class CycleFits(FittedCycles):
     """Fits of the cycles of one record, and how they are written; see `FittedCycles`."""
 
-    def save(self, folder: str | Path, *, figure_width: str = TWO) -> Path:
+    def save(self, folder: str | Path, *, report: bool = True, figure_width: str = TWO) -> Path:
         """Write ``cycle-<n>/``, cycles.csv, cycles.png and cycles.json whole; returns the folder.
 
         cycles-plotted.csv holds what is plotted in cycles.png. An older result there is replaced as
-        a whole, at the end. Figures are "one" or "two" columns wide, or as wide as a length
-        ("85 mm").
+        a whole, at the end. Without `report` there are tables alone. Figures are "one" or
+        "two" columns wide, or as wide as a length ("85 mm").
         """
         inches(figure_width)  # refuses what is no width
-        return save_cycles(self, folder, width=figure_width)
+        return save_cycles(self, folder, report=report, width=figure_width)
 
 
 def fit_cycles(
@@ -86,7 +86,7 @@ def fit_cycles(
     InputError
         If the record or an option cannot be used at all.
     """
-    chosen = Options(**options)
+    chosen = Options.of("fit_cycles", options)
     report = progress or (lambda *_: None)
     first = read_test(path, specimen)
     wanted = first.cycles if cycles is None else tuple(dict.fromkeys(cycles))

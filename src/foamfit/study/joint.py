@@ -22,7 +22,7 @@ from foamfit.fitting.problem import Problem, make_params
 from foamfit.fitting.search import Tracker, descend
 from foamfit.one_model import Options, Progress, identify, weigh_motion
 from foamfit.report.figures import TWO, inches
-from foamfit.report.folder import check_target
+from foamfit.report.folder import check_target, try_target
 from foamfit.report.studies.joint import save_joint
 from foamfit.springs.model import Model
 from foamfit.study.joint_estimates import common_covariance, parameters_of
@@ -62,20 +62,20 @@ class JointResult(JointData):
     """Everything that a joint fit found, and how it is written; its fields are `JointData`'s."""
 
     def save(
-        self, folder: str | Path, *, jobs: int | None = None, reports: bool = True,
+        self, folder: str | Path, *, jobs: int | None = None, report: bool = True,
         figure_width: str = TWO,
     ) -> Path:  # fmt: skip
         """Write joint.json, joint.html, joint.png and a result folder per test; returns the folder.
 
         joint.csv holds what is plotted in joint.png. An older result there is replaced as a whole,
         at the end. The folders of the tests are made by `jobs` processes (by default one for each
-        core), without `reports` with tables alone. Figures are "one" or "two" columns wide, or as
+        core), without `report` with tables alone. Figures are "one" or "two" columns wide, or as
         wide as a length ("85 mm").
         """
         inches(figure_width)  # refuses what is no width
         check_target(folder)
         with workers(jobs, len(self.tests), FEW_FOLDERS) as each:
-            return save_joint(self, folder, each, reports=reports, width=figure_width)
+            return save_joint(self, folder, each, reports=report, width=figure_width)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +96,7 @@ def joint(
     jobs: int | None = None,
     out: str | Path | None = None,
     seed: int | None = None,
-    reports: bool = True,
+    report: bool = True,
     progress: Progress | None = None,
 ) -> JointResult:
     """Fit the tests of a study together.
@@ -110,7 +110,7 @@ def joint(
     jobs : int, optional
         Processes; by default one for each core. The numbers are the same with any.
     out : str or Path, optional
-        Folder to write the result to, as `JointResult.save` does, with or without `reports`.
+        Folder to write the result to, as `JointResult.save` does, with or without `report`.
     seed : int, optional
         Of the search; by default that of the study, or 0.
     progress : callable, optional
@@ -131,8 +131,8 @@ def joint(
     began, tell = time.perf_counter(), progress or (lambda *_: None)
     study = path if isinstance(path, Study) else read_study(path)
     if out is not None:
-        check_target(out)
-        if reports:
+        try_target(out)
+        if report:
             begin(jobs, len(study.tests), FEW_FOLDERS)
     seed = study.seed if seed is None else seed
     options = Options(
@@ -153,7 +153,7 @@ def joint(
     result = _conclude(study, seed, tests, fit, vectors, tried, n_eff, refused, began)
     tell(1.0, "done")
     if out is not None:
-        result.save(out, jobs=jobs, reports=reports)
+        result.save(out, jobs=jobs, report=report)
     return result
 
 

@@ -44,14 +44,15 @@ ALIGNING = 40  # steps of the fit of what a record does not say exactly
 class Prediction(PredictedTest):
     """A test that was not fitted, predicted with its 95 % band, and how it is written."""
 
-    def save(self, folder: str | Path, *, figure_width: str = TWO) -> Path:
+    def save(self, folder: str | Path, *, report: bool = True, figure_width: str = TWO) -> Path:
         """Write ``prediction.json``, ``.csv``, ``.png`` and ``.pdf`` whole; returns the folder.
 
-        An older prediction there is replaced as a whole, at the end. The figure is "one" or "two"
-        columns wide, or as wide as a length ("85 mm"); prediction.csv holds all that it shows.
+        An older prediction there is replaced as a whole, at the end. Without `report` there is no
+        figure. It is "one" or "two" columns wide, or as wide as a length ("85 mm");
+        prediction.csv holds all that it shows.
         """
         inches(figure_width)  # refuses what is no width
-        return save_prediction(self, folder, width=figure_width)
+        return save_prediction(self, folder, report=report, width=figure_width)
 
 
 def predict(

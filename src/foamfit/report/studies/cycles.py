@@ -30,13 +30,16 @@ FAR = 20  # a last cycle that is so many times the first is drawn on a logarithm
 
 
 def save_cycles(
-    found: FittedCycles, folder: str | Path, *, width: str = TWO, mapped: Mapped = map
-) -> Path:
+    found: FittedCycles, folder: str | Path, *, report: bool = True, width: str = TWO,
+    mapped: Mapped = map,
+) -> Path:  # fmt: skip
     """Write the folder whole, replacing an older result at the end; returns it.
 
-    `width` and `mapped` are those of the figures, see `foamfit.report.result_figures.draw_all`.
+    For `report`, `width` and `mapped` see `foamfit.report.folder.save_result`.
     """
-    return save_whole(folder, lambda fresh: write_cycles(found, fresh, width=width, mapped=mapped))
+    return save_whole(
+        folder, lambda fresh: write_cycles(found, fresh, pages=report, width=width, mapped=mapped)
+    )
 
 
 def write_cycles(

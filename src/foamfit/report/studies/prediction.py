@@ -43,10 +43,12 @@ COLOURS: dict[str, tuple[str, Any]] = {
 }
 
 
-def save_prediction(found: PredictedTest, folder: str | Path, *, width: str = TWO) -> Path:
+def save_prediction(
+    found: PredictedTest, folder: str | Path, *, report: bool = True, width: str = TWO
+) -> Path:
     """Write the folder whole, replacing an older prediction at the end; returns it.
 
-    `width` is that of the figure, see `plot_prediction`.
+    Without `report` there is no figure; for its `width` see `plot_prediction`.
     """
 
     def write(fresh: Path) -> None:
@@ -55,6 +57,8 @@ def save_prediction(found: PredictedTest, folder: str | Path, *, width: str = TW
             text + "\n", encoding="utf-8", errors="backslashreplace"
         )
         write_table(fresh / "prediction.csv", found.rows())
+        if not report:
+            return
         figure = plot_prediction(found, width=width)
         with laid_out(figure):
             (fresh / "prediction.png").write_bytes(image(figure, "png"))
