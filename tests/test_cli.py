@@ -285,6 +285,15 @@ def test_one_table_is_that_of_a_response_and_of_its_figure(here: Path) -> None:
     assert set(files(here)) == {"scene.toml", "scene.csv", "scene.pdf"}
 
 
+def test_a_response_takes_the_place_of_a_response_alone(here: Path) -> None:
+    path = write(here, toml=PUBLISHED + IMPACT).with_suffix(".toml")
+    for args in ((), ("--out", "test.csv")):
+        refused(here, "simulate", path, *args, words=("test.csv", "response", "another"))
+    for _ in range(2):
+        accepted("simulate", path, "--out", "new.csv")
+    accepted("simulate", path, "--out", "/dev/null")
+
+
 def test_the_data_of_a_figure_take_the_place_of_no_other_table(here: Path) -> None:
     path = write(here)
     before = path.read_bytes()

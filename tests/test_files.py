@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Iterable
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -24,12 +25,13 @@ import foamfit.results
 from conftest import EXPERIMENTS, without_pictures
 from foamfit.cli import main
 from foamfit.errors import InputError
-from foamfit.files import check_file, replacing, sweep, write_file
+from foamfit.files import check_file, csv_bytes, replacing, sweep, write_file
 from foamfit.report.comparison import compare
 from foamfit.report.comparison_text import write_csv
 from foamfit.report.folder import check_target, load_result
 from foamfit.report.plots import plot_fit
 from foamfit.report.result_figures import Images
+from foamfit.report.studies.batch import row_of, write_summary
 
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
 posix = pytest.mark.skipif(os.name != "posix", reason="signals and permissions of POSIX")
@@ -193,6 +195,20 @@ def test_a_full_disk_leaves_the_older_file(
             make(path)
         assert path.read_text() == "older"
     assert names(here) == ["a.csv", "b.png", "r"]
+
+
+def test_no_text_of_a_table_is_a_formula(here: Path) -> None:
+    """A spreadsheet would compute the name of a test, as =1+1, and could start programs."""
+    texts = ("=1+1", "@SUM(1)", "+1+1", "-1+1", "\t=1", "a=1", "-2.5e-3", "-", "-inf")
+    told = csv_bytes([texts, (-1.5, None, "")]).decode().splitlines()
+    assert told == ["'=1+1,'@SUM(1),'+1+1,'-1+1,'\t=1,a=1,-2.5e-3,'-,-inf", "-1.5,,"]
+    one = fabricated.result()
+    named = replace(one, measurement=replace(one.measurement, name="=foam-1/model-1"))
+    write_csv(compare([named], "foam-1/model-1"), "c.csv")
+    write_summary([row_of("=1+1", "=1+1.csv", one)], here)
+    for name in ("c.csv", "summary.csv"):
+        assert all(line[0] == "'" for line in Path(name).read_text().splitlines()[1:])
+        assert ",=" not in Path(name).read_text()
 
 
 def test_a_full_disk_loses_no_numbers(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,8 +7,10 @@ writes to the same place.
 
 from __future__ import annotations
 
+import csv
 import errno
 import hashlib
+import io
 import os
 import platform
 import re
@@ -82,6 +84,24 @@ def write_file(path: str | Path, content: bytes) -> None:
             raise
     except (OSError, RuntimeError) as error:
         raise InputError(f"{path} cannot be written: {reason(error)}") from None
+
+
+def csv_bytes(rows: Iterable[Iterable[object]]) -> bytes:
+    """Rows of cells as CSV; an apostrophe keeps a spreadsheet from taking a text for a formula."""
+    text = io.StringIO(newline="")
+    csv.writer(text, lineterminator="\n").writerows(map(_harmless, row) for row in rows)
+    # A name that is no UTF-8 keeps its bytes as an escape.
+    return text.getvalue().encode("utf-8", "backslashreplace")
+
+
+def _harmless(cell: object) -> object:
+    if not isinstance(cell, str) or not cell.startswith(("=", "+", "-", "@", "\t", "\r")):
+        return cell
+    try:
+        float(cell)
+    except ValueError:
+        return f"'{cell}"
+    return cell
 
 
 @contextmanager

@@ -43,6 +43,8 @@ _EXAMPLES = {  # key: SI unit and an example
     "end": ("s", "1 ms"),
 }
 _MOST_SAMPLES = 1_000_000
+# What the table of a response begins with.
+RESPONSE = "time (s),base stress (Pa),strain"
 
 
 def read_scene(path: Path) -> tuple[Chain, Drive, Array]:
@@ -183,7 +185,7 @@ def _samples(path: Path, document: dict[str, Any]) -> Array:
 def write_response(response: Response, path: Path) -> None:
     """Write a response as CSV, SI, one row per sample; what stood there stays if that fails."""
     nodes = range(1, len(response.displacement) + 1)
-    header = ["time (s)", "base stress (Pa)", "strain", *(f"displacement_{i} (m)" for i in nodes)]
+    header = [RESPONSE, *(f"displacement_{i} (m)" for i in nodes)]
     columns = [response.time, response.base_stress, response.strain, *response.displacement]
     text = io.StringIO()
     np.savetxt(text, np.transpose(columns), "%s", ",", header=",".join(header), comments="")

@@ -52,11 +52,14 @@ def simulate(
     microscale spring has k0, kc, eps_star, sigma_plus, spread_plus, sigma_minus and spread_minus;
     it and the bistable one may relax: relaxation = [{ g = 0.5, tau = "0.2 s" }].
     """
-    from foamfit.scene_file import files_of_scene, read_scene, write_response
+    from foamfit.report.plotted import check_table
+    from foamfit.scene_file import RESPONSE, files_of_scene, read_scene, write_response
     from foamfit.solve.simulation import simulate as run
 
     target = Path(scene.with_suffix(".csv").name) if out is None else out
     table = check_files(target, plot, files_of_scene(scene))
+    if target.is_file():
+        check_table(target, RESPONSE, "the response is to be written, and is none; name another")
     with compiling(quiet=False) as compile_rest:
         chain, drive, time = read_scene(scene)
         compile_rest()

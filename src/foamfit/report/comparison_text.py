@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Iterator
 from pathlib import Path
 
-from foamfit.files import write_file
+from foamfit.files import csv_bytes, write_file
 from foamfit.report.comparison import Comparison, Pair, Row
 from foamfit.report.readable import readable
 from foamfit.results import ParameterEstimate
@@ -87,14 +85,12 @@ def write_csv(comparison: Comparison, path: str | Path) -> None:
         "test", "model", "drive", "reference", "spring", "parameter", "unit", "value", "stderr",
         "state", "reference_value", "reference_stderr", "percent", "standard_errors", "remark",
     )  # fmt: skip
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(head)
-    for pair in comparison.pairs:
-        for row in pair.rows:
-            writer.writerow((
-                pair.test, pair.model, pair.drive, pair.reference, row.spring or "", row.name,
-                row.unit, row.value, row.stderr, row.state, row.reference,
-                row.reference_stderr, row.percent, row.standard_errors, row.remark,
-            ))  # fmt: skip
-    write_file(path, text.getvalue().encode(errors="replace"))
+    rows = (
+        (
+            pair.test, pair.model, pair.drive, pair.reference, row.spring or "", row.name,
+            row.unit, row.value, row.stderr, row.state, row.reference,
+            row.reference_stderr, row.percent, row.standard_errors, row.remark,
+        )
+        for pair in comparison.pairs for row in pair.rows
+    )  # fmt: skip
+    write_file(path, csv_bytes((head, *rows)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import re
@@ -16,7 +15,7 @@ from typing import Any, NoReturn
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement, interior_channel
 from foamfit.errors import InputError
-from foamfit.files import read_whole, reason, replacing
+from foamfit.files import csv_bytes, read_whole, reason, replacing
 from foamfit.report.figures import TWO
 from foamfit.report.page import render_report
 from foamfit.report.result_figures import Mapped, draw_all
@@ -248,9 +247,7 @@ def write_result(
 
 def write_table(path: Path, rows: Iterable[Iterable[object]]) -> None:
     """Write rows of cells as CSV."""
-    # A name that is no UTF-8 keeps its bytes as an escape.
-    with path.open("w", encoding="utf-8", errors="backslashreplace", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows(rows)
+    path.write_bytes(csv_bytes(rows))
 
 
 def _parameter_rows(parameters: Mapping[str, ParameterEstimate]) -> Iterator[list[object]]:

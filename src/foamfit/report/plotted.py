@@ -7,8 +7,6 @@ label is decoration. A panel has the name of its label, if it has one, or of its
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,6 +15,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from foamfit.errors import InputError
+from foamfit.files import csv_bytes
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -52,27 +51,24 @@ def plotted(figure: Figure) -> Iterator[tuple[object, ...]]:
 
 def table(figure: Figure) -> bytes:
     """Return the table as the bytes of a CSV file."""
-    text = io.StringIO(newline="")
-    csv.writer(text, lineterminator="\n").writerows(plotted(figure))
-    # A name that is no UTF-8 keeps its bytes as an escape.
-    return text.getvalue().encode("utf-8", "backslashreplace")
+    return csv_bytes(plotted(figure))
 
 
-def check_table(path: Path) -> None:
-    """Raise InputError if something else stands where the table of a figure is to be written."""
-    head = ",".join(HEAD)
+def check_table(
+    path: Path, head: str = ",".join(HEAD),
+    words: str = "the plotted data of the figure are to be written, and is no such table; name the "
+    "figure otherwise",
+) -> None:  # fmt: skip
+    """Raise InputError if something else stands where a table that begins so is to be written."""
     try:
         with path.open(encoding="utf-8", errors="replace") as file:
-            known = file.readline().rstrip("\n") == head
+            known = file.readline().startswith(head)
     except FileNotFoundError:
         return
     except OSError:
         known = False
     if not known:
-        raise InputError(
-            f"{path} stands where the plotted data of the figure are to be written, and is no "
-            "such table; name the figure otherwise"
-        )
+        raise InputError(f"{path} stands where {words}")
 
 
 def _sides(ax: Axes) -> tuple[str, str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,7 +14,7 @@ from urllib.parse import quote
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.files import write_file
+from foamfit.files import csv_bytes, write_file
 from foamfit.report.page import environment
 from foamfit.report.readable import readable_unit, symbol
 from foamfit.results import Fit, ParameterEstimate, plain
@@ -130,11 +129,7 @@ def table(rows: Sequence[Row]) -> pd.DataFrame:
 
 def write_summary(rows: Sequence[Row], folder: Path) -> None:
     """Write summary.csv whole."""
-    import csv
-
-    text = io.StringIO(newline="")
-    csv.writer(text, lineterminator="\n").writerows(table_rows(rows))
-    write_file(folder / "summary.csv", text.getvalue().encode("utf-8", "backslashreplace"))
+    write_file(folder / "summary.csv", csv_bytes(table_rows(rows)))
 
 
 def counts_in_words(rows: Sequence[Row]) -> str:
