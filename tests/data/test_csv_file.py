@@ -330,6 +330,33 @@ def test_refuses_rows_by_their_number(tmp_path, row, words):
     refused(write(tmp_path, rows=rows, toml=toml), "test.csv", *words)
 
 
+@pytest.mark.parametrize(
+    ("form", "last", "cut"),
+    [
+        (".6f", "41,0.01,0.", True),
+        (".6f", "41,0.01,0.0123", True),
+        (".6f", "41,0.01", True),
+        (".3e", "41,0.01,1.234e-0", True),
+        (".6f", "41,0.01,0.012345", False),
+        (".9g", "41,0.01,0.", True),
+        (".9g", "41,0.01,0.01", False),
+    ],
+)
+def test_a_last_row_that_is_cut_is_left_out_and_named(tmp_path, form, last, cut):
+    """Writing was interrupted: 6. stands for 6.428."""
+    table = zip(np.arange(41.0), 2 * LOOP, 4 * LOOP, strict=True)
+    rows = [",".join(f"{value:{form}}" for value in row) for row in table]
+    path = write(tmp_path, rows=[*rows, last])
+    path.write_text(path.read_text().removesuffix("\n"))
+    test = read_test(path)
+    told = f"row 43: the file ends within it, at {last.split(',')[-1]!r}"
+    assert (told in map(str, test.rows.dropped)) == cut
+    assert test.rows.rows == 42
+    path.write_text(path.read_text() + "\n")
+    if last.count(",") == 2:
+        assert "ends within" not in str(read_test(path).rows)
+
+
 def test_row_numbers_count_titles_and_blank_lines(tmp_path):
     rows = ["", HEADER, *numbers()]
     rows.insert(5, "")

@@ -30,7 +30,7 @@ from foamfit.data.columns import (
     si_factor,
     sign_advice,
 )
-from foamfit.data.csv_table import Table, find_table, read_numbers, read_text
+from foamfit.data.csv_table import Table, find_table, read_numbers, read_text, without_cut_row
 from foamfit.data.frames import Frames, join
 from foamfit.data.headers import CHANNELS, example
 from foamfit.data.measurement import (
@@ -204,6 +204,7 @@ def _channels(
     table: Table, needed: dict[str, int], given: dict[str, Column], settings: Settings
 ) -> tuple[dict[str, Array], NDArray[np.int64], list[Dropped], list[str]]:
     """Channels of a table in SI, the numbers of their rows, the rows left out, and notes."""
+    table, dropped = without_cut_row(table)
     headers = table.headers
     factors = {c: si_factor(table, c, k, given.get(c)) for c, k in needed.items()}
     numbers, empty = read_numbers(table, needed)
@@ -225,7 +226,7 @@ def _channels(
         if measure:
             converted.append(f"The strain is converted from the {measure} strain {name!r}.")
     notes = [read_note(table, needed, given), *converted, *_announced(table, count)]
-    rows, dropped = table.row_numbers(count, empty), list[Dropped]()
+    rows = table.row_numbers(count, empty)
     if empty.size:
         dropped.append(Dropped.of(empty, "nothing in the columns that are read"))
     if "time" in numbers:

@@ -9,7 +9,7 @@ import io
 import math
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from foamfit.arrays import Array
 from foamfit.data.headers import CHANNELS, Header, parse_header
 from foamfit.data.layouts import blanks_as_tabs, scope_of, unpacked
-from foamfit.data.measurement import MIN_ROWS
+from foamfit.data.measurement import MIN_ROWS, Dropped
 from foamfit.data.toml_file import LONGEST, read_bytes
 from foamfit.data.units import is_unit
 from foamfit.errors import InputError
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 _HEAD_ROWS = 400
 _SEPARATORS = "\t", ";", "|", ","
+_ABOVE = 40  # rows that a last row is compared with
 _NUMBER = re.compile(
     r"[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|nan|inf(?:inity)?)", re.IGNORECASE | re.ASCII
 )
@@ -337,6 +338,33 @@ def _refuse_thousands(table: Table, column: int, values: Array) -> None:
             f"{whole[-1]!r} seems to separate thousands; write the numbers with a decimal point "
             "and without separators."
         )
+
+
+def without_cut_row(table: Table) -> tuple[Table, list[Dropped]]:
+    """Leave out the last row if the file ends within it, as where writing was interrupted.
+
+    It has no line end, and fewer cells than the rows above, or a last number that ends in the
+    decimal sign, or has fewer digits behind it where `_ABOVE` rows have equally many.
+    """
+    above = table.body().rsplit(b"\n", _ABOVE)[1:]
+    if len(above) < MIN_ROWS or not above[-1].strip() or b'"' in above[-1]:
+        return table, []
+    *whole, last = (
+        [c.strip() for c in line.decode(table.encoding, "replace").split(table.separator)]
+        for line in above
+    )
+    (_, sign, end), *ends = (cells[-1].partition(table.decimal) for cells in (last, *whole))
+    digits, counts = {len(digits) for *_, digits in ends}, {len(cells) for cells in whole}
+    point = sign and not end and not any(sign and not digits for _, sign, digits in ends)
+    fewer = len(above) == _ABOVE and len(digits) == 1 and len(end) < min(digits)
+    if len(counts) > 1 or not (point or fewer or len(last) < min(counts)):
+        return table, []
+    if not all(map(_is_number, last)):
+        return table, []
+    row, raw = table.raw.count(b"\n") + 1, table.raw.removesuffix(above[-1])
+    return replace(table, raw=raw), [
+        Dropped(1, row, row, f"the file ends within it, at {last[-1]!r}")
+    ]
 
 
 def _frame(table: Table, columns: dict[str, int], body: bytes) -> pd.DataFrame:
