@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,7 @@ FILES = {
     "residuals.csv", "sensitivities.csv",
 }  # fmt: skip
 COMMANDS = (
-    "batch", "check", "fit", "simulate", "compare", "published", "joint", "predict"
+    "batch", "check", "fit", "init", "simulate", "compare", "published", "joint", "predict"
 )  # fmt: skip
 
 SPECIMEN = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\n'
@@ -458,9 +459,9 @@ def test_refuses_values(here: Path, factors: tuple[float, float], words: tuple[s
 @pytest.mark.parametrize(
     ("toml", "args", "words"),
     [
-        (None, (), ("test.toml", "no such file", "height")),
         ("[specimen\n", (), ("test.toml", "no valid TOML", "line 1")),
         ('[specimen]\narea = "1 mm^2"\n', (), ("test.toml", "height is missing", '"1.19 mm"')),
+        ("[specimen]\n", (), ("height is missing", "diameter or area", '"1.19 mm"', '"5 mm"')),
         (SPECIMEN.replace('"10', '"-10'), (), ("test.toml", "height", "must be positive")),
         (SPECIMEN.replace("100 mm", "1e300 mm"), (), ("test.toml", "area", "1e-30 and 1e+30")),
         (
@@ -490,6 +491,67 @@ def test_refuses_tomls(
         refused(here, "fit", path, *args, words=words)
     else:
         accepted("check", path)
+
+
+@pytest.mark.parametrize("command", ["check", "fit"])
+@pytest.mark.parametrize(
+    ("header", "keys", "lines"),
+    [
+        (HEADER, ["height", "diameter"], 6),
+        ("Time (s),Load,Way", ["height", "diameter", "force", "displacement"], 9),
+        ("a,b,c", ["height", "diameter", "stress", "displacement"], 9),
+    ],
+)
+def test_without_a_toml_all_that_is_missing_is_shown(
+    here: Path, command: str, header: str, keys: list[str], lines: int
+) -> None:
+    path = write(here, header, toml=None)
+    result = run(command, path)
+    assert (result.exit_code, result.stdout, list(files(here))) == (1, "", ["test.csv"])
+    told, *shown = result.stderr.splitlines()
+    assert told.startswith(f"foamfit: {path.with_suffix('.toml')}: no such file; test.csv needs")
+    assert told.endswith(f"write it by: foamfit init {path}")
+    assert f"a TOML with {', '.join(keys[:-1])} and {keys[-1]}, and" in told
+    assert [line.split(" = ")[0].strip() for line in shown if " = " in line] == [
+        *keys, "mass", "velocity",
+    ]  # fmt: skip
+    assert len(shown) == lines
+    tomllib.loads("\n".join(shown))  # it can be copied
+
+
+@pytest.mark.parametrize(
+    ("header", "answers"),
+    [
+        (HEADER, {}),
+        ("Time [ms],Load,Extension (mm)", {"force": "N"}),
+        ("t (ms),Stress (MPa),Way", {"displacement": "mm"}),
+    ],
+)
+def test_init_asks_what_the_file_does_not_say(
+    here: Path, header: str, answers: dict[str, str]
+) -> None:
+    path = write(here, header, toml=None)
+    told = accepted("init", path).stdout
+    toml = path.with_suffix(".toml")
+    text = toml.read_text(encoding="utf-8")
+    assert set(tomllib.loads(text)["columns"]) | answers.keys() >= {"time", "displacement"}
+    assert run("check", path).exit_code == 1  # as the questions are open
+    for key in ("height", "diameter", *answers):
+        assert f"    {key} = " in told
+        at = text.index(f"\n# {key} = ")
+        text = text[:at] + text[at:].replace("# ", "", 1)
+    toml.write_text(text, encoding="utf-8")
+    understood = accepted("check", path).stdout
+    assert "height 10 mm" in understood
+    for channel, unit in answers.items():
+        assert re.search(rf"{channel} from '\w+' in {unit}", " ".join(understood.split()))
+    refused(here, "init", path, words=("test.toml is there", "left as it is", "foamfit check"))
+
+
+def test_init_needs_a_table(here: Path) -> None:
+    (here / "empty.csv").write_text("")
+    refused(here, "init", "none.csv", words=("none.csv", "no such file"))
+    refused(here, "init", "empty.csv", words=("empty.csv", "empty"))
 
 
 @pytest.mark.parametrize(

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 
 class InputError(ValueError):
     """A file, key, column, option or argument is wrong; the message says what would be right.
 
-    Any other ValueError, as numpy's LinAlgError is one, is a defect of foamfit.
+    Any other ValueError, as numpy's LinAlgError is one, is a defect of foamfit. The command shows
+    `lines`, what is to be written into a file, beneath the message.
     """
+
+    def __init__(self, message: str = "", lines: Sequence[str] = ()) -> None:
+        super().__init__(message)
+        self.lines = lines
 
 
 class SimulationError(RuntimeError):

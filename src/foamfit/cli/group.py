@@ -10,6 +10,7 @@ import gc
 import os
 import signal
 import sys
+from collections.abc import Sequence
 from typing import Any, NoReturn
 
 import click
@@ -36,7 +37,7 @@ class _Group(click.Group):
         except click.ClickException as error:
             _leave(WRONG, _one_sentence(error))
         except (InputError, SimulationError) as error:
-            _leave(WRONG, str(error))
+            _leave(WRONG, str(error), getattr(error, "lines", ()))
         except (click.Abort, KeyboardInterrupt) as error:  # the first is what click makes of these
             first = error.__cause__ or error
             if isinstance(first, TerminatedError):
@@ -64,9 +65,9 @@ def _spare_the_collector() -> None:
     atexit.register(gc.freeze)
 
 
-def _leave(code: int, message: str) -> NoReturn:
-    """Print one line on stderr and leave."""
-    say(f"foamfit: {' '.join(message.split())}", err=True)
+def _leave(code: int, message: str, lines: Sequence[str] = ()) -> NoReturn:
+    """Print one line on stderr, and what may be copied beneath it, and leave."""
+    say("\n    ".join([f"foamfit: {' '.join(message.split())}", *lines]), err=True)
     sys.exit(code)
 
 
@@ -92,7 +93,7 @@ def main(context: click.Context) -> None:
     """Identify the parameters of a foam from an impact or compression test.
 
     \b
-    Look at a test, then fit it:
+    Look at a test, then fit it (foamfit init TEST.csv writes the TOML that yours needs):
         foamfit check experiments/foam-1/model-1-2.0mps-reconstruction.csv
         foamfit fit experiments/foam-1/model-1-2.0mps-reconstruction.csv
     Two springs, fixed seed, result as JSON:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +41,7 @@ def assign_columns(table: Table, given: dict[str, Column], toml: Path | None) ->
             continue
         if len(best) > 1:
             both = " and ".join(map(table.name, best))
-            entry = f"{channel} = {{ column = {_quoted(table, best[0])} }}"
+            entry = f"{channel} = {{ column = {quoted(table, best[0])} }}"
             more = f", or write {entry} in [columns] of {toml.name}" if toml else ""
             raise InputError(
                 f"{table.path}: columns {both} could both be the {channel}; keep one{more}."
@@ -77,11 +78,11 @@ def _place(table: Table, channel: str, column: str | int, toml: Path | None) -> 
     raise InputError(f"{toml}: [columns] {channel}: column {column!r} is {more}.")
 
 
-def _quoted(table: Table, k: int) -> str:
+def quoted(table: Table, k: int) -> str:
     """A column as [columns] names it: by its header, or by its number where others are equal."""
     text = table.headers[k].text
     alone = table.header_row and [h.text for h in table.headers].count(text) == 1
-    return f'"{text}"' if alone else str(k + 1)
+    return json.dumps(text, ensure_ascii=False) if alone else str(k + 1)
 
 
 def _channels(table: Table, given: dict[str, Column]) -> list[str]:
@@ -126,7 +127,7 @@ def si_factor(table: Table, channel: str, k: int, given: Column | None) -> float
             more = f', scale = "{given.scale:g} {given.scale_unit}"'
         raise InputError(
             f"{where} has no unit; write it in the header like '{right}' or in [columns] like "
-            f'{channel} = {{ column = {_quoted(table, k)}, unit = "{usual}"{more} }}.'
+            f'{channel} = {{ column = {quoted(table, k)}, unit = "{usual}"{more} }}.'
         )
     unit = unit or ""
     if not is_unit(unit, any_case=True):
@@ -176,7 +177,7 @@ def needed_columns(table: Table, columns: dict[str, int], settings: Settings) ->
     forced = bool(has & {"stress", "force"})
     braked = bool(has & {"acceleration", "velocity"} or (has & set(_MOTIONS) and striker.velocity))
     if not forced and not ("time" in has and braked and striker.mass):
-        entries = _entries(table, has, "force", "displacement", "time")
+        entries = entries_of(table, has, "force", "displacement", "time")
         raise InputError(
             f"{table.path}: no column is a stress or a force (there are {table.listed}); name one "
             f"like 'stress (MPa)', or write {entries} in [columns]; "
@@ -196,16 +197,16 @@ def needed_columns(table: Table, columns: dict[str, int], settings: Settings) ->
             has.remove(channel)
     sources = "velocity" in has or (striker.velocity and (striker.mass or "acceleration" in has))
     if "time" not in has or not sources:
-        timed = "" if "time" in has else f"{_entries(table, has, 'time')} there, and "
+        timed = "" if "time" in has else f"{entries_of(table, has, 'time')} there, and "
         raise InputError(
             f"{table.path}: no column is a displacement or a strain (there are {table.listed}); "
-            f"name one like 'displacement (mm)', or write {_entries(table, has, 'displacement')} "
+            f"name one like 'displacement (mm)', or write {entries_of(table, has, 'displacement')} "
             f"in [columns], or give {timed}the [striker] mass and velocity to integrate the motion."
         )
     return {c: k for c, k in columns.items() if c in has}
 
 
-def _entries(table: Table, has: set[str], *channels: str) -> str:
+def entries_of(table: Table, has: set[str], *channels: str) -> str:
     """Entries of [columns] for channels that the file seems to lack, by units of its headers."""
     entries = []
     for channel in channels:
@@ -215,7 +216,7 @@ def _entries(table: Table, has: set[str], *channels: str) -> str:
             and all(header.rank(other) is None for other in CHANNELS)
         )  # fmt: skip
         k = next(fits, None)
-        column = '"…"' if k is None else _quoted(table, k)
+        column = '"…"' if k is None else quoted(table, k)
         unit = f', unit = "{channel_of(channel).unit}"' if k is None else ""
         entries += [f"{channel} = {{ column = {column}{unit} }}"] if channel not in has else []
     return listed(entries)
@@ -300,7 +301,7 @@ def sign_advice(
     """Say what makes a channel positive that is negative in compression; see `check_signs`."""
     channel = next(c for c in _SOURCES.get(channel, (channel,)) if c in columns)
     given, motion = entries.get(channel, _NONE), channel.startswith("displacement")
-    entry = f"{channel} = {{ column = {_quoted(table, columns[channel])}"
+    entry = f"{channel} = {{ column = {quoted(table, columns[channel])}"
     by = f'"{-given.scale:g} {given.scale_unit}"' if given.scale_unit else f"{-given.scale:g}"
     wrong = "is negative in compression; it must be positive"
     right = f"write {entry}, scale = {by} }}"

@@ -31,6 +31,7 @@ from foamfit.data.columns import (
     sign_advice,
 )
 from foamfit.data.csv_table import Table, find_table, read_numbers, read_text, without_cut_row
+from foamfit.data.draft import without_toml
 from foamfit.data.frames import Frames, join
 from foamfit.data.headers import CHANNELS, example
 from foamfit.data.measurement import (
@@ -81,6 +82,8 @@ def read_test(
     path = Path(path)
     read_bytes(path, "give the CSV file of a test", 0)  # missed before its TOML is
     toml = Path(specimen) if specimen is not None else toml_beside(path)
+    if specimen is None and not os.path.lexists(toml):
+        raise without_toml(toml, read_text(path, "the CSV file of a test"))
     settings = read_settings(toml, path, channels=CHANNELS)
     text = read_text(path, "the CSV file of a test", settings.sheet)
     window = settings.window if cycle is None else replace(settings.window, cycle=cycle)

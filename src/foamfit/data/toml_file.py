@@ -235,10 +235,13 @@ def _value(path: Path, section: str, key: str, value: Any, spreads: dict[str, fl
 
 
 def _specimen(path: Path, values: dict[str, Any], spreads: dict[str, float]) -> Specimen:
+    size = "diameter" in values or "area" in values
     if "height" not in values:
-        raise InputError(f'{path}: [specimen] height is missing; give it like height = "1.19 mm".')
+        also, it = ("", "it") if size else (", and so is diameter or area", "them")
+        right = 'height = "1.19 mm"' + ("" if size else ', diameter = "5 mm"')
+        raise InputError(f"{path}: [specimen] height is missing{also}; give {it} like {right}.")
     diameter, spread = values.pop("diameter", None), spreads.pop("diameter", 0.0)
-    if diameter is None and "area" not in values:
+    if not size:
         raise InputError(f'{path}: [specimen] needs a diameter = "5 mm" or an area = "19.6 mm^2".')
     if diameter is not None:
         area = math.pi * diameter**2 / 4
