@@ -213,7 +213,7 @@ def test_what_no_spring_follows_fails_and_is_written(here: Path) -> None:
     assert set(files(here / "out")) - {"profiles.csv"} == FILES
     content = json.loads((here / "out" / "fit.json").read_text())
     assert content["status"] == "failed"
-    assert "not acceptable" in content["warnings"][0]
+    assert any("not acceptable" in warning for warning in content["warnings"])
 
 
 def test_the_terminal_is_one_screen_and_verbose_says_the_rest(
@@ -421,7 +421,7 @@ def test_refuses_files(here: Path, command: str, content: bytes, words: tuple[st
         ("time (ms),stress (mm),displacement (mm)", ("stress (mm)", "another kind", "(MPa)")),
         ("time (ms),torque (N m),displacement (mm)", ("no column is a stress", "'torque (N m)'")),
         ("time (ms),stress (MPa),torque (N m)", ("no column is a displacement", "[striker]")),
-        ("time (ms),stress (MPa),stress (MPa)", ("'stress (MPa)' and 'stress (MPa)'", "keep one")),
+        ("time (ms),stress (MPa),stress (MPa)", ("'stress (MPa)' (number 3)", "keep one")),
     ],
 )
 def test_refuses_headers(here: Path, header: str, words: tuple[str, ...]) -> None:
@@ -573,7 +573,7 @@ def test_init_needs_a_table(here: Path) -> None:
         (["--starts", "1000000000"], ("starts = 1000000000", "from 1 to 10000")),
         (["--relaxation", "999"], ("relaxation = 999", "from 0 (none) to 10")),
         (["--model", "+".join(["linear"] * 99)], ("99 springs", "20 at most")),
-        (["--bootstrap", "1000000000"], ("too many", "1000000")),
+        (["--bootstrap", "1000000000"], ("too many", "most 100000")),
         (["--cycle", "1,99"], ("no cycle 99", "1 to 1")),
         (["--seed", "-1"], ("'--seed'", "x>=0")),
         (["--max-time", "-1"], ("max_time", "positive")),

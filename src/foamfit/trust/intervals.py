@@ -28,7 +28,7 @@ from foamfit.trust.residuals.noise_process import parts
 BENT = 0.15
 METHODS = ("auto", "local", "profile", "bootstrap", "mcmc")
 # Refits of an average profile, for the announcement; draws that percentiles need, and at most.
-REFITS, ENOUGH_DRAWS, MOST_DRAWS = 9, 40, 1_000_000
+REFITS, ENOUGH_DRAWS, MOST_DRAWS = 9, 40, 100_000
 # Evaluations of a refit, and its slopes.
 EVALUATIONS, SLOPES = 6.0, 0.6
 # A minimum is hardly worse than the best within this factor of the 95 % cut, of standard errors:
