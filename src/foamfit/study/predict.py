@@ -143,7 +143,7 @@ def predict(
         draws=min((len(one.values) for one in drawn.values()), default=0),
         redrawn=sum(one.redrawn for one in set(drawn.values())),
         held=population.held,
-        sentences=(*_of_curves(curves), *_of_aligned(aligned), *_of_trends(population)),
+        sentences=(*_of_curves(curves), *_of_aligned(aligned, population), *_of_trends(population)),
         warnings=tuple(warnings),
         aligned=aligned,
     )
@@ -454,7 +454,7 @@ def _of_trends(population: Population) -> list[str]:
     ]
 
 
-def _of_aligned(aligned: dict[str, float]) -> list[str]:
+def _of_aligned(aligned: dict[str, float], population: Population) -> list[str]:
     """What was fitted of the record."""
     if not aligned:
         return []
@@ -462,7 +462,8 @@ def _of_aligned(aligned: dict[str, float]) -> list[str]:
         f"{name.replace('_', ' ')} {engineering(value, unit_of(name)).replace('-', '−')}"
         for name, value in aligned.items()
     ]
-    return [f"Aligned to the record, with the springs held, and no prediction: {listed(told)}."]
+    held = "as another specimen of the foam" if population.scattering else "held"
+    return [f"Aligned to the record, with the springs {held}, and no prediction: {listed(told)}."]
 
 
 def _of_curves(curves: dict[str, PredictedCurve]) -> list[str]:

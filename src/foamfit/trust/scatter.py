@@ -135,9 +135,10 @@ def correlation(values: Array, errors: Array) -> Array:
     products = np.einsum("ti,tj->tij", off / scale, off / scale)
     mean = products.mean(axis=0)
     apart = ~np.eye(k, dtype=bool)
-    doubt = np.sum((products - mean) ** 2, axis=0)[apart].sum() / (n * (n - 1))
-    share = min(doubt / max(float(np.sum(mean[apart] ** 2)), 1e-300), 1.0)
-    power, axes = np.linalg.eigh(mean * n / (n - 1) - errors / np.outer(scale, scale))
+    doubt = np.sum((products - mean) ** 2, axis=0)[apart].sum() * n / (n - 1) ** 3
+    left = mean * n / (n - 1) - errors / np.outer(scale, scale)
+    share = min(doubt / max(float(np.sum(left[apart] ** 2)), 1e-300), 1.0)
+    power, axes = np.linalg.eigh(left)
     true = (axes * np.maximum(power, 0.0)) @ axes.T
     size = np.sqrt(np.maximum(np.diag(true), 1e-12))
     out = (1.0 - share) * true / np.outer(size, size)
