@@ -87,11 +87,11 @@ def told_of(found, spans, together):
 @pytest.mark.parametrize(
     ("spans", "together", "wanted"),
     [
-        ([(0.10, 0.11), (0.12, 0.13), (0.14, 0.15)], [0.1, 0.12, 0.15], "s1_eps_a rises by 50 %."),
+        ([(0.10, 0.11), (0.12, 0.13), (0.14, 0.15)], [0.1, 0.12, 0.15], "s1_eps_a rises by 50 % ("),
         # the fit of all cycles goes the other way than their own fits
-        ([(0.10, 0.11), (0.12, 0.13), (0.14, 0.15)], [0.15, 0.12, 0.1], "cycles hop: the values"),
+        ([(0.10, 0.11), (0.12, 0.13), (0.14, 0.15)], [0.15, 0.12, 0.1], "cycles hop: s1_eps_a of"),
         # there and back
-        ([(0.10, 0.11), (0.30, 0.31), (0.14, 0.15)], [0.1, 0.12, 0.15], "cycles hop: the values"),
+        ([(0.10, 0.11), (0.30, 0.31), (0.14, 0.15)], [0.1, 0.12, 0.15], "cycles hop: s1_eps_a of"),
         ([(0.10, 0.15), (0.12, 0.13), (0.14, 0.19)], [0.1, 0.12, 0.15], "no trend is said: the"),
         ([(-np.inf, np.inf), (0.1, 0.2), (0.3, 0.4)], [0.1, 0.1, 0.3], "no trend is said: the"),
     ],
@@ -99,7 +99,7 @@ def told_of(found, spans, together):
 def test_a_trend_is_said_where_values_ranges_and_joint_fit_agree(found, spans, together, wanted):
     told = told_of(found, spans, together)
     assert wanted in told
-    assert ("rises" in told or "falls" in told) == (wanted == "s1_eps_a rises by 50 %.")
+    assert ("rises" in told or "falls" in told) == ("rises" in wanted)
 
 
 def test_cycles_together_are_spread_over_a_long_record():

@@ -27,6 +27,8 @@ from foamfit.trust.intervals import Announce
 
 # Cycles that are fitted together at most; of more the first and others at equal ratios are taken.
 MOST_TOGETHER = 6
+# Factor by which a parameter goes up and down from cycle to cycle where its descriptions hop.
+HOP = 1.5
 CTRL_C = "not fitted, because Ctrl-C ended the command before"
 
 Params = Callable[[Measurement], lmfit.Parameters | None]
@@ -204,28 +206,31 @@ def _sentences(found: CycleFits, selection: Selection) -> Iterator[str]:
 def _trends(found: CycleFits, together: dict[str, list[float]]) -> Iterator[str]:
     """Say what rises or falls, where the cycles one by one and together agree on it.
 
-    `together` has the values of the fit of all cycles. Spans are the 95 % intervals and ranges of
-    the cycles one by one.
+    `together` has the values of the fit of all cycles. A description of the cycles hops where a
+    parameter of theirs goes up and down again, or another way than in the fit of all.
     """
     first, last = found.together[0], found.together[-1]
     sure, hopping, unsure = list[str](), list[str](), list[str]()
-    for name, values in together.items():
-        spans = [_span(found.results[n].parameters[name]) for n in found.together]
-        sides = {_side(*pair) for pair in itertools.pairwise(spans)} - {0}
-        side = _side(spans[0], spans[-1])
-        if len(sides) == 2 or side * (values[-1] - values[0]) < 0.0:
+    for name in found.varied:
+        each = [found.results[n].parameters[name] for n in found.together]
+        side = _side(_span(each[0]), _span(each[-1]))
+        steps = {_step(*pair) for pair in itertools.pairwise(each)}
+        values = together.get(name)
+        if steps >= {1, -1} or (values and side * (values[-1] - values[0]) < 0.0):
             hopping.append(name)
-        elif side:
-            sure.append(f"{name} {_change(values[0], values[-1])}")
-        else:
+        elif values and side:
+            alone = _change(each[0].value, each[-1].value)
+            sure.append(f"{name} {_change(values[0], values[-1])} (each cycle alone: {alone})")
+        elif values:
             unsure.append(name)
     if sure:
         yield f"From cycle {first} to {last}: {listed(sure)}."
     if hopping:
         yield (
-            f"The descriptions of the cycles hop: the values of {listed(hopping)} go up and down "
-            "by more than their ranges, or another way in the fit of all cycles together, so "
-            "several sets of parameters follow the loops about as well. No trend is said of it."
+            f"The descriptions of the cycles hop: {listed(hopping)} of single cycles go up and "
+            f"down by a factor of {HOP} or more, or another way than in the fit of all cycles "
+            "together. Different sets of parameters follow the loops about as well, and no trend "
+            "is said of these."
         )
     if unsure:
         yield (
@@ -238,6 +243,13 @@ def _span(one: ParameterEstimate) -> tuple[float, float]:
     """Where a parameter of one cycle may lie, by interval and range; anywhere if unknown."""
     ends = [one.value, *(one.ci95 or (-math.inf, math.inf)), *(one.range or ())]
     return min(ends), max(ends)
+
+
+def _step(before: ParameterEstimate, after: ParameterEstimate) -> int:
+    """1 or -1 where a parameter rises or falls by a factor of `HOP`, beyond noise; else 0."""
+    side = _side(*(_span(replace(one, range=None)) for one in (before, after)))
+    low, high = sorted([abs(before.value), abs(after.value)])
+    return side if high > HOP * low else 0
 
 
 def _side(before: tuple[float, float], after: tuple[float, float]) -> int:
