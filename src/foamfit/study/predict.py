@@ -69,11 +69,10 @@ def predict(
 
     Height, area, mass and velocity are those of the test, and so is the rate at which laws of rate
     are evaluated. What its record does not say exactly, such as the contact time and zeros of an
-    impact, is fitted to it with the springs held as predicted (`PredictedTest.aligned`). The 95 %
-    band has these parts: what the result leaves uncertain of the parameters, their scatter between
-    specimens (of a joint result), the noise of the test, that of a motion that drives, and what the
-    law has missed of the fitted tests beyond their noise. The first two are drawn and simulated
-    exactly.
+    impact, is fitted to it (`PredictedTest.aligned`). The 95 % band has these parts: what the
+    result leaves uncertain of the parameters, their scatter between specimens (of a joint result),
+    the noise of the test, that of a motion that drives, and what the law has missed of the fitted
+    tests beyond their noise. The first two are drawn and simulated exactly.
 
     Parameters
     ----------
