@@ -70,6 +70,38 @@ def test_what_changes_by_cycle_is_found(found):
     assert "From cycle 1 to 3: s1_eps_a falls by" in told
 
 
+def told_of(found, spans, together):
+    """Sentences on eps_a, with these 95 % intervals of the cycles and values of all together."""
+    from foamfit.study import cycles
+
+    results = {}
+    for number, (low, high) in zip(found.together, spans, strict=True):
+        result = found.results[number]
+        one = replace(
+            result.parameters["s1_eps_a"], value=0.5 * (low + high), ci95=(low, high), range=None
+        )
+        results[number] = replace(result, parameters={**result.parameters, "s1_eps_a": one})
+    return " ".join(cycles._trends(replace(found, results=results), {"s1_eps_a": together}))
+
+
+@pytest.mark.parametrize(
+    ("spans", "together", "wanted"),
+    [
+        ([(0.10, 0.11), (0.12, 0.13), (0.14, 0.15)], [0.1, 0.12, 0.15], "s1_eps_a rises by 50 % ("),
+        # the fit of all cycles goes the other way than their own fits
+        ([(0.10, 0.11), (0.12, 0.13), (0.14, 0.15)], [0.15, 0.12, 0.1], "cycles hop: s1_eps_a of"),
+        # there and back
+        ([(0.10, 0.11), (0.30, 0.31), (0.14, 0.15)], [0.1, 0.12, 0.15], "cycles hop: s1_eps_a of"),
+        ([(0.10, 0.15), (0.12, 0.13), (0.14, 0.19)], [0.1, 0.12, 0.15], "no trend is said: the"),
+        ([(-np.inf, np.inf), (0.1, 0.2), (0.3, 0.4)], [0.1, 0.1, 0.3], "no trend is said: the"),
+    ],
+)
+def test_a_trend_is_said_where_values_ranges_and_joint_fit_agree(found, spans, together, wanted):
+    told = told_of(found, spans, together)
+    assert wanted in told
+    assert ("rises" in told or "falls" in told) == ("rises" in wanted)
+
+
 def test_cycles_together_are_spread_over_a_long_record():
     from foamfit.study.cycles import MOST_TOGETHER, spread
 

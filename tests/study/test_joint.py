@@ -493,3 +493,75 @@ def test_one_number_may_be_all_that_is_fitted(tmp_path):
     assert k0.kind == "shared"
     assert k0.ci95[0] < k0.value < k0.ci95[1]
     assert k0.range[0] < k0.value < k0.range[1]
+
+
+# ------------------------------------------------------------------- the last steps of a joint fit
+
+
+def test_a_common_value_that_is_open_by_any_orders_of_magnitude_is_not_determined(found):
+    wide = replace(found.fit.spreads["s1_kc"], ci95=(-1500.0, 1800.0), stderr=800.0)
+    one = parameter_of(replace(found.fit, spreads={"s1_kc": wide}), found.tests, "s1_kc")
+    assert (one.state, one.ci95, one.stderr) == ("not determined", None, None)
+    assert np.isfinite(one.value)
+
+
+def test_a_test_that_says_nothing_of_a_parameter_has_no_part_in_its_scatter(tmp_path, monkeypatch):
+    """It does not bend to where kc shows; its logarithm would count with errors of thousands."""
+    for i, kc in enumerate((3.6e5, 4e5, 4.5e5)):
+        write_test(tmp_path, f"t{i}", seed=i, kc=kc)
+    study = write_study(tmp_path, 's1_k0 = "shared"\ns1_kc = "scatter"' + SHARED)
+    real = joint_fit.JointPoint.of_logarithms
+
+    def nothing(self, name):
+        matrix, bread = real(self, name)
+        matrix[2, 2], bread[2, 2] = 1e6, 1e6
+        return matrix, bread
+
+    monkeypatch.setattr(joint_fit.JointPoint, "of_logarithms", nothing)
+    kc = ff.joint(study, jobs=1).parameters["s1_kc"]
+    assert "common value of 2 tests" in kc.why
+    assert kc.value == pytest.approx(3.8e5, rel=0.05)
+
+
+def test_joint_json_has_how_parameters_vary_together(found):
+    said = found.to_json_dict()["specimens"]
+    assert said["names"] == ["s1_kc", "s1_sigma_minus"]
+    matrix = np.array(said["correlation"])
+    assert np.diag(matrix) == pytest.approx(1.0)
+    assert read_source(found).changing == tuple(said["names"])
+    np.testing.assert_allclose(read_source(found).together, matrix)
+
+
+@pytest.mark.parametrize("step", ["_evidence", "_conclude", "fit_jointly"])
+def test_what_was_found_is_on_disk_whatever_fails_then(folder, tmp_path, monkeypatch, step):
+    def fails(*_, **__):
+        raise OverflowError("math range error")
+
+    monkeypatch.setattr(joint_module, step, fails)
+    study = write_study(folder, 's1_k0 = "shared"\ns1_kc = 4e5' + SHARED)
+    result = run("joint", study, "--out", tmp_path / "out", "--jobs", 1)
+    file = tmp_path / "out.found.json"
+    assert result.exit_code == 70
+    assert "math range error" in result.stderr
+    assert f"the values of each test that were found are in {file}" in result.stderr
+    tests = json.loads(file.read_text())["tests"]
+    assert {values["s1_k0"] for values in tests.values()} != {None}
+    assert [values["s1_kc"] for values in tests.values()] == [4e5] * 3
+    if step != "fit_jointly":  # then the joint fit itself is there
+        assert len({values["s1_k0"] for values in tests.values()}) == 1
+
+
+def test_a_report_that_fails_leaves_the_numbers(found, tmp_path, monkeypatch):
+    without_pictures(monkeypatch)
+
+    def fails(*_, **__):
+        raise OverflowError("math range error")
+
+    monkeypatch.setattr("foamfit.report.studies.joint.plot_joint", fails)
+    with pytest.raises(RuntimeError, match=r"math range error.*joint.json is written, but not all"):
+        found.save(tmp_path / "out", jobs=1)
+    content = json.loads((tmp_path / "out" / "joint.json").read_text())
+    assert content["parameters"]["s1_kc"]["scatter"] == found.parameters["s1_kc"].scatter
+    monkeypatch.undo()
+    without_pictures(monkeypatch)
+    found.save(tmp_path / "out", jobs=1)  # and may be replaced

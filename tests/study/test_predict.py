@@ -208,6 +208,45 @@ def test_what_own_parameters_share_from_test_to_test_widens_the_band_together():
     assert widths[0] > 1.15 * widths[1]
 
 
+def scattering(n=5, **more):
+    """joint.json of n specimens in which k0 and sigma_plus scatter by 20 % each."""
+    logs = 0.2 * np.array([-1.0, -0.5, 0.0, 0.5, 1.0][:n])
+    made = {
+        name: {
+            "kind": "scatter", "value": LAW[name], "stderr": 1e-3 * LAW[name], "scatter": 0.2,
+            "tests": {f"t{i}": {"value": LAW[name] * np.exp(v)} for i, v in enumerate(logs)},
+        }
+        for name in ("s1_k0", "s1_sigma_plus")
+    }  # fmt: skip
+    return joint_content(made, [0.25] * n) | more
+
+
+@pytest.mark.parametrize("together", [-0.99, 0.99])
+def test_what_scatters_is_drawn_as_it_varies_together(tmp_path, together):
+    names, matrix = ["s1_k0", "s1_sigma_plus"], [[1.0, together], [together, 1.0]]
+    content = scattering(specimens={"names": names, "correlation": matrix})
+    drawn, rng = population(content, tmp_path), np.random.default_rng(0)
+    logs = np.log([drawn.draw(rng, open_=False, scatter=True)[[0, 3]] for _ in range(400)])
+    ranks = np.argsort(np.argsort(logs, axis=0), axis=0)
+    assert np.corrcoef(ranks.T)[0, 1] == pytest.approx(together, abs=0.03)
+
+
+def test_two_tests_are_said_to_leave_the_scatter_open():
+    found = ff.predict(InMemory(scattering(2)), loop(seed=0), draws=DRAWS)
+    assert any("2 tests leave open how s1_k0 and s1_sigma_plus vary" in w for w in found.warnings)
+    many = ff.predict(InMemory(scattering(5)), loop(seed=0), draws=DRAWS)
+    assert not any("leave open" in one for one in many.warnings)
+    width = {n: one.curves["stress_strain"].half_width for n, one in ((2, found), (5, many))}
+    assert width[2] > 1.5 * width[5]
+
+
+def test_a_stiffer_specimen_is_not_taken_for_one_that_is_touched_earlier():
+    stiffer = replace(loop(seed=0, k0=1.2 * LAW["s1_k0"], sigma_plus=1.3e5), contact="motion")
+    found = ff.predict(InMemory(scattering()), stiffer, draws=DRAWS)
+    assert found.aligned["displacement_zero"] == pytest.approx(0.0, abs=1e-3 * HEIGHT)
+    assert found.inside["stress_strain"] > 0.9
+
+
 def test_what_the_law_missed_before_is_in_the_band():
     content = fit_content(misfit={"stress_strain": 0.05})
     content["noise"] = {"stress_strain": {"sigma": 3e3, "range": 1e5}}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from foamfit.trust.scatter import common_and_spread
+from foamfit.trust.scatter import common_and_spread, correlation
 
 
 def test_equal_errors_leave_what_the_text_books_have():
@@ -55,3 +55,40 @@ def test_intervals_hold(tau):
     mean, spread = np.mean(hits, axis=0)
     assert 0.92 < mean < 0.98
     assert 0.92 < spread < (0.98 if tau else 1.0)
+
+
+def specimens(n, seed, errors=0.0):
+    """Three parameters of n specimens: the first two with a correlation of -0.9; and errors."""
+    truth = np.array([[1.0, -0.9, 0.0], [-0.9, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    rng = np.random.default_rng(seed)
+    drawn = rng.multivariate_normal(np.zeros(3), truth, n)
+    # errors that two parameters have in common, as those of stiffness and onset
+    return drawn + errors * rng.standard_normal((n, 1)) * np.array([1.0, 1.0, 0.0]), truth
+
+
+def test_many_specimens_show_how_parameters_vary_together():
+    values, truth = specimens(2000, 0)
+    np.testing.assert_allclose(correlation(values, np.zeros((3, 3))), truth, atol=0.05)
+
+
+def test_the_errors_of_the_estimates_are_no_correlation_between_specimens():
+    values, truth = specimens(4000, 1, errors=1.0)
+    errors = np.zeros((3, 3))
+    errors[:2, :2] = 1.0
+    assert correlation(values, np.zeros((3, 3)))[0, 1] > -0.1
+    np.testing.assert_allclose(correlation(values, errors), truth, atol=0.1)
+
+
+def test_few_specimens_show_less_of_it():
+    none = np.zeros((3, 3))
+    size = {
+        n: np.mean([abs(correlation(specimens(n, seed)[0], none)[0, 1]) for seed in range(50)])
+        for n in (2, 4, 16)
+    }
+    assert size[2] == 0.0
+    assert 0.3 < size[4] < size[16] - 0.05 < 0.85
+    # a correlation it stays: of unit diagonal, and positive
+    for seed in range(20):
+        found = correlation(specimens(3, seed)[0], 0.5 * np.eye(3))
+        assert np.diag(found) == pytest.approx(1.0)
+        assert np.linalg.eigvalsh(found)[0] > -1e-12

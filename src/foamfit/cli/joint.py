@@ -87,7 +87,9 @@ def joint(
         if not no_report:
             begin(jobs, len(read.tests), FEW_FOLDERS)
         with progress_line(quiet or as_json, "joint fit") as shown:
-            result = fit_jointly(read, jobs=jobs, seed=seed, progress=shown.progress)
+            result = fit_jointly(
+                read, jobs=jobs, seed=seed, progress=shown.progress, keep=folder
+            )  # fmt: skip
         try:
             with progress_line(quiet or as_json, "joint fit") as shown, without_ctrl_c():
                 shown.progress(1.0, "writing the reports")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +20,7 @@ from foamfit.fitting.search import what_stopped
 from foamfit.one_model import Keywords, Options, Progress
 from foamfit.report.figures import TWO, inches
 from foamfit.report.studies.cycles import save_cycles
+from foamfit.results import ParameterEstimate
 from foamfit.study.cycle_fits import FittedCycles, loop_misfits
 from foamfit.study.shared import Group, Selection, select_own
 from foamfit.text import counted, listed, percent
@@ -25,6 +28,8 @@ from foamfit.trust.intervals import Announce
 
 # Cycles that are fitted together at most; of more the first and others at equal ratios are taken.
 MOST_TOGETHER = 6
+# Factor by which a parameter goes up and down from cycle to cycle where its descriptions hop.
+HOP = 1.5
 
 Params = Callable[[Measurement], lmfit.Parameters | None]
 
@@ -187,18 +192,67 @@ def _sentences(found: CycleFits, selection: Selection) -> Iterator[str]:
             f"with {best.n_vary} parameters, against {shown(first)} with {first.n_vary} where all "
             f"are shared and {each} with {selection.n_alone} where none is."
         )
-        last = found.together[-1]
-        changes = []
-        for name in best.own:
-            values = best.fits[0].value(name)
-            changes.append(f"{name} {_change(values[0], values[-1])}")
-        yield f"From cycle {found.together[0]} to {last}: {listed(changes)}."
+        yield from _trends(found, {name: best.fits[0].value(name) for name in best.own})
     yield (
         f"A parameter gets one value per cycle where this lowers BIC, counted with "
         f"{selection.n_eff} effective samples: the stretches in which a cycle's own fit lies on "
         "one side of its curve, because what that fit leaves is an error of the law rather than "
         "noise."
     )
+
+
+def _trends(found: CycleFits, together: dict[str, list[float]]) -> Iterator[str]:
+    """Say what rises or falls, where the cycles one by one and together agree on it.
+
+    `together` has the values of the fit of all cycles. A description of the cycles hops where a
+    parameter of theirs goes up and down again, or another way than in the fit of all.
+    """
+    first, last = found.together[0], found.together[-1]
+    sure, hopping, unsure = list[str](), list[str](), list[str]()
+    for name in found.varied:
+        each = [found.results[n].parameters[name] for n in found.together]
+        side = _side(_span(each[0]), _span(each[-1]))
+        steps = {_step(*pair) for pair in itertools.pairwise(each)}
+        values = together.get(name)
+        if steps >= {1, -1} or (values and side * (values[-1] - values[0]) < 0.0):
+            hopping.append(name)
+        elif values and side:
+            alone = _change(each[0].value, each[-1].value)
+            sure.append(f"{name} {_change(values[0], values[-1])} (each cycle alone: {alone})")
+        elif values:
+            unsure.append(name)
+    if sure:
+        yield f"From cycle {first} to {last}: {listed(sure)}."
+    if hopping:
+        yield (
+            f"The descriptions of the cycles hop: {listed(hopping)} of single cycles go up and "
+            f"down by a factor of {HOP} or more, or another way than in the fit of all cycles "
+            "together. Different sets of parameters follow the loops about as well, and no trend "
+            "is said of these."
+        )
+    if unsure:
+        yield (
+            f"Of {listed(unsure)} no trend is said: the ranges of the cycles {first} and {last} "
+            "overlap, or one of them does not determine it."
+        )
+
+
+def _span(one: ParameterEstimate) -> tuple[float, float]:
+    """Where a parameter of one cycle may lie, by interval and range; anywhere if unknown."""
+    ends = [one.value, *(one.ci95 or (-math.inf, math.inf)), *(one.range or ())]
+    return min(ends), max(ends)
+
+
+def _step(before: ParameterEstimate, after: ParameterEstimate) -> int:
+    """1 or -1 where a parameter rises or falls by a factor of `HOP`, beyond noise; else 0."""
+    side = _side(*(_span(replace(one, range=None)) for one in (before, after)))
+    low, high = sorted([abs(before.value), abs(after.value)])
+    return side if high > HOP * low else 0
+
+
+def _side(before: tuple[float, float], after: tuple[float, float]) -> int:
+    """1 if one span lies above the one before, -1 if below, 0 if they overlap."""
+    return int(after[0] > before[1]) - int(after[1] < before[0])
 
 
 def _change(before: float, after: float) -> str:

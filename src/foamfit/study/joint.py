@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NoReturn
@@ -17,6 +19,7 @@ from foamfit.data.csv_file import read_test
 from foamfit.data.measurement import Measurement
 from foamfit.data.rate import loading_rate, rate_error
 from foamfit.errors import InputError, SimulationError
+from foamfit.files import write_file
 from foamfit.fitting.links import KINDS, RATES, Links
 from foamfit.fitting.problem import Problem, make_params
 from foamfit.fitting.search import Tracker, descend
@@ -24,6 +27,7 @@ from foamfit.one_model import Options, Progress, identify, weigh_motion
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import check_target, try_target
 from foamfit.report.studies.joint import save_joint
+from foamfit.results import plain
 from foamfit.springs.model import Model
 from foamfit.study.joint_estimates import common_covariance, parameters_of
 from foamfit.study.joint_fit import (
@@ -98,6 +102,7 @@ def joint(
     seed: int | None = None,
     report: bool = True,
     progress: Progress | None = None,
+    keep: str | Path | None = None,
 ) -> JointResult:
     """Fit the tests of a study together.
 
@@ -115,6 +120,9 @@ def joint(
         Of the search; by default that of the study, or 0.
     progress : callable, optional
         Told the fraction done and what is going on.
+    keep : str or Path, optional
+        Folder beside which the values that were found are written, as ``<folder>.found.json``, if
+        a later step fails; by default `out`.
 
     Returns
     -------
@@ -142,19 +150,45 @@ def joint(
     _links(study, tests)  # refuses what cannot be, before anything is fitted
     with workers(jobs, len(tests), FEW) as each:
         tests, vectors = _own_fits(study, options, tests, refused, each, tell)
-        problems, links = [test.problem for test in tests], _links(study, tests)
-        starts, n_eff = _starts(problems, vectors), samples_of(problems, vectors)
-        tell(0.5, "together")
-        choices = _choices(tests)
-        links = _chosen(study, problems, links, starts, n_eff, choices)
-        fit = fit_jointly(problems, links, starts, each=each)
-    tell(0.9, "evidence")
-    tried = _evidence(study, fit, n_eff, vectors, choices)
-    result = _conclude(study, seed, tests, fit, vectors, tried, n_eff, refused, began)
+        best = list(vectors)
+        with _kept(study, tests, best, out if keep is None else keep):
+            problems, links = [test.problem for test in tests], _links(study, tests)
+            starts, n_eff = _starts(problems, vectors), samples_of(problems, vectors)
+            tell(0.5, "together")
+            choices = _choices(tests)
+            links = _chosen(study, problems, links, starts, n_eff, choices)
+            fit = fit_jointly(problems, links, starts, each=each, best=best)
+            tell(0.9, "evidence")
+            tried = _evidence(study, fit, n_eff, vectors, choices)
+            result = _conclude(study, seed, tests, fit, vectors, tried, n_eff, refused, began)
     tell(1.0, "done")
     if out is not None:
         result.save(out, jobs=jobs, report=report)
     return result
+
+
+@contextmanager
+def _kept(
+    study: Study, tests: Sequence[_Test], best: Sequence[Array], folder: str | Path | None
+) -> Iterator[None]:
+    """Write the best values of each test beside a folder if anything fails, and say where."""
+    try:
+        yield
+    except Exception as error:
+        if folder is None:
+            raise
+        file = Path(f"{folder}.found.json")
+        told = f"{error}" if isinstance(error, InputError | SimulationError) else f"{error!r}"
+        values = {
+            test.name: dict(zip(test.problem.names, own + test.problem.origins, strict=True))
+            for test, own in zip(tests, best, strict=True)
+        }
+        content = {"name": study.name, "model": study.model, "error": told, "tests": values}
+        text = json.dumps(plain(content), indent=2, ensure_ascii=False)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_file(file, (text + "\n").encode(errors="backslashreplace"))
+        kind = type(error) if isinstance(error, InputError | SimulationError) else RuntimeError
+        raise kind(f"{told}; the values of each test that were found are in {file}") from error
 
 
 # ------------------------------------------------------------------------------- reading

@@ -16,13 +16,16 @@ from foamfit.study.joint_result import JointParameter, TestValue
 from foamfit.text import counted
 from foamfit.trust import covariance
 
+# Logarithms of what tests leave open by any number of orders of magnitude end here.
+LARGEST = 300.0
+
 
 def common_covariance(fit: JointFit) -> tuple[tuple[str, ...], Array]:
     """Covariance of the common values and slopes, SI; see `JointData.to_json_dict`."""
     spread, scales = fit.covariance, []
     for name in spread.names:
         one = fit.spreads.get(name)
-        value = math.exp(one.mean) if one else fit.found.common.get(name, (1.0,))[0]
+        value = math.exp(min(one.mean, LARGEST)) if one else fit.found.common.get(name, (1.0,))[0]
         before = spread.of_common(name)[0]
         factor = one.stderr / before if one and before > 0.0 else 1.0
         scales.append(value * factor if fit.found.links.kind(name) == "scatter" else 1.0)
@@ -87,7 +90,8 @@ def _scattering(fit: JointFit, tests: tuple[str, ...], name: str) -> JointParame
             "scatter", common, unit, state="not determined", why=why, tests=values
         )
     sign = -1.0 if next(iter(values.values())).value < 0.0 else 1.0
-    value, ends = sign * math.exp(spread.mean), [sign * math.exp(end) for end in spread.ci95]
+    ends = np.minimum([spread.mean, *spread.ci95], LARGEST)
+    value, *ends = (sign * np.exp(ends)).tolist()
     half = 0.5 * abs(ends[1] - ends[0])
     state, why = covariance.state(value, half, abs(value), -math.inf, math.inf)
     known = state != "not determined"

@@ -18,16 +18,18 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.errors import SimulationError
+from foamfit.fitting.box import is_logarithmic
 from foamfit.fitting.links import RATES, Links
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.together import Together, fit_linked
+from foamfit.springs.parameters import NUISANCE, split_name
 from foamfit.study.shared import bic, effective_samples
 from foamfit.trust import covariance
 from foamfit.trust.joint_covariance import JointCovariance, JointPoint
 from foamfit.trust.ranges import ALIKE, ITERATIONS, TRIALS
 from foamfit.trust.residuals.law_error import CurveError, curve_errors
 from foamfit.trust.residuals.noise_process import noise_processes
-from foamfit.trust.scatter import Spread, common_and_spread
+from foamfit.trust.scatter import Spread, common_and_spread, correlation
 
 # Rounds between the best values and the spreads at most, and the change of the logarithm of a
 # spread at which they end.
@@ -35,6 +37,8 @@ ROUNDS, STILL = 12, 0.01
 # Nothing is drawn harder than by a spread of so much of the errors of a single test: with no spread
 # at all the values of the tests would be one, and nothing would say what they are undrawn.
 LEAST_SPREAD = 0.3
+# Tests say nothing of a parameter whose logarithm has a larger error than this (a factor of 150).
+SAYS_NOTHING = 5.0
 # Groups of tests that are left out in turn, and steps of a fit without one of them.
 GROUPS, REFIT = 10, 15
 Map = Callable[..., Iterable[Any]]
@@ -45,11 +49,14 @@ class JointFit:
     """Several tests fitted together: the best point, and the spread of what scatters.
 
     `ranges` are those of shared values, and with ":b" of slopes by rate; see `ranges_of`.
+    `correlation` has the names of what changes from specimen to specimen, and how these parameters
+    vary together (`correlation_of`).
     """
 
     point: JointPoint
     spreads: Mapping[str, Spread] = field(default_factory=dict)
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    correlation: tuple[tuple[str, ...], Array] = ((), np.empty((0, 0)))
 
     @property
     def found(self) -> Together:
@@ -68,35 +75,40 @@ def fit_jointly(
     starts: Sequence[Sequence[Array]],
     *,
     each: Map = map,
+    best: list[Array] | None = None,
 ) -> JointFit:
     """Fit tests whose parameters are linked as `links` say, and judge the fit.
 
     Arguments are those of `fitting.together.fit_linked`; `each` maps a function over what is to be
-    done for each test, as `map` does.
+    done for each test, as `map` does. `best` is given the values of each test as they are found.
     """
     scatter = [name for name, kind in links.kinds.items() if kind == "scatter"]
+    best = [] if best is None else best
     found = fit_linked(problems, links, starts)
+    best[:] = found.values
     errors = errors_of(found, each)
     point, spreads = JointPoint(found, errors), dict[str, Spread]()
     scatter = [name for name in scatter if name in found.own]
     if not scatter:
-        return JointFit(point, ranges=ranges_of(point, each))
+        return JointFit(point, {}, ranges_of(point, each), correlation_of(point, {}))
+    undrawn = dict[str, Array]()
     for _ in range(ROUNDS):
         before, inflations, pulls = spreads, dict[str, Array](), dict[str, Array]()
         spreads = {}
         for name in scatter:
             matrix, bread = point.of_logarithms(name)
             drawn = _drawn(found, name)
-            there = np.isfinite(np.diag(matrix)) & np.isfinite(drawn)
+            there = (np.diag(matrix) < SAYS_NOTHING**2) & np.isfinite(drawn)
             pull = found.links.pulls.get(name, np.zeros(drawn.size))
             (common,) = found.common[name]
             inner = np.ix_(there, there)
-            undrawn = drawn[there] + bread[inner] @ (
+            if np.count_nonzero(there) < 2:
+                continue
+            undrawn[name] = np.full(drawn.size, np.nan)
+            undrawn[name][there] = drawn[there] + bread[inner] @ (
                 pull[there] ** 2 * (drawn[there] - math.log(common))
             )
-            if undrawn.size < 2:
-                continue
-            spreads[name] = common_and_spread(undrawn, matrix[inner])
+            spreads[name] = common_and_spread(undrawn[name][there], matrix[inner])
             more = np.ones(drawn.size)
             more[there] = np.maximum(np.diag(matrix)[there] / np.diag(bread)[there], 1e-6)
             least = LEAST_SPREAD * math.sqrt(float(np.median(np.diag(matrix)[there])))
@@ -105,8 +117,38 @@ def fit_jointly(
         if _still(before, spreads):
             break
         found = fit_linked(problems, replace(links, pulls=pulls), [found.values])
+        best[:] = found.values
         point = JointPoint(found, errors, inflations)
-    return JointFit(point, spreads, ranges_of(point, each))
+    return JointFit(point, spreads, ranges_of(point, each), correlation_of(point, undrawn))
+
+
+def correlation_of(
+    point: JointPoint, undrawn: Mapping[str, Array]
+) -> tuple[tuple[str, ...], Array]:
+    """Names of own and scattering parameters, and their correlation between specimens.
+
+    Of logarithms where these are what varies (`is_logarithmic`); `undrawn` has them for what
+    scatters. Tests count that tell of all of these parameters; see `trust.scatter.correlation`.
+    """
+    found, scales = point.found, list[Array]()
+    columns, names = list[Array](), list[str]()
+    for name in found.own:
+        if name in NUISANCE or (found.links.kind(name) == "scatter" and name not in undrawn):
+            continue
+        values = np.array(found.value(name))
+        logs = name in undrawn or (is_logarithmic(split_name(name)[1]) and np.all(values > 0.0))
+        free = np.array([name in problem.free() for problem in found.problems])
+        own = np.where(free, np.log(values) if logs and name not in undrawn else values, np.nan)
+        columns.append(undrawn.get(name, own))
+        scales.append(np.abs(values) if logs else np.ones(values.size))
+        names.append(name)
+    table = np.array(columns).reshape(len(names), len(found.problems)).T
+    there = np.flatnonzero(np.isfinite(table).all(axis=1))
+    errors = np.zeros((len(names), len(names)))
+    for t in there:
+        scale = np.array([one[t] for one in scales])
+        errors += point.own_errors(int(t), names) / np.outer(scale, scale) / there.size
+    return tuple(names), correlation(table[there], errors)
 
 
 def _drawn(found: Together, name: str) -> Array:

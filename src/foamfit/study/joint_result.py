@@ -212,7 +212,8 @@ class JointData:
         """Return the content of joint.json: SI, plain types, null for what is not there.
 
         The covariance is that of shared values, common values of what scatters, and by a law of
-        rate of the value at `rate0` and, with ":b", the slope.
+        rate of the value at `rate0` and, with ":b", the slope. "specimens" has the correlation of
+        what changes from specimen to specimen.
         """
         found = self.fit.found
         content = {
@@ -243,6 +244,7 @@ class JointData:
             },
             "parameters": {name: one.to_json_dict() for name, one in self.parameters.items()},
             "covariance": {"names": self.covariance[0], "matrix": self.covariance[1]},
+            "specimens": {"names": self.fit.correlation[0], "correlation": self.fit.correlation[1]},
             "evidence": [asdict(one) for one in self.evidence],
             "statistics": self.statistics,
             "refused": self.refused,

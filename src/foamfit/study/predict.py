@@ -38,6 +38,8 @@ RATE_FACTOR = 1.25
 # Draws that are tried for each that is wanted, before the others are given up.
 TRIES = 5
 BAND = (0.025, 0.975)
+# Tests from which on nothing is said of how few they are; fewer do where fewer parameters change.
+FEW_TESTS = 5
 ALIGNING = 40  # steps of the fit of what a record does not say exactly
 
 
@@ -68,11 +70,10 @@ def predict(
 
     Height, area, mass and velocity are those of the test, and so is the rate at which laws of rate
     are evaluated. What its record does not say exactly, such as the contact time and zeros of an
-    impact, is fitted to it with the springs held as predicted (`PredictedTest.aligned`). The 95 %
-    band has these parts: what the result leaves uncertain of the parameters, their scatter between
-    specimens (of a joint result), the noise of the test, that of a motion that drives, and what the
-    law has missed of the fitted tests beyond their noise. The first two are drawn and simulated
-    exactly.
+    impact, is fitted to it (`PredictedTest.aligned`). The 95 % band has these parts: what the
+    result leaves uncertain of the parameters, their scatter between specimens (of a joint result),
+    the noise of the test, that of a motion that drives, and what the law has missed of the fitted
+    tests beyond their noise. The first two are drawn and simulated exactly.
 
     Parameters
     ----------
@@ -112,7 +113,7 @@ def predict(
     population = Population(source, problem.model.names, problem.measurement.specimen, rate)
     springs = _point(population, problem, warnings)
     try:
-        point, aligned = _aligned(problem, springs)
+        point, aligned = _aligned(problem, springs, population.scattering)
         simulated = objective.simulate(point, everything=True)
     except SimulationError as error:
         raise SimulationError(
@@ -142,7 +143,7 @@ def predict(
         draws=min((len(one.values) for one in drawn.values()), default=0),
         redrawn=sum(one.redrawn for one in set(drawn.values())),
         held=population.held,
-        sentences=(*_of_curves(curves), *_of_aligned(aligned), *_of_trends(population)),
+        sentences=(*_of_curves(curves), *_of_aligned(aligned, population), *_of_trends(population)),
         warnings=tuple(warnings),
         aligned=aligned,
     )
@@ -228,23 +229,33 @@ def _point(population: Population, problem: Problem, warnings: list[str]) -> Arr
     return nearest
 
 
-def _aligned(problem: Problem, springs: Array) -> tuple[Array, dict[str, float]]:
+def _aligned(
+    problem: Problem, springs: Array, scattering: tuple[str, ...]
+) -> tuple[Array, dict[str, float]]:
     """The springs and what of the record fits them best, and that in the numbers of its file.
 
+    Parameters that change from specimen to specimen are fitted with it and then given up: held, a
+    stiffer specimen would be taken for one that is touched earlier.
     Raises SimulationError if the springs cannot be simulated.
     """
     params = problem.params.copy()
     for name, value in zip(problem.model.names, springs.tolist(), strict=True):
-        params[name].set(value=value, vary=False, expr="", min=-math.inf, max=math.inf)
+        one = params[name]
+        free = name in scattering and one.vary and not name.endswith("_height")
+        if free and one.min < value < one.max:
+            one.set(value=value)
+        else:
+            one.set(value=value, vary=False, expr="", min=-math.inf, max=math.inf)
     held = replace(problem, params=params)
-    point, names = held.vector(), held.free()
+    point = held.vector()
+    names = [name for name in held.free() if name in problem.objective.nuisance]
     if not names:
         return point, {}
     problem.objective.simulate(point)
     space, tracker = held.space(), Tracker(problem.objective)
     descend(tracker, space, space.encode(point), ALIGNING)
     assert tracker.best_values is not None  # the first point can be simulated
-    point = tracker.best_values
+    point = np.append(springs, tracker.best_values[springs.size :])
     told = dict(zip(problem.names, (point + problem.origins).tolist(), strict=True))
     return point, {name: told[name] for name in names}
 
@@ -407,6 +418,13 @@ def _warn(
             "One test tells nothing of the scatter between specimens, so the band holds none: fit "
             "several specimens together (foamfit joint)."
         )
+    changing = population.scattering
+    if changing and population.fewest < max(3, min(len(changing), FEW_TESTS)):
+        warnings.append(
+            f"{counted(population.fewest, 'test')} leave open how {listed(changing)} vary from "
+            "specimen to specimen, and how they do so together: the band is wide for it, and "
+            "nothing shows that it is wide enough; fit more specimens, or share more parameters."
+        )
     if population.held:
         many = len(population.held) > 1
         warnings.append(
@@ -436,7 +454,7 @@ def _of_trends(population: Population) -> list[str]:
     ]
 
 
-def _of_aligned(aligned: dict[str, float]) -> list[str]:
+def _of_aligned(aligned: dict[str, float], population: Population) -> list[str]:
     """What was fitted of the record."""
     if not aligned:
         return []
@@ -444,7 +462,8 @@ def _of_aligned(aligned: dict[str, float]) -> list[str]:
         f"{name.replace('_', ' ')} {engineering(value, unit_of(name)).replace('-', '−')}"
         for name, value in aligned.items()
     ]
-    return [f"Aligned to the record, with the springs held, and no prediction: {listed(told)}."]
+    held = "as another specimen of the foam" if population.scattering else "held"
+    return [f"Aligned to the record, with the springs {held}, and no prediction: {listed(told)}."]
 
 
 def _of_curves(curves: dict[str, PredictedCurve]) -> list[str]:

@@ -550,12 +550,9 @@ class JointPoint:
             float(effective),
         )  # fmt: skip
 
-    def of_logarithms(self, name: str) -> tuple[Array, Array]:
-        """Covariance of the logarithms of a parameter in all tests that have it of its own, (n, n).
-
-        As the data alone have it, whatever draws it to a common value; then the inverse curvature.
-        NaN where a test says nothing of it.
-        """
+    @cached_property
+    def _undrawn(self) -> Arrow:
+        """The blocks as the data alone have them, whatever draws parameters to a common value."""
         s = len(self.names)
         free = [i for i, one in enumerate(self.names) if one not in self._scatter]
         blocks = list[_Block]()
@@ -563,9 +560,30 @@ class JointPoint:
             columns = np.array([*free, *range(s, block.through.shape[1])], dtype=np.intp)
             none = np.zeros((0, columns.size))
             curved = replace(block, curvature=self._curvatures[t]) if self.errs else block
-            kept = replace(curved.kept(columns), pulls=none, drawn=none)
-            blocks.append(kept)
-        arrow = Arrow(tuple(blocks), plain=not self.errs)
+            blocks.append(replace(curved.kept(columns), pulls=none, drawn=none))
+        return Arrow(tuple(blocks), plain=not self.errs)
+
+    def own_errors(self, test: int, names: Sequence[str]) -> Array:
+        """Covariance of some own parameters of a test as the data alone have it, SI, (k, k).
+
+        Zero where the test says nothing of them.
+        """
+        block, arrow = self.blocks[test], self._undrawn
+        mine = [name for name in block.names if name in self.found.own]
+        whole = np.where(arrow.lost(test), 0.0, 1.0) * arrow.of_test(test)[arrow.s :, arrow.s :]
+        out = np.zeros((len(names), len(names)))
+        here = [i for i, name in enumerate(names) if name in mine]
+        places = [mine.index(names[i]) for i in here]
+        sizes = [block.best.sizes[block.names.index(names[i])] for i in here]
+        out[np.ix_(here, here)] = whole[np.ix_(places, places)] * np.outer(sizes, sizes)
+        return out
+
+    def of_logarithms(self, name: str) -> tuple[Array, Array]:
+        """Covariance of the logarithms of a parameter in all tests that have it of its own, (n, n).
+
+        As the data alone have it, whatever draws it to a common value; then the inverse curvature.
+        NaN where a test says nothing of it.
+        """
         places, factors = list[int | None](), list[float]()
         for block in self.blocks:
             mine = [one for one in block.names if one in self.found.own]
@@ -573,7 +591,7 @@ class JointPoint:
             value = float(block.best.values[block.best.index[name]])
             size = block.best.sizes[block.names.index(name)] if name in block.names else 0.0
             factors.append(size / abs(value) if value else np.nan)
-        matrix, bread = arrow.across(places)
+        matrix, bread = self._undrawn.across(places)
         scale = np.outer(factors, factors)
         return matrix * scale, bread * scale
 

@@ -2,7 +2,7 @@
 
 The estimates u of n tests have errors of covariance C; the specimens scatter about a common value μ
 with a standard deviation τ: u ~ N(μ, C + τ²). τ is that of the largest restricted likelihood
-(REML), μ the generalised mean.
+(REML), μ the generalised mean. How several parameters vary together is in `correlation`.
 """
 
 from __future__ import annotations
@@ -116,3 +116,31 @@ def _crossing(q: Callable[[float], float], level: float, most: float) -> float:
     while q(most) > level:
         most *= 10.0
     return float(brentq(lambda tau2: q(tau2) - level, 0.0, most, xtol=1e-12 * most, rtol=1e-10))
+
+
+def correlation(values: Array, errors: Array) -> Array:
+    """Correlation (k, k) between specimens of k parameters, estimated in n tests: (n, k).
+
+    It is that of the covariance of the estimates less the mean covariance (k, k) of their errors,
+    shrunk towards none, 0, by the share that Schäfer and Strimmer (2005, Stat. Appl. Genet. Mol.
+    Biol. 4, 32) give: the variances of the correlations over their squares. The fewer the tests,
+    the larger it is; two tests say nothing of a correlation.
+    """
+    n, k = values.shape
+    off = values - values.mean(axis=0)
+    scale = np.sqrt(np.sum(off**2, axis=0) / max(n - 1, 1))
+    scale = np.where(scale > 0.0, scale, 1.0)
+    if n < 3:
+        return np.eye(k)
+    products = np.einsum("ti,tj->tij", off / scale, off / scale)
+    mean = products.mean(axis=0)
+    apart = ~np.eye(k, dtype=bool)
+    doubt = np.sum((products - mean) ** 2, axis=0)[apart].sum() * n / (n - 1) ** 3
+    left = mean * n / (n - 1) - errors / np.outer(scale, scale)
+    share = min(doubt / max(float(np.sum(left[apart] ** 2)), 1e-300), 1.0)
+    power, axes = np.linalg.eigh(left)
+    true = (axes * np.maximum(power, 0.0)) @ axes.T
+    size = np.sqrt(np.maximum(np.diag(true), 1e-12))
+    out = (1.0 - share) * true / np.outer(size, size)
+    np.fill_diagonal(out, 1.0)
+    return np.asarray(out)

@@ -25,12 +25,22 @@ def save_joint(
 ) -> Path:  # fmt: skip
     """Write the folder whole, replacing an older result at the end; returns it.
 
-    `each` maps a function over the tests, as `map` does; `width` is that of the figures.
+    `each` maps a function over the tests, as `map` does; `width` is that of the figures. Where the
+    reports fail, joint.json is written all the same, and RuntimeError says so.
     """
+    failed = list[Exception]()
 
     def write(fresh: Path) -> None:
         text = json.dumps(found.to_json_dict(), indent=2, ensure_ascii=False, allow_nan=False)
         (fresh / "joint.json").write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
+        try:
+            show(fresh)
+        except OSError:
+            raise
+        except Exception as error:
+            failed.append(error)
+
+    def show(fresh: Path) -> None:
         folders = [fresh / name for name in found.tests]
         # Where other processes make the folders, the picture of all is drawn beside them.
         n = len(folders)
@@ -46,7 +56,12 @@ def save_joint(
         for _ in made:
             pass
 
-    return save_whole(folder, write)
+    save_whole(folder, write)
+    if failed:
+        raise RuntimeError(
+            f"{failed[0]!r}; {Path(folder) / 'joint.json'} is written, but not all reports"
+        ) from failed[0]
+    return Path(folder)
 
 
 def _write_test(one: TestFit, folder: Path, reports: bool, width: str) -> None:

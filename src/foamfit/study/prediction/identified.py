@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -96,6 +96,9 @@ class Source:
     correlation: Array
     misses: dict[str, tuple[Miss, ...]]  # Of the fitted tests, by channel
     time_shift: bool = False  # Whether a time shift of the motion was fitted
+    # Correlation between specimens of own and scattering parameters, as far as the result has it.
+    changing: tuple[str, ...] = ()
+    together: Array = field(default_factory=lambda: np.empty((0, 0)))
 
     def law_error(self, channel: str, noise: float) -> float:
         """RMS of what the law missed of the fitted tests beyond their noise, over the range.
@@ -185,7 +188,10 @@ def _source(content: Mapping[str, Any], where: str) -> Source:
     if unknown := [name for name in parameters if name not in model.names]:
         raise InputError(f"{where}: {unknown[0]} is no parameter of its model {model.name}")
     rate0 = content.get("rate0")
-    names, correlation = _correlation(content, joint, parameters, where)
+    names, correlation = _correlation(
+        content, "covariance" if joint else "correlation", "matrix", parameters, where
+    )
+    changing, together = _correlation(content, "specimens", "correlation", parameters, where)
     fits = list(tests.values()) if joint else [content]
     return Source(
         name=str(content.get("name" if joint else "test") or where),
@@ -202,6 +208,8 @@ def _source(content: Mapping[str, Any], where: str) -> Source:
         correlation=correlation,
         misses=_misses([one for one in fits if isinstance(one, Mapping)], where),
         time_shift=TIME_SHIFT in content["parameters"],
+        changing=changing,
+        together=together,
     )
 
 
@@ -242,16 +250,15 @@ def _parameter(
 
 
 def _correlation(
-    content: Mapping[str, Any], joint: bool, parameters: Mapping[str, Identified], where: str
+    content: Mapping[str, Any], key: str, of: str, parameters: Mapping[str, Identified], where: str
 ) -> tuple[tuple[str, ...], Array]:
-    """Correlation of the parameters that are named; 0 where it is not known."""
-    key = "covariance" if joint else "correlation"
+    """Correlation of the parameters that are named, from that or a covariance; 0 if unknown."""
     if content.get(key) is None:
         return (), np.empty((0, 0))
     item = _mapping(content, key, where)
     names = item.get("names")
     try:
-        matrix = np.array(item.get("matrix"), dtype=float).reshape(len(names or ()), -1)
+        matrix = np.array(item.get(of), dtype=float).reshape(len(names or ()), -1)
     except (TypeError, ValueError):
         matrix = np.empty((0, 0))
     known = isinstance(names, list) and all(
@@ -264,10 +271,9 @@ def _correlation(
         )
     kept = [i for i, name in enumerate(names or ()) if name not in NUISANCE]
     names, matrix = [(names or ())[i] for i in kept], matrix[np.ix_(kept, kept)]
-    if joint:
-        with np.errstate(invalid="ignore", divide="ignore"):
-            scale = np.sqrt(np.diag(matrix))
-            matrix = matrix / np.outer(scale, scale)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        scale = np.sqrt(np.diag(matrix))
+        matrix = matrix / np.outer(scale, scale)
     matrix = np.clip(np.where(np.isfinite(matrix), matrix, 0.0), -1.0, 1.0)
     np.fill_diagonal(matrix, 1.0)
     return tuple(names), 0.5 * (matrix + matrix.T)

@@ -21,6 +21,7 @@ from foamfit.fitting.box import is_logarithmic
 from foamfit.fitting.links import RATES, law
 from foamfit.springs.parameters import split_name
 from foamfit.study.prediction.identified import Identified, Pair, Source
+from foamfit.trust.scatter import correlation
 
 # Own parameters change with the rate if that lowers BIC by so much, over so many tests or more, of
 # which the logarithms of the rate spread by more than this.
@@ -95,8 +96,12 @@ class Population:
             )
         if there:
             matrix[np.ix_(there, there)] = inner
-        power, axes = np.linalg.eigh(matrix)
-        return tuple(free), axes * np.sqrt(np.maximum(power, 0.0))
+        changing = {name: i for i, name in enumerate(self.scattering)}
+        mine = [i for i, name in enumerate(free) if name in changing]  # means of what scatters
+        if mine:
+            places = [changing[free[i]] for i in mine]
+            matrix[np.ix_(mine, mine)] = self._correlation[np.ix_(places, places)]
+        return tuple(free), _root(matrix)
 
     @property
     def uncertain(self) -> bool:
@@ -133,6 +138,35 @@ class Population:
             if (one.kind == "scatter" and one.scatter > 0.0)
             or (one.kind == "own" and np.ptp(one.tests) > 0.0)
         )
+
+    @cached_property
+    def _correlation(self) -> Array:
+        """Correlation of the scattering parameters from specimen to specimen.
+
+        That of the result; of own parameters that change with the rate, or of which it says
+        nothing, that of their deviations.
+        """
+        names, own = self.scattering, self._own
+        out = np.eye(len(names))
+        known = {name: i for i, name in enumerate(self.source.changing)}
+        there = [i for i, name in enumerate(names) if name in known]
+        places = [known[names[i]] for i in there]
+        out[np.ix_(there, there)] = self.source.together[np.ix_(places, places)]
+        if own.slopes.any() or not set(own.names) <= known.keys():
+            places = [names.index(name) for name in own.names]
+            none = np.zeros((len(places), len(places)))
+            out[np.ix_(places, places)] = correlation(own.off, none)
+        return out
+
+    @property
+    def fewest(self) -> int:
+        """Tests from which what changes from specimen to specimen is known."""
+        return min(len(self.source.parameters[name].tests) for name in self.scattering)
+
+    @cached_property
+    def _changed(self) -> Array:
+        """Root of the correlation of the scattering parameters."""
+        return _root(self._correlation)
 
     @cached_property
     def _own(self) -> _Own:
@@ -195,7 +229,8 @@ class Population:
     def draw(self, rng: np.random.Generator, *, open_: bool, scatter: bool) -> Array:
         """Draw what the result leaves open, the scatter between specimens, or both.
 
-        A spread is known from n tests: its deviates are Student's t with n - 1 degrees of freedom.
+        Parameters change together from specimen to specimen. Their spreads are known from n tests:
+        the deviates are Student's t with n - 1 degrees of freedom.
         """
         values = {name: one.value for name, one in self._items}
         slopes = {name: one.b for name, one in self._items}
@@ -207,15 +242,15 @@ class Population:
                 else:
                     values[name] = self._placed(name, float(z))
         if scatter:
-            for name in self.scattering:
+            freedom = max(self.fewest - 1 - bool(self._own.slopes.any()), 1)
+            tail = math.sqrt(freedom / rng.chisquare(freedom))
+            drawn = tail * (self._changed @ rng.standard_normal(len(self.scattering)))
+            for name, z in zip(self.scattering, drawn.tolist(), strict=True):
                 one = self.source.parameters[name]
                 if one.kind == "scatter":
-                    z = rng.standard_t(max(len(one.tests) - 1, 1))
                     values[name] *= _exp(one.scatter * z)
-            if self._own.names:
-                drawn = self._own.draw(rng)
-                for name, value in zip(self._own.names, drawn, strict=True):
-                    values[name] = self._from_own(name, value)
+                else:
+                    values[name] = self._from_own(name, self._own.at(name, z))
         return self._vector(
             {name: self._at_rate(name, value, slopes[name]) for name, value in values.items()}
         )
@@ -282,14 +317,14 @@ class _Own:
                 slopes = np.where(sure, steep, 0.0)
                 mean, off = mean + slopes * at, np.where(sure, left, off)
                 leverage = leverage + sure * at**2 / square
-        freedom = n - 1 - bool(np.any(slopes))
+        freedom = max(n - 1 - bool(np.any(slopes)), 1)
         return cls(names, mean, slopes, off, np.sqrt(1.0 + leverage), freedom)
 
-    def draw(self, rng: np.random.Generator) -> Array:
-        """Draw a specimen: a combination of the tests' deviations, Student's t each."""
-        weights = rng.standard_normal(len(self.off))
-        tail = math.sqrt(rng.chisquare(self.freedom))
-        return np.asarray(self.mean + self.wider * (weights @ self.off) / tail)
+    def at(self, name: str, z: float) -> float:
+        """Value of a specimen that is z standard deviations off the mean."""
+        i = self.names.index(name)
+        spread = math.sqrt(float(np.sum(self.off[:, i] ** 2)) / self.freedom)
+        return float(self.mean[i] + self.wider[i] * spread * z)
 
 
 def _wider(ci95: Pair | None, stderr: float) -> float:
@@ -301,6 +336,12 @@ def _wider(ci95: Pair | None, stderr: float) -> float:
     if ci95 is None:
         return 1.0
     return max(1.0, 0.5 * (ci95[1] - ci95[0]) / (NORMAL * stderr))
+
+
+def _root(correlation: Array) -> Array:
+    """A root of a correlation; what of it is negative is none."""
+    power, axes = np.linalg.eigh(correlation)
+    return np.asarray(axes * np.sqrt(np.maximum(power, 0.0)))
 
 
 def _exp(value: float) -> float:

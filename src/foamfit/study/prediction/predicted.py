@@ -92,7 +92,8 @@ class PredictedTest:
         Parameters that the result leaves undetermined and that were held at their values.
     aligned : dict of str to float
         What the record of the test does not say exactly (its contact time, zeros, striker, time
-        shift) was fitted to it with the springs held as predicted: values in its own numbers, SI.
+        shift) was fitted to it, with the springs held as predicted but for what varies between
+        specimens: values in its own numbers, SI.
     """
 
     source: str
