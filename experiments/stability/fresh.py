@@ -528,7 +528,10 @@ def follower(scene: Scene) -> Callable[[Any, Any, Array, float, int], Truth]:
     """Choose the program that judges a scene."""
     if roots.has_no_rates(*scene[:2]) and independent_memory.has_memory(scene[0]):
         return roots.follow
-    return independent_memory.follow if independent_memory.has_memory(scene[0]) else follow
+    by = independent_memory.follow if independent_memory.has_memory(scene[0]) else follow
+    if isinstance(scene[1], ff.Impact):
+        return by
+    return lambda chain, drive, time, *bounds: by(chain, drive, time - time[0], *bounds)
 
 
 # ------------------------------------------------------------------------------- the derivatives

@@ -18,7 +18,7 @@ from foamfit.solve.implicit import steps, vibration
 from foamfit.springs import equilibrium, kernels
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.springs.law import BISTABLE, LINEAR, MICROSCALE
-from foamfit.springs.parameters import OWN_ETA, OWN_HEIGHT
+from foamfit.springs.parameters import DRAG, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
 from foamfit.springs.sensitivities import equilibrium_tangents
 from foamfit.springs.spring import as_samples
 
@@ -126,6 +126,9 @@ class Plan(NamedTuple):
         Whether to take implicit steps; None = where explicit ones are the wrong tool.
     memory : bool
         Whether a spring keeps more than its branch: microscale springs and relaxation.
+    unit : float
+        Time, s, in which springs with memory are strained by about 1: in it the coefficients of
+        their series stay numbers. A power of 2, which costs no digit.
     """
 
     solver: str
@@ -143,6 +146,7 @@ class Plan(NamedTuple):
     plain: bool = False
     implicit: bool | None = None
     memory: bool = False
+    unit: float = 1.0
 
     def run(
         self,
@@ -214,9 +218,11 @@ class Plan(NamedTuple):
         if self.top not in _RESTING:
             start = self._start(given[0], given[1], directions)
         cache.announce(taylor.integrate_with_memory, "the solver of springs with memory")
+        unit = self.unit
+        scaled = _in_units(given, unit)
         for most in (min(FEW_EXPLICIT, self.max_steps), self.max_steps):
-            ending = taylor.integrate_with_memory(
-                given, self.margin * rtol, most, directions, start, curves, slopes, log
+            ending: Sequence[Any] = taylor.integrate_with_memory(
+                scaled, self.margin * rtol, most, directions, start, curves, slopes, log
             )
             if ending[0] not in _STIFF:
                 break
@@ -229,6 +235,11 @@ class Plan(NamedTuple):
                 raise SimulationError(message)
             if ending[0] == scenes.STEP_UNDERFLOW:  # more steps would end there too
                 break
+        log[: ending[3], 0] *= unit
+        for p, what in enumerate(directions[:, 1]):
+            of_tau = what > OWN_RELAXATION and (what - OWN_RELAXATION) % 2 == 1
+            slopes[p] /= unit if of_tau or what in (OWN_ETA, DRAG) else 1.0
+        ending = (ending[0], ending[1] * unit, *ending[2:])
         return _motion(TAYLOR, ending, curves, slopes, log)
 
     def _fastest(self, given: scenes.SceneTuple) -> tuple[float, str]:
@@ -373,6 +384,17 @@ class Plan(NamedTuple):
         return bool(vibrates > MOST_VIBRATION or relaxes > MOST_RELAXATION)
 
 
+def _in_units(given: scenes.SceneTuple, unit: float) -> scenes.SceneTuple:
+    """Count the times of a scene in a unit, s."""
+    rows, heights, ends, mass, drag, top, values, speed, t = given
+    rows = rows.copy()
+    rows[:, kernels.ETA] /= unit
+    rows[:, kernels.N_COLUMNS + 1 :: 2] /= unit
+    return (
+        rows, heights, ends, mass / unit**2, drag / unit, top, values, speed * unit, t / unit,
+    )  # fmt: skip
+
+
 def _motion(
     method: str, ending: Sequence[Any], curves: Array, slopes: Array, log: Array, lost: float = 0.0
 ) -> Motion:
@@ -495,4 +517,18 @@ def plan(
         max_explicit=min(most, explicit),
         plain=speed > 0.0 and len(ends) == 1 and not damped and chain.site_damping == 0.0,
         memory=memory,
+        unit=_unit(chain, drive, time) if memory else 1.0,
     )
+
+
+def _unit(chain: Chain, drive: Drive, time: Array) -> float:
+    """Find the unit of time of a `Plan`, s."""
+    least, softest = min(chain.heights), min(spring.k0 for spring in chain.springs)
+    if isinstance(drive, Impact):
+        rate = drive.velocity / least
+    else:
+        values = (
+            drive.stress / softest if isinstance(drive, StressDrive) else drive.displacement / least
+        )
+        rate = float(np.abs(np.diff(values) / np.diff(time)).max(initial=0.0))
+    return 2.0 ** -round(math.log2(rate)) if 1e-100 < rate < 1e100 else 1.0

@@ -202,6 +202,19 @@ def begin(row: Row, state: Array) -> None:
 
 
 @inner
+def begin_above(row: Row, state: Array, least: float) -> None:
+    """Set the state of a spring that never bore anything, and snaps nothing below a strain."""
+    begin(row, state)
+    plus = _along_law(row, state, least, row[LOG_PLUS], row[SPREAD_PLUS])
+    minus = _along_law(row, state, least, row[LOG_MINUS], row[SPREAD_MINUS])
+    if state[FIRST] < least:
+        state[FIRST], state[SIGMA_FIRST] = least, plus
+    if state[LAST] < least:
+        state[LAST], state[SIGMA_LAST] = least, min(plus, minus)
+    _enter(row, state, A)
+
+
+@inner
 def _hysteretic_below(row: Row) -> bool:
     """Whether snap-back lies below snap-through under the stress at which both meet, or above."""
     return row[SPREAD_MINUS] >= row[SPREAD_PLUS]

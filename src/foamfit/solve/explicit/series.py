@@ -393,8 +393,7 @@ def _group_term(
 ) -> float:
     """Order n of the common stress of a group whose elongation u and its rate are known."""
     if i1 - i0 == 1:
-        if n > 0:
-            eps[i0, n] = u_n * (1.0 / law[i0, HEIGHT])  # the quotient waits for nothing
+        eps[i0, n] = u_n * (1.0 / law[i0, HEIGHT])  # the quotient waits for nothing
         sig[i0, n] = _stress_term(law, i0, eps, sig, n, memory)
         if law[i0, DASHPOT] == 0.0:
             return sig[i0, n]
@@ -630,17 +629,31 @@ def settle_together(
         stress = push[0] + push[1] * span if stressed else value_at(s[GROUP, g], order, span)
         for i in range(i0, i1):
             s[TILT, i, 0] = eps[i, 0]
-        found, before, more = False, math.inf, 0.0
-        for _ in range(20):
+        found, before, more, low, high = False, math.inf, 0.0, -math.inf, math.inf
+        for trial in range(120):
             total, size, compliance = _share_under(law, i0, i1, eps, softs, stress, memory)
+            if stressed:
+                found = True
+                break
             miss = abs(total - rest)
-            more = 0.0 if stressed else (rest - total) / compliance
+            more = (rest - total) / compliance
             found = miss <= 4e-16 * (size + abs(rest)) or abs(more) <= 4e-15 * abs(stress)
             found = found or 0.5 * before <= miss <= 1e-14 * size  # no better than rounding allows
-            if found or not math.isfinite(total + more):
+            if found:
                 break
-            before = miss
+            if total > rest:
+                high = stress
+            else:  # also where a law has ended: then nothing can be said but that this is too low
+                low = stress
+            before, more = miss, more if math.isfinite(total + more) else 0.0
             stress += more
+            if not low < stress < high or trial % 4 == 3:
+                if not math.isfinite(high - low):
+                    step = max(abs(more), 1e-6 * abs(low if low > -math.inf else high), 1.0)
+                    step *= 2.0 ** (trial + 1)
+                    stress = low + step if low > -math.inf else high - step
+                else:
+                    stress = 0.5 * (low + high)
         for i in range(i0, i1):
             if not (found and math.isfinite(total)):
                 eps[i, 0] = s[TILT, i, 0]
