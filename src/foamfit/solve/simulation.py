@@ -314,9 +314,8 @@ def simulate(
         miss = _difference(scene.values, motion.displacement[-1])
         if not miss <= max(rtol, ROUNDING):
             raise SimulationError(
-                f"the elongations of the springs miss the prescribed displacement by {miss:.1g} of "
-                f"its range, more than rtol = {rtol:g}: a strain or a step lies beyond what numbers "
-                "can tell; give more samples where the motion is fast"
+                f"the springs' elongations miss the prescribed displacement by {miss:.1g} of its "
+                f"range, more than rtol = {rtol:g}: ask for a larger rtol, or give more samples"
             )
     return Response(
         time=scene.time,

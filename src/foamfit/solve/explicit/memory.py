@@ -85,7 +85,7 @@ MARGIN = 1e-13
 # A spring that turns within so small a part of a step turns at its start.
 NOW = 1e-8
 # Strain below which no micro-spring counts: the stress, whose logarithm is followed, is 0 at 0.
-LEAST_STRAIN = 1e-13
+LEAST_STRAIN = 1e-14
 # Beyond the normal score FAR, P is 0 or 1 to rounding; it is from somewhere beyond NEAR on where
 # what it adds to a strain is below the share NEGLIGIBLE (a tenth of it: P is about exp(-u²/2)/10)
 # of the truncation. Within, the score u may change in a step by so much over u as its series have
