@@ -18,7 +18,7 @@ from foamfit.solve.implicit import steps, vibration
 from foamfit.springs import equilibrium, kernels
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.springs.law import BISTABLE, LINEAR, MICROSCALE
-from foamfit.springs.parameters import DRAG, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
+from foamfit.springs.parameters import OWN_ETA, OWN_HEIGHT
 from foamfit.springs.sensitivities import equilibrium_tangents
 from foamfit.springs.spring import as_samples
 
@@ -218,11 +218,9 @@ class Plan(NamedTuple):
         if self.top not in _RESTING:
             start = self._start(given[0], given[1], directions)
         cache.announce(taylor.integrate_with_memory, "the solver of springs with memory")
-        unit = self.unit
-        scaled = _in_units(given, unit)
         for most in (min(FEW_EXPLICIT, self.max_steps), self.max_steps):
             ending: Sequence[Any] = taylor.integrate_with_memory(
-                scaled, self.margin * rtol, most, directions, start, curves, slopes, log
+                given, self.unit, self.margin * rtol, most, directions, start, curves, slopes, log
             )
             if ending[0] not in _STIFF:
                 break
@@ -235,11 +233,6 @@ class Plan(NamedTuple):
                 raise SimulationError(message)
             if ending[0] == scenes.STEP_UNDERFLOW:  # more steps would end there too
                 break
-        log[: ending[3], 0] *= unit
-        for p, what in enumerate(directions[:, 1]):
-            of_tau = what > OWN_RELAXATION and (what - OWN_RELAXATION) % 2 == 1
-            slopes[p] /= unit if of_tau or what in (OWN_ETA, DRAG) else 1.0
-        ending = (ending[0], ending[1] * unit, *ending[2:])
         return _motion(TAYLOR, ending, curves, slopes, log)
 
     def _fastest(self, given: scenes.SceneTuple) -> tuple[float, str]:
@@ -382,17 +375,6 @@ class Plan(NamedTuple):
             return self.implicit
         vibrates, relaxes = vibration.fastest_rates(given)
         return bool(vibrates > MOST_VIBRATION or relaxes > MOST_RELAXATION)
-
-
-def _in_units(given: scenes.SceneTuple, unit: float) -> scenes.SceneTuple:
-    """Count the times of a scene in a unit, s."""
-    rows, heights, ends, mass, drag, top, values, speed, t = given
-    rows = rows.copy()
-    rows[:, kernels.ETA] /= unit
-    rows[:, kernels.N_COLUMNS + 1 :: 2] /= unit
-    return (
-        rows, heights, ends, mass / unit**2, drag / unit, top, values, speed * unit, t / unit,
-    )  # fmt: skip
 
 
 def _motion(

@@ -205,6 +205,8 @@ def begin(row: Row, state: Array) -> None:
 def begin_above(row: Row, state: Array, least: float) -> None:
     """Set the state of a spring that never bore anything, and snaps nothing below a strain."""
     begin(row, state)
+    if min(state[FIRST], state[LAST]) >= least:
+        return
     plus = _along_law(row, state, least, row[LOG_PLUS], row[SPREAD_PLUS])
     minus = _along_law(row, state, least, row[LOG_MINUS], row[SPREAD_MINUS])
     if state[FIRST] < least:

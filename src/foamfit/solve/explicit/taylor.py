@@ -50,10 +50,9 @@ from foamfit.solve.explicit.series import (
     expand_remembered,
     is_bare,
     make_series,
+    settle,
     settle_together,
     share_a_stress,
-    slope_now,
-    springs_of,
 )
 from foamfit.solve.explicit.tangents import (
     expand_tangents,
@@ -86,6 +85,7 @@ from foamfit.springs.kernels import (
     ETA,
     HELD,
     KIND,
+    N_COLUMNS,
     A,
     Array,
     Branches,
@@ -100,6 +100,7 @@ from foamfit.springs.kernels import (
     piece,
 )
 from foamfit.springs.law import MICROSCALE
+from foamfit.springs.parameters import DRAG, OWN_ETA, OWN_RELAXATION
 
 # Strains closer than this to the end of a branch are at it.
 CLOSE = 1e-13
@@ -256,38 +257,6 @@ def _enough(
 
 
 # ---------------------------------------------------------------- the state between steps
-
-
-@inner
-def settle(links: Links, s: Array, memory: Memory | None) -> None:
-    """Share the elongation of each group anew, so that nothing piles up.
-
-    What is missed, the springs without dashpot take by their compliances; a flat branch takes all,
-    and where every spring has a dashpot they share as these would.
-    """
-    law = links.law
-    for g in range(links.ends.size):
-        i0, i1 = springs_of(links.ends, g)
-        if i1 - i0 == 1 or (g == links.ends.size - 1 and links.top == STRESS):
-            continue
-        weight, flow, flat = 0.0, 0.0, -1
-        miss = s[W, g, 0] - (s[W, g - 1, 0] if g > 0 else 0.0)
-        for i in range(i0, i1):
-            miss -= law[i, HEIGHT] * s[EPS, i, 0]
-            slope = slope_now(law, i, s[EPS, i, 0], memory)
-            if law[i, DASHPOT] > 0.0:
-                flow += law[i, HEIGHT] / law[i, DASHPOT]
-            elif slope > 0.0:
-                weight += law[i, HEIGHT] / slope
-            elif flat < 0:
-                flat = i
-        for i in range(i0, i1):
-            if flat >= 0:
-                s[EPS, i, 0] += miss / law[i, HEIGHT] if i == flat else 0.0
-            elif weight > 0.0 and law[i, DASHPOT] == 0.0:
-                s[EPS, i, 0] += miss / weight / slope_now(law, i, s[EPS, i, 0], memory)
-            elif weight == 0.0:
-                s[EPS, i, 0] += miss / flow / law[i, DASHPOT]
 
 
 @inner
@@ -560,10 +529,10 @@ def _integrated(
         w_scale, total = _reached(links, s, w_scale)
         if not math.isfinite(total):
             return NOT_FINITE, since + now, step, switches
-        if shared:
-            settle(links, s, memory)
-            if memory is not None:
-                settle_together(links, s, order, span, push, memory)
+        if shared and memory is None:
+            settle(links, s)
+        elif shared:
+            settle_together(links, s, order, span, push, memory)
         if spring >= 0:
             switches = switch(
                 rows, branches, law, s, d, directions, order, span, since + now, spring, side, log,
@@ -622,6 +591,7 @@ def integrate(
 @compiled
 def integrate_with_memory(
     given: SceneTuple,
+    unit: float,
     tol: float,
     max_steps: int,
     directions: Branches,
@@ -630,7 +600,29 @@ def integrate_with_memory(
     slopes: Array,
     log: Array,
 ) -> tuple[int, float, int, int]:
-    """Integrate a chain in which springs relax or are microscale, as `integrate` does others."""
+    """Integrate a chain in which springs relax or are microscale, as `integrate` does others.
+
+    Times are counted in a `unit`, s.
+    """
+    rows, heights, ends, mass, drag, top, values, speed, t = given
     order = order_for(max(tol, LEAST_TRUNCATION), MOST_ORDERS)
-    memory = make_memory(given[0], order, directions)
-    return _integrated(given, tol, max_steps, directions, start, curves, slopes, log, memory)
+    rows, terms = rows.copy(), rows[:, N_COLUMNS:].shape[1]
+    for i in range(heights.size):
+        rows[i, ETA] /= unit
+        for k in range(1, terms, 2):
+            rows[i, N_COLUMNS + k] /= unit
+    scene = (
+        rows, heights, ends, mass / unit**2, drag / unit, top, values, speed * unit, t / unit,
+    )  # fmt: skip
+    memory = make_memory(rows, order, directions)
+    outcome, end, steps, switches = _integrated(
+        scene, tol, max_steps, directions, start, curves, slopes, log, memory
+    )
+    for j in range(min(switches, log.shape[0])):
+        log[j, 0] *= unit
+    for p in range(directions.shape[0]):
+        what = directions[p, 1]
+        of_tau = what > OWN_RELAXATION and (what - OWN_RELAXATION) % 2 == 1
+        if of_tau or what in (OWN_ETA, DRAG):
+            slopes[p] /= unit
+    return outcome, end * unit, steps, switches
