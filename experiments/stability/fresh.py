@@ -53,7 +53,6 @@ HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
 
 import independent_memory  # noqa: E402
-import roots  # noqa: E402
 from energy import rebound_of  # noqa: E402
 from independent import LOOSE, Truth, follow, judge, over_range  # noqa: E402
 from scenes import Point, designed, scene_of  # noqa: E402
@@ -468,13 +467,14 @@ def known_motion(rng: Generator, number: int) -> Spec:
             f"s{i}_{rng.choice(MICROSCALE if 'sigma_plus' in s else ('k0', 'height'))}"
             for i, s in enumerate(springs, start=1)
         ]
-    return spec | {"stop": sum(spec["steps"]), "samples": samples}
+    return spec | {"stop": sum(spec["steps"]), "samples": samples, "judge": "roots"}
 
 
 def relaxing_motion(rng: Generator, number: int) -> Spec:
     """Let springs of `known_motion` relax, and give some of them dashpots."""
     spec = known_motion(rng, number)
-    spec.pop("sensitivities", None)
+    for key in ("sensitivities", "judge"):
+        spec.pop(key, None)
     relaxes = rng.random() < 0.7
     for i, spring in enumerate(spec["springs"]):
         if relaxes and "kc" in spring and (i == 0 or rng.random() < 0.5):
@@ -524,9 +524,11 @@ def scene_from(spec: Spec) -> Scene:
     return chain, (ff.StressDrive if drive == "stress" else ff.DisplacementDrive)(values), grid
 
 
-def follower(scene: Scene) -> Callable[[Any, Any, Array, float, int], Truth]:
+def follower(scene: Scene, spec: Spec) -> Callable[[Any, Any, Array, float, int], Truth]:
     """Choose the program that judges a scene."""
-    if roots.has_no_rates(*scene[:2]) and independent_memory.has_memory(scene[0]):
+    if spec.get("judge") == "roots":
+        import roots  # the only one that needs mpmath
+
         return roots.follow
     by = independent_memory.follow if independent_memory.has_memory(scene[0]) else follow
     if isinstance(scene[1], ff.Impact):
@@ -572,7 +574,7 @@ def slopes_of(spec: Spec, name: str, most: int) -> tuple[Array, Array, NDArray[n
                 scene = scene_from(other)
             except ValueError:  # the scene is at the end of what is admissible
                 return None
-            truth = follower(scene)(*scene, LOOSE, most)
+            truth = follower(scene, spec)(*scene, LOOSE, most)
             if truth.why:
                 return None
             sides.append(np.vstack((truth.base_stress, truth.displacement)))
@@ -638,7 +640,7 @@ def lines_of(
     spec, most = spec_of(family, number), most or MOST[family]
     scene = scene_from(spec)
     began = time.perf_counter()
-    truth = judge(*scene, most, follower(scene))
+    truth = judge(*scene, most, follower(scene, spec))
     took = time.perf_counter() - began
     known: dict[str, Any] = {}
     lines = [
@@ -773,7 +775,7 @@ def show(name: str, rtol: float) -> None:
     spec = spec_of(family, int(number))
     scene = scene_from(spec)
     print(json.dumps(spec, indent=1))
-    truth = judge(*scene, MOST[family], follower(scene))
+    truth = judge(*scene, MOST[family], follower(scene, spec))
     found = judged(spec, scene, truth, rtol, MOST[family], {})
     for key, value in found.items():
         print(f"{key:>14}  {value}")

@@ -99,14 +99,6 @@ def _spring(spring: Any) -> _Linear:
     return _Bistable(spring) if hasattr(spring, "kc") else _Linear(spring)
 
 
-def has_no_rates(chain: Any, drive: Any) -> bool:
-    """Whether the judge knows such a scene."""
-    still = all(s.eta == 0.0 and all(g == 0.0 for g, _ in s.relaxation) for s in chain.springs)
-    closed = not any(getattr(s, "unilateral", False) for s in chain.springs)
-    inner = hasattr(drive, "displacement") and not any(chain.masses[:-1])
-    return still and closed and bool(inner)
-
-
 def _root(springs: list[_Linear], heights: list[Any], top: Any, s: Any) -> Any:
     """Stress at which the elongations add up: Illinois steps inside a bracket, from the last one.
 

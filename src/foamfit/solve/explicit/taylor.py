@@ -529,10 +529,11 @@ def _integrated(
         w_scale, total = _reached(links, s, w_scale)
         if not math.isfinite(total):
             return NOT_FINITE, since + now, step, switches
-        if shared and memory is None:
-            settle(links, s)
-        elif shared:
-            settle_together(links, s, order, span, push, memory)
+        if shared:  # where there is no memory, what asks for it is not compiled
+            if memory is None:
+                settle(links, s)
+            else:
+                settle_together(links, s, order, span, push, memory)
         if spring >= 0:
             switches = switch(
                 rows, branches, law, s, d, directions, order, span, since + now, spring, side, log,
