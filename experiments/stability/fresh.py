@@ -1,6 +1,6 @@
 """Fresh scenes, each answered by the solver and by a judge that shares nothing with it.
 
-Nine families, drawn at random from a seed (every scene is synthetic):
+Eleven families, drawn at random from a seed (every scene is synthetic):
 
 - study: the ranges of scenes.py, another seed;
 - base: impacts on a chain whose base spring has a dashpot, with a mass above it; windows from 1e-7
@@ -11,9 +11,12 @@ Nine families, drawn at random from a seed (every scene is synthetic):
 - microscale: one to three microscale springs, in all three drives, with spreads from 1e-3 to 2;
 - relaxation: one to three bistable springs with one to three relaxation terms each;
 - microscale+relaxation: both;
-- mixed: two to five springs of all kinds, with and without relaxation, dashpots and masses.
+- mixed: two to five springs of all kinds, with and without relaxation, dashpots and masses;
+- motion: two to four springs under a known motion, at least one of them microscale, with spreads
+  from 1e-6 to 5, times from anywhere and steps that differ up to 1e8-fold, by root finding;
+- motion+relaxation: the same with relaxation and dashpots, by brute force.
 
-A tenth of the last four ask for derivatives.
+A tenth of those with memory ask for derivatives.
 
 One command runs them and writes a line per scene and rtol; another shows one scene:
 
@@ -64,7 +67,8 @@ SEED = 2027
 RTOLS = (1e-4, 1e-6, 1e-8)
 MOST = {"study": 4_000_000, "base": 10_000_000, "gap": 4_000_000, "turns": 4_000_000,
         "long": 20_000_000, "microscale": 4_000_000, "relaxation": 4_000_000,
-        "microscale+relaxation": 4_000_000, "mixed": 4_000_000}  # fmt: skip
+        "microscale+relaxation": 4_000_000, "mixed": 4_000_000, "motion": 0,
+        "motion+relaxation": 4_000_000}  # fmt: skip
 BAD, POOR = 3.0, 1.0  # error over rtol
 SLOPE_BAR = 1e-3  # error of a derivative over its range, at an rtol of up to 1e-5
 
@@ -428,9 +432,62 @@ def mixed(rng: Generator, number: int) -> Spec:
     return remembering(rng, number, springs, relaxing)
 
 
+def known_motion(rng: Generator, number: int) -> Spec:
+    """Springs in series, some alike, under a motion whose samples lie anywhere in time.
+
+    A third starts at 0, a third at another time, and a third at 1.7e9 s with least steps of 1 µs.
+    """
+    k0, count = log(rng, 1e5, 3e7), int(rng.integers(2, 5))
+    springs = []
+    for i in range(count):
+        stiff, kind = k0 * log(rng, 0.5, 2.0), rng.random()
+        if i == 0 or kind < 0.5:
+            springs.append(microscale(rng, stiff))
+            for spread in ("spread_plus", "spread_minus"):
+                springs[-1][spread] = log(rng, 1e-6, 5.0)
+        elif kind < 0.75:
+            springs.append(bistable(rng, stiff))
+        else:
+            springs.append(linear(rng, stiff, unilateral=False))
+    if rng.random() < 0.15:
+        springs[-1] = dict(springs[0])
+    spec = chain_of(rng, springs, log(rng, 3e-4, 2e-2), [0.0] * count)
+    most = sum(h * room(s) for s, h in zip(springs, spec["heights"], strict=True))
+    samples = int(rng.choice([11, 31, 61]))
+    ratio = 10.0 ** float(rng.choice([0.0, 2.0, 5.0, 8.0]))
+    steps = ratio ** rng.random(samples - 1)
+    at, levels = path(rng, rng.uniform(0.1, 0.75), int(rng.integers(1, 8)))
+    floor = -math.inf if rng.random() < 0.3 else 0.0
+    spec["displacement"] = [at, [most * max(level, floor) for level in levels]]
+    spec["origin"] = (0.0, -log(rng, 1.0, 1e4), 1.7e9)[number % 3]
+    least = 1e-6 if number % 3 == 2 else log(rng, 1e-7, 1e-2)
+    spec["steps"] = [float(step) for step in steps * least / steps.min()]
+    if number % 10 == 0:
+        spec["sensitivities"] = [
+            f"s{i}_{rng.choice(MICROSCALE if 'sigma_plus' in s else ('k0', 'height'))}"
+            for i, s in enumerate(springs, start=1)
+        ]
+    return spec | {"stop": sum(spec["steps"]), "samples": samples, "judge": "roots"}
+
+
+def relaxing_motion(rng: Generator, number: int) -> Spec:
+    """Let springs of `known_motion` relax, and give some of them dashpots."""
+    spec = known_motion(rng, number)
+    for key in ("sensitivities", "judge"):
+        spec.pop(key, None)
+    relaxes = rng.random() < 0.7
+    for i, spring in enumerate(spec["springs"]):
+        if relaxes and "kc" in spring and (i == 0 or rng.random() < 0.5):
+            spring["relaxation"] = [[log(rng, 1e-3, 5.0), spec["stop"] * log(rng, 1e-3, 1e3)]]
+        if not relaxes or rng.random() < 0.2:
+            spring["eta"] = spring["k0"] * spec["stop"] * log(rng, 1e-3, 10.0)
+    return spec
+
+
 DRAWN: dict[str, Callable[[Generator, int], Spec]] = {
     "base": base, "gap": gap, "turns": turns, "long": long, "microscale": only_microscale,
     "relaxation": only_relaxation, "microscale+relaxation": relaxing_microscale, "mixed": mixed,
+    "motion": known_motion, "motion+relaxation": relaxing_motion,
 }  # fmt: skip
 FAMILIES = ("study", *DRAWN)
 MEMORY = FAMILIES[5:]
@@ -459,13 +516,24 @@ def scene_from(spec: Spec) -> Scene:
         return chain, ff.Impact(*spec["impact"]), grid
     drive = "stress" if "stress" in spec else "displacement"
     at, levels = np.array(spec[drive][0]), np.array(spec[drive][1])
+    if "steps" in spec:
+        grid = spec["origin"] + np.append(0.0, np.cumsum(spec["steps"]))
+        way = np.linspace(at[0], at[-1], grid.size)
+        return chain, ff.DisplacementDrive(np.interp(way, at, levels)), grid
     values = np.interp(grid, spec["stop"] * (at - at[0]) / (at[-1] - at[0]), levels)
     return chain, (ff.StressDrive if drive == "stress" else ff.DisplacementDrive)(values), grid
 
 
-def follower(scene: Scene) -> Callable[[Any, Any, Array, float, int], Truth]:
+def follower(scene: Scene, spec: Spec) -> Callable[[Any, Any, Array, float, int], Truth]:
     """Choose the program that judges a scene."""
-    return independent_memory.follow if independent_memory.has_memory(scene[0]) else follow
+    if spec.get("judge") == "roots":
+        import roots  # the only one that needs mpmath
+
+        return roots.follow
+    by = independent_memory.follow if independent_memory.has_memory(scene[0]) else follow
+    if isinstance(scene[1], ff.Impact):
+        return by
+    return lambda chain, drive, time, *bounds: by(chain, drive, time - time[0], *bounds)
 
 
 # ------------------------------------------------------------------------------- the derivatives
@@ -506,7 +574,7 @@ def slopes_of(spec: Spec, name: str, most: int) -> tuple[Array, Array, NDArray[n
                 scene = scene_from(other)
             except ValueError:  # the scene is at the end of what is admissible
                 return None
-            truth = follower(scene)(*scene, LOOSE, most)
+            truth = follower(scene, spec)(*scene, LOOSE, most)
             if truth.why:
                 return None
             sides.append(np.vstack((truth.base_stress, truth.displacement)))
@@ -572,7 +640,7 @@ def lines_of(
     spec, most = spec_of(family, number), most or MOST[family]
     scene = scene_from(spec)
     began = time.perf_counter()
-    truth = judge(*scene, most, follower(scene))
+    truth = judge(*scene, most, follower(scene, spec))
     took = time.perf_counter() - began
     known: dict[str, Any] = {}
     lines = [
@@ -707,7 +775,7 @@ def show(name: str, rtol: float) -> None:
     spec = spec_of(family, int(number))
     scene = scene_from(spec)
     print(json.dumps(spec, indent=1))
-    truth = judge(*scene, MOST[family], follower(scene))
+    truth = judge(*scene, MOST[family], follower(scene, spec))
     found = judged(spec, scene, truth, rtol, MOST[family], {})
     for key, value in found.items():
         print(f"{key:>14}  {value}")

@@ -91,6 +91,19 @@ def test_a_digitiser_makes_noise_of_its_own(step):
     assert quantum(signal("stress", 600)) == 0.0
 
 
+@pytest.mark.parametrize("samples", [121, 301, 1001])
+@pytest.mark.parametrize("digits", [4, 9])
+@pytest.mark.parametrize(
+    "turns", [(0.0, 1.0, 0.0), (0.0, 1.0, 1.0, 0.0), (0.0, 1.0, 0.2, 0.8, 0.2)]
+)
+def test_a_motion_at_one_speed_has_no_noise(samples, digits, turns):
+    """To and fro it meets the same levels again, as a digitised signal does."""
+    share = np.linspace(0.0, 1.0, samples)
+    at = np.cumsum([0.0, *np.maximum(np.abs(np.diff(turns)), 0.2)])
+    motion = np.round(10.0 * np.interp(share, at / at[-1], turns), digits)
+    assert residual_noise(motion)[0] <= 10.0 ** (1 - digits)
+
+
 def test_noise_is_taken_from_the_samples_before_contact():
     """Slow in time, so that the signal's own samples would show less of it."""
     _, test = synthetic_impact(noise=0.0, samples=601)

@@ -12,7 +12,7 @@ from foamfit.solve import many
 from foamfit.solve import plan as planned
 from foamfit.solve.plan import AGGREGATE, TAYLOR, plan
 from foamfit.solve.simulation import Response
-from foamfit.springs import kernels
+from foamfit.springs import equilibrium, kernels
 from reference import Bistable, Chain, Impact, Linear, energy_balance
 
 TIME = np.linspace(-0.05e-3, 0.9e-3, 301)
@@ -209,7 +209,7 @@ def test_springs_under_a_known_elongation_carry_one_stress(count: int, linear: b
     rows, heights = chain.arrays.rows, chain.arrays.heights
     stress, strain = np.empty(TO_AND_FRO.size), np.empty((count, TO_AND_FRO.size))
     branches = np.empty(strain.shape, np.int64)
-    kernels.equilibrium_along(rows, heights, TO_AND_FRO, stress, strain, branches)
+    equilibrium.equilibrium_along(rows, heights, TO_AND_FRO, stress, strain, branches)
     assert np.abs(heights @ strain - TO_AND_FRO).max() <= 1e-13 * HEIGHT
     for spring, own in zip(chain.springs, strain, strict=True):
         assert np.abs(spring.stress(own) - stress).max() <= 1e-11 * np.ptp(stress)

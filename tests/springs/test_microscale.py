@@ -13,6 +13,7 @@ from scipy.stats import norm, weibull_min
 import foamfit as ff
 from foamfit.springs import microscale_kernels
 from foamfit.springs.microscale import follow_fractions, follow_strain, fractions_of
+from foamfit.springs.sensitivities import equilibrium_tangents
 
 SHOE = ff.MicroscaleSpring(5.5e5, 2.5e5, 0.08, 1.3e5, 0.4, 5.5e4, 0.77)
 SPRINGS = {
@@ -164,8 +165,11 @@ def test_derivatives_along_histories(spring: ff.MicroscaleSpring) -> None:
     assert {6, 7, 8} <= set(path[2].tolist())
     by, slope = microscale_kernels.stress_tangents_along(spring.row, strain, *path)
     stress = walk((0.0, 3e5, 2e4, 1.51e5, 5.1e4, 4e5, -1e4, 2e5), 7)[1:]
-    _, ranks, branches = microscale_kernels.strain_along(spring.row, stress)
-    inverse = microscale_kernels.strain_tangents_along(spring.row, stress, ranks, branches)
+    strains, _, branches = microscale_kernels.strain_along(spring.row, stress)
+    directions = np.column_stack((np.zeros(7, int), np.arange(7)))
+    inverse = equilibrium_tangents(
+        spring.row[None], np.ones(1), stress, strains[None], branches[None], False, directions
+    )[0][:, 0]
     for own, name in enumerate(NAMES):
         check_derivative(spring, name, strain, "stress", by[own])
         check_derivative(spring, name, stress, "strain", inverse[own])

@@ -49,8 +49,13 @@ def quantum(values: Array) -> float:
     levels = np.unique(values)
     gaps = np.diff(levels)
     gaps = gaps[gaps > 1e-9 * max(float(np.ptp(values)), 1e-300)]
-    # On a grid most gaps are the same few steps.
-    return float(gaps.min()) if gaps.size and levels.size < 0.7 * values.size else 0.0
+    # On a grid most gaps are the same few steps; a motion at one speed, to and fro, has them too,
+    # but goes from sample to sample by the same step, where a digitiser changes it at every level.
+    if not gaps.size or levels.size >= 0.7 * values.size:
+        return 0.0
+    step = float(gaps.min())
+    changes = np.count_nonzero(np.abs(np.diff(np.abs(np.diff(values)))) > 0.3 * step)
+    return step if changes > levels.size / 4 else 0.0
 
 
 def residual_noise(values: Array) -> tuple[float, float]:

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import optimize
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
@@ -16,7 +15,7 @@ from foamfit.solve import cache, many, relaxation
 from foamfit.solve import scene as scenes
 from foamfit.solve.explicit import taylor
 from foamfit.solve.implicit import steps, vibration
-from foamfit.springs import kernels, microscale_kernels
+from foamfit.springs import equilibrium, kernels
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.springs.law import BISTABLE, LINEAR, MICROSCALE
 from foamfit.springs.parameters import OWN_ETA, OWN_HEIGHT
@@ -127,6 +126,9 @@ class Plan(NamedTuple):
         Whether to take implicit steps; None = where explicit ones are the wrong tool.
     memory : bool
         Whether a spring keeps more than its branch: microscale springs and relaxation.
+    unit : float
+        Time, s, in which springs with memory are strained by about 1: in it the coefficients of
+        their series stay numbers. A power of 2, which costs no digit.
     """
 
     solver: str
@@ -144,6 +146,7 @@ class Plan(NamedTuple):
     plain: bool = False
     implicit: bool | None = None
     memory: bool = False
+    unit: float = 1.0
 
     def run(
         self,
@@ -213,13 +216,11 @@ class Plan(NamedTuple):
         """Springs with memory: by explicit steps, which must follow all that is fast."""
         start = _AT_REST
         if self.top not in _RESTING:
-            start = np.zeros((1 + len(directions), len(given[1])))
-            if self.values[0] != 0.0:
-                start = self._loaded(given[0], given[1], directions)
+            start = self._start(given[0], given[1], directions)
         cache.announce(taylor.integrate_with_memory, "the solver of springs with memory")
         for most in (min(FEW_EXPLICIT, self.max_steps), self.max_steps):
-            ending = taylor.integrate_with_memory(
-                given, self.margin * rtol, most, directions, start, curves, slopes, log
+            ending: Sequence[Any] = taylor.integrate_with_memory(
+                given, self.unit, self.margin * rtol, most, directions, start, curves, slopes, log
             )
             if ending[0] not in _STIFF:
                 break
@@ -251,44 +252,6 @@ class Plan(NamedTuple):
             found.append((lasts / tau, name))
         return max(found)
 
-    def _loaded(self, rows: Array, heights: Array, directions: Directions) -> Array:
-        """Strains of springs with memory, loaded in one go, and derivatives; see `_start`."""
-        start = np.zeros((1 + len(directions), len(heights)))
-        first = self.ends[-2] if len(self.ends) > 1 else 0
-        rows, heights = rows[first:], heights[first:]
-        moved = self.top == scenes.MOTION
-
-        def strains(stress: float) -> Array:
-            at = np.array([stress])
-            strain: Array = relaxation.strains_along(rows, heights, at, NO_DIRECTIONS)[0][:, 0]
-            return strain
-
-        def missing(stress: float) -> float:
-            return max(float(heights @ strains(stress)), -1e300) - float(self.values[0])
-
-        stress = float(self.values[0])
-        if moved:
-            stress = 1e-6 * rows[0, kernels.K0] * math.copysign(1.0, stress)
-            while missing(stress) * stress < 0.0 and abs(stress) < 1e290:
-                stress *= 2.0
-            stress = optimize.brentq(missing, 0.0, stress, xtol=1e-300, rtol=1e-15)
-        strain = strains(stress)
-        rigid = np.full(len(rows), True) if moved else rows[:, kernels.ETA] == 0.0
-        if not np.isfinite(strain[rigid]).all():
-            raise SimulationError(_OUTCOMES[scenes.NOT_FINITE])
-        own = np.flatnonzero(directions[:, 0] >= first)
-        local = directions[own] - np.array([first, 0])
-        above = relaxation.strains_along(rows, heights, np.array([stress]), local)[2]
-        longer = np.diff(above[:, :, 0], axis=1, prepend=0.0)
-        if moved:
-            soft = heights / [_slope(row, eps) for row, eps in zip(rows, strain, strict=True)]
-            longer -= longer.sum(axis=1, keepdims=True) * soft / soft.sum()
-        for p, (spring, what) in enumerate(local):
-            longer[p, spring] -= strain[spring] if what == OWN_HEIGHT else 0.0
-        start[0, first:] = np.where(rigid, strain, 0.0)  # a dashpot holds its spring where it is
-        start[1 + own, first:] = np.where(rigid, longer / heights, 0.0)
-        return start
-
     def given(self, rows: Array, heights: Array, drag: float | None = None) -> scenes.SceneTuple:
         """The scene with these springs (and onsite damping) as the compiled integrators take it."""
         return (
@@ -307,7 +270,7 @@ class Plan(NamedTuple):
         """Undamped and massless: one stress in all springs; or one spring under known motion."""
         moved, wanted = self.top == scenes.MOTION, everything or len(directions) > 0
         slopes: Slopes | None = None
-        if self.memory and moved:
+        if self.memory and moved and len(heights) == 1:
             top, fine = np.array(self.values), True
             strain = (self.values / heights)[None, :]
             stress, seen, pressed = relaxation.stress_along(
@@ -316,13 +279,6 @@ class Plan(NamedTuple):
             branches = seen[None, :]
             if len(directions):
                 slopes = Slopes(np.zeros((len(directions), 1, stress.size)), pressed)
-        elif self.memory:
-            stress = np.array(self.values)
-            strain, branches, longer = relaxation.strains_along(rows, heights, stress, directions)
-            top = heights @ strain
-            fine = math.isfinite(kernels.total(top))
-            if len(directions):
-                slopes = Slopes(longer, np.zeros((len(directions), stress.size)))
         elif moved:
             top = np.array(self.values)
             stress, strain, branches = self._stretched(rows, heights)
@@ -330,10 +286,10 @@ class Plan(NamedTuple):
         else:
             stress, top = np.array(self.values), np.empty(self.time.size)
             strain, branches = _new_history(len(heights) if wanted else 0, self.time.size)
-            fine = kernels.strains_along(rows, heights, stress, top, strain, branches)
+            fine = equilibrium.strains_along(rows, heights, stress, top, strain, branches)
         if len(directions) and slopes is None:
             slopes = Slopes(
-                *equilibrium_tangents(rows, heights, strain, branches, moved, directions)
+                *equilibrium_tangents(rows, heights, stress, strain, branches, moved, directions)
             )
         eta = rows[0, kernels.ETA]
         if moved and len(heights) == 1 and stress.size > 1 and (eta > 0.0 or slopes is not None):
@@ -365,7 +321,7 @@ class Plan(NamedTuple):
             return stress, strain[None, :], history[None, :]
         stress = np.empty(n)
         strain, branches = _new_history(count, n)
-        kernels.equilibrium_along(rows, heights, self.values, stress, strain, branches)
+        equilibrium.equilibrium_along(rows, heights, self.values, stress, strain, branches)
         miss = np.abs(heights @ strain - self.values).max()
         if not miss <= 1e-9 * (self.height + np.abs(self.values).max()):
             raise SimulationError(_OUTCOMES[scenes.NOT_FINITE])
@@ -390,26 +346,23 @@ class Plan(NamedTuple):
         first = self.ends[-2] if len(self.ends) > 1 else 0
         rows, heights, moved = rows[first:], heights[first:], self.top == scenes.MOTION
         stress, (strain, branches) = self.values[:1].copy(), _new_history(len(heights), 1)
+        held = (rows[:, kernels.ETA] > 0.0) & (not moved)  # a dashpot holds its spring where it is
         if moved:
-            kernels.equilibrium_along(rows, heights, self.values[:1], stress, strain, branches)
+            equilibrium.equilibrium_along(rows, heights, self.values[:1], stress, strain, branches)
         else:
-            kernels.strains_along(rows, heights, stress, np.empty(1), strain, branches)
-            held = rows[:, kernels.ETA] > 0.0
-            strain[held] = 0.0  # a dashpot holds its spring where it is
-            if not np.isfinite(strain).all():
-                raise SimulationError(_OUTCOMES[scenes.NOT_FINITE])
-            branches[held, 0] = np.where(
-                rows[held, kernels.KIND] == BISTABLE, kernels.A, kernels.LINE
-            )
+            equilibrium.strains_along(rows, heights, stress, np.empty(1), strain, branches)
+            strain[held] = 0.0
+        if not np.isfinite(strain).all():
+            raise SimulationError(_OUTCOMES[scenes.NOT_FINITE])
         start[0, first:] = strain[:, 0]
         own = np.flatnonzero(directions[:, 0] >= first)
         if len(own):
             local = directions[own] - np.array([first, 0])
-            above, _ = equilibrium_tangents(rows, heights, strain, branches, moved, local)
+            above, _ = equilibrium_tangents(rows, heights, stress, strain, branches, moved, local)
             longer = np.diff(above[:, :, 0], axis=1, prepend=0.0)
             for p, (spring, what) in enumerate(local):
                 longer[p, spring] -= strain[spring, 0] if what == OWN_HEIGHT else 0.0
-            start[1 + own, first:] = longer / heights
+            start[1 + own, first:] = np.where(held, 0.0, longer / heights)
         return start
 
     def fastest_rates(self, rows: Array, heights: Array) -> tuple[float, float]:
@@ -422,15 +375,6 @@ class Plan(NamedTuple):
             return self.implicit
         vibrates, relaxes = vibration.fastest_rates(given)
         return bool(vibrates > MOST_VIBRATION or relaxes > MOST_RELAXATION)
-
-
-def _slope(row: Array, eps: float) -> float:
-    """Slope dσ/dε of a spring that was loaded from rest to a strain in one go."""
-    strain = np.array([eps])
-    if row[kernels.KIND] == MICROSCALE:
-        at = microscale_kernels.stress_along(row, strain)
-        return float(microscale_kernels.stress_tangents_along(row, strain, *at)[1][0])
-    return float(kernels.tangent_along(row, strain, kernels.stress_along(row, strain)[1])[0])
 
 
 def _motion(
@@ -532,7 +476,7 @@ def plan(
     damped = dashpots or chain.arrays.damped or top == scenes.VISCOUS
     if len(ends) > 1 or above > 0.0:
         solver = SECOND_ORDER
-    elif (damped or relaxing or (memory and top == scenes.MOTION)) and not alone:
+    elif (damped or relaxing) and not alone:
         solver = FIRST_ORDER
     else:
         solver = CLOSED_FORM
@@ -555,4 +499,18 @@ def plan(
         max_explicit=min(most, explicit),
         plain=speed > 0.0 and len(ends) == 1 and not damped and chain.site_damping == 0.0,
         memory=memory,
+        unit=_unit(chain, drive, time) if memory else 1.0,
     )
+
+
+def _unit(chain: Chain, drive: Drive, time: Array) -> float:
+    """Find the unit of time of a `Plan`, s."""
+    least, softest = min(chain.heights), min(spring.k0 for spring in chain.springs)
+    if isinstance(drive, Impact):
+        rate = drive.velocity / least
+    else:
+        values = (
+            drive.stress / softest if isinstance(drive, StressDrive) else drive.displacement / least
+        )
+        rate = float(np.abs(np.diff(values) / np.diff(time)).max(initial=0.0))
+    return 2.0 ** -round(math.log2(rate)) if 1e-100 < rate < 1e100 else 1.0

@@ -49,7 +49,7 @@ def _calls() -> dict[Any, tuple[Any, ...]]:
 
     from foamfit.solve import plan, polynomial, scene
     from foamfit.solve.explicit import samples, series, tangents, taylor
-    from foamfit.springs import kernels, sensitivities
+    from foamfit.springs import equilibrium, kernels, microscale_kernels, sensitivities
 
     calls: dict[Any, tuple[Any, ...]] = {}
 
@@ -63,7 +63,8 @@ def _calls() -> dict[Any, tuple[Any, ...]]:
 
     with ExitStack() as uncompiled, np.errstate(all="ignore"):
         for module in (
-            kernels, sensitivities, polynomial, scene, series, tangents, samples, taylor, plan,
+            kernels, microscale_kernels, equilibrium, sensitivities, polynomial, scene, series,
+            tangents, samples, taylor, plan,
         ):  # fmt: skip
             names = {name: loop for name, loop in vars(module).items() if hasattr(loop, "py_func")}
             called = {}
@@ -100,7 +101,7 @@ def _memory(relaxed: bool) -> None:
         relaxation.relaxed_along(row, at, np.arange(2.0), 1e-6, False)
         return
     micro.stress_tangents_along(row, at, *micro.stress_along(row, at))
-    micro.strain_tangents_along(row, at, *micro.strain_along(row, at)[1:])
+    micro.strain_along(row, at)
 
 
 def _rest() -> None:

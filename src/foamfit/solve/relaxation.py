@@ -20,7 +20,6 @@ import math
 
 import numpy as np
 
-from foamfit.springs import kernels
 from foamfit.springs import microscale_kernels as micro
 from foamfit.springs.kernels import (
     HELD,
@@ -53,7 +52,7 @@ from foamfit.springs.microscale_kernels import (
     STATE,
 )
 from foamfit.springs.parameters import OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
-from foamfit.springs.sensitivities import branch_derivative, equilibrium_tangents
+from foamfit.springs.sensitivities import branch_derivative
 
 # The nodes on [0, 1], and the coefficients of 1, r, r², r³ in the Lagrange polynomials on them.
 _NODES = (0.0, 0.5 - math.sqrt(0.05), 0.5 + math.sqrt(0.05), 1.0)
@@ -449,40 +448,3 @@ def stress_along(
             term, of_tau = divmod(what - OWN_RELAXATION, 2)
             out[p] = by_tau[term] if of_tau else by_g[term]
     return stress, branches, out
-
-
-def strains_along(
-    rows: Array, heights: Array, sigma: Array, directions: Branches
-) -> tuple[Array, Branches, Array]:
-    """Strains of springs in series, which do not relax, along a history of their stress.
-
-    Returns
-    -------
-    tuple of arrays
-        Strains, -inf where a spring cannot have its stress, and branches (springs, n); derivatives
-        of the displacements above the springs (p, springs, n), m.
-    """
-    count, n = len(rows), sigma.size
-    strain, branches = np.empty((count, n)), np.empty((count, n), np.int64)
-    longer = np.zeros((len(directions), count, n))
-    for i, row in enumerate(rows):
-        mine = np.flatnonzero(directions[:, 0] == i)
-        own, here = directions[mine, 1], slice(i, i + 1)
-        if row[KIND] == MICROSCALE:
-            strain[i], ranks, branches[i] = micro.strain_along(row, sigma)
-            if len(own):
-                by = micro.strain_tangents_along(row, sigma, ranks, branches[i])
-                for p, what in zip(mine, own, strict=True):
-                    law = heights[i] * by[what] if what < OWN_ETA else 0.0
-                    longer[p, i:] = strain[i] if what == OWN_HEIGHT else law
-            continue
-        kernels.strains_along(
-            rows[here], heights[here], sigma, np.empty(n), strain[here], branches[here]
-        )
-        if len(own):
-            local = np.column_stack([np.zeros_like(own), own])
-            by, _ = equilibrium_tangents(
-                rows[here], heights[here], strain[here], branches[here], False, local
-            )
-            longer[mine, i:] = by
-    return strain, branches, longer

@@ -42,7 +42,7 @@ class Scene(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """The curves to fill, over the samples t (n,).
+    """The curves to fill, over the samples t (n,), counted each from the one before it in a drive.
 
     curves (1 + springs or 1, n) holds the base stress, Pa, then the displacements above each spring
     or of the top alone, m; slopes (p, …) are their derivatives in p directions.

@@ -25,6 +25,7 @@ from foamfit.solve.plan import (
     Slopes,
     plan,
 )
+from foamfit.solve.scene import MOTION
 from foamfit.springs import kernels
 from foamfit.springs.chain import Chain, Drive, check_scene
 from foamfit.springs.law import BISTABLE, MICROSCALE
@@ -39,6 +40,7 @@ _UNRESOLVED = (
 # inside, or dashpots below a mass, a motion is run again to check it; so it is where a strain comes
 # so close to the end of its branch.
 FEW_STEPS, FEW_SWITCHES, CLOSE = 1000, 32, 1e-3
+ROUNDING = 1e-12  # of a sum of elongations
 LOST = 0.03  # so large a difference is not mended by still shorter steps
 
 
@@ -308,6 +310,13 @@ def simulate(
         relaxing=any(what >= OWN_RELAXATION for _, what in directions),
     )
     motion = _verified(scene, chain.arrays.rows, chain.arrays.heights, rtol, directions)
+    if scene.top == MOTION and len(chain.springs) > 1:
+        miss = _difference(scene.values, motion.displacement[-1])
+        if not miss <= max(rtol, ROUNDING):
+            raise SimulationError(
+                f"the springs' elongations miss the prescribed displacement by {miss:.1g} of its "
+                f"range, more than rtol = {rtol:g}: ask for a larger rtol, or give more samples"
+            )
     return Response(
         time=scene.time,
         displacement=motion.displacement,

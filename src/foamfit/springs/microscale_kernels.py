@@ -202,6 +202,21 @@ def begin(row: Row, state: Array) -> None:
 
 
 @inner
+def begin_above(row: Row, state: Array, least: float) -> None:
+    """Set the state of a spring that never bore anything, and snaps nothing below a strain."""
+    begin(row, state)
+    if min(state[FIRST], state[LAST]) >= least:
+        return
+    plus = _along_law(row, state, least, row[LOG_PLUS], row[SPREAD_PLUS])
+    minus = _along_law(row, state, least, row[LOG_MINUS], row[SPREAD_MINUS])
+    if state[FIRST] < least:
+        state[FIRST], state[SIGMA_FIRST] = least, plus
+    if state[LAST] < least:
+        state[LAST], state[SIGMA_LAST] = least, min(plus, minus)
+    _enter(row, state, A)
+
+
+@inner
 def _hysteretic_below(row: Row) -> bool:
     """Whether snap-back lies below snap-through under the stress at which both meet, or above."""
     return row[SPREAD_MINUS] >= row[SPREAD_PLUS]
@@ -416,6 +431,48 @@ def stress_along(row: Row, eps: Array) -> tuple[Array, Array, Branches]:
     return sigma, rank, branches
 
 
+@inner
+def rank_at(row: Row, rank: float, branch: int, sigma: float) -> tuple[float, int]:
+    """Rank and branch at a stress of a spring that was last seen at others."""
+    plus = minus = -math.inf
+    if sigma > 0.0:
+        log = math.log(sigma)
+        plus = (log - row[LOG_PLUS]) / row[SPREAD_PLUS]
+        minus = (log - row[LOG_MINUS]) / row[SPREAD_MINUS]
+    most = max(plus, minus)
+    if rank < plus:
+        rank, branch = plus, SNAP if minus > plus else BOTH
+    elif rank > most:
+        rank, branch = most, BACK if minus > plus else BOTH
+    elif plus < rank < most or branch == (BACK if rank == plus else SNAP):
+        branch = HELD  # also at an end of the held stresses that it has not passed
+    if rank < LEAST_RANK:
+        rank, branch = -math.inf, A
+    return rank, branch
+
+
+@inner
+def under_stress(
+    row: Row, branch: int, rank: float, sigma: float
+) -> tuple[float, float, float, float]:
+    """Strain at a stress, its derivatives by stress and rank, and that of the rank by the stress.
+
+    The strain is -inf where the spring cannot carry the tension.
+    """
+    if not sigma > -row[K0]:
+        return -math.inf, 0.0, 0.0, 0.0
+    one = 1.0 / (row[K0] + sigma)
+    if branch == A:
+        return sigma * one, row[K0] * one * one, 0.0, 0.0
+    two, p, rest = 1.0 / (row[KC] + sigma), share(rank), share(-rank)
+    on_a, on_c = sigma * one, row[EPS_STAR] + sigma * two
+    soft = rest * row[K0] * one * one + p * row[KC] * two * two
+    pace = 0.0
+    if branch != HELD:
+        pace = 1.0 / (row[SPREAD_MINUS if branch == BACK else SPREAD_PLUS] * sigma)
+    return rest * on_a + p * on_c, soft, density(rank) * (on_c - on_a), pace
+
+
 @compiled
 def strain_along(row: Row, sigma: Array) -> tuple[Array, Array, Branches]:
     """Strain, rank and branch of one microscale spring along a stress history, from rest.
@@ -425,20 +482,7 @@ def strain_along(row: Row, sigma: Array) -> tuple[Array, Array, Branches]:
     eps, ranks = np.empty(sigma.size), np.empty(sigma.size)
     branches, branch, rank = np.empty(sigma.size, np.int64), A, -math.inf
     for j in range(sigma.size):
-        plus = minus = -math.inf
-        if sigma[j] > 0.0:
-            log = math.log(sigma[j])
-            plus = (log - row[LOG_PLUS]) / row[SPREAD_PLUS]
-            minus = (log - row[LOG_MINUS]) / row[SPREAD_MINUS]
-        most = max(plus, minus)
-        if rank < plus:
-            rank, branch = plus, SNAP if minus > plus else BOTH
-        elif rank > most:
-            rank, branch = most, BACK if minus > plus else BOTH
-        elif plus < rank < most or branch == (BACK if rank == plus else SNAP):
-            branch = HELD  # also at an end of the held stresses that it has not passed
-        if rank < LEAST_RANK:
-            rank, branch = -math.inf, A
+        rank, branch = rank_at(row, rank, branch, sigma[j])
         eps[j] = -math.inf
         if sigma[j] > -row[K0]:
             eps[j] = strain_of(row, share(rank), share(-rank), sigma[j])
@@ -514,26 +558,19 @@ def stress_tangents_along(
     return out, slope
 
 
-@compiled
-def strain_tangents_along(row: Row, sigma: Array, ranks: Array, branches: Branches) -> Array:
-    """Derivatives of the strain (7, n) along a stress history by k0 … spread_minus."""
-    out, d_rank = np.zeros((OF_STRAIN, sigma.size)), np.zeros(4)
-    for j in range(sigma.size):
-        branch, rank, s = branches[j], ranks[j], sigma[j]
-        one, two = 1.0 / (row[K0] + s), 1.0 / (row[KC] + s)
-        p = share(rank)
-        if branch == A:
-            d_rank[:] = 0.0
-        elif branch == BACK:
-            d_rank[:2] = 0.0
-            d_rank[2] = -math.exp(-row[LOG_MINUS]) / row[SPREAD_MINUS]
-            d_rank[3] = -rank / row[SPREAD_MINUS]
-        elif branch != HELD:
-            d_rank[2:] = 0.0
-            d_rank[0] = -math.exp(-row[LOG_PLUS]) / row[SPREAD_PLUS]
-            d_rank[1] = -rank / row[SPREAD_PLUS]
-        out[0, j], out[1, j], out[2, j] = -share(-rank) * s * one * one, -p * s * two * two, p
-        weight = density(rank) * (row[EPS_STAR] + s * (two - one))
-        for c in range(4):
-            out[3 + c, j] = weight * d_rank[c]
-    return out
+@inner
+def strain_tangents(row: Row, branch: int, rank: float, sigma: float, out: Array) -> None:
+    """Fill the derivatives of the strain by k0, kc, eps_star; of the rank by sigma_plus and so on.
+
+    Those of the strain are at a fixed stress and rank, those of the rank at a fixed stress.
+    """
+    one, two, p = 1.0 / (row[K0] + sigma), 1.0 / (row[KC] + sigma), share(rank)
+    out[0], out[1], out[2] = -share(-rank) * sigma * one * one, -p * sigma * two * two, p
+    for own in range(3, OF_STRAIN):
+        out[own] = 0.0
+    if branch == BACK:
+        out[5] = -math.exp(-row[LOG_MINUS]) / row[SPREAD_MINUS]
+        out[6] = -rank / row[SPREAD_MINUS]
+    elif branch not in (A, HELD):
+        out[3] = -math.exp(-row[LOG_PLUS]) / row[SPREAD_PLUS]
+        out[4] = -rank / row[SPREAD_PLUS]

@@ -191,11 +191,11 @@ class _Law(ABC):
 
     def _strain_along(self, stress: Array) -> Array:
         """Strains of a stress history; not finite where the spring cannot have its stress."""
-        from foamfit.springs import kernels
+        from foamfit.springs import equilibrium
 
         strain, none = np.empty(stress.size), np.empty((0, stress.size))
         row = self.row[None, :]  # of height 1: its elongation is its strain
-        kernels.strains_along(row, np.ones(1), stress, strain, none, none.astype(np.int64))
+        equilibrium.strains_along(row, np.ones(1), stress, strain, none, none.astype(np.int64))
         return strain
 
     def _slope_along(self, strain: Array) -> Array:
@@ -418,11 +418,6 @@ class MicroscaleSpring(_Law):
 
         stress, _, branches = microscale_kernels.stress_along(self.row, strain)
         return stress, branches
-
-    def _strain_along(self, stress: Array) -> Array:
-        from foamfit.springs import microscale_kernels
-
-        return microscale_kernels.strain_along(self.row, stress)[0]
 
     def _slope_along(self, strain: Array) -> Array:
         from foamfit.springs import microscale_kernels

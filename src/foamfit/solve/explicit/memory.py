@@ -84,6 +84,8 @@ PER_A, PER_C, PER_S, RATE_A, RATE_C, RATE_U, GAP, N_NOW = range(10, 18)
 MARGIN = 1e-13
 # A spring that turns within so small a part of a step turns at its start.
 NOW = 1e-8
+# Strain below which no micro-spring counts: the stress, whose logarithm is followed, is 0 at 0.
+LEAST_STRAIN = 1e-14
 # Beyond the normal score FAR, P is 0 or 1 to rounding; it is from somewhere beyond NEAR on where
 # what it adds to a strain is below the share NEGLIGIBLE (a tenth of it: P is about exp(-u²/2)/10)
 # of the truncation. Within, the score u may change in a step by so much over u as its series have
@@ -137,7 +139,7 @@ def make_memory(rows: Array, order: int, directions: Branches) -> Memory:
             gain += rows[i, N_COLUMNS + 2 * k]
         memory.now[i, GAIN], memory.now[i, PER_GAIN] = gain, 1.0 / gain
         if rows[i, KIND] == MICROSCALE:
-            micro.begin(rows[i], memory.state[i])
+            micro.begin_above(rows[i], memory.state[i], LEAST_STRAIN)
     return memory
 
 

@@ -89,7 +89,7 @@ def sample_tangents(
 @inner
 def mend_kink(out: Samples, s: Array, d: SeriesTangents, knot: int) -> None:
     """A dashpot feels the mean rate where the prescribed motion has a kink."""
-    before, after = out.t[knot] - out.t[knot - 1], out.t[knot + 1] - out.t[knot]
+    before, after = out.t[knot], out.t[knot + 1]  # each counted from the sample before it
     share = before / (before + after)
     out.curves[0, knot] += share * (s[GROUP, 0, 0] - out.curves[0, knot])
     for p in range(d.drag.size):

@@ -393,8 +393,7 @@ def _group_term(
 ) -> float:
     """Order n of the common stress of a group whose elongation u and its rate are known."""
     if i1 - i0 == 1:
-        if n > 0:
-            eps[i0, n] = u_n * (1.0 / law[i0, HEIGHT])  # the quotient waits for nothing
+        eps[i0, n] = u_n * (1.0 / law[i0, HEIGHT])  # the quotient waits for nothing
         sig[i0, n] = _stress_term(law, i0, eps, sig, n, memory)
         if law[i0, DASHPOT] == 0.0:
             return sig[i0, n]
@@ -556,6 +555,43 @@ def expand(
 # ---------------------------------------------------------------- the end of a step
 
 
+@inlined
+def _settle_group(links: Links, s: Array, g: int, memory: Memory | None) -> None:
+    """Share the elongation of a group anew, so that nothing piles up.
+
+    What is missed, the springs without dashpot take by their compliances; a flat branch takes all,
+    and where every spring has a dashpot they share as these would.
+    """
+    law, (i0, i1) = links.law, springs_of(links.ends, g)
+    if i1 - i0 == 1 or (g == links.ends.size - 1 and links.top == STRESS):
+        return
+    weight, flow, flat = 0.0, 0.0, -1
+    miss = s[W, g, 0] - (s[W, g - 1, 0] if g > 0 else 0.0)
+    for i in range(i0, i1):
+        miss -= law[i, HEIGHT] * s[EPS, i, 0]
+        slope = slope_now(law, i, s[EPS, i, 0], memory)
+        if law[i, DASHPOT] > 0.0:
+            flow += law[i, HEIGHT] / law[i, DASHPOT]
+        elif slope > 0.0:
+            weight += law[i, HEIGHT] / slope
+        elif flat < 0:
+            flat = i
+    for i in range(i0, i1):
+        if flat >= 0:
+            s[EPS, i, 0] += miss / law[i, HEIGHT] if i == flat else 0.0
+        elif weight > 0.0 and law[i, DASHPOT] == 0.0:
+            s[EPS, i, 0] += miss / weight / slope_now(law, i, s[EPS, i, 0], memory)
+        elif weight == 0.0:
+            s[EPS, i, 0] += miss / flow / law[i, DASHPOT]
+
+
+@inner
+def settle(links: Links, s: Array) -> None:
+    """Share the elongation of every group of a chain without memory anew."""
+    for g in range(links.ends.size):
+        _settle_group(links, s, g, None)
+
+
 @inner
 def share_a_stress(law: Array, ends: Branches, i: int, j: int, memory: Memory) -> bool:
     """Whether two springs bear one stress, without dashpot or relaxation."""
@@ -626,26 +662,44 @@ def settle_together(
             else:
                 free += 1
         if free <= 0:
+            _settle_group(links, s, g, memory)
             continue
         stress = push[0] + push[1] * span if stressed else value_at(s[GROUP, g], order, span)
         for i in range(i0, i1):
             s[TILT, i, 0] = eps[i, 0]
-        found, before, more = False, math.inf, 0.0
-        for _ in range(20):
+        found, before, more, low, high = False, math.inf, 0.0, -math.inf, math.inf
+        for trial in range(120):
             total, size, compliance = _share_under(law, i0, i1, eps, softs, stress, memory)
+            if stressed:
+                found = True
+                break
             miss = abs(total - rest)
-            more = 0.0 if stressed else (rest - total) / compliance
+            more = (rest - total) / compliance
             found = miss <= 4e-16 * (size + abs(rest)) or abs(more) <= 4e-15 * abs(stress)
             found = found or 0.5 * before <= miss <= 1e-14 * size  # no better than rounding allows
-            if found or not math.isfinite(total + more):
+            if found:
                 break
-            before = miss
+            if total > rest:
+                high = stress
+            else:  # also where a law has ended: then nothing can be said but that this is too low
+                low = stress
+            before, more = miss, more if math.isfinite(total + more) else 0.0
             stress += more
+            if not low < stress < high or trial % 8 == 7:
+                if not math.isfinite(high - low):
+                    step = max(abs(more), 1e-6 * abs(low if low > -math.inf else high), 1.0)
+                    step *= 2.0 ** (trial + 1)
+                    stress = low + step if low > -math.inf else high - step
+                else:
+                    stress = 0.5 * (low + high)
+        lost = not (found and math.isfinite(total))
         for i in range(i0, i1):
-            if not (found and math.isfinite(total)):
+            if lost:
                 eps[i, 0] = s[TILT, i, 0]
             elif law[i, DASHPOT] == 0.0:
                 eps[i, 0] += softs[i, 0] * more  # what no number for the stress is fine enough for
+        if lost:
+            _settle_group(links, s, g, memory)
 
 
 @inner

@@ -50,10 +50,9 @@ from foamfit.solve.explicit.series import (
     expand_remembered,
     is_bare,
     make_series,
+    settle,
     settle_together,
     share_a_stress,
-    slope_now,
-    springs_of,
 )
 from foamfit.solve.explicit.tangents import (
     expand_tangents,
@@ -86,6 +85,7 @@ from foamfit.springs.kernels import (
     ETA,
     HELD,
     KIND,
+    N_COLUMNS,
     A,
     Array,
     Branches,
@@ -100,6 +100,7 @@ from foamfit.springs.kernels import (
     piece,
 )
 from foamfit.springs.law import MICROSCALE
+from foamfit.springs.parameters import DRAG, OWN_ETA, OWN_RELAXATION
 
 # Strains closer than this to the end of a branch are at it.
 CLOSE = 1e-13
@@ -259,27 +260,6 @@ def _enough(
 
 
 @inner
-def settle(links: Links, s: Array, memory: Memory | None) -> None:
-    """Share the elongation of undamped groups anew, so that rounding does not pile up."""
-    law = links.law
-    for g in range(links.ends.size):
-        i0, i1 = springs_of(links.ends, g)
-        plain = not (g == links.ends.size - 1 and links.top == STRESS)
-        if i1 - i0 == 1:
-            continue
-        compliance = 0.0
-        miss = s[W, g, 0] - (s[W, g - 1, 0] if g > 0 else 0.0)
-        for i in range(i0, i1):
-            slope = slope_now(law, i, s[EPS, i, 0], memory)
-            plain = plain and law[i, DASHPOT] == 0.0 and slope > 0.0
-            compliance += law[i, HEIGHT] / slope
-            miss -= law[i, HEIGHT] * s[EPS, i, 0]
-        if plain:
-            for i in range(i0, i1):
-                s[EPS, i, 0] += miss / compliance / slope_now(law, i, s[EPS, i, 0], memory)
-
-
-@inner
 def switch(
     rows: Array,
     branches: Branches,
@@ -301,7 +281,9 @@ def switch(
     turned = branches[spring]
     for i in range(branches.size):
         low, high, eps = law[i, LOW], law[i, HIGH], s[EPS, i, 0]
-        out = 0
+        out, near = 0, 1.0
+        if rows[i, KIND] == MICROSCALE:  # its first micro-spring may snap at any strain above 0
+            near = min(abs(eps), 1.0)
         if i == spring:
             out = side
         elif (
@@ -311,9 +293,9 @@ def switch(
             and share_a_stress(law, ends, i, spring, memory)
         ):
             out = TURN  # the stress turns for both
-        elif eps >= high - CLOSE and slope_at(s[EPS, i], order, span) > 0.0:
+        elif eps >= high - CLOSE * near and slope_at(s[EPS, i], order, span) > 0.0:
             out = 1
-        elif eps <= low + CLOSE and slope_at(s[EPS, i], order, span) < 0.0:
+        elif eps <= low + CLOSE * near and slope_at(s[EPS, i], order, span) < 0.0:
             out = -1
         if out == 0:
             continue
@@ -336,16 +318,27 @@ def switch(
 
 @inner
 def _prescribe(
-    top: int, values: Array, t: Array, knot: int, now: float, push: Array, motion: Array
+    top: int, values: Array, clock: Array, knot: int, now: float, push: Array, motion: Array
 ) -> float:
-    """Write what the top is given between samples knot and knot + 1; returns when that ends."""
-    horizon, rate = t[t.size - 1], 0.0
-    if t.size > 1:
-        horizon = t[knot + 1]
-        rate = (values[knot + 1] - values[knot]) / (t[knot + 1] - t[knot])
+    """Write what the top is given between samples knot and knot + 1; returns when that ends.
+
+    Times are counted from sample knot.
+    """
+    horizon = rate = 0.0
+    if values.size > 1:
+        horizon = clock[knot + 1]
+        rate = (values[knot + 1] - values[knot]) / horizon
     driven = motion if top == MOTION else push
-    driven[0], driven[1] = values[knot] + rate * (now - t[knot]), rate
+    driven[0], driven[1] = values[knot] + rate * now, rate
     return horizon
+
+
+@inner
+def _clock(t: Array, clock: Array) -> None:
+    """Count the time of each sample from the one before it: no origin then takes its digits."""
+    clock[0] = 0.0
+    for j in range(1, t.size):
+        clock[j] = t[j] - t[j - 1]
 
 
 @piece
@@ -434,7 +427,10 @@ def _integrated(
     count, groups, size = heights.size, ends.size, directions.shape[0]
     struck, tangent, order = speed > 0.0, size > 0, order_for(tol, MOST_ORDERS)
     links = Links(np.empty((count, N_LAW)), ends, mass, drag, top)
-    law, out = links.law, Samples(t, curves, slopes)
+    clock = t if struck else np.empty(t.size)
+    if not struck:
+        _clock(t, clock)
+    law, out = links.law, Samples(clock, curves, slopes)
     s, d = make_series(count, order, directions)
     branches = np.empty(count, np.int64)
     scratch = np.empty((6, max(order + 1, max(size, curves.shape[0]))))
@@ -449,7 +445,7 @@ def _integrated(
     fine = 0.0 if tangent else tol  # a derivative may be of what is negligible
     w_scale, s_scale, b_scale, pressed, knot, stalled, done = 0.0, 0.0, math.inf, False, 0, 0, 0
     switches = count - count  # a whole number, and no constant: one type to compile for
-    now = 0.0 if struck else t[0]
+    now = since = 0.0  # of a drive, since the sample where it last had a kink
     if struck:
         s[V, groups - 1, 0] = speed
         done = before_contact(curves, t, speed)
@@ -460,24 +456,23 @@ def _integrated(
             return DONE, math.nan, step, switches
         fresh, horizon = False, t[t.size - 1]
         if not struck:
-            while knot < t.size - 2 and now >= t[knot + 1]:
-                knot += 1
-                fresh = True
-            horizon = _prescribe(top, values, t, knot, now, push, motion)
+            if done == knot + 2:
+                knot, now, fresh = knot + 1, 0.0, True
+            since, horizon = t[knot], _prescribe(top, values, clock, knot, now, push, motion)
         if bare:
             if memory is None:
                 expand_bare(links, s, push, order)
             else:
                 expand_remembered(links, s, push, order, memory)
         elif not expand(links, s, push, motion, order, memory):
-            return FLAT_UNDER_STRESS, now, step, switches
+            return FLAT_UNDER_STRESS, since + now, step, switches
         if step > 0:
             s_scale = _loaded(s, s_scale)
         if apart:
             b_scale = max(b_scale if step > 0 else 0.0, abs(s[GROUP, 0, 0]))
         span = step_length(links, s, push, order, tol, horizon - now, w_scale, s_scale, b_scale)
         if not math.isfinite(span) or not math.isfinite(s[GROUP, 0, order]):
-            return NOT_FINITE, now, step, switches
+            return NOT_FINITE, since + now, step, switches
         if memory is not None:
             for i in range(count):
                 if branches[i] > HELD:
@@ -504,12 +499,18 @@ def _integrated(
         end = now + span
         stalled = stalled + 1 if span == 0.0 else 0
         if (end <= now and span > 0.0) or stalled > 4 * count + 8:
-            return STEP_UNDERFLOW, now, step, switches
+            return STEP_UNDERFLOW, since + now, step, switches
         last = end >= horizon and not leaves and spring < 0
         end = horizon if last else end
         if top == MOTION and knot > 0 and fresh:
             mend_kink(out, s, d, knot)
-        first, done = done, first_past(t, done, end, last)
+        first = done
+        if struck:
+            done = first_past(t, done, end, last)
+        elif last:
+            done = min(knot + 2, t.size)
+        elif end > 0.0:
+            done = max(done, 1)
         if first < done:
             sample(links, s, least, out, first, done, now, c)
         if tangent:
@@ -527,19 +528,20 @@ def _integrated(
             advance_tangents(d, groups, more, span, memory)
         w_scale, total = _reached(links, s, w_scale)
         if not math.isfinite(total):
-            return NOT_FINITE, now, step, switches
-        if shared:
-            settle(links, s, memory)
-            if memory is not None:
+            return NOT_FINITE, since + now, step, switches
+        if shared:  # where there is no memory, what asks for it is not compiled
+            if memory is None:
+                settle(links, s)
+            else:
                 settle_together(links, s, order, span, push, memory)
         if spring >= 0:
             switches = switch(
-                rows, branches, law, s, d, directions, order, span, now, spring, side, log,
+                rows, branches, law, s, d, directions, order, span, since + now, spring, side, log,
                 switches, ends, memory,
             )  # fmt: skip
             if memory is not None and shared:
                 settle_together(links, s, order, span, push, memory)
-    return TOO_MANY_STEPS, now, max_steps, switches
+    return TOO_MANY_STEPS, since + now, max_steps, switches
 
 
 @compiled
@@ -590,6 +592,7 @@ def integrate(
 @compiled
 def integrate_with_memory(
     given: SceneTuple,
+    unit: float,
     tol: float,
     max_steps: int,
     directions: Branches,
@@ -598,7 +601,29 @@ def integrate_with_memory(
     slopes: Array,
     log: Array,
 ) -> tuple[int, float, int, int]:
-    """Integrate a chain in which springs relax or are microscale, as `integrate` does others."""
+    """Integrate a chain in which springs relax or are microscale, as `integrate` does others.
+
+    Times are counted in a `unit`, s.
+    """
+    rows, heights, ends, mass, drag, top, values, speed, t = given
     order = order_for(max(tol, LEAST_TRUNCATION), MOST_ORDERS)
-    memory = make_memory(given[0], order, directions)
-    return _integrated(given, tol, max_steps, directions, start, curves, slopes, log, memory)
+    rows, terms = rows.copy(), rows[:, N_COLUMNS:].shape[1]
+    for i in range(heights.size):
+        rows[i, ETA] /= unit
+        for k in range(1, terms, 2):
+            rows[i, N_COLUMNS + k] /= unit
+    scene = (
+        rows, heights, ends, mass / unit**2, drag / unit, top, values, speed * unit, t / unit,
+    )  # fmt: skip
+    memory = make_memory(rows, order, directions)
+    outcome, end, steps, switches = _integrated(
+        scene, tol, max_steps, directions, start, curves, slopes, log, memory
+    )
+    for j in range(min(switches, log.shape[0])):
+        log[j, 0] *= unit
+    for p in range(directions.shape[0]):
+        what = directions[p, 1]
+        of_tau = what > OWN_RELAXATION and (what - OWN_RELAXATION) % 2 == 1
+        if of_tau or what in (OWN_ETA, DRAG):
+            slopes[p] /= unit
+    return outcome, end * unit, steps, switches

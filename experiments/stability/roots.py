@@ -1,0 +1,163 @@
+"""The judge of chains without rates under a known motion: root finding at 30 digits.
+
+Undamped, massless springs that do not relax bear one stress, and along a monotone stretch of it
+the strain of each is a monotone function of that stress. At every sample the stress is sought at
+which their elongations add up to the prescribed displacement; then each spring takes down what it
+remembers: the flag of a bistable spring, the rank of a microscale one. Nothing is integrated, so
+neither the times of the samples nor the width of a snap matter. Law: model.md, sections 1 and 6.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from independent import Array, Truth
+from mpmath import inf, log, mp, mpf, ncdf, sqrt
+
+DIGITS = 30
+
+
+class _Linear:
+    """ε = σ/k."""
+
+    def __init__(self, spring: Any) -> None:
+        self.k0 = mpf(spring.k0)
+
+    def strain(self, s: Any) -> Any:
+        return s / self.k0
+
+    def keep(self, s: Any) -> None:
+        """Take down what the spring remembers at a stress."""
+
+
+class _Bistable(_Linear):
+    """Four branches, and a flag that tells whether the spring has snapped."""
+
+    def __init__(self, spring: Any) -> None:
+        names = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
+        k0, kc, dsigma, eps_a, eps_c, up, down = (mpf(getattr(spring, name)) for name in names)
+        self.k0, self.kc, self.up, self.down, self.snapped = k0, kc, up, down, False
+        self.eps_a, self.eps_c = eps_a, eps_c
+        self.sigma_a = k0 * eps_a / (1 - eps_a)
+        self.sigma_c = self.sigma_a + dsigma
+        self.star = eps_c - self.sigma_c / (kc + self.sigma_c)
+        shift = up * (self.star - eps_a)  # where d meets c: the larger root of a quadratic
+        half = (kc - self.sigma_a - up - shift) / 2
+        self.through = -half + sqrt(half**2 + self.sigma_a * kc + shift * kc)
+        shift = down * eps_c - self.sigma_c  # where e meets a, if it does
+        half = (k0 - down + shift) / 2
+        root = half**2 - shift * k0
+        self.back = -half + sqrt(root) if root >= 0 else -inf
+
+    def strain(self, s: Any) -> Any:
+        on_c = s > self.sigma_c if self.snapped else s > self.through
+        if on_c:
+            return self.star + s / (self.kc + s)
+        if self.snapped and s >= self.back:
+            return self.eps_c + (s - self.sigma_c) / self.down
+        if not self.snapped and s >= self.sigma_a:
+            return self.eps_a + (s - self.sigma_a) / self.up
+        return s / (self.k0 + s)
+
+    def keep(self, s: Any) -> None:
+        self.snapped = s >= self.back if self.snapped else s > self.through
+
+
+class _Microscale(_Linear):
+    """The rank up to which micro-springs have snapped, as a normal score."""
+
+    def __init__(self, spring: Any) -> None:
+        names = ("k0", "kc", "eps_star", "spread_plus", "spread_minus")
+        self.k0, self.kc, self.star, self.plus, self.minus = (
+            mpf(getattr(spring, name)) for name in names
+        )
+        self.at_plus, self.at_minus = log(mpf(spring.sigma_plus)), log(mpf(spring.sigma_minus))
+        self.rank = -inf
+
+    def moved(self, s: Any) -> Any:
+        """Return the rank at a stress, from the one that is remembered."""
+        if s <= 0:
+            return -inf
+        plus = (log(s) - self.at_plus) / self.plus
+        minus = (log(s) - self.at_minus) / self.minus
+        return min(max(self.rank, plus), max(plus, minus))
+
+    def strain(self, s: Any) -> Any:
+        rank = self.moved(s)
+        snapped, rest = ncdf(rank), ncdf(-rank)
+        on_c = self.star + s / (self.kc + s) if snapped > 0 else mpf(0)
+        return rest * s / (self.k0 + s) + snapped * on_c
+
+    def keep(self, s: Any) -> None:
+        self.rank = self.moved(s)
+
+
+def _spring(spring: Any) -> _Linear:
+    if hasattr(spring, "sigma_plus"):
+        return _Microscale(spring)
+    return _Bistable(spring) if hasattr(spring, "kc") else _Linear(spring)
+
+
+def _root(springs: list[_Linear], heights: list[Any], top: Any, s: Any) -> Any:
+    """Stress at which the elongations add up: Illinois steps inside a bracket, from the last one.
+
+    A step of another kind every third time halves the bracket.
+    """
+
+    def miss(at: Any) -> Any:
+        return sum(h * p.strain(at) for h, p in zip(heights, springs, strict=True)) - top
+
+    here = miss(s)
+    if here == 0:
+        return s
+    low = high = s
+    low_miss = high_miss = here
+    step = max(abs(s), min(p.k0 for p in springs)) / 1000
+    floor = -min(p.k0 for p in springs)  # no spring but a linear one can be pulled further
+    while here * (high_miss if here < 0 else low_miss) > 0:
+        if here < 0:
+            low, low_miss = high, high_miss
+            high += step
+            high_miss = miss(high)
+        else:
+            high, high_miss = low, low_miss
+            low = max(low - step, (low + floor) / 2) if low > floor else low - step
+            low_miss = miss(low)
+        step *= 2
+    close = mpf(10) ** (2 - DIGITS)
+    for n in range(400):
+        if high - low <= close * max(abs(low), abs(high)):
+            break
+        at = (
+            (low + high) / 2
+            if n % 3 == 2
+            else low - low_miss * (high - low) / (high_miss - low_miss)
+        )
+        if not low < at < high:
+            at = (low + high) / 2
+        found = miss(at)
+        if found == 0:
+            return at
+        if found < 0:
+            low, low_miss = at, found
+        else:
+            high, high_miss = at, found
+    return (low + high) / 2
+
+
+def follow(chain: Any, drive: Any, time: Array, tol: float = 0.0, most: int = 0) -> Truth:
+    """Follow a chain over the samples of a known displacement of its top, whatever `tol` asks."""
+    with mp.workdps(DIGITS):
+        springs = [_spring(spring) for spring in chain.springs]
+        heights = [mpf(h) for h in chain.heights]
+        base, nodes = np.empty(time.size), np.empty((len(springs), time.size))
+        s = mpf(0)
+        for j, top in enumerate(drive.displacement):
+            s = _root(springs, heights, mpf(float(top)), s)
+            strains = [p.strain(s) for p in springs]
+            base[j] = float(s)
+            nodes[:, j] = np.cumsum([float(h * e) for h, e in zip(heights, strains, strict=True)])
+            for p in springs:
+                p.keep(s)
+    return Truth(nodes, base, None, 0.0, 0.0, 1.0, 0, 0)

@@ -1,0 +1,228 @@
+"""Springs in series, undamped and massless: one stress in all, along a motion or a stress.
+
+Along a monotone stretch each spring follows one monotone function of the common stress, so the sum
+of their elongations has one root, whatever switches lie on the way: nothing is integrated.
+"""
+
+# mypy: disallow-untyped-decorators=False, warn-return-any=False
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from foamfit.springs.kernels import (
+    K0,
+    KIND,
+    OPEN,
+    Array,
+    Branches,
+    branch_at_strain,
+    branch_at_stress,
+    compiled,
+    first_branch,
+    follow_stress,
+    inner,
+    maker,
+    slope_on,
+    strain_on,
+)
+from foamfit.springs.law import MICROSCALE, UNILATERAL
+from foamfit.springs.microscale_kernels import rank_at, strain_along, under_stress
+
+# The least strain that an elongation is followed to is this times rounding.
+LEAST = 1e-6
+
+# ---------------------------------------------------------------- springs in series, in equilibrium
+
+
+@inner
+def _series_strain(
+    rows: Array, branches: Branches, ranks: Array, heights: Array, sigma: float, eps: Array
+) -> tuple[float, float, float]:
+    """Fill the strains of springs in series under one stress, from what they remember.
+
+    Returns elongation, compliance, and the size of the terms that the elongation is made of.
+    """
+    total = 0.0
+    compliance = 0.0
+    size = 0.0
+    for i in range(rows.shape[0]):
+        if rows[i, KIND] == MICROSCALE:
+            rank, branch = rank_at(rows[i], ranks[i], branches[i], sigma)
+            eps[i], soft, by_rank, pace = under_stress(rows[i], branch, rank, sigma)
+            compliance += heights[i] * (soft + by_rank * pace)
+            total += heights[i] * eps[i]
+            size += heights[i] * max(abs(eps[i]), LEAST)
+            continue
+        branch = branch_at_stress(rows[i], branches[i], sigma)
+        if branch == OPEN:
+            eps[i] = -math.inf
+        else:
+            eps[i] = strain_on(rows[i], branch, sigma)
+            compliance += heights[i] / slope_on(rows[i], branch, eps[i])
+        total += heights[i] * eps[i]
+        size += heights[i] * max(abs(eps[i]), LEAST)
+    return total, compliance, size
+
+
+@inner
+def _bracket(
+    rows: Array,
+    branches: Branches,
+    ranks: Array,
+    heights: Array,
+    elongation: float,
+    sigma: float,
+    eps: Array,
+) -> tuple[float, float]:
+    """Stresses (low, high) between which springs in series reach `elongation`."""
+    step = 1e-3 * abs(sigma)
+    for i in range(rows.shape[0]):
+        step = max(step, 1e-6 * rows[i, K0])
+    low = high = sigma
+    for _ in range(200):
+        if _series_strain(rows, branches, ranks, heights, low, eps)[0] <= elongation:
+            break
+        high = low
+        low -= step
+        step *= 2.0
+    for _ in range(200):
+        if _series_strain(rows, branches, ranks, heights, high, eps)[0] >= elongation:
+            break
+        low = high
+        high += step
+        step *= 2.0
+    return low, high
+
+
+@maker
+def _split_jump(
+    rows: Array,
+    branches: Branches,
+    ranks: Array,
+    heights: Array,
+    elongation: float,
+    low: float,
+    high: float,
+    eps: Array,
+) -> float:
+    """Share out an elongation that lies inside a jump at one stress; returns that stress.
+
+    Flat branches (k_h± = 0) share it from the base up. Where a unilateral spring opens, the stress
+    is zero and the gap takes what the other springs leave.
+    """
+    upper = np.empty(eps.size)
+    _series_strain(rows, branches, ranks, heights, high, upper)
+    rest = elongation - _series_strain(rows, branches, ranks, heights, low, eps)[0]
+    for i in range(eps.size):
+        if eps[i] == -math.inf and rows[i, KIND] == UNILATERAL:
+            rest = elongation - _series_strain(rows, branches, ranks, heights, 0.0, eps)[0]
+            eps[i] += rest / heights[i]
+            return 0.0
+    for i in range(eps.size):
+        gain = min(max(rest / heights[i], 0.0), upper[i] - eps[i])
+        eps[i] += gain
+        rest -= heights[i] * gain
+    return 0.5 * (low + high)
+
+
+@maker
+def equilibrate(
+    rows: Array,
+    branches: Branches,
+    ranks: Array,
+    heights: Array,
+    elongation: float,
+    sigma: float,
+    eps: Array,
+) -> float:
+    """Common stress of undamped springs in series at a given elongation; fills their strains.
+
+    Newton's method finds it, from the eighth trial on inside a bracket that every third trial
+    halves. Where the root lies in a jump of the elongation (k_h± = 0, or a snap so narrow that
+    neighbouring numbers for the stress lie apart in it), the springs share it from the base up.
+    `branches` and `ranks`, those of microscale springs, are brought up to date.
+    """
+    found = False
+    low, high = -math.inf, math.inf
+    for trial_number in range(400):
+        total, compliance, size = _series_strain(rows, branches, ranks, heights, sigma, eps)
+        miss = total - elongation
+        if abs(miss) <= 2e-15 * (size + abs(elongation)) and math.isfinite(total):
+            found = True
+            break
+        if miss > 0.0:
+            high = min(high, sigma)
+        else:
+            low = max(low, sigma)
+        trial = sigma - miss / compliance
+        if trial_number == 8:  # a kink or a jump: bracket it
+            low, high = _bracket(rows, branches, ranks, heights, elongation, sigma, eps)
+        if trial_number >= 8 and (trial_number % 3 == 0 or not low < trial < high):
+            trial = 0.5 * (low + high)
+            if trial in (low, high):  # neighbouring numbers: nothing lies between them
+                found = abs(miss) <= 1e-12 * (size + abs(elongation))
+                break
+        elif not low < trial < high:
+            trial = 0.5 * (low + high) if math.isfinite(low) and math.isfinite(high) else sigma
+        sigma = trial
+    if not found:
+        sigma = _split_jump(rows, branches, ranks, heights, elongation, low, high, eps)
+    for i in range(eps.size):
+        if rows[i, KIND] == MICROSCALE:
+            ranks[i], branches[i] = rank_at(rows[i], ranks[i], branches[i], sigma)
+        else:
+            branches[i] = branch_at_strain(rows[i], branches[i], eps[i])
+    return sigma
+
+
+@compiled
+def equilibrium_along(
+    rows: Array, heights: Array, top: Array, sigma: Array, eps: Array, history: Branches
+) -> None:
+    """Springs in series, undamped and massless, along a history of the top's displacement (m).
+
+    Fills the common stress (n,), the strains and the branches (springs, n).
+    """
+    count, n = rows.shape[0], top.size
+    branches = np.empty(count, np.int64)
+    now, ranks = np.empty(count), np.full(count, -math.inf)
+    for i in range(count):
+        branches[i] = first_branch(rows[i])
+    last = 0.0
+    for j in range(n):
+        last = equilibrate(rows, branches, ranks, heights, top[j], last, now)
+        sigma[j] = last
+        for i in range(count):
+            eps[i, j] = now[i]
+            history[i, j] = branches[i]
+
+
+@compiled
+def strains_along(
+    rows: Array, heights: Array, sigma: Array, top: Array, eps: Array, history: Branches
+) -> bool:
+    """Springs in series along a history of their stress.
+
+    Fills the displacement of the top (n,), m, and strains and branches (springs or 0, n). False if
+    a spring cannot have its stress; its strain is -inf then.
+    """
+    n, kept, total = sigma.size, eps.shape[0] > 0, 0.0
+    strain, branches = np.empty(n), np.empty(n, np.int64)
+    for i in range(rows.shape[0]):
+        if kept:
+            strain, branches = eps[i], history[i]
+        if rows[i, KIND] == MICROSCALE:
+            strain[:], _, branches[:] = strain_along(rows[i], sigma)
+        else:
+            follow_stress(rows[i], sigma, strain, branches)
+        if i == 0:
+            for j in range(n):
+                top[j] = heights[i] * strain[j]
+        else:
+            for j in range(n):
+                top[j] += heights[i] * strain[j]
+    for j in range(n):
+        total += top[j]
+    return math.isfinite(total)

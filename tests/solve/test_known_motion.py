@@ -1,0 +1,122 @@
+"""Chains with memory under a known motion: narrow snaps, like springs, origins of time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import foamfit as ff
+from foamfit.errors import SimulationError
+from foamfit.solve.plan import Plan
+
+AREA, H = 1e-3, 10e-3
+SHOE = ff.MicroscaleSpring(5.5e5, 2.5e5, 0.08, 1.3e5, 0.4, 5.5e4, 0.77)
+FOAM = ff.published["foam-1/model-3"].bistable
+SOFT = replace(FOAM, k0=5e5, kc=8e6, dsigma=-3e4, kh_plus=1e6, kh_minus=3e5)
+STRESSES = np.concatenate(
+    [
+        np.linspace(a, b, 12)[1:]
+        for a, b in zip([0, 3e5, 4e4, 2e5, 1e5, 5e5], [3e5, 4e4, 2e5, 1e5, 5e5, 0], strict=True)
+    ]
+)
+TURNS = [0.0, 0.25, 0.1, 0.3, 0.02, 0.4, 0.0]
+
+
+def narrow(spread: float, **more: float) -> ff.MicroscaleSpring:
+    return replace(SHOE, spread_plus=spread, spread_minus=spread, **more)
+
+
+def chain(*springs: ff.springs.spring.Spring) -> ff.Chain:
+    return ff.Chain(springs, [H * (1.0 + 0.3 * i) for i in range(len(springs))], AREA)
+
+
+def off(got: np.ndarray, want: np.ndarray) -> float:
+    return float(np.abs(got - want).max() / (max(want.max(), 0.0) - min(want.min(), 0.0)))
+
+
+@pytest.mark.parametrize("spread", [1e-6, 1e-5, 5e-4, 1e-2, 0.3, 5.0])
+@pytest.mark.parametrize("other", [SHOE, SOFT, ff.LinearSpring(2e6)], ids=["micro", "two", "line"])
+def test_the_stress_whose_strains_make_the_motion_is_found(spread, other) -> None:
+    """The motion is made from a stress: what every spring's strain is under it, the law says."""
+    given = chain(narrow(spread), other, narrow(3.0 * spread, sigma_plus=1.7e5))
+    strains = np.array([spring.strain(STRESSES) for spring in given.springs])
+    above = np.cumsum(np.array(given.heights)[:, None] * strains, axis=0)
+    time = np.cumsum(10.0 ** np.linspace(-8.0, 0.0, STRESSES.size))
+    for rtol in (1e-4, 1e-8):
+        got = ff.simulate(given, ff.DisplacementDrive(above[-1]), time, rtol)
+        # An ulp of the stress is so many of the rank.
+        assert off(got.base_stress, STRESSES) <= 1e-12 + 1e-15 / min(spread, 1.0)
+        assert off(got.displacement, above) <= 1e-12 + 1e-15 / min(spread, 1.0)
+
+
+@pytest.mark.parametrize("rtol", [1e-4, 1e-6, 1e-8])
+def test_like_springs_share_the_motion(rtol) -> None:
+    """Two of them are one of twice the height, with derivatives and without."""
+    top = np.interp(np.linspace(0.0, 6.0, 61), np.arange(7.0), 2 * H * np.array(TURNS))
+    time, drive = np.linspace(0.0, 1.0, 61), ff.DisplacementDrive(top)
+    for spring in (narrow(1e-5), SHOE, replace(SHOE, relaxation=[(0.5, 0.1)])):
+        one = ff.simulate(ff.Chain([spring], [2 * H], AREA), drive, time, rtol)
+        two = ff.Chain([spring] * 2, [H] * 2, AREA)
+        for names in ((), ("s1_k0",)):
+            got = ff.simulate(two, drive, time, rtol, sensitivities=names)
+            assert off(got.base_stress, one.base_stress) <= rtol
+            assert off(got.displacement[0], 0.5 * top) <= rtol
+
+
+@pytest.mark.parametrize("eta", [0.0, 2e3])
+def test_no_origin_of_time_takes_digits(eta) -> None:
+    """Steps of about 1 µs at 1.7e9 s, which are whole multiples of its last digit."""
+    step, origin = 2.0**-20, 1.7e9
+    given = chain(replace(SHOE, eta=eta, relaxation=[(0.5, 2e-5)]), replace(SHOE, k0=8e5))
+    top = np.interp(np.linspace(0.0, 6.0, 61), np.arange(7.0), 2 * H * np.array(TURNS))
+    runs = [
+        ff.simulate(given, ff.DisplacementDrive(top), at + step * np.arange(61.0))
+        for at in (0.0, origin)
+    ]
+    np.testing.assert_array_equal(runs[1].base_stress, runs[0].base_stress)
+    np.testing.assert_array_equal(runs[1].displacement, runs[0].displacement)
+    np.testing.assert_allclose(runs[1].switches[:, 0] - origin, runs[0].switches[:, 0], atol=step)
+
+
+def test_derivatives_under_a_known_motion_are_those_of_differences() -> None:
+    """What is held moves with the stress at which it turned, which other springs move as well."""
+    springs = [SHOE, replace(SHOE, k0=8e5, sigma_plus=2e5, spread_minus=0.3), SOFT]
+    heights, time = [H, 2 * H, H], np.linspace(0.0, 1.0, 97)
+    top = np.interp(time, np.linspace(0.0, 1.0, 7), 4 * H * np.array(TURNS))
+    names = ["s1_k0", "s1_kc", "s1_eps_star", "s1_sigma_plus", "s1_spread_plus", "s2_sigma_minus",
+             "s2_spread_minus", "s3_k0", "s3_eps_a", "s3_kh_plus"]  # fmt: skip
+
+    def run(changed: dict[int, ff.springs.spring.Spring], **more) -> ff.Response:
+        own = [changed.get(i, spring) for i, spring in enumerate(springs)]
+        return ff.simulate(ff.Chain(own, heights, AREA), ff.DisplacementDrive(top), time, **more)
+
+    got = run({}, sensitivities=[*names, "s2_height"])
+    for name in names:
+        i, short = int(name[1]) - 1, name[3:]
+        value = getattr(springs[i], short)
+        sides = [run({i: replace(springs[i], **{short: value * (1 + k)})}) for k in (1e-5, -1e-5)]
+        for what in ("base_stress", "displacement"):
+            up, down = (getattr(side, what) for side in sides)
+            want, mine = (up - down) / (2e-5 * value), getattr(got.sensitivities[name], what)
+            assert np.abs(mine - want).max() <= 1e-5 * np.abs(want).max(), (name, what)
+    heights[1] *= 1 + 1e-5
+    up = run({})
+    heights[1] *= (1 - 1e-5) / (1 + 1e-5)
+    want = (up.base_stress - run({}).base_stress) / (4e-5 * H)
+    mine = got.sensitivities["s2_height"].base_stress
+    assert np.abs(mine - want).max() <= 1e-5 * np.abs(want).max()
+
+
+def test_a_top_that_is_not_where_it_was_prescribed_is_refused(monkeypatch) -> None:
+    run, top, time = Plan.run, 2 * H * np.array(TURNS), np.linspace(0.0, 1.0, 7)
+
+    def drifted(self: Plan, *given, **more):
+        motion = run(self, *given, **more)
+        return motion._replace(displacement=motion.displacement * (1.0 + 1e-5))
+
+    monkeypatch.setattr(Plan, "run", drifted)
+    with pytest.raises(SimulationError, match="miss the prescribed displacement by 1e-05 of its"):
+        ff.simulate(chain(SHOE, SOFT), ff.DisplacementDrive(top), time)
+    assert ff.simulate(chain(SHOE, SOFT), ff.DisplacementDrive(top), time, 1e-4).steps == 0
