@@ -570,7 +570,7 @@ def test_init_needs_a_table(here: Path) -> None:
         (["--fix", "s1_eps_a=2"], ("s1_eps_a = 2", "between 0 and 1")),
         (["--fix", "s1_k0=1e300"], ("s1_k0 = 1e+300", "less than 1e+30")),
         (["--starts", "0"], ("'--starts'", "x>=1")),
-        (["--starts", "1000000000"], ("starts = 1000000000", "from 1 to 10000")),
+        (["--starts", "1000000000"], ("starts = 1000000000", "from 1 to 100000")),
         (["--relaxation", "999"], ("relaxation = 999", "from 0 (none) to 10")),
         (["--model", "+".join(["linear"] * 99)], ("99 springs", "20 at most")),
         (["--bootstrap", "1000000000"], ("too many", "most 100000")),

@@ -45,7 +45,7 @@ Watch = Callable[[Problem, Array], None]
 
 # Descents of the search for each spring, for each of several hysteretic springs in series, and at
 # most in all.
-STARTS, STARTS_IN_SERIES, MOST_STARTS = 16, 48, 10_000
+STARTS, STARTS_IN_SERIES, MOST_STARTS = 16, 48, 100_000
 # Refits of the bootstrap and steps of the Markov chain.
 DRAWS = {"bootstrap": 500, "mcmc": 2000}
 # Evaluations that the default spends on profiles, and on ranges, over those of the search; and how

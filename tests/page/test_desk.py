@@ -195,20 +195,19 @@ def test_a_fit_is_that_of_the_command(ready):
 def test_cycles_and_what_is_held_are_those_of_the_command(desk, tmp_path, monkeypatch):
     record = write_record(tmp_path)
     desk.take(record)
-    assert not desk.check(*desk.dropped_toml(), "3,9").error
+    assert not desk.check(*desk.dropped_toml(), "3,2").error
     assert (desk.measurement.cycle, desk.measurement.cycles) == (3, (1, 2, 3))
-    asked = ["--cycle", "3,9", "--fix=s1_kh_minus=2200000.0", "--vary=s1_eta", "--starts", "1"]
+    asked = ["--cycle", "3,2", "--fix=s1_kh_minus=2200000.0", "--vary=s1_eta", "--starts", "1"]
     wait(desk.fit(asked))
     assert desk.ending() == ""
     assert desk.command == f"foamfit fit synthetic.csv {' '.join(asked)}"
-    assert "1 of 3 cycles fitted" in desk.told
-    assert "cycle 9" in desk.told
+    assert "2 of 3 cycles fitted" in desk.told
     without_pictures(monkeypatch)
     monkeypatch.setattr(cycles_report, "image", lambda *_: b"")
     monkeypatch.setattr(cycles_report, "plot_cycles", lambda _: None)
     told = CliRunner().invoke(main, ["fit", str(record), *asked, "--json", f"--out={tmp_path}/r"])
     command = json.loads(told.stdout)["cycles"]
-    assert list(desk.fits) == [3]
+    assert sorted(desk.fits) == [2, 3]
     for number, folder in desk.fits.items():
         page = load_result(folder)
         assert page["parameters"] == command[str(number)]["parameters"]

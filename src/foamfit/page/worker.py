@@ -216,7 +216,7 @@ def parsed(arguments: list[str]) -> dict[str, Any]:
         context = command.make_context("fit", ["TEST.csv", *arguments])
     except click.ClickException as error:
         raise InputError(error.format_message()) from None
-    others = {"test", "specimen", "out", "as_json", "quiet", "verbose"}
+    others = {"test", "specimen", "out", "no_report", "as_json", "quiet", "verbose"}
     return {name: value for name, value in context.params.items() if name not in others}
 
 
