@@ -458,6 +458,9 @@ def known_motion(rng: Generator, number: int) -> Spec:
     steps = ratio ** rng.random(samples - 1)
     at, levels = path(rng, rng.uniform(0.1, 0.75), int(rng.integers(1, 8)))
     floor = -math.inf if rng.random() < 0.3 else 0.0
+    if number % 5 == 2:  # and holds for a while
+        at.append(at[-1] + 0.5)
+        levels.insert(len(levels) // 2, levels[len(levels) // 2])
     spec["displacement"] = [at, [most * max(level, floor) for level in levels]]
     spec["origin"] = (0.0, -log(rng, 1.0, 1e4), 1.7e9)[number % 3]
     least = 1e-6 if number % 3 == 2 else log(rng, 1e-7, 1e-2)

@@ -78,10 +78,14 @@ NO_SLOPES = np.empty((0, 0, 0))
 
 
 class Slopes(NamedTuple):
-    """Derivatives of displacement (p, nodes, n_t) and base stress (p, n_t) in p directions."""
+    """Derivatives of displacement (p, nodes, n_t) and base stress (p, n_t) in p directions.
+
+    Of those marked in `one_sided` (p,), there are two.
+    """
 
     displacement: Array
     base_stress: Array
+    one_sided: Array = _NOTHING[:0]
 
 
 class Motion(NamedTuple):
@@ -217,11 +221,13 @@ class Plan(NamedTuple):
         start = _AT_REST
         if self.top not in _RESTING:
             start = self._start(given[0], given[1], directions)
+        one_sided = np.zeros(len(directions))
         cache.announce(taylor.integrate_with_memory, "the solver of springs with memory")
         for most in (min(FEW_EXPLICIT, self.max_steps), self.max_steps):
             ending: Sequence[Any] = taylor.integrate_with_memory(
-                given, self.unit, self.margin * rtol, most, directions, start, curves, slopes, log
-            )
+                given, self.unit, self.margin * rtol, most, directions, start, curves, slopes, log,
+                one_sided,
+            )  # fmt: skip
             if ending[0] not in _STIFF:
                 break
             rate, culprit = self._fastest(given)
@@ -233,7 +239,7 @@ class Plan(NamedTuple):
                 raise SimulationError(message)
             if ending[0] == scenes.STEP_UNDERFLOW:  # more steps would end there too
                 break
-        return _motion(TAYLOR, ending, curves, slopes, log)
+        return _motion(TAYLOR, ending, curves, slopes, log, one_sided=one_sided)
 
     def _fastest(self, given: scenes.SceneTuple) -> tuple[float, str]:
         """What of springs with memory is fastest, in radians while the scene lasts; its name."""
@@ -289,7 +295,8 @@ class Plan(NamedTuple):
             fine = equilibrium.strains_along(rows, heights, stress, top, strain, branches)
         if len(directions) and slopes is None:
             slopes = Slopes(
-                *equilibrium_tangents(rows, heights, stress, strain, branches, moved, directions)
+                *equilibrium_tangents(rows, heights, stress, strain, branches, moved, directions),
+                _on_one_plateau(rows, branches, directions) if moved else _NOTHING[:0],
             )
         eta = rows[0, kernels.ETA]
         if moved and len(heights) == 1 and stress.size > 1 and (eta > 0.0 or slopes is not None):
@@ -304,7 +311,7 @@ class Plan(NamedTuple):
             raise SimulationError(_OUTCOMES[scenes.NOT_FINITE])
         if not everything:
             if slopes is not None:
-                slopes = Slopes(slopes.displacement[:, -1:], slopes.base_stress)
+                slopes = slopes._replace(displacement=slopes.displacement[:, -1:])
             return Motion(top[None, :], stress, math.nan, NO_SWITCHES, 0, CLOSED_FORM, slopes)
         nodes = heights[:, None] * strain
         for i in range(1, len(nodes)):  # np.cumsum takes six times as long
@@ -377,14 +384,31 @@ class Plan(NamedTuple):
         return bool(vibrates > MOST_VIBRATION or relaxes > MOST_RELAXATION)
 
 
+def _on_one_plateau(rows: Array, branches: NDArray[np.int64], directions: Directions) -> Array:
+    """Mark the directions of springs that were on flat branches together: either may go first."""
+    flat = (branches == kernels.D) & (rows[:, kernels.KH_PLUS] == 0.0)[:, None]
+    flat |= (branches == kernels.E) & (rows[:, kernels.KH_MINUS] == 0.0)[:, None]
+    together = (flat & (flat.sum(axis=0) > 1)).any(axis=1)
+    height = np.isin(directions[:, 1], (0, 2, 3))  # k0, dsigma, eps_a
+    return np.where(height & (directions[:, 0] >= 0), together[directions[:, 0]], False).astype(
+        float
+    )
+
+
 def _motion(
-    method: str, ending: Sequence[Any], curves: Array, slopes: Array, log: Array, lost: float = 0.0
+    method: str,
+    ending: Sequence[Any],
+    curves: Array,
+    slopes: Array,
+    log: Array,
+    lost: float = 0.0,
+    one_sided: Array = _NOTHING[:0],
 ) -> Motion:
     """Gather what an integrator found, or say why it found nothing."""
     outcome, time, steps, switches = ending
     if outcome != scenes.DONE:
         raise SimulationError(_OUTCOMES[outcome].format(steps=steps, time=time))
-    slope = None if slopes is NO_SLOPES else Slopes(slopes[:, 1:], slopes[:, 0])
+    slope = None if slopes is NO_SLOPES else Slopes(slopes[:, 1:], slopes[:, 0], one_sided)
     seen = log if log is NO_SWITCHES else log[:switches]
     return Motion(curves[1:], curves[0], time, seen, steps, method, slope, lost)
 

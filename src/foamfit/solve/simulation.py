@@ -72,7 +72,8 @@ class Response:
     steps : int
         Steps of the integrator; 0 for the closed form.
     sensitivities : dict of str to Sensitivity
-        Derivatives by the parameters that were asked for.
+        Derivatives by the parameters that were asked for; one that does not exist is said to be
+        `one_sided`.
     """
 
     time: Array
@@ -231,10 +232,15 @@ class Sensitivity:
     base_stress : (n_t,) array
         Pa per unit of the parameter. At a switch of branch its slope jumps, not its value; it jumps
         where contact ends.
+    one_sided : bool
+        Whether the derivative does not exist, and one from above and one from below do: where like
+        springs that snap stand still together, or share a flat branch, the least change decides
+        which of them goes on. Then what is given need not be either of the two.
     """
 
     displacement: Array
     base_stress: Array
+    one_sided: bool = False
 
 
 def _sensitivities(
@@ -250,7 +256,8 @@ def _sensitivities(
         elif directions[p, 1] == OWN_HEIGHT and drag > 0.0:
             moved = moved - drag / chain.height * slopes.displacement[-1]
             pressed = pressed - drag / chain.height * slopes.base_stress[-1]
-        out[name] = Sensitivity(moved, pressed)
+        sided = slopes.one_sided.size > 0 and slopes.one_sided[p] > 0.0
+        out[name] = Sensitivity(moved, pressed, bool(sided))
     return out
 
 

@@ -28,9 +28,12 @@ from foamfit.springs import microscale_kernels as micro
 from foamfit.springs.kernels import (
     BACK,
     EPS_STAR,
+    ETA,
     HELD,
     K0,
     KC,
+    KH_MINUS,
+    KH_PLUS,
     KIND,
     LOG_MINUS,
     LOG_PLUS,
@@ -40,13 +43,15 @@ from foamfit.springs.kernels import (
     SPREAD_PLUS,
     Array,
     Branches,
+    D,
+    E,
     Row,
     inlined,
     inner,
     maker,
     piece,
 )
-from foamfit.springs.law import MICROSCALE
+from foamfit.springs.law import BISTABLE, MICROSCALE
 from foamfit.springs.microscale_kernels import (
     BRANCH,
     CARRIED,
@@ -82,6 +87,8 @@ PLACE, SCALE, FRACTION, LEFT, GAIN, PER_GAIN, GIVE, PER_GIVE, SOFT, BASE = range
 PER_A, PER_C, PER_S, RATE_A, RATE_C, RATE_U, GAP, N_NOW = range(10, 18)
 # A held spring is past where it turned if its strain is, by so much of itself.
 MARGIN = 1e-13
+# A strain that changes in a step by so little of itself stands still.
+STILL = 1e-14
 # A spring that turns within so small a part of a step turns at its start.
 NOW = 1e-8
 # Strain below which no micro-spring counts: the stress, whose logarithm is followed, is 0 at 0.
@@ -103,7 +110,8 @@ class Memory(NamedTuple):
     of the relaxation. `partials` (N_PARTIALS, springs, order + 2) are filled where
     derivatives are wanted; of these, in p `directions` (p, 2), `ranks` (p, springs) are those of
     what is held. `tangents` (order + 2, columns, p or up to three more) are their series, all
-    directions of a quantity side by side. `scratch` is (2, CARRIED).
+    directions of a quantity side by side. `one_sided` (p,) marks derivatives that do not exist.
+    `scratch` is (2, CARRIED).
     """
 
     rows: Array
@@ -114,11 +122,12 @@ class Memory(NamedTuple):
     directions: Branches
     ranks: Array
     tangents: Array
+    one_sided: Array
     scratch: Array
 
 
 @maker
-def make_memory(rows: Array, order: int, directions: Branches) -> Memory:
+def make_memory(rows: Array, order: int, directions: Branches, one_sided: Array) -> Memory:
     """Make the memory of springs at rest."""
     count, terms, size = rows.shape[0], (rows.shape[1] - N_COLUMNS) // 2, directions.shape[0]
     columns, wide = count * (N_TANGENTS + terms + N_MOTION), (size + 3) // 4 * 4
@@ -131,6 +140,7 @@ def make_memory(rows: Array, order: int, directions: Branches) -> Memory:
         directions,
         np.zeros((size, count)),
         np.zeros((order + 2, columns, wide)),
+        one_sided,
         np.empty((2, CARRIED)),
     )
     for i in range(count):
@@ -195,17 +205,28 @@ def leave(memory: Memory, i: int, eps: float, up: bool, turning: bool, d_eps: Ar
     return int(state[BRANCH])
 
 
+@inner
+def stands(c: Array, order: int, span: float) -> bool:
+    """Whether a strain stands still over a step, but for rounding."""
+    change = 0.0
+    for n in range(order, 0, -1):
+        change = (change + abs(c[n])) * span
+    return change <= STILL * abs(c[0])
+
+
 @piece
 def first_turn(
     branches: Branches, eps: Array, order: int, span: float, c: Array
 ) -> tuple[float, int]:
     """First time within `span` at which a spring that snaps turns, and which; c is scratch.
 
-    After a kink it may have turned already.
+    After a kink it may have turned already. While the motion holds, rounding turns no spring.
     """
     spring, whole = -1, span
     for i in range(branches.size):
         if branches[i] == SNAP or branches[i] == BACK:
+            if stands(eps[i], order, whole):
+                continue
             ahead = 1.0 if branches[i] == SNAP else -1.0
             for n in range(order):
                 c[n] = ahead * (n + 1) * eps[i, n + 1]
@@ -517,6 +538,37 @@ def advance_memory_tangents(memory: Memory, k: int, order: int, span: float) -> 
         for term in range(memory.series.shape[2] - N_MEMORY):
             dz = memory.tangents[:, first + term, k]
             dz[0] = value_at(dz, order, span)
+
+
+@inner
+def _is_flat(row: Row, branch: int) -> bool:
+    """Whether a spring is on a flat branch that nothing slows."""
+    slope = row[KH_PLUS] if branch == D else row[KH_MINUS] if branch == E else 1.0
+    return row[KIND] == BISTABLE and slope == 0.0 and row[ETA] == 0.0
+
+
+@inner
+def mark_one_sided(
+    memory: Memory, branches: Branches, eps: Array, series: Array, order: int, span: float
+) -> None:
+    """Mark the directions that would move a spring that snaps and stands still, or a plateau.
+
+    One way of the parameter the spring snaps on, the other way it is held; of several springs on
+    flat branches one goes first: there are two derivatives. `eps` and `series` (p, springs, …) are
+    the series of the strains, and their derivatives.
+    """
+    flat = 0
+    for i in range(branches.size):
+        flat += _is_flat(memory.rows[i], branches[i])
+    for p in range(series.shape[0]):
+        i, own = memory.directions[p, 0], memory.directions[p, 1]
+        if flat > 1 and i >= 0 and own in (0, 2, 3) and _is_flat(memory.rows[i], branches[i]):
+            memory.one_sided[p] = 1.0
+    for i in range(branches.size):
+        if (branches[i] == SNAP or branches[i] == BACK) and stands(eps[i], order, span):
+            for p in range(series.shape[0]):
+                if not stands(series[p, i], order, span) and series[p, i, 1] != 0.0:
+                    memory.one_sided[p] = 1.0
 
 
 @inner

@@ -20,6 +20,7 @@ from foamfit.solve.explicit.memory import (
     load,
     longest,
     make_memory,
+    mark_one_sided,
 )
 from foamfit.solve.explicit.samples import (
     delay,
@@ -493,6 +494,8 @@ def _integrated(
         more = min(least + 2, order)  # for what is, in time, a derivative of these
         if tangent:
             expand_tangents(links, s, d, more, memory)
+            if memory is not None:
+                mark_one_sided(memory, branches, s[EPS], d.series[:, EPS], more, span)
             shorter = tangent_length(heights, d, more, OF_TANGENTS * tol, span, sizes, memory)
             if shorter < span:
                 span, spring, leaves = shorter, -1, False
@@ -600,10 +603,12 @@ def integrate_with_memory(
     curves: Array,
     slopes: Array,
     log: Array,
+    one_sided: Array,
 ) -> tuple[int, float, int, int]:
     """Integrate a chain in which springs relax or are microscale, as `integrate` does others.
 
-    Times are counted in a `unit`, s.
+    Times are counted in a `unit`, s. What of the p derivatives does not exist is marked in
+    `one_sided` (p,).
     """
     rows, heights, ends, mass, drag, top, values, speed, t = given
     order = order_for(max(tol, LEAST_TRUNCATION), MOST_ORDERS)
@@ -615,7 +620,7 @@ def integrate_with_memory(
     scene = (
         rows, heights, ends, mass / unit**2, drag / unit, top, values, speed * unit, t / unit,
     )  # fmt: skip
-    memory = make_memory(rows, order, directions)
+    memory = make_memory(rows, order, directions, one_sided)
     outcome, end, steps, switches = _integrated(
         scene, tol, max_steps, directions, start, curves, slopes, log, memory
     )
