@@ -375,13 +375,14 @@ def longest(m: Array, now: Array, order: int, tol: float, span: float) -> float:
         change = max(change, u - math.sqrt(min(max(few, NEAR * NEAR), FAR * FAR)))
     rise = s * min(MOST_GROWTH, math.exp(scale * change) - 1.0)
     fall = s * min(MOST_GROWTH, 1.0 - math.exp(-scale * change))
+    least = LOOSE * MOST_SCORE * scale * s  # far from a narrow snap a share of the way is too loose
     for _ in range(40):  # Newton's method from above, for what grows faster than in proportion
         up = down = up_slope = down_slope = 0.0
         for n in range(order, 0, -1):
             up_slope, down_slope = up_slope * span + up, down_slope * span + down
             up, down = up * span + max(m[n, EQ], 0.0), down * span + max(-m[n, EQ], 0.0)
         over, under = up * span - rise, down * span - fall
-        if over <= LOOSE * rise and under <= LOOSE * fall:
+        if over <= min(LOOSE * rise, least) and under <= min(LOOSE * fall, least):
             break
         span -= max(over / (up + up_slope * span), under / (down + down_slope * span), 0.0)
     return span
