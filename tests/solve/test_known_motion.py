@@ -129,7 +129,8 @@ ALIKE = {
         replace(FLAT, relaxation=[(0.5, 0.1)]), ("k0", "eps_a"), ("kc", "eps_c")),
     "held": (
         replace(SHOE, eta=1e4, relaxation=[(0.5, 0.1)]), ("k0", "sigma_plus"), ("sigma_minus",)),
-    "steep": (replace(FOAM, eta=1e5, relaxation=[(0.5, 0.1)]), (), ("k0", "kc", "eps_a")),
+    "steep": (
+        replace(FLAT, kh_plus=1.4e7, eta=1e5, relaxation=[(0.5, 0.1)]), (), ("k0", "kc", "eps_a")),
 }  # fmt: skip
 
 
