@@ -24,6 +24,7 @@ EXPERIMENTS = ROOT / "experiments"
 DATA = Path(os.environ.get("FOAMFIT_DATA", ROOT.parent / "shared" / "data"))
 
 HEIGHT, AREA = 1.19e-3, 1.9635e-5
+os.environ["COLUMNS"] = "100"  # of what commands print, whatever the terminal of the tests
 
 needs_data = pytest.mark.skipif(
     not DATA.is_dir(), reason="the measurements of others are not beside this checkout"

@@ -233,7 +233,7 @@ def test_intervals_of_other_kinds_agree_with_the_local_ones(together, tmp_path, 
 
 def test_a_batch_fixes_and_varies_what_a_record_does_not_say(together, tmp_path):
     folder, _, _ = together
-    quick = {"starts": 2, "intervals": "local", "figure_width": None, "jobs": 1}
+    quick = {"starts": 2, "intervals": "local", "report": False, "jobs": 1}
     fixed = {"stress_zero": 0.0}
     frame = ff.batch(
         [folder / "t1.csv", folder / "t2.csv"], out=tmp_path / "out", fix=fixed,
