@@ -1,0 +1,205 @@
+"""Does a change of the code change its results? Fits, simulations, a joint fit, a prediction.
+
+The reconstructions of the repository and synthetic records (`experiments/recovery/rig.py`, whose
+integrator is its own) go the way of a user: CSV, TOML, `foamfit.read_test`, the defaults of
+`foamfit.fit`. Kept are values, standard errors, ends of intervals and states, misfits, and marks of
+simulated curves. A simulation is unchanged within 1e-9 of its size, a fitted number within a
+hundredth of its standard error and anything else within 1e-3. What differs is listed.
+
+    python experiments/frozen/frozen.py            # compare with frozen.csv; exit code 1 if changed
+    python experiments/frozen/frozen.py --renew    # write frozen.csv
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import math
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+import foamfit as ff
+
+HERE = Path(__file__).parent
+ROOT = HERE.parent
+sys.path.insert(0, str(ROOT / "recovery"))
+from rig import Impact, Slow, impact, slow, write  # noqa: E402
+
+Row = tuple[str, str, str]  # result, quantity, value
+FILE = HERE / "frozen.csv"
+EXACT, OTHER, ERRORS = 1e-9, 1e-3, 0.01
+RECORDS = {
+    "impact": Impact(),
+    "impact trimmed": Impact(trimmed=True),
+    "impact, acceleration": Impact(channels=("acceleration",)),
+    "impact, velocity ±": Impact(velocity_sd=0.01),
+    "impact, correlated": Impact(tau=8.0),
+    "impact, microscale": Impact(law="microscale"),
+    "impact, microscale+1": Impact(law="microscale", relaxation=1),
+    "slow, bistable": Slow("bistable", noise=1e-3),
+    "slow, bistable, any zero": Slow("bistable", noise=1e-3, early=True, zero=True),
+    "slow, microscale": Slow(),
+    "slow, microscale+1": Slow(relaxation=1),
+    "slow, microscale+2, sine": Slow(relaxation=2, motion="sine", noise=1e-3),
+    "slow, two springs": Slow("bistable+bistable", noise=1e-3),
+    "slow, inner loop": Slow(inner=0.1, noise=1e-3),
+}
+FITS = {  # reconstruction, model, drive
+    "foam-1/model-1-2.0mps": ("bistable", "impact"),
+    "foam-1/model-1-1.75mps": ("bistable", "displacement"),
+    "foam-1/model-2-2.0mps": ("bistable", "impact"),
+    "foam-1/model-2-1.75mps": ("bistable", "stress"),
+    "foam-1/model-3-2.0mps": ("linear+bistable", "impact"),
+    "foam-2/4.5mps": ("linear+bistable", "impact"),
+    "foam-2/4.44mps": ("microscale", "displacement"),
+}
+JOINT = """name = "synthetic loops"
+tests = ["loop-*.csv"]
+model = "microscale"
+drive = "displacement"
+
+[parameters]
+s1_k0 = "shared"
+s1_kc = "shared"
+s1_eps_star = "shared"
+s1_spread_plus = "shared"
+s1_sigma_minus = "shared"
+s1_spread_minus = "shared"
+s1_sigma_plus = "scatter"
+"""
+
+
+def of_fit(name: str, result: ff.FitResult) -> Iterator[Row]:
+    """What is kept of a fit."""
+    yield name, "status", result.status
+    for curve, misfit in result.misfit.items():
+        if misfit is not None:
+            yield name, f"misfit {curve}", repr(misfit)
+    for parameter, p in result.parameters.items():
+        yield name, f"{parameter} state", p.state
+        yield name, f"{parameter} value", repr(p.value)
+        low, high = p.ci95 or (None, None)
+        for what, number in {"stderr": p.stderr, "low": low, "high": high}.items():
+            if number is not None:
+                yield name, f"{parameter} {what}", repr(number)
+
+
+def fits(folder: Path) -> Iterator[Row]:
+    """Fits of the reconstructions and of synthetic records."""
+    for name, (model, drive) in FITS.items():
+        test = ff.read_test(ROOT / f"{name}-reconstruction.csv")
+        yield from of_fit(f"{name}, {model}, {drive}", ff.fit(test, model=model, drive=drive))
+    for name, setup in RECORDS.items():
+        record = impact(setup, 4001) if isinstance(setup, Impact) else slow(setup, 4001)
+        (place := folder / name).mkdir()
+        test = ff.read_test(write(record, place))
+        yield from of_fit(name, ff.fit(test, model=record.model, relaxation=setup.relaxation))
+
+
+def simulations() -> Iterator[Row]:
+    """Marks of simulated curves: the published chains, relaxation, masses, under each drive."""
+    time = np.linspace(0.0, 2e-3, 401)
+    shape = np.sin(np.pi * time / time[-1]) ** 2
+    relaxing = ff.MicroscaleSpring(
+        5.5e5, 2.5e5, 0.08, 1.3e5, 0.4, 5.5e4, 0.77, 20.0, relaxation=[(0.5, 2e-4)]
+    )
+    alone = ff.Chain([relaxing], [1.2e-3], 2e-5)
+    chains = {name: item.chain for name, item in ff.published.items()} | {"relaxation": alone}
+    for name, chain in chains.items():
+        height = sum(chain.heights)
+        drives = {
+            "impact": ff.Impact(7e-3, 2.0 if name != "relaxation" else 0.4),
+            "displacement": ff.DisplacementDrive(0.4 * height * shape),
+            "stress": ff.StressDrive((5e6 if name != "relaxation" else 3e5) * shape),
+        }
+        for drive, driven in drives.items():
+            found = ff.simulate(chain, driven, time)
+            for mark, value in {
+                "peak": found.base_stress.max(),
+                "mean": found.base_stress.mean(),
+                "strain": found.strain.max(),
+                "end": found.contact_end,
+            }.items():
+                if value is not None:
+                    yield f"simulation {name}, {drive}", mark, repr(float(value))
+
+
+def together(folder: Path) -> Iterator[Row]:
+    """A joint fit of three synthetic loops, and a fourth predicted from it."""
+    time = np.linspace(0.0, 2.0, 201)
+    moved = 5e-3 * (1.0 - np.abs(time - 1.0))
+    rng = np.random.default_rng(5)
+    for i, factor in enumerate((0.9, 1.0, 1.1, 1.04)):
+        spring = ff.MicroscaleSpring(5e5, 4e5, 0.1, 1e5 * factor, 0.35, 5e4, 0.6)
+        stress = ff.simulate(ff.Chain([spring], [1e-2], 1e-4), ff.DisplacementDrive(moved), time)
+        noisy = stress.base_stress + 300.0 * rng.standard_normal(time.size)
+        path = folder / (f"loop-{i}.csv" if i < 3 else "other.csv")
+        rows = zip(time, moved * 1e3, noisy / 1e3, strict=True)
+        lines = [
+            "time (s),displacement (mm),stress (kPa)",
+            *(f"{t:.9g},{w:.9g},{s:.9g}" for t, w, s in rows),
+        ]
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        text = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\n[noise]\nstress = "300 Pa"\n'
+        path.with_suffix(".toml").write_text(text, encoding="utf-8")
+    (folder / "STUDY.toml").write_text(JOINT, encoding="utf-8")
+    found = ff.joint(folder / "STUDY.toml", jobs=1)
+    for name, one in found.parameters.items():
+        yield "joint", f"{name} value", repr(one.value)
+        if one.ci95 is not None:
+            yield "joint", f"{name} stderr", repr((one.ci95[1] - one.ci95[0]) / 3.92)
+    told = ff.predict(found, folder / "other.csv")
+    for curve, share in told.inside.items():
+        yield "prediction", f"inside {curve}", repr(share)
+        yield "prediction", f"band {curve}", repr(told.curves[curve].half_width)
+
+
+def changed(before: dict[tuple[str, str], str], now: dict[tuple[str, str], str]) -> list[str]:
+    """Sentences on what is not as it was."""
+    out = [f"{' '.join(key)}: gone" for key in before if key not in now]
+    for (name, what), value in now.items():
+        old = before.get((name, what))
+        if old is None:
+            out.append(f"{name} {what}: new ({value})")
+            continue
+        try:
+            size, off = abs(float(old)), abs(float(value) - float(old))
+        except ValueError:
+            same = old == value
+        else:
+            error = before.get((name, f"{what.rpartition(' ')[0]} stderr"), "0")
+            bound = EXACT if name.startswith("simulation") else OTHER
+            ends = what.endswith((" value", " low", " high"))
+            allowed = ERRORS * float(error) + 1e-9 * size if ends and float(error) else bound * size
+            same = off <= allowed or (math.isnan(float(old)) and math.isnan(float(value)))
+        if not same:
+            out.append(f"{name} {what}: {old} is now {value}")
+    return out
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--renew", action="store_true")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as place:
+        rows = [*simulations(), *fits(Path(place)), *together(Path(place))]
+    if options.renew:
+        with FILE.open("w", newline="", encoding="utf-8") as file:
+            csv.writer(file, lineterminator="\n").writerows(
+                [("result", "quantity", "value"), *rows]
+            )
+        return 0
+    with FILE.open(newline="", encoding="utf-8") as file:
+        before = {(name, what): value for name, what, value in list(csv.reader(file))[1:]}
+    now = {(name, what): value for name, what, value in rows}
+    told = changed(before, now)
+    print("\n".join(told) or f"All {len(now)} numbers are as they were.")
+    return 1 if told else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
