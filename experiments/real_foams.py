@@ -30,7 +30,8 @@ import foamfit as ff
 from foamfit.data.measurement import Measurement
 from foamfit.report.figures import BLUE, GREY, VERMILION, drawing, save
 from foamfit.report.readable import readable
-from foamfit.results import Fit
+from foamfit.results import Fit, ParameterEstimate
+from foamfit.springs.parameters import NUISANCE
 from foamfit.text import number, percent
 
 HERE = Path(__file__).parent
@@ -127,19 +128,24 @@ def first_cycles(data: Path, folder: Path) -> Iterator[Measurement]:
         yield ff.read_test(file, toml)
 
 
+def varied(result: Fit) -> dict[str, ParameterEstimate]:
+    """Parameters of the springs that vary; the zeros of a record are none of the foam's."""
+    found = result.parameters.items()
+    return {name: p for name, p in found if p.vary and name not in NUISANCE}
+
+
 def rows_of(test: str, law: str, result: Fit, seconds: float) -> Iterator[dict[str, object]]:
-    """Give one row for each parameter that varies."""
-    for name, p in result.parameters.items():
-        if p.vary:
-            low, high = p.ci95 or (None, None)
-            yield {
-                "test": test, "foam": test.rpartition("-comp")[0], "law": law,
-                "misfit": result.misfit["stress_strain"],
-                "agreeing": result.statistics["n_agreeing"],
-                "seconds": seconds,
-                "parameter": name, "value": p.value, "stderr": p.stderr, "ci95_low": low,
-                "ci95_high": high, "unit": p.unit, "state": p.state,
-            }  # fmt: skip
+    """Give one row for each parameter of the springs that varies."""
+    for name, p in varied(result).items():
+        low, high = p.ci95 or (None, None)
+        yield {
+            "test": test, "foam": test.rpartition("-comp")[0], "law": law,
+            "misfit": result.misfit["stress_strain"],
+            "agreeing": result.statistics["n_agreeing"],
+            "seconds": seconds,
+            "parameter": name, "value": p.value, "stderr": p.stderr, "ci95_low": low,
+            "ci95_high": high, "unit": p.unit, "state": p.state,
+        }  # fmt: skip
 
 
 def markdown(head: list[str], rows: list[list[str]]) -> str:
@@ -224,7 +230,7 @@ def draw(results: dict[str, Fit], path: Path) -> None:
         for law, result in results.items():
             fitted = result.curves.stress
             assert fitted is not None
-            count = sum(p.vary for p in result.parameters.values())
+            count = len(varied(result))
             misfit = percent(result.misfit["stress_strain"] or 0.0)
             name = {PLAIN: "bistable", BEST: "microscale with relaxation"}[law]
             style = styles[law] | {"zorder": 3 if law == BEST else 2.5}
@@ -254,8 +260,7 @@ def _write_values(side: Axes, result: Fit) -> None:
         "sigma_minus": "snap-back stress", "spread_minus": "and its spread",
         "g1": "relaxing strength", "tau1": "relaxation time",
     }  # fmt: skip
-    varied = {name: p for name, p in result.parameters.items() if p.vary}
-    for i, (name, p) in enumerate(varied.items()):
+    for i, (name, p) in enumerate(varied(result).items()):
         one, y = readable(name, p), 0.93 - 0.088 * i
         stem, index = one.symbol
         index = index.partition(",")[0].replace("−", "-")

@@ -14,16 +14,20 @@ EXACT, FOLLOWED = 1e-6, 1.5
 
 
 def driving_motion(measurement: Measurement, time: Array) -> SmoothMotion | None:
-    """The measured motion without its noise; None where it is exact, or is not there.
+    """The measured motion without its noise; None where its samples say all, or are not there.
 
-    Where it leaves the samples more than their noise the machine's motion is not that smooth: the
-    samples themselves are the better motion. `time` (n,) is that of the samples, s.
+    An exact motion that turns sharply between samples went further than they say. Where a noisy one
+    leaves the samples more than their noise the machine's motion is not that smooth: the samples
+    themselves are the better motion. `time` (n,) is that of the samples, s.
     """
     values, level = measurement.displacement, measurement.noise.of("displacement")
-    if values is None or level is None or level.sigma <= EXACT * float(np.ptp(values)):
+    if values is None or level is None:
         return None
     counts = measurement.sampled.get("displacement")
     found = follow(time, values, level, counts)
+    if level.sigma <= EXACT * float(np.ptp(values)):
+        beside = np.abs(found.turns[:, None] - time).min(axis=1, initial=np.inf)
+        return found if np.any(beside > 1e-6 * float(np.median(np.diff(time)))) else None
     if measurement.block > 1 and found.turns.size:
         # The mean of rows on either side of a turn lies off the motion.
         gap = float(np.median(np.diff(time)))
