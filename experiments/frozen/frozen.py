@@ -78,14 +78,14 @@ def of_fit(name: str, result: ff.FitResult) -> Iterator[Row]:
     yield name, "status", result.status
     for curve, misfit in result.misfit.items():
         if misfit is not None:
-            yield name, f"misfit {curve}", repr(misfit)
+            yield name, f"misfit {curve}", repr(float(misfit))
     for parameter, p in result.parameters.items():
         yield name, f"{parameter} state", p.state
-        yield name, f"{parameter} value", repr(p.value)
+        yield name, f"{parameter} value", repr(float(p.value))
         low, high = p.ci95 or (None, None)
         for what, number in {"stderr": p.stderr, "low": low, "high": high}.items():
             if number is not None:
-                yield name, f"{parameter} {what}", repr(number)
+                yield name, f"{parameter} {what}", repr(float(number))
 
 
 def fits(folder: Path) -> Iterator[Row]:
@@ -149,13 +149,13 @@ def together(folder: Path) -> Iterator[Row]:
     (folder / "STUDY.toml").write_text(JOINT, encoding="utf-8")
     found = ff.joint(folder / "STUDY.toml", jobs=1)
     for name, one in found.parameters.items():
-        yield "joint", f"{name} value", repr(one.value)
+        yield "joint", f"{name} value", repr(float(one.value))
         if one.ci95 is not None:
-            yield "joint", f"{name} stderr", repr((one.ci95[1] - one.ci95[0]) / 3.92)
+            yield "joint", f"{name} stderr", repr(float(one.ci95[1] - one.ci95[0]) / 3.92)
     told = ff.predict(found, folder / "other.csv")
     for curve, share in told.inside.items():
-        yield "prediction", f"inside {curve}", repr(share)
-        yield "prediction", f"band {curve}", repr(told.curves[curve].half_width)
+        yield "prediction", f"inside {curve}", repr(float(share))
+        yield "prediction", f"band {curve}", repr(float(told.curves[curve].half_width))
 
 
 def changed(before: dict[tuple[str, str], str], now: dict[tuple[str, str], str]) -> list[str]:
