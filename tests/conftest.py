@@ -120,6 +120,16 @@ def synthetic_impact(
 
 
 @functools.cache
+def refused(path: Path, *words: str) -> None:
+    """A test is refused in one sentence that has these words."""
+    with pytest.raises(ff.InputError) as caught:
+        ff.read_test(path)
+    message = str(caught.value)
+    assert "\n" not in message
+    for word in words:
+        assert word in message
+
+
 def synthetic_loop(noise: float = 0.005) -> tuple[ff.BistableSpring, Measurement]:
     """A quasi-static loop without time and without striker."""
     spring = ff.published["foam-1/model-1"].bistable

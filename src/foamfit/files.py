@@ -90,7 +90,7 @@ def csv_bytes(rows: Iterable[Iterable[object]]) -> bytes:
     """Rows of cells as CSV; an apostrophe keeps a spreadsheet from taking a text for a formula."""
     text = io.StringIO(newline="")
     csv.writer(text, lineterminator="\n").writerows(map(_harmless, row) for row in rows)
-    # A name that is no UTF-8 keeps its bytes as an escape.
+    # A non-UTF-8 name keeps its bytes as an escape.
     return text.getvalue().encode("utf-8", "backslashreplace")
 
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from conftest import refused
 from foamfit.cli import main
 from foamfit.data.csv_file import read_test
-from foamfit.errors import InputError
 
 SPECIMEN = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\n'
 COLUMNS = SPECIMEN + "[columns]\n"
@@ -42,15 +42,6 @@ def expect(test, time=TIME[-1]):
     assert test.stress.max() == pytest.approx(2e6, rel=1e-5)
     assert test.displacement.max() == pytest.approx(4e-3, rel=1e-5)
     assert (None if test.time is None else test.time[-1]) == pytest.approx(time)
-
-
-def refused(path, *words):
-    with pytest.raises(InputError) as caught:
-        read_test(path)
-    message = str(caught.value)
-    assert "\n" not in message
-    for word in words:
-        assert word in message
 
 
 def asked(test):

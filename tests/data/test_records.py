@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 import fabricated
 import foamfit as ff
-from conftest import synthetic_impact
+from conftest import refused, synthetic_impact
 from foamfit.cli import main
 from foamfit.data.csv_file import read_test
 from foamfit.data.describe import describe
@@ -42,15 +42,6 @@ def loop(n=101, top=4.0):
     """Time (ms), stress (MPa) and displacement (mm) of one loading and unloading."""
     shape = np.sin(np.linspace(0.0, np.pi, n))
     return np.arange(float(n)), 0.5 * top * shape, top * shape
-
-
-def refused(path, *words):
-    with pytest.raises(InputError) as caught:
-        read_test(path)
-    message = str(caught.value)
-    assert "\n" not in message
-    for word in words:
-        assert word in message
 
 
 def accounted(test):

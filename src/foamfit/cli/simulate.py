@@ -59,7 +59,7 @@ def simulate(
     target = Path(scene.with_suffix(".csv").name) if out is None else out
     table = check_files(target, plot, files_of_scene(scene))
     if target.is_file():
-        check_table(target, RESPONSE, "the response is to be written, and is none; name another")
+        check_table(target, RESPONSE, "the response is to go, and is not one; choose another name")
     with compiling(quiet=False) as compile_rest:
         chain, drive, time = read_scene(scene)
         compile_rest()

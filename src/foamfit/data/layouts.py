@@ -1,4 +1,4 @@
-"""What laboratories write that is no CSV with one header: archives, workbooks, blanks, scopes."""
+"""Laboratory files beyond plain CSV: compressed, workbooks, blank-separated, oscilloscopes."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def _sheet(path: Path, raw: bytes, sheet: str | None) -> bytes:
     except ImportError:
         needs = 'reading .xlsx needs openpyxl, which is not installed: pip install "foamfit[excel]"'
         raise InputError(f"{path}: {needs}") from None
-    except Exception as error:  # a zip that is no workbook, in a dozen ways
+    except Exception as error:  # many kinds are raised for a ZIP that is not a workbook
         raise InputError(f"{path}: is no Excel workbook that can be read ({error}).") from None
     tables = [
         str(name)

@@ -225,7 +225,7 @@ def write_result(
     """Write all files of a result into a folder that is there; the report and figures if wanted."""
     figures = draw_all(result, width, mapped) if pages else ()
     text = json.dumps(result.to_json_dict(), indent=2, ensure_ascii=False, allow_nan=False)
-    # A name that is no UTF-8 keeps its bytes as an escape of JSON.
+    # A non-UTF-8 name keeps its bytes as a JSON escape.
     (folder / "fit.json").write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
     write_table(folder / "parameters.csv", _parameter_rows(result.parameters))
     write_table(folder / "curves.csv", _curve_rows(result.curves, result.measurement))

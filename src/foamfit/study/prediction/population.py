@@ -339,7 +339,7 @@ def _wider(ci95: Pair | None, stderr: float) -> float:
 
 
 def _root(correlation: Array) -> Array:
-    """A root of a correlation; what of it is negative is none."""
+    """Matrix square root of a correlation, its negative eigenvalues set to zero."""
     power, axes = np.linalg.eigh(correlation)
     return np.asarray(axes * np.sqrt(np.maximum(power, 0.0)))
 
