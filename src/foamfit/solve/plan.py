@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
-from foamfit.solve import cache, many, relaxation
+from foamfit.solve import cache, many, rates, relaxation
 from foamfit.solve import scene as scenes
 from foamfit.solve.explicit import taylor
-from foamfit.solve.implicit import steps, vibration
+from foamfit.solve.implicit import steps
 from foamfit.springs import equilibrium, kernels
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.springs.law import BISTABLE, LINEAR, MICROSCALE
@@ -29,7 +29,7 @@ TAYLOR, RADAU, AGGREGATE = "Taylor series", "Radau IIA", "aggregate"
 MAX_STEPS = 2_000_000
 # Explicit steps are given up where something relaxes, or vibrates, so many times (in radians) while
 # the scene lasts, or after so many steps.
-MOST_RELAXATION, MOST_VIBRATION, MOST_EXPLICIT = 1e4, 1e5, 200_000
+MOST_RELAXATION, MOST_VIBRATION, MOST_EXPLICIT = 1e4, 3e5, 200_000
 # Bounds on steps times springs (seconds, not hours): for all but the samples of a drive, before
 # explicit steps are given up, and for everything.
 MOST_WORK, MOST_EXPLICIT_WORK, MOST_SAMPLED = 1_500_000, 500_000, 10_000_000
@@ -39,8 +39,9 @@ MOST_WORK, MOST_EXPLICIT_WORK, MOST_SAMPLED = 1_500_000, 500_000, 10_000_000
 # and without; of springs that count as one, whose errors add up.
 OF_MASSES, OF_IMPACT, ALONG_DRIVE = 1e-4, 1e-3, 1e-4
 OF_MASSES_IMPLICIT, IMPLICIT, AS_ONE = 3e-2, 3e-4, 1e-4
-# Least truncation of implicit steps: less is rounding.
-LEAST_IMPLICIT = 1e-14
+# Least truncation of implicit steps: less is rounding. The most of them: each takes half a
+# millisecond.
+LEAST_IMPLICIT, MOST_IMPLICIT = 1e-14, 250_000
 # From so many springs on, those that carry one stress in an impact count as one.
 LEAST_AGGREGATE = 9
 # Switches that are kept, of springs that do not count as one.
@@ -201,11 +202,14 @@ class Plan(NamedTuple):
             if self.implicit is False or ending[0] not in _STIFF:
                 return _motion(TAYLOR, ending, curves, slopes, log)
         margin = OF_MASSES_IMPLICIT if len(self.ends) > 1 else IMPLICIT
-        cache.announce(steps.integrate_implicit, "the solver of stiff scenes")
+        scene, tol = (
+            scenes.Scene(*self.given(rows, heights, drag)),
+            max(margin * rtol, LEAST_IMPLICIT),
+        )
+        out = scenes.Samples(time, curves, slopes)
         *ending, lost = steps.integrate_implicit(
-            self.given(rows, heights, drag), max(margin * rtol, LEAST_IMPLICIT),
-            self.max_steps, directions, start, curves, slopes, log, np.zeros(2, np.int64),
-        )  # fmt: skip
+            scene, tol, min(self.max_steps, MOST_IMPLICIT), directions, start, out, log
+        )
         return _motion(RADAU, ending, curves, slopes, log, lost)
 
     def _remembered(
@@ -249,7 +253,7 @@ class Plan(NamedTuple):
         steep = np.where(bistable, np.maximum(rows[:, k.KH_PLUS], rows[:, k.KC]), rows[:, k.KC])
         elastic[:, k.KIND], elastic[:, k.ETA] = LINEAR, rows[:, k.ETA]
         elastic[:, k.K0] = np.maximum(rows[:, k.K0], steep) * (1.0 + terms[:, ::2].sum(axis=1))
-        swings, decays = vibration.fastest_rates((elastic, heights, *given[2:]))
+        swings, decays = rates.fastest_rates((elastic, heights, *given[2:]))
         found = [(swings, "a light mass"), (decays, "a light mass or a dashpot")]
         lasts = float(given[8][-1] - (0.0 if self.speed > 0.0 else given[8][0]))
         for i, term in zip(*np.nonzero(terms[:, ::2]), strict=True):
@@ -374,13 +378,13 @@ class Plan(NamedTuple):
 
     def fastest_rates(self, rows: Array, heights: Array) -> tuple[float, float]:
         """Vibration and relaxation (radians) that explicit steps would have to go through."""
-        return vibration.fastest_rates(self.given(rows, heights))
+        return rates.fastest_rates(self.given(rows, heights))
 
     def _is_stiff(self, given: scenes.SceneTuple) -> bool:
         """Whether explicit steps would have to follow rates that have long died out."""
         if self.implicit is not None:
             return self.implicit
-        vibrates, relaxes = vibration.fastest_rates(given)
+        vibrates, relaxes = rates.fastest_rates(given)
         return bool(vibrates > MOST_VIBRATION or relaxes > MOST_RELAXATION)
 
 

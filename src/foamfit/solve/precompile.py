@@ -106,15 +106,14 @@ def _memory(relaxed: bool) -> None:
 
 def _rest() -> None:
     """Call what else a fit calls; last what an impact on one spring does not need."""
-    from foamfit.solve import scene
-    from foamfit.solve.implicit import vibration
+    from foamfit.solve import rates, scene
     from foamfit.springs import kernels
     from foamfit.springs.model import Model
 
     Model(("linear",)).rows(np.ones(2))
     one, rows = np.ones(1), np.ones((1, kernels.N_COLUMNS))
     groups = np.ones(1, np.int64)
-    vibration.fastest_rates((rows, one, groups, one, 0.0, scene.FREE, one, 1.0, one))
+    rates.fastest_rates((rows, one, groups, one, 0.0, scene.FREE, one, 1.0, one))
     _run("displacement")
     _run("displacement", 2)
     _run("stress")
