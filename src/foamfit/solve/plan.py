@@ -75,7 +75,6 @@ _NOTHING = np.zeros(1)
 _RESTING, _AT_REST = (scenes.FREE, scenes.VISCOUS), np.zeros((1, 0))
 # Outcomes of explicit steps after which implicit ones are tried.
 _STIFF = (scenes.TOO_MANY_STEPS, scenes.STEP_UNDERFLOW)
-NO_SLOPES = np.empty((0, 0, 0))
 
 
 class Slopes(NamedTuple):
@@ -177,49 +176,48 @@ class Plan(NamedTuple):
         if self.solver == CLOSED_FORM:
             return self._closed_form(rows, heights, rtol, everything, directions)
         p, time = len(directions), self.time
-        curves = np.empty((1 + len(heights) if everything else 2, time.size))
-        slopes = np.empty((p, *curves.shape)) if p else NO_SLOPES
+        out = np.empty((1 + p, 1 + len(heights) if everything else 2, time.size))
+        log = np.empty((LOGGED, 5)) if everything else NO_SWITCHES
         if self.memory:
-            log = np.empty((LOGGED, 5)) if everything else NO_SWITCHES
-            scene = self.given(rows, heights, drag)
-            return self._remembered(scene, rtol, directions, curves, slopes, log)
+            return self._remembered(self.given(rows, heights, drag), rtol, directions, out, log)
+        drag = self.drag if drag is None else drag
         bounces = self.plain and not drag and self.implicit is None
         stiff = not bounces and self._is_stiff(self.given(rows, heights, drag))
         one = self.speed > 0.0 and self.top == scenes.FREE and len(self.ends) == 1
         one = one and p == 0 and not stiff and len(heights) >= LEAST_AGGREGATE
         if one and many.holds(rows):
-            return self._aggregate(self.given(rows, heights, drag), rtol, curves)
+            return self._aggregate(self.given(rows, heights, drag), rtol, out)
         start = _AT_REST if self.top in _RESTING else self._start(rows, heights, directions)
-        log = np.empty((LOGGED, 5)) if everything else NO_SWITCHES
         if not stiff:
             cache.announce(taylor.integrate, "the solver")
             most = self.max_explicit if self.implicit is None else self.max_steps
             ending: Sequence[Any] = taylor.integrate(
-                rows, heights, self.ends, self.mass, self.drag if drag is None else drag, self.top,
-                self.values, self.speed, time, self.margin * rtol, most, directions, start, curves,
-                slopes, log,
-            )  # fmt: skip
+                rows,
+                heights,
+                self.ends,
+                self.mass,
+                np.array((drag, self.top, self.speed, self.margin * rtol, most)),
+                self.values,
+                time,
+                directions,
+                start,
+                out,
+                log,
+            )
             if self.implicit is False or ending[0] not in _STIFF:
-                return _motion(TAYLOR, ending, curves, slopes, log)
+                return _motion(TAYLOR, ending, out, log)
         margin = OF_MASSES_IMPLICIT if len(self.ends) > 1 else IMPLICIT
         scene, tol = (
             scenes.Scene(*self.given(rows, heights, drag)),
             max(margin * rtol, LEAST_IMPLICIT),
         )
-        out = scenes.Samples(time, curves, slopes)
-        *ending, lost = steps.integrate_implicit(
-            scene, tol, min(self.max_steps, MOST_IMPLICIT), directions, start, out, log
-        )
-        return _motion(RADAU, ending, curves, slopes, log, lost)
+        most = min(self.max_steps, MOST_IMPLICIT)
+        samples = scenes.Samples(time, out[0], out[1:])
+        *ending, lost = steps.integrate_implicit(scene, tol, most, directions, start, samples, log)
+        return _motion(RADAU, ending, out, log, lost)
 
     def _remembered(
-        self,
-        given: scenes.SceneTuple,
-        rtol: float,
-        directions: Directions,
-        curves: Array,
-        slopes: Array,
-        log: Array,
+        self, given: scenes.SceneTuple, rtol: float, directions: Directions, out: Array, log: Array
     ) -> Motion:
         """Springs with memory: by explicit steps, which must follow all that is fast."""
         start = _AT_REST
@@ -229,9 +227,8 @@ class Plan(NamedTuple):
         cache.announce(taylor.integrate_with_memory, "the solver of springs with memory")
         for most in (min(FEW_EXPLICIT, self.max_steps), self.max_steps):
             ending: Sequence[Any] = taylor.integrate_with_memory(
-                given, self.unit, self.margin * rtol, most, directions, start, curves, slopes, log,
-                one_sided,
-            )  # fmt: skip
+                given, self.unit, self.margin * rtol, most, directions, start, out, log, one_sided
+            )
             if ending[0] not in _STIFF:
                 break
             rate, culprit = self._fastest(given)
@@ -243,7 +240,7 @@ class Plan(NamedTuple):
                 raise SimulationError(message)
             if ending[0] == scenes.STEP_UNDERFLOW:  # more steps would end there too
                 break
-        return _motion(TAYLOR, ending, curves, slopes, log, one_sided=one_sided)
+        return _motion(TAYLOR, ending, out, log, one_sided=one_sided)
 
     def _fastest(self, given: scenes.SceneTuple) -> tuple[float, str]:
         """What of springs with memory is fastest, in radians while the scene lasts; its name."""
@@ -338,15 +335,15 @@ class Plan(NamedTuple):
             raise SimulationError(_OUTCOMES[scenes.NOT_FINITE])
         return stress, strain, branches
 
-    def _aggregate(self, given: scenes.SceneTuple, rtol: float, curves: Array) -> Motion:
+    def _aggregate(self, given: scenes.SceneTuple, rtol: float, out: Array) -> Motion:
         """Springs under one stress count as one: one step to a switch."""
         count = len(given[0])
         log, tolerance = np.empty((4 * count + 64, 5)), AS_ONE * rtol / count
         cache.announce(many.integrate_aggregate, "the solver of many springs")
         ending = many.integrate_aggregate(
-            given, tolerance, self.max_steps, curves, log, np.zeros(2, np.int64)
+            given, tolerance, self.max_steps, out[0], log, np.zeros(2, np.int64)
         )
-        return _motion(AGGREGATE, ending, curves, NO_SLOPES, log)
+        return _motion(AGGREGATE, ending, out, log)
 
     def _start(self, rows: Array, heights: Array, directions: Directions) -> Array:
         """Strains (1 + p, springs) in equilibrium with the first sample, and their derivatives.
@@ -402,8 +399,7 @@ def _on_one_plateau(rows: Array, branches: NDArray[np.int64], directions: Direct
 def _motion(
     method: str,
     ending: Sequence[Any],
-    curves: Array,
-    slopes: Array,
+    out: Array,
     log: Array,
     lost: float = 0.0,
     one_sided: Array = _NOTHING[:0],
@@ -412,9 +408,9 @@ def _motion(
     outcome, time, steps, switches = ending
     if outcome != scenes.DONE:
         raise SimulationError(_OUTCOMES[outcome].format(steps=steps, time=time))
-    slope = None if slopes is NO_SLOPES else Slopes(slopes[:, 1:], slopes[:, 0], one_sided)
+    slopes = Slopes(out[1:, 1:], out[1:, 0], one_sided) if len(out) > 1 else None
     seen = log if log is NO_SWITCHES else log[:switches]
-    return Motion(curves[1:], curves[0], time, seen, steps, method, slope, lost)
+    return Motion(out[0, 1:], out[0, 0], time, seen, steps, method, slopes, lost)
 
 
 def _new_history(count: int, n: int) -> tuple[Array, NDArray[np.int64]]:

@@ -80,10 +80,11 @@ class Step:
 
     Of the state, `w` and `v` (springs,) are displacements and velocities of the nodes, `v0` those
     of nodes with a mass (0 of the others) or a prescribed motion, `eps0` the strains, `branches`
-    (springs,) the branches, between the strains `low` and `high`, `stress0` and `slope0` stresses
-    and slopes dσ/dε of the law; `moves` (springs, 6) are the
-    polynomials of the nodes' motion in the last step. At the points, (springs, points), z is what the nodes move beyond v0 times time, `eps` the strains, `vel` the velocities
-    of the nodes, `stress` that of the law, `total` that with the dashpots, `slope` dσ/dε.
+    the branches, between the strains `low` and `high`, `stress0` and `slope0` the stresses of the
+    law and their slopes dσ/dε; `moves` (springs, 6) are the polynomials of the nodes' motion in
+    the last step. At the points, (springs, points), z is what the nodes move beyond v0 times time,
+    `eps` the strains, `vel` the velocities of the nodes, `stress` that of the law, `total` that
+    with the dashpots, `slope` dσ/dε.
 
     Of p derivatives, `d_w`, `d_v0`, `d_eps0` are (p, springs), `d_z`, `d_eps`, `d_total` (p,
     springs, points), and `d_base` (p,) is that of the base stress where the last step ended.

@@ -44,7 +44,7 @@ class Start(NamedTuple):
 
 
 class Event(NamedTuple):
-    """An event: when in a step [0, 1], of which spring (-1: none, one past the last: base), side."""
+    """When in a step [0, 1], of which spring (-1: none, one past the last: base), on which side."""
 
     when: float
     which: int

@@ -53,7 +53,7 @@ class Ending(NamedTuple):
     lost: float = 0.0
 
 
-class _End(Exception):
+class _EndError(Exception):
     """The end of a run."""
 
     def __init__(self, outcome: int, time: float) -> None:
@@ -78,13 +78,13 @@ def integrate_implicit(
         run = _Run(scene, tol, directions, start, out, log)
         try:
             run.follow(max_steps)
-        except _End as end:
+        except _EndError as end:
             lost = run.control.damped
             if run.vibrations.worst[1] > 0.0:
                 scales = run.control.motion, run.control.stress
                 lost += float((run.vibrations.worst / scales).max())
             return Ending(end.outcome, end.time, run.steps, run.switches, lost)
-    raise AssertionError  # a run ends by `_End`
+    raise AssertionError  # a run ends by `_EndError`
 
 
 class _Run:
@@ -158,17 +158,17 @@ class _Run:
         step, stalled = self.step, 0
         while self.steps < max_steps:
             if self.done == self.t.size:
-                raise _End(scenes.DONE, math.nan)
+                raise _EndError(scenes.DONE, math.nan)
             horizon, push, push_rate = float(self.t[-1]), 0.0, 0.0
             if not self.struck:
                 horizon, push, push_rate = self._drive(self.steps == 0 and stalled == 0)
             step.settle()
             if self.scene.top == scenes.STRESS and self._is_flat():
-                raise _End(scenes.FLAT_UNDER_STRESS, self.now)
+                raise _EndError(scenes.FLAT_UNDER_STRESS, self.now)
             base = self._base_stress(push)
             if horizon <= self.now:  # a single sample, or the last one
                 self._record_rest(base)
-                raise _End(scenes.DONE, math.nan)
+                raise _EndError(scenes.DONE, math.nan)
             start = Start(self.now, base, self.pressed, push, push_rate)
             span = min(horizon - self.now, self.control.proposed)
             span, arrived, event = self._longest_step(start, span)
@@ -178,14 +178,14 @@ class _Run:
                 stalled = 0
                 self._take(span, horizon, leaves)
             elif stalled > 4 * self.count + 8:
-                raise _End(scenes.STEP_UNDERFLOW, self.now)
+                raise _EndError(scenes.STEP_UNDERFLOW, self.now)
             if arrived and not leaves:
                 opened = self._switch(event, span)
                 leaves = opened and self.struck and self.pressed
             if leaves:
                 self._fly()
-                raise _End(scenes.DONE, self.now)
-        raise _End(scenes.TOO_MANY_STEPS, self.now)
+                raise _EndError(scenes.DONE, self.now)
+        raise _EndError(scenes.TOO_MANY_STEPS, self.now)
 
     def _longest_step(self, start: Start, span: float) -> tuple[float, bool, Event]:
         """Find the longest step within `span` that is exact enough and ends no later than an event.
@@ -217,8 +217,8 @@ class _Run:
             if what != AGAIN:
                 return span, what != FREELY, event
         if (step.ahead() < 1e-3).any():
-            raise _End(scenes.NOT_FINITE, now)
-        raise _End(scenes.STEP_UNDERFLOW, now)
+            raise _EndError(scenes.NOT_FINITE, now)
+        raise _EndError(scenes.STEP_UNDERFLOW, now)
 
     def _guess(self, span: float) -> None:
         """Fill z with the motion of the last step carried on over the next."""
@@ -241,7 +241,7 @@ class _Run:
         self.done = max(begun, int(np.searchsorted(self.t, end, "right" if last else "left")))
         step.moves = polynomial(0.0, step.z + step.v0[:, None] * (span * NODES))
         if not self._record(slice(begun, self.done), span):
-            raise _End(scenes.NOT_FINITE, self.now)
+            raise _EndError(scenes.NOT_FINITE, self.now)
         self.steps += 1
         wait = float(self.t[min(begun, self.t.size - 1)]) - self.now
         self.vibrations.remember(step, span, wait)
