@@ -157,10 +157,8 @@ def backgrounds(template: str) -> dict[str, tuple[str, str]]:
 @pytest.mark.parametrize(
     ("template", "states"),
     [
-        ("report.html", ("determined", "weak", "not-determined")),
-        ("report.html", ("ok", "warnings-state", "failed")),
-        ("joint.html", ("determined", "weak", "not-determined")),
-        ("summary.html", ("ok", "warnings", "failed")),
+        ("base.html", ("determined", "weak", "not-determined")),
+        ("base.html", ("ok", "warnings", "failed")),
     ],
 )
 def test_states_on_the_pages_are_told_apart_and_can_be_read(

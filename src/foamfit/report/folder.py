@@ -224,9 +224,7 @@ def write_result(
 ) -> None:
     """Write all files of a result into a folder that is there; the report and figures if wanted."""
     figures = draw_all(result, width, mapped) if pages else ()
-    text = json.dumps(result.to_json_dict(), indent=2, ensure_ascii=False, allow_nan=False)
-    # A non-UTF-8 name keeps its bytes as a JSON escape.
-    (folder / "fit.json").write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
+    write_json(folder / "fit.json", result.to_json_dict())
     write_table(folder / "parameters.csv", _parameter_rows(result.parameters))
     write_table(folder / "curves.csv", _curve_rows(result.curves, result.measurement))
     if result.intervals is not None and result.intervals.profiles:
@@ -243,6 +241,12 @@ def write_result(
     if pages:
         page = render_report(result, drawn)
         (folder / "report.html").write_text(page, encoding="utf-8", errors="replace")
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write plain types as JSON; a non-UTF-8 name keeps its bytes as a JSON escape."""
+    text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
+    path.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
 
 
 def write_table(path: Path, rows: Iterable[Iterable[object]]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from foamfit.report.figures import BLUE, GREY, TWO, VERMILION, abreast, drawing, image, inches
-from foamfit.report.folder import CYCLES_PLOTTED, save_whole, write_result, write_table
+from foamfit.report.folder import CYCLES_PLOTTED, save_whole, write_json, write_result, write_table
 from foamfit.report.plotted import table
 from foamfit.text import aligned, percent, wrapped
 
@@ -51,8 +50,7 @@ def write_cycles(
         inner = folder / f"cycle-{number}"
         write_result(result, inner, pages=pages, width=width, mapped=mapped)
     write_table(folder / "cycles.csv", found.rows())
-    text = json.dumps(found.to_json_dict(), indent=2, ensure_ascii=False, allow_nan=False)
-    (folder / "cycles.json").write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
+    write_json(folder / "cycles.json", found.to_json_dict())
     if pages:
         figure = plot_cycles(found, width=width)
         (folder / "cycles.png").write_bytes(image(figure, "png", DPI))

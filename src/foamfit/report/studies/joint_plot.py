@@ -11,8 +11,7 @@ import numpy as np
 
 from foamfit.fitting.links import RATES, law_values
 from foamfit.report.figures import BLUE, GREY, TWO, VERMILION, abreast, drawing, inches
-from foamfit.report.readable import readable_unit
-from foamfit.report.studies.joint_text import in_unit
+from foamfit.report.readable import in_unit, readable_unit
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import percent
 

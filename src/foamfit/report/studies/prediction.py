@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +19,13 @@ from foamfit.report.figures import (
     inches,
     laid_out,
 )
-from foamfit.report.folder import PREDICTION_FILES, check_target, save_whole, write_table
+from foamfit.report.folder import (
+    PREDICTION_FILES,
+    check_target,
+    save_whole,
+    write_json,
+    write_table,
+)
 from foamfit.report.readable import readable_unit
 from foamfit.text import aligned, percent, wrapped
 
@@ -52,10 +57,7 @@ def save_prediction(
     """
 
     def write(fresh: Path) -> None:
-        text = json.dumps(found.to_json_dict(), indent=2, ensure_ascii=False, allow_nan=False)
-        (fresh / "prediction.json").write_text(
-            text + "\n", encoding="utf-8", errors="backslashreplace"
-        )
+        write_json(fresh / "prediction.json", found.to_json_dict())
         write_table(fresh / "prediction.csv", found.rows())
         if not report:
             return
