@@ -19,7 +19,7 @@ from matplotlib.colors import to_rgb
 
 import foamfit.report
 from drawn import figures
-from foamfit.report.budget_plot import LOOKS
+from foamfit.report.identifiability_plots import LOOKS
 from foamfit.report.plots import DASHES, MARKS
 from foamfit.report.studies import cycles, joint_plot, prediction
 from foamfit.results import SOURCES
