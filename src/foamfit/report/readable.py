@@ -110,6 +110,11 @@ def readable(name: str, p: ParameterEstimate) -> Readable:
     )  # fmt: skip
 
 
+def own_name(name: str, model: str) -> str:
+    """Name of a parameter, without the spring where there is only one."""
+    return name if "+" in model else name.removeprefix("s1_")
+
+
 def in_unit(values: Sequence[float], unit: str) -> str:
     """Write one value, or the ends of an interval, in the unit in which they read well."""
     if not values:

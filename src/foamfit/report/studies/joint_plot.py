@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Sequence
 from itertools import takewhile
 from typing import TYPE_CHECKING, Any
@@ -10,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from foamfit.fitting.links import RATES, law_values
-from foamfit.report.figures import BLUE, GREY, TWO, VERMILION, abreast, drawing, inches
-from foamfit.report.readable import in_unit, readable_unit
+from foamfit.report import figures
+from foamfit.report.figures import BLUE, TWO, VERMILION
+from foamfit.report.readable import in_unit, own_name, readable_unit
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import percent
 
@@ -48,22 +48,19 @@ def plot_joint(found: JointData, *, width: str = TWO) -> Figure:
         if one.kind not in ("fixed", "shared") and name not in NUISANCE
     ]  # fmt: skip
     shared = [n for n, one in found.parameters.items() if one.kind == "shared"]
-    panels, wide = len(names) + bool(shared), inches(width)
-    across = abreast(wide, min(LOOPS, max(len(shown), COLUMNS)), LEAST_LOOP)
-    columns = abreast(wide, COLUMNS, LEAST_PANEL)
+    panels, wide = len(names) + bool(shared), figures.inches(width)
+    across = figures.abreast(wide, min(LOOPS, max(len(shown), COLUMNS)), LEAST_LOOP)
+    columns = figures.abreast(wide, COLUMNS, LEAST_PANEL)
     rows, low = -(-len(shown) // across), -(-panels // columns)
     heights = [rows * LOOP[1], low * PANEL[1]]
     more = f"; {len(shown)} of {len(found.tests)} drawn" if len(shown) < len(found.tests) else ""
-    lines = [
-        line
-        for part in (
-            f"{found.study.name} · {found.study.model} · {len(found.tests)} tests together",
-            f"loops: measured grey and wide, fitted blue and thin{more}; below: 95 % intervals by "
-            "test, hollow if not well determined; lines: in common",
-        )
-        for line in textwrap.wrap(part, int(17 * wide))
-    ]
-    with drawing(wide, sum(heights) + 0.2 + 0.13 * len(lines)) as figure:
+    lines = figures.title_lines(
+        wide,
+        f"{found.study.name} · {found.study.model} · {len(found.tests)} tests together",
+        f"loops: measured grey and wide, fitted blue and thin{more}; below: 95 % intervals by "
+        "test, hollow if not well determined; lines: in common",
+    )
+    with figures.drawing(wide, sum(heights) + 0.2 + 0.13 * len(lines), lines) as figure:
         top, bottom = figure.subfigures(2, 1, height_ratios=heights, squeeze=False)[:, 0]
         most = int(72.0 * wide / across / 4.2)  # letters of a name
         loops = top.subplots(rows, across, squeeze=False).ravel().tolist()
@@ -76,7 +73,6 @@ def plot_joint(found: JointData, *, width: str = TWO) -> Figure:
             ax.set_axis_off()
         if shared:
             _list(axes[len(names)], found, shared, stacked=narrow)
-        figure.suptitle("\n".join(lines), x=0.01, ha="left", fontsize=8, parse_math=False)
     return figure
 
 
@@ -156,31 +152,14 @@ def _parameter(ax: Axes, found: JointData, name: str, *, parted: bool) -> None:
     rated = by_rate(found)
     factor, unit = readable_unit(abs(one.value), one.unit)
     x = np.array(found.rates, dtype=float) if rated else np.arange(1.0, len(found.tests) + 1)
-    told = f"{_title(found, name)}{f' ({unit})' if unit else ''}:"
+    told = f"{own_name(name, found.study.model)}{f' ({unit})' if unit else ''}:"
     ax.set_title(f"{told}\n{one.kind}" if parted else f"{told} {one.kind}")
     ax.set_label(f"{told} {one.kind}")
-    there = [
-        (at, one.tests[test]) for at, test in zip(x, found.tests, strict=True)
-        if one.tests and one.tests[test].state != "fixed"
-    ]  # fmt: skip
-    bars = [(at, *v.ci95) for at, v in there if v.ci95 is not None]
-    ends = np.array(bars, dtype=float).reshape(-1, 3)
-    ends[:, 1:] /= factor
-    ax.vlines(
-        ends[:, 0], ends[:, 1], ends[:, 2], color=GREY, linewidth=0.8, zorder=1,
-        label="_95 % interval",
-    )  # fmt: skip
-    middle = [v.value / factor for _, v in there]
-    if one.kind not in RATES:
-        size = 3.5 if len(found.tests) < 60 else 1.5
-        for sure, face in ((True, BLUE), (False, "white")):
-            points = [
-                (at, v.value / factor) for at, v in there if (v.state == "determined") == sure
-            ]
-            ax.plot(
-                *np.array(points).reshape(-1, 2).T, "o", color=BLUE, markerfacecolor=face,
-                markersize=size, label="_determined" if sure else "_not well determined",
-            )  # fmt: skip
+    tests = one.tests or {}
+    points = [(at, tests[test]) for at, test in zip(x, found.tests, strict=True) if test in tests]
+    points = [(at, value) for at, value in points if value.state != "fixed"]
+    size = 0.0 if one.kind in RATES else 3.5 if len(found.tests) < 60 else 1.5
+    values, ends = figures.draw_estimates(ax, points, factor, size)
     if rated:
         ax.set_xscale("log")
         ax.set_xlabel("strain rate (1/s)", labelpad=1)
@@ -193,8 +172,8 @@ def _parameter(ax: Axes, found: JointData, name: str, *, parted: bool) -> None:
         if len(x) <= MOST_NAMES:
             ax.set_xticks(x, _marks(found.tests))
     _common(ax, found, name, x, factor)
-    if middle and one.kind not in RATES:
-        _limit(ax, middle, ends[:, 1:].ravel().tolist())
+    if values and one.kind not in RATES:
+        figures.limit(ax, values, ends)
 
 
 def _common(ax: Axes, found: JointData, name: str, x: Array, factor: float) -> None:
@@ -238,29 +217,15 @@ def _list(ax: Axes, found: JointData, names: list[str], *, stacked: bool) -> Non
         error += f" {one.state or ''}" if one.state != "determined" else ""
         value = in_unit((one.value,), one.unit)
         if stacked:
-            lines += [[_title(found, name), "", ""], [f"   {value} {error}", "", ""]]
+            lines += [[own_name(name, found.study.model), "", ""], [f"   {value} {error}", "", ""]]
         else:
-            lines.append([_title(found, name), value, error])
+            lines.append([own_name(name, found.study.model), value, error])
     size = min(7.0, 90.0 / len(lines))
     for column, x in ((0, 0.0), (1, 0.42), (2, 0.78)):
         told = "\n".join(line[column] for line in lines)
         ax.text(x, 1.0, told, transform=ax.transAxes, va="top", fontsize=size, linespacing=1.5)
 
 
-def _title(found: JointData, name: str) -> str:
-    """Name of a parameter, without the spring where there is one alone."""
-    return name if "+" in found.study.model else name.removeprefix("s1_")
-
-
 def _say(ax: Axes, told: str, *, below: bool = False) -> None:
     y, side = (0.05, "bottom") if below else (0.97, "top")
     ax.text(0.98, y, told, transform=ax.transAxes, ha="right", va=side, fontsize=6.5)
-
-
-def _limit(ax: Axes, values: list[float], ends: list[float]) -> None:
-    """Let wide intervals run out of the panel rather than flatten the values."""
-    low, high = min(values), max(values)
-    room = max(1.5 * (high - low), 0.1 * max(abs(low), abs(high)), 1e-12)
-    bottom, top = max(min([low, *ends]), low - room), min(max([high, *ends]), high + room)
-    edge = 0.08 * max(top - bottom, 0.2 * room)
-    ax.set_ylim(bottom - edge, top + 2.0 * edge)
