@@ -24,10 +24,11 @@ from foamfit.report.comparison import (
     Pair,
     Row,
     compare,
+    comparison_text,
     recognised,
+    write_csv,
 )
 from foamfit.report.comparison_plot import plot_comparison
-from foamfit.report.comparison_text import comparison_text, write_csv
 from foamfit.results import Correlation
 
 NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")

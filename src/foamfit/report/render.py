@@ -27,6 +27,7 @@ def environment() -> Environment:
     filters = (text.percent, text.engineering, text.significant, text.counted, text.listed, number)
     made.filters |= {one.__name__: one for one in filters}
     made.filters |= {"paragraphs": _paragraphs, "aligned": _aligned}
+    made.filters["spoken"] = lambda name: name.replace("_", "-")
     return made
 
 
