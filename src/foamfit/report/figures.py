@@ -128,7 +128,8 @@ def legend_below(figure: Figure, entries: dict[str, Any]) -> int:
         widths = [max(sizes[i : i + lines]) for i in range(0, len(names), lines)]
         if sum(widths) <= room:
             break
-    figure.legend(handles, names, loc="outside lower center", ncols=len(widths))
+    told = [name.replace("$", r"\$") for name in names]
+    figure.legend(handles, told, loc="outside lower center", ncols=len(widths))
     return lines
 
 
