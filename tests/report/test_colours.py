@@ -21,7 +21,7 @@ import foamfit.report
 from drawn import figures
 from foamfit.report.identifiability_plots import LOOKS
 from foamfit.report.plots import DASHES, MARKS
-from foamfit.report.studies import cycles, joint_plot, prediction
+from foamfit.report.studies import cycles, joint, prediction
 from foamfit.results import SOURCES
 
 EYES = {
@@ -125,7 +125,7 @@ def test_sources_of_a_budget_are_told_apart_by_colour_or_hatching() -> None:
     ("one", "other"),
     [
         (prediction.MEASURED, prediction.VERMILION),
-        (joint_plot.MEASURED, joint_plot.BLUE),
+        (joint.MEASURED, joint.BLUE),
         (cycles.BLUE, "white"),  # hollow marks
     ],
 )
