@@ -21,9 +21,10 @@ from foamfit.report.folder import load_result
 from foamfit.report.readable import readable
 from foamfit.report.render import sentences, words
 from foamfit.results import Fit, ParameterEstimate, law_in_words
+from foamfit.springs.laws import law
+from foamfit.springs.laws.record import ETA, RELAXATION_TIME, STRENGTH, Compared
 from foamfit.springs.model import Model
-from foamfit.springs.parameters import HYSTERETIC, names_of
-from foamfit.springs.published import MM, MPA, PublishedSet
+from foamfit.springs.published import PublishedSet
 from foamfit.springs.published import published as published_sets
 from foamfit.text import signed, significant
 
@@ -39,7 +40,7 @@ VAGUE = "its standard error is many times its value, so the test does not determ
 # What is read of a result, and of each of its parameters.
 _NUMBER = int | float | None
 CONTENT = {"test": str, "model": str, "drive": str, "status": str, "parameters": Mapping}
-ESTIMATE = {"value": _NUMBER, "stderr": _NUMBER}
+ESTIMATE: dict[str, Any] = {"value": _NUMBER, "stderr": _NUMBER}
 ESTIMATE |= {"unit": str, "vary": bool, "state": str, "why": str}
 
 
@@ -128,10 +129,9 @@ def compare(results: Sequence[Result], published: str | None = None) -> Comparis
     where a test names none, all are put beside the first of them. InputError if a result cannot be
     read, the set is unknown, or there is nothing to compare with.
     """
-    names = ", ".join(published_sets)
-    if published is not None and published not in published_sets:
-        raise InputError(f"there is no published set '{published}'; there are {names}")
-    sides = [_side_of(result) for result in results]
+    if published is not None:
+        published_side(published)  # refuses one that is not there
+    sides = [side_of(result) for result in results]
     if not sides:
         raise InputError("nothing to compare; give at least one result folder")
     belongs = [published or (None if _unpublished(s) else recognised(s.test)) for s in sides]
@@ -145,7 +145,7 @@ def compare(results: Sequence[Result], published: str | None = None) -> Comparis
             f"no published set has {kind} springs; give a second result to compare with"
             if kind
             else f"the test '{sides[0].test}' names no published set; choose one by --published "
-            f"({names}), or give a second result"
+            f"({', '.join(published_sets)}), or give a second result"
         )
     return Comparison(tuple(_pair(side, sides[0]) for side in sides[1:]), with_published=False)
 
@@ -182,7 +182,7 @@ class Side:
     relaxation: int = 0  # terms of each hysteretic spring
 
 
-def _side_of(result: Result) -> Side:
+def side_of(result: Result) -> Side:
     """Return the parameters of a fit; InputError if the result is not whole."""
     if isinstance(result, Fit):
         content: Mapping[str, Any] = result.to_json_dict()
@@ -245,93 +245,42 @@ def _correlation(content: Any, where: str) -> dict[tuple[str, str], float]:
 
 
 def published_side(name: str) -> Side:
-    """Return the parameters of a published set."""
+    """Return the parameters of a published set; InputError if there is none of that name."""
+    if name not in published_sets:
+        known = ", ".join(published_sets)
+        raise InputError(f"there is no published set '{name}'; there are {known}")
     item = published_sets[name]
-    kinds = Model.parse(item.model).kinds
     values = {} if item.eta is None else {"site_eta": item.eta}
-    for i, (kind, spring) in enumerate(zip(kinds, item.chain.springs, strict=True), start=1):
-        shorts = (short for short in names_of(kind) if short != "eta")
-        values |= {f"s{i}_{short}": getattr(spring, short) for short in shorts}
+    for i, spring in enumerate(item.chain.springs, start=1):
+        values |= {f"s{i}_{name}": getattr(spring, name) for name in spring.law.own}
         values[f"s{i}_height"] = item.chain.heights[i - 1]
     estimates = {
         name: ParameterEstimate(value, None, None, "", False, "published", "")
         for name, value in values.items()
     }
+    kinds = tuple(spring.law.kind for spring in item.chain.springs)
     return Side(f"published {name}", kinds, estimates, {}, source=item)
 
 
 def _unpublished(side: Side) -> str:
     """Kind of spring of which nothing is published, "" if there is none."""
-    return next((kind for kind in side.kinds if kind == "microscale"), "")
+    laws = map(law, side.kinds)
+    return next((one.kind for one in laws if one.hysteretic and not one.published), "")
 
 
 # ---------------------------------------------------------------- the quantities of the tables
 
 
-class _Quantity(NamedTuple):
-    """A number of the paper's tables as a function of the parameters of one spring."""
-
-    name: str
-    unit: str
-    parts: tuple[str, ...]
-    formula: Callable[..., Any]  # of floats; also of complex numbers, for its derivatives
+def _quantities(kind: str, relaxation: int) -> Iterator[Compared]:
+    """Give the rows of a kind of spring."""
+    yield from law(kind).compared
+    for k in range(1, relaxation + 1) if law(kind).hysteretic else ():
+        for param in (STRENGTH, RELAXATION_TIME):
+            yield Compared(f"{param.symbol[0]}_{k}", param.unit, (f"{param.name}{k}",), _total)
 
 
 def _total(*parts: Any) -> Any:
     return sum(parts)
-
-
-def _ratio(part: Any, k0: Any) -> Any:
-    return part / k0
-
-
-def _in_mpa(value: Any) -> Any:
-    return value / MPA
-
-
-_ETA = _Quantity("η", "Pa·s", ("eta",), _total)
-_K0 = _Quantity("k0", "MPa", ("k0",), _in_mpa)
-_HEIGHT = _Quantity("h", "mm", ("height",), lambda h: h / MM)
-TABLE = (  # of a linear spring, those whose parameters it has
-    _K0,
-    _Quantity(
-        "Δσ/σ_a",
-        "",
-        ("dsigma", "k0", "eps_a"),
-        lambda drop, k0, eps_a: drop * (1.0 - eps_a) / (k0 * eps_a),
-    ),
-    _ETA,
-    _Quantity("ε_a", "", ("eps_a",), _total),
-    _Quantity("ε_c", "", ("eps_c",), _total),
-    _HEIGHT,
-    _Quantity("k_h+/k0", "", ("kh_plus", "k0"), _ratio),
-    _Quantity("k_h−/k0", "", ("kh_minus", "k0"), _ratio),
-    _Quantity("k_c/k0", "", ("kc", "k0"), _ratio),
-)
-OF_MICROSCALE = (  # which the paper's tables do not have
-    _K0,
-    _Quantity("k_c", "MPa", ("kc",), _in_mpa),
-    _ETA,
-    _Quantity("ε_*", "", ("eps_star",), _total),
-    _Quantity("σ₊", "MPa", ("sigma_plus",), _in_mpa),
-    _Quantity("s₊", "", ("spread_plus",), _total),
-    _Quantity("σ₋", "MPa", ("sigma_minus",), _in_mpa),
-    _Quantity("s₋", "", ("spread_minus",), _total),
-    _HEIGHT,
-)
-
-
-def _quantities(kind: str, relaxation: int) -> tuple[_Quantity, ...]:
-    """Return the rows of a kind of spring; a linear spring leaves out what it does not have."""
-    table = OF_MICROSCALE if kind == "microscale" else TABLE
-    if kind not in HYSTERETIC:
-        return table
-    terms = [
-        _Quantity(f"{symbol}_{k}", unit, (f"{short}{k}",), _total)
-        for k in range(1, relaxation + 1)
-        for symbol, unit, short in (("g", "", "g"), ("τ", "s", "tau"))
-    ]
-    return (*table, *terms)
 
 
 class _Value(NamedTuple):
@@ -394,7 +343,7 @@ def _incomparable(side: Side, other: Side) -> str:
 
 
 def _family(kind: str) -> str:
-    return kind if kind in HYSTERETIC else "linear"
+    return kind if law(kind).hysteretic else "linear"
 
 
 def _spring_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
@@ -402,17 +351,17 @@ def _spring_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
     for i, kind in enumerate(side.kinds, start=1):
         alike = i <= len(other.kinds) and _family(other.kinds[i - 1]) == _family(kind)
         for quantity in _quantities(kind, side.relaxation):
-            eta = quantity is _ETA
+            eta = quantity.of == (ETA.name,)
             if eta and not several:
                 continue  # of one spring, it stands with the onsite damper
-            names = [f"s{i}_{part}" for part in quantity.parts]
+            names = [f"s{i}_{part}" for part in quantity.of]
             value = _evaluate(side, names, quantity.formula)
             reference = _evaluate(other, names, quantity.formula) if alike else None
             idle = eta and reference is None
             if value is None or (idle and (value.state, value.value) == ("fixed", 0.0)):
                 continue
             remark = nothing or _remark(value, reference, eta, side, other)
-            yield _row(i if several else 0, quantity.name, quantity.unit, value, reference, remark)
+            yield _row(i if several else 0, quantity.label, quantity.unit, value, reference, remark)
 
 
 def _damping_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
@@ -427,7 +376,7 @@ def _damping_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
         return
     remark = nothing or _remark(value, reference, True, side, other)
     yield _row(0, "η" if one_spring else "site η", "Pa·s", value, reference, remark)
-    soft = [i for i, kind in enumerate(side.kinds, 1) if kind in HYSTERETIC]
+    soft = [i for i, kind in enumerate(side.kinds, 1) if law(kind).hysteretic]
     if item is None or len(soft) != 1 or nothing:
         return
     # ρ H = m/A, so that 2 H √(ρ k_c) = 2 √(m H k_c/A).
