@@ -157,12 +157,12 @@ def known_values(problem: Problem, side: Side) -> Array:
     if side.source is not None:
         zero = ParameterEstimate(0.0, None, None, "", False, "published", "")
         known |= {name: zero for name in model.names if name.endswith("_eta")}
-    missing = [name for name in model.names if name not in known]
     families = [[law(kind).hysteretic for kind in kinds] for kinds in (model.kinds, side.kinds)]
-    if missing or families[0] != families[1]:
-        of = f"has no {missing[0]}; it " if missing else ""
-        kinds = "+".join(side.kinds)
-        raise InputError(f"{side.label} {of}is a {kinds}, not a {model.name}; give --model")
+    if families[0] != families[1]:
+        kinds = side.source.model if side.source else "+".join(side.kinds)
+        raise InputError(f"{side.label} is a {kinds}, not a {model.name}; give --model")
+    if missing := [name for name in model.names if name not in known]:
+        raise InputError(f"{side.label} has no {missing[0]}, which {model.name} needs")
     total = sum(p.value for name, p in known.items() if name.endswith("_height"))
     values = problem.vector()
     for name in model.names:

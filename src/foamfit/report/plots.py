@@ -197,12 +197,15 @@ def _panels(result: Fit) -> list[_Panel]:
         pale = {"color": PALE, "lw": 3.2, "zorder": 2}
         loop.append(_Line(strain, c.stress_along, "springs along measured strain", pale))
     pushing = [_measured(c.time, c.measured_stress), _fitted(c.time, c.stress)]
-    panels: tuple[Any, ...] = (
+    panels = (
         ("stress_time", "time", "s", "stress", "Pa", pushing),
         ("displacement_time", "time", "s", "displacement", "m", moving),
         ("stress_strain", "strain", "–", "stress", "Pa", loop),
     )
-    made = (_Panel(*panel[:-1], [line for line in panel[-1] if line]) for panel in panels)
+    made = (
+        _Panel(key, x, x_unit, y, y_unit, [line for line in lines if line])
+        for key, x, x_unit, y, y_unit, lines in panels
+    )
     return [panel for panel in made if panel.lines]
 
 
@@ -385,16 +388,18 @@ def _mark_switches(labels: _Labels, panel: _Panel, result: Fit) -> None:
 
 
 def _switches(panel: _Panel, result: Fit) -> Iterator[tuple[str, str, float, float]]:
-    """Give the corners at which a spring changes its branch: spring, name and place, SI."""
+    """Give the points at which a spring changes its branch: spring, name and place, SI."""
     for switch in result.switches:
-        name = f"s{switch.spring}"
+        ends = switch.source, switch.target
+        name = POINTS.get("".join(ends))
+        if name is None and result.chain.springs[switch.spring - 1].law.remembers:
+            continue
         x = switch.time
         if panel.is_loop:
             x = switch.displacement / result.measurement.specimen.height
-        if result.chain.springs[switch.spring - 1].corners and x is not None:
-            ends = switch.source, switch.target
+        if x is not None:
             y = switch.displacement if panel.key == "displacement_time" else switch.stress
-            yield name, POINTS.get("".join(ends), "→".join(ends)), x, y
+            yield f"s{switch.spring}", name or "→".join(ends), x, y
 
 
 def _halves(panel: _Panel, result: Fit) -> Iterator[tuple[str, str, float, float]]:
@@ -456,13 +461,15 @@ def _first_visits(result: Fit, fitted: _Line) -> Iterator[tuple[str, int, int]]:
     branches += [switch.target for switch in result.switches]
     stretches: list[tuple[str, int, int]] = []
     for branch, start, end in zip(branches, starts, starts[1:], strict=False):
+        if end <= start:
+            continue
         shakes = np.ptp(fitted.x[start : end + 1]) < 0.02 * np.ptp(fitted.x)
         if stretches and (shakes or branch == stretches[-1][0]):
             stretches[-1] = (stretches[-1][0], stretches[-1][1], end)
         elif not shakes:
             stretches.append((branch, start, end))
     for i, (branch, start, end) in enumerate(stretches):
-        if end > start and branch not in [one for one, *_ in stretches[:i]]:
+        if branch not in [one for one, *_ in stretches[:i]]:
             yield branch, start, end
 
 
