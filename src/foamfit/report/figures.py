@@ -63,6 +63,7 @@ NARROWEST, WIDEST = 2.5, 20.0
 # many stretches, which no print tells from all samples.
 MOST_POINTS, STRETCHES = 3000, 500
 HEAD = ("panel", "series", "x axis", "y axis", "x", "y")
+_STANDS = "the data of the figure would be written, and is no such table; name the figure otherwise"
 # Names of the rows and columns of a matrix that is drawn as shaded cells.
 _CELLS = WeakKeyDictionary["Artist", tuple[Sequence[str], Sequence[str]]]()
 
@@ -290,11 +291,7 @@ def table(figure: Figure) -> bytes:
     return csv_bytes(plotted(figure))
 
 
-def check_table(
-    path: Path, head: str = ",".join(HEAD),
-    words: str = "the plotted data of the figure are to be written, and is no such table; name the "
-    "figure otherwise",
-) -> None:  # fmt: skip
+def check_table(path: Path, head: str = ",".join(HEAD), words: str = _STANDS) -> None:
     """Raise InputError if something else stands where a table that begins so is to be written."""
     try:
         with path.open(encoding="utf-8", errors="replace") as file:

@@ -215,13 +215,11 @@ def simulated_test(like: Measurement, chain: Chain, drive: Impact) -> Measuremen
         like.noise.displacement or NOISE * float(np.ptp(motion)),
     )
     inside = {node: response.displacement[node - 1] for node in like.interior}
-    slowed = -np.gradient(np.gradient(motion, time), time)
-    return replace(
-        like, time=time, stress=stress, displacement=motion, interior=inside, noise=noise,
-        acceleration=None if like.acceleration is None else slowed,
-        striker=Striker(drive.mass, drive.velocity), outliers={}, sampled={}, block=1,
-        contact="file",
-    )  # fmt: skip
+    measured = like.acceleration is not None
+    slowed = -np.gradient(np.gradient(motion, time), time) if measured else None
+    made = replace(like, time=time, stress=stress, displacement=motion, acceleration=slowed)
+    made = replace(made, interior=inside, striker=Striker(drive.mass, drive.velocity), noise=noise)
+    return replace(made, outliers={}, sampled={}, block=1, contact="file")
 
 
 def _runs(chain: Chain, drive: Impact) -> Iterator[Response]:
@@ -281,21 +279,20 @@ def _faster(
 
     Its curves are simulated, and its nuisance parameters those of such a record.
     """
-    test, springs = problem.measurement, problem.model.names
-    given = {problem.objective.channel(name): value for name, value in noise.items()}
-    moved = next((value for name, value in given.items() if name.startswith("displacement")), None)
+    test = problem.measurement
+    known = {problem.objective.channel(name): value for name, value in noise.items()}
+    moved = next((value for name, value in known.items() if name.startswith("displacement")), None)
     estimated = {name: x for name, x in test.noise.estimated.items() if name == "acceleration"}
-    test = replace(test, noise=Noise(given.get("stress"), moved, estimated))
+    test = replace(test, noise=Noise(known.get("stress"), moved, estimated))
     impact = Impact(_impact(test).mass, velocity)
     test = simulated_test(test, chain_of(problem, values), impact)
     params = problem.params.copy()
     for name in problem.objective.nuisance:
         del params[name]
-    faster = make_problem(
-        test, problem.model.name, "impact", params, problem.objective.weights,
-        problem.objective.interior_mass, relaxation=problem.model.relaxation,
-    )  # fmt: skip
-    own = values[: len(springs)]
+    model, objective = problem.model, problem.objective
+    given = (test, model.name, "impact", params, objective.weights, objective.interior_mass)
+    faster = make_problem(*given, relaxation=model.relaxation)
+    own = values[: len(model.names)]
     return faster, np.append(own, faster.vector()[own.size :])
 
 

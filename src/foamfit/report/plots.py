@@ -106,19 +106,18 @@ def plot_response(
     loop = time <= (np.inf if end is None else end)  # then the striker flies
     # From the base up: light to dark, the top in the colour of what is simulated.
     shades = np.linspace(0.7, 0.35, max(len(nodes) - 1, 1))
-    motion = [
+    last = {"color": VERMILION, "lw": 1.3}
+    moving = [
         _Line(time, node, f"node {i}", {"color": str(shade), "lw": 1.0})
         for i, (node, shade) in enumerate(zip(nodes[:-1], shades, strict=False), start=1)
-    ]
-    last = {"color": VERMILION, "lw": 1.3}
-    pushed = _Line(time, stress, "_base stress", last)
-    looped = _Line(response.strain[loop], stress[loop], "_base stress", last)
+    ] + [_Line(time, nodes[-1], "top", last)]
+    pushed = [_Line(time, stress, "_base stress", last)]
+    looped = [_Line(response.strain[loop], stress[loop], "_base stress", last)]
     panels = [
-        _Panel("stress_time", "time", "s", "base stress", "Pa", [pushed]),
-        _Panel("displacement_time", "time", "s", "displacement", "m",
-               [*motion, _Line(time, nodes[-1], "top", last)]),
-        _Panel("stress_strain", "overall strain", "–", "base stress", "Pa", [looped]),
-    ]  # fmt: skip
+        _Panel("stress_time", "time", "s", "base stress", "Pa", pushed),
+        _Panel("displacement_time", "time", "s", "displacement", "m", moving),
+        _Panel("stress_strain", "overall strain", "–", "base stress", "Pa", looped),
+    ]
     with _panelled(panels, width) as (figure, axes, _):
         if end is not None:
             at = end / panels[0].scale()[0]
@@ -183,9 +182,7 @@ def _panels(result: Fit) -> list[_Panel]:
         moved = c.measured_displacement
     strain = None if c.measured_displacement is None else c.measured_displacement / height
     motion = result.measurement.motion or "measured"
-    moving = [
-        _measured(c.time, c.measured_displacement, motion), _fitted(c.time, c.displacement)
-    ]  # fmt: skip
+    moving = [_measured(c.time, c.measured_displacement, motion), _fitted(c.time, c.displacement)]
     for node, (measured, fitted) in c.interior.items():
         moving += [_measured(c.time, measured, node=node), _fitted(c.time, fitted, node)]
     loop = [

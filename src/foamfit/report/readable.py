@@ -106,10 +106,8 @@ def readable(name: str, p: ParameterEstimate) -> Readable:
         span = " to ".join(f"{end:g}".replace("-", "−") for end in ends)
     unit = {"": "–", "1": "–", "-": "–", "Pa s": "Pa·s", "Pa*s": "Pa·s"}.get(unit, unit)
     scale = f"{p.systematic / factor:.2g}" if p.systematic > 0.0 else ""
-    return Readable(
-        name, symbol(name), shown, stderr, interval, unit, p.state, p.why, p.ci95_method or "",
-        span, scale,
-    )  # fmt: skip
+    told = (p.state, p.why, p.ci95_method or "", span, scale)
+    return Readable(name, symbol(name), shown, stderr, interval, unit, *told)
 
 
 def quantity(value: float, unit: str) -> tuple[str, str]:
