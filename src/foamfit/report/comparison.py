@@ -25,7 +25,7 @@ from foamfit.report.readable import readable
 from foamfit.report.render import sentences, words
 from foamfit.results import Fit, ParameterEstimate, law_in_words
 from foamfit.springs.laws import law
-from foamfit.springs.laws.record import ETA, RELAXATION_TIME, STRENGTH, Compared
+from foamfit.springs.laws.record import ETA, RELAXATION_TIME, STRENGTH, Compared, Param
 from foamfit.springs.model import Model
 from foamfit.springs.published import PublishedSet
 from foamfit.springs.published import published as published_sets
@@ -281,10 +281,17 @@ def _unpublished(side: Side) -> str:
 
 def _quantities(kind: str, relaxation: int) -> Iterator[Compared]:
     """Give the rows of a kind of spring."""
-    yield from law(kind).compared
+    yield from law(kind).compared or map(_as_it_is, law(kind).params)
     for k in range(1, relaxation + 1) if law(kind).hysteretic else ():
         for param in (STRENGTH, RELAXATION_TIME):
             yield Compared(f"{param.symbol[0]}_{k}", param.unit, (f"{param.name}{k}",), _total)
+
+
+def _as_it_is(param: Param) -> Compared:
+    """Row of a parameter of a law that names none for the comparison."""
+    factor, unit = (1e6, "MPa") if param.unit == "Pa" else (1.0, param.unit)
+    label = "_".join(filter(None, param.symbol)) or param.name
+    return Compared(label, unit, (param.name,), lambda value: value / factor)
 
 
 def _total(*parts: Any) -> Any:
