@@ -36,10 +36,10 @@ IN_TIME = {"A1": (5, -4), "C1": (-5, 3), "C2": (5, 3), "A2": (5, 4), "σ₊": (5
 # the share of its length at which the name stands.
 BESIDE = {"c": (7.0, -3.0), "e": (4.0, -7.0), "snap-back": (7.0, -6.0)}
 LIGHT = {"a": (0.9, (-4.0, 3.0)), "c": (0.5, (5.0, -4.0))}
-MARKERS = 60  # of a measured curve: more of them blot
+MARKERS = 60  # markers on a measured curve; more would blot
 PALE = "#A6CEE3"
 STOOD = "#F2DC6B"  # where the gauge stood still
-# Of masses inside, from the base up: beside their colours, for who sees or prints grey.
+# Dashes and marks of interior masses, from the base up, for readers without colour.
 DASHES: Any = ((0, (5, 1.2)), (0, (2.5, 1.2)), (0, (1, 1)), (0, (5, 1.2, 1, 1.2)))
 MARKS = ("^", "v", "D", "p")
 # Typographic points: height of a panel beside others and above others, what its labels take beside
@@ -175,7 +175,7 @@ class _Panel:
 
 def _panels(result: Fit) -> list[_Panel]:
     c, height = result.curves, result.measurement.specimen.height
-    # What a drive prescribes, the fitted loop has too, whether or not it is kept twice.
+    # The fitted loop includes the prescribed curve even if only the measured copy is kept.
     pushed = c.measured_stress if result.drive == "stress" and c.stress is None else c.stress
     moved = c.displacement
     if result.drive == "displacement" and moved is None:
@@ -414,7 +414,7 @@ def _draw_law(labels: _Labels, result: Fit) -> None:
     if len(result.chain.springs) > 1 or not hasattr(spring, "elastic_branches"):
         return
     (left, right), (low, top) = ax.get_xlim(), ax.get_ylim()
-    ax.set(xlim=(left, right), ylim=(low, top))  # the branches go on beyond
+    ax.set(xlim=(left, right), ylim=(low, top))  # the branches extend beyond the panel
     stress = np.linspace(0.0, top * labels.fy, 200)
     for name, strain in spring.elastic_branches(stress).items():
         line = np.column_stack((strain, stress / labels.fy))[strain < right]
@@ -491,7 +491,7 @@ def _head(figure: Figure, result: Fit) -> None:
     word = origin_word(result)
     more = [word] if word and word not in name.lower() else []
     more += [f"stopped by {result.stopped}"] if result.stopped else []
-    # A dot stays with what is before it.
+    # No line begins with a dot.
     title = "\u00a0· ".join([name, result.law, f"{result.drive} drive", *more])
     title = textwrap.fill(title, int(12 * figure.get_figwidth()))
     # A name may hold a dollar sign: it is no formula.

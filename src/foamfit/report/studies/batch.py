@@ -205,7 +205,7 @@ def _sketch(result: Fit) -> Sketch | None:
 
 
 def _path(x: Array, y: Array) -> str:
-    """Draw a curve in few points, equally far from each other along it, in whole pixels."""
+    """Draw a curve through a few points at equal distances along it, in whole pixels."""
     if x.size < 2:
         return ""
     length = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
@@ -219,7 +219,7 @@ def _path(x: Array, y: Array) -> str:
 def write_page(rows: Sequence[Row], folder: Path, title: str) -> None:
     """Write summary.html whole: one file that needs nothing else."""
     shown = rows
-    if len(rows) > MOST_ON_PAGE:  # what has no fit must be seen
+    if len(rows) > MOST_ON_PAGE:  # tests without a fit are always shown
         first = {id(row) for row in rows[:MOST_ON_PAGE]}
         shown = [row for row in rows if id(row) in first or not row.has_fit][: 2 * MOST_ON_PAGE]
     columns = list(_columns(shown))
