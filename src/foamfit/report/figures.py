@@ -31,11 +31,7 @@ if TYPE_CHECKING:
 
     from foamfit.arrays import Array
 
-GREY, BLUE, VERMILION = (
-    "#6b6b6b",
-    "#0072B2",
-    "#D55E00",
-)  # by Okabe and Ito
+GREY, BLUE, VERMILION = "#6b6b6b", "#0072B2", "#D55E00"  # by Okabe and Ito
 INSIDE = ("#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # of interior masses, from the base up
 STYLE: Any = {  # matplotlib types its keys one by one
     "font.family": "DejaVu Sans",  # one upright font: each further font costs 0.1 s per PDF
