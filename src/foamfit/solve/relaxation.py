@@ -280,7 +280,8 @@ def _derive(
     row: Row, state: Array, nodes: Array, d_rank: Array, d_nodes: Array, first: float, last: float
 ) -> None:
     """Fill the derivatives of the stress at the nodes of a step between two strains."""
-    d_nodes[0] = d_nodes[3]
+    for c in range(CARRIED):
+        d_nodes[0, c] = d_nodes[3, c]
     here = state[SIGMA], state[EPS]
     for i in range(1, 4):
         state[EPS], state[SIGMA] = first + NODES[i] * (last - first), nodes[i]
