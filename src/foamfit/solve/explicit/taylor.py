@@ -190,7 +190,7 @@ def step_length(
 
 @piece
 def tangent_length(
-    heights: Array,
+    law: Array,
     d: SeriesTangents,
     order: int,
     tol: float,
@@ -211,9 +211,9 @@ def tangent_length(
         for part in range(2):
             for _ in range(2):  # what a step that is too long reaches is too large
                 bar = tail = before = 0.0
-                for i in range(heights.size if part == 0 else 1):
+                for i in range(law.shape[0] if part == 0 else 1):
                     c = d.series[p, EPS, i] if part == 0 else d.series[p, GROUP, 0]
-                    weight, power = heights[i] if part == 0 else 1.0, 1.0
+                    weight, power = law[i, HEIGHT] if part == 0 else 1.0, 1.0
                     for n in range(order // 2 + 1):
                         bar = max(bar, weight * abs(c[n]) * power)
                         power *= span
@@ -452,8 +452,7 @@ def _expand_tangents(
     if memory is not None:
         eps, moved = run.s[EPS], run.d.series[:, EPS]
         mark_one_sided(memory, run.branches, eps, moved, order, span)
-    heights = run.links.law[:, HEIGHT]
-    return tangent_length(heights, run.d, order, OF_TANGENTS * tol, span, sizes, memory)
+    return tangent_length(run.links.law, run.d, order, OF_TANGENTS * tol, span, sizes, memory)
 
 
 @inlined
