@@ -1,7 +1,5 @@
 """The command `foamfit` itself: its help, its exit codes, and how every refusal is one sentence."""
 
-# ruff: noqa: D301  (a \b keeps click from joining the lines of an example)
-
 from __future__ import annotations
 
 import atexit
@@ -85,7 +83,7 @@ def _one_sentence(error: click.ClickException) -> str:
     "foamfit",
     cls=_Group,
     invoke_without_command=True,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={"help_option_names": ["-h", "--help"], "show_default": True},
 )
 @click.version_option(package_name="foamfit", message="foamfit %(version)s")
 @click.pass_context

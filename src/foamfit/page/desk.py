@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from foamfit.cli.options import cycles_of
+from foamfit.cli.fitting import cycles_of
 from foamfit.data.csv_file import read_test
 from foamfit.data.csv_table import find_table, read_text
 from foamfit.data.describe import describe

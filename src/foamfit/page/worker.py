@@ -211,19 +211,20 @@ def parsed(arguments: list[str]) -> dict[str, Any]:
     import click
 
     from foamfit.cli.fit import fit as command
+    from foamfit.cli.options import Output
 
     try:
         context = command.make_context("fit", ["TEST.csv", *arguments])
     except click.ClickException as error:
         raise InputError(error.format_message()) from None
-    others = {"test", "specimen", "out", "no_report", "as_json", "quiet", "verbose"}
+    others = {"test", "specimen", "verbose", *Output.__dataclass_fields__} - {"figure_width"}
     return {name: value for name, value in context.params.items() if name not in others}
 
 
 def _run(job: Job) -> tuple[str, str]:
     """Fit and write the result; returns "" or why there is none, and what is told of cycles."""
     try:
-        from foamfit.cli.fit import fit_as_asked
+        from foamfit.cli.fitting import fit_as_asked
         from foamfit.report.studies.cycles import cycles_text
         from foamfit.results import Fit
         from foamfit.solve.precompile import at_first_use
