@@ -242,7 +242,7 @@ def test_simulations_for_the_line_take_a_small_share_of_the_time(
     line, now = standing(monkeypatch, [])
     looks: list[float] = []
 
-    def look(_: np.ndarray) -> None:
+    def look(*_: object, **__: object) -> None:
         looks.append(now[0])
         now[0] += took
 

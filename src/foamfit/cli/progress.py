@@ -43,7 +43,34 @@ class Progress:
             say(f"foamfit: {told}", err=True)
 
 
-class ProgressLine(Progress):
+class Watcher(Progress):
+    """Looks at the best point so far a few times a second, for a small share of the time."""
+
+    def __init__(self, says: bool = True) -> None:
+        super().__init__(says)
+        self.watch = self._watch
+        self._best: tuple[Problem, Array] | None = None
+        self._next, self._looked = 0.0, False
+
+    def _watch(self, problem: Problem, values: Array) -> None:
+        self._best = problem, values
+        self.look()
+
+    def look(self) -> None:
+        """Simulate the best point so far, unless that would slow the fit."""
+        if self._best is None or (began := time.monotonic()) < self._next:
+            return
+        (problem, values), self._best = self._best, None
+        if (misfit := problem.objective.look(values, everything=True)) is not None:
+            self.seen(problem, values, misfit)
+        took = time.monotonic() - began if self._looked else 0.0  # the first one loads the solver
+        self._next, self._looked = began + took + max(took / SHARE, APART), True
+
+    def seen(self, problem: Problem, values: Array, misfit: dict[str, float | None]) -> None:
+        """Take the best point and its misfits, which count as no step of the fit."""
+
+
+class ProgressLine(Watcher):
     """Keeps one line of a terminal up to date, from a thread: a fit may be silent for long.
 
     The work ends after `limit` seconds in any case; `name` begins the line. The misfit is the RMS
@@ -59,9 +86,6 @@ class ProgressLine(Progress):
         self.fraction, self.what, self.scope = 0.0, "", ""
         self.misfit: float | None = None
         self.marks = deque([(self.began, 0.0)], maxlen=400)
-        self.watch = self._watch
-        self._best: tuple[Problem, Array] | None = None
-        self._next, self._looked = 0.0, False
         self._ended = threading.Event()
         self._bar: Any = tqdm(
             total=1.0, file=stream, leave=False, dynamic_ncols=True, bar_format=f"{name}:"
@@ -78,25 +102,15 @@ class ProgressLine(Progress):
         if fraction > self.fraction:
             self.fraction = fraction
             self.marks.append((time.monotonic(), fraction))
-        self._look()
+        self.look()
 
-    def _watch(self, problem: Problem, values: Array) -> None:
-        self._best = problem, values
-        self._look()
-
-    def _look(self) -> None:
-        """Simulate the best point so far, unless that would slow the fit."""
-        if self._best is None or (began := time.monotonic()) < self._next:
-            return
-        (problem, values), self._best = self._best, None
+    def seen(self, problem: Problem, values: Array, misfit: dict[str, float | None]) -> None:
+        """Take the misfit of all fitted curves together."""
         objective = problem.objective
-        if (found := objective.look(values)) is not None:
-            pairs = zip(objective.counted, objective.sizes, strict=True)
-            squares = sum(size * (found[name] or 0.0) ** 2 for name, size in pairs)
-            misfit = math.sqrt(squares / objective.n_data)
-            self.misfit = misfit if self.misfit is None else min(self.misfit, misfit)
-        took = time.monotonic() - began if self._looked else 0.0  # the first one loads the solver
-        self._next, self._looked = began + took + max(took / SHARE, APART), True
+        pairs = zip(objective.counted, objective.sizes, strict=True)
+        squares = sum(size * (misfit[name] or 0.0) ** 2 for name, size in pairs)
+        whole = math.sqrt(squares / objective.n_data)
+        self.misfit = whole if self.misfit is None else min(self.misfit, whole)
 
     def tell(self, told: str) -> None:
         """Print a sentence above the line."""

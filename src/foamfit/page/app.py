@@ -1,13 +1,12 @@
 """One window of the page: its inputs, its curves, and what happens when something is pressed.
 
-What is computed stands in `desk` and `turning`, and is what the commands compute; here it is asked
-for and shown. All that comes from a file is shown as text.
+`desk` and `turning` compute, as the commands do; here their results are asked for and shown. All
+that comes from a file is shown as text.
 """
 
 from __future__ import annotations
 
 import base64
-import html
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -24,20 +23,22 @@ from foamfit.page.desk import BUSY, LARGEST, QUANTITIES, Checked, Desk, Excerpt
 from foamfit.page.fields import RELAXATIONS, Field
 from foamfit.page.first_use import FirstUse
 from foamfit.page.turning import Turning
-from foamfit.page.widgets import TEMPLATES, Upload, message
+from foamfit.page.widgets import TEMPLATES, Upload, message, piece, style
 from foamfit.page.worker import News, parsed
 from foamfit.report.folder import load_result
 from foamfit.results import law_in_words
+from foamfit.springs.parameters import HYSTERETIC
 from foamfit.springs.published import published
 
 # Where a checkout of the repository may be: the working directory, or around an editable package.
 CHECKOUTS = (Path(), Path(__file__).parents[3])
-MODELS = ("auto", "bistable", "linear+bistable", "bistable+bistable", "microscale",
-          "linear+microscale", "unilateral+bistable")  # fmt: skip
-# Options of the command that are folded away; fixed and varied parameters have ticks.
-FOLDED = ("starts", "max_time", "seed", "loss", "interior_mass", "time_shift", "profile",
-          "bootstrap", "mcmc")  # fmt: skip
-ENDED = '<p role="status">The fit has ended: see <a href="#h-result">its result</a>.</p>'
+# Options that hang together with the test and model, and those that are folded away; fixed and
+# varied parameters have ticks.
+SHOWN = ("model", "drive", "relaxation", "cycle")
+FOLDED = (
+    *("starts", "max_time", "seed", "loss", "interior_mass", "time_shift"),
+    *("profile", "bootstrap", "mcmc"),
+)
 POLL = 200  # ms
 # For all windows one test is read at a time, and the curves of one are prepared.
 READING, PREPARING = (
@@ -47,75 +48,49 @@ COMPILING = (
     "The solver is being compiled, once after installation, in half a minute or, where the "
     "machine is busy, a whole one. Meanwhile a test can be dropped and its specimen filled in."
 )
-TEXT = """
-  :host { font: 1rem/1.5 system-ui, sans-serif; color: #1d2327; }
-  p { margin: .3rem 0; overflow-wrap: anywhere; } pre { margin: 0; overflow-x: auto;
-    font: .8rem/1.45 ui-monospace, Menlo, Consolas, monospace; white-space: pre; }
-  .error { border-left: 4px solid #b3261e; background: #fdeeed; padding: .5rem .8rem; }
-  .soft { color: #4f5960; } iframe { width: 100%; height: 85vh; border: 1px solid #dfe3e6; }
-  .wide { overflow-x: auto; } img { max-width: 100%; height: auto; }
-  table { border-collapse: collapse; font-size: .84rem; margin: .6rem 0; }
-  th, td { border: 1px solid #aab2b8; padding: .1rem .5rem; text-align: left; white-space: pre; }
-  th { background: #f5f7f8; } td.wrong { background: #f9dbd3; outline: 2px solid #85280a; }
-  progress { width: 100%; height: .8rem; accent-color: #0072B2; }
-"""
-FIELD = """
-  :host { width: 100%; color: #1d2327; font-size: .9rem; --font-size: .9rem; }
-  label { color: #1d2327; font-size: .9rem; white-space: normal; line-height: 1.3; }
-  .bk-input { color: #1d2327; border: 1px solid #6f7a81; font-size: .95rem; }
-  .bk-input::placeholder { color: #667078; }
-  .bk-input:focus-visible, .bk-btn:focus-visible { outline: 3px solid #0072B2;
-    outline-offset: 2px; }
-  .bk-btn, .bk-btn a { font-size: .95rem; }
-  .bk-btn-primary { background: #005a8f; color: white; }
-  .bk-btn-danger { background: #9b2218; color: white; }
-"""
+TEXT, FIELD = style("text"), style("field")
 WRONG = FIELD + ".bk-input { border: 2px solid #b3261e; background: #fdeeed; }"
-
-
-def text_pane() -> pn.pane.HTML:
-    """Make a place for text that is put there already escaped."""
-    return pn.pane.HTML("", stylesheets=[TEXT], sizing_mode="stretch_width", margin=(4, 0))
-
-
-def paragraph(text: str, kind: str = "") -> str:
-    """Write a text, whatever is in it, as a paragraph."""
-    role = ' role="alert"' if kind == "error" else ""
-    return f'<p class="{kind}"{role}>{html.escape(text)}</p>'
+WIDE: dict[str, Any] = {"sizing_mode": "stretch_width", "margin": 0}
+STYLE: dict[str, Any] = {
+    "stylesheets": [FIELD],
+    "sizing_mode": "stretch_width",
+    "margin": (3, 0),
+}
 
 
 class Window:
     """The page in one window of a browser; it shares nothing with another one."""
 
     def __init__(
-        self, desk: Desk, address: str, test: Path | None, first_use: FirstUse,
+        self,
+        desk: Desk,
+        address: str,
+        test: Path | None,
+        first_use: FirstUse,
         gone: Callable[[], None],
-    ) -> None:  # fmt: skip
-        self.desk = desk
-        self.curves = Curves()
+    ) -> None:
+        self.desk, self.first_use, self.curves = desk, first_use, Curves()
         self._shown: object = None
         self._filling = False
         self._asked = {READING: 0, PREPARING: 0}
+        self._before: tuple[dict[str, str], str] = {}, ""
         self._inputs(address)
         self._outputs()
         self._react()
         self.template = pn.Template((TEMPLATES / "page.html").read_text(encoding="utf-8"))
-        wide: dict[str, Any] = {"sizing_mode": "stretch_width", "margin": 0}
+        test_parts = [self.upload, self.chosen, self.as_before, *self.quantities.values()]
+        result_parts = [self.saves, self.ending, self.report_of, self.beside, self.comparison]
         parts = {
-            "test": pn.Column(self.upload, self.chosen, self.as_before, *self.quantities.values(),
-                              self.rest, self.check, self.problem, **wide),
-            "model": pn.Column(*(self.options[name].widget for name in self.options
-                                 if name not in FOLDED), **wide),
-            "more": pn.Column(*(self.options[name].widget for name in FOLDED), **wide),
-            "run": pn.Column(self.run, self.stop, self.progress, **wide),
-            "curves": pn.Column(self.compiling, self.misfit, self.curves.view, self.back, **wide),
-            "understood": pn.Column(self.understood, **wide),
-            "result": pn.Column(self.saves, self.ending, self.report_of, self.beside,
-                                self.comparison, self.report, **wide),
-        }  # fmt: skip
+            "test": [*test_parts, self.rest, self.check, self.problem],
+            "model": [self.options[name].widget for name in SHOWN],
+            "more": [self.options[name].widget for name in FOLDED],
+            "run": [self.run, self.stop, self.progress],
+            "curves": [self.compiling, self.misfit, self.curves.view, self.back],
+            "understood": [self.understood],
+            "result": [*result_parts, self.report],
+        }
         for name, part in parts.items():
-            self.template.add_panel(name, part)
-        self.first_use = first_use
+            self.template.add_panel(name, pn.Column(*part, **WIDE))
         self._allow()
         self._await()
         self._poll = pn.state.add_periodic_callback(self._follow, POLL, start=False)
@@ -127,69 +102,72 @@ class Window:
     # ------------------------------------------------------------------------------- the parts
 
     def _inputs(self, address: str) -> None:
-        style: dict[str, Any] = {
-            "stylesheets": [FIELD], "sizing_mode": "stretch_width", "margin": (3, 0),
-        }  # fmt: skip
-        text, select, button = pn.widgets.TextInput, pn.widgets.Select, pn.widgets.Button
+        text, select, button = (
+            partial(getattr(pn.widgets, name), **STYLE)
+            for name in ("TextInput", "Select", "Button")
+        )
         self.upload = Upload(address=address, limit=LARGEST, sizing_mode="stretch_width")
         listed = [sorted(one.glob("experiments/foam-*/*-reconstruction.csv")) for one in CHECKOUTS]
         found = next(filter(None, listed), [])
         self.reconstructions = {f"{one.parent.name}: {one.stem}": one for one in found}
         self.chosen = select(
-            name="or a reconstruction of the repository", options=["", *self.reconstructions],
-            visible=bool(found), **style,
-        )  # fmt: skip
+            name="or a reconstruction of the repository",
+            options=["", *self.reconstructions],
+            visible=bool(found),
+        )
         self.quantities = {
-            q.name: text(name=q.label, placeholder=f"like {q.example}", **style) for q in QUANTITIES
+            q.name: text(name=q.label, placeholder=f"like {q.example}") for q in QUANTITIES
         }
         self.rest = pn.widgets.TextAreaInput(
-            name="Further TOML: name, [columns], [noise], [window]", rows=4, max_length=20_000,
-            placeholder='[columns]\nforce = { column = "Load", unit = "kN" }', **style,
-        )  # fmt: skip
-        self.as_before = button(name="Fill in as for the file before", visible=False, **style)
-        self._before: tuple[dict[str, str], str] = {}, ""
-        self.check = button(name="Check the test", **style)
-        lists = {"model": [*MODELS], "relaxation": [*range(RELAXATIONS)]}
-        self.options = {
-            name: Field(name, lists.get(name), **style)
-            for name in ("model", "drive", "relaxation", "cycle", *FOLDED)
-        }
-        self.model, self.relaxation = (self.options[n].widget for n in ("model", "relaxation"))
-        self.cycle = self.options["cycle"].widget
-        self.cycle.visible = False
-        self.run = button(name="Fit", button_type="primary", disabled=True, **style)
-        self.stop = button(name="Stop, and keep the best", button_type="danger", visible=False,
-                           **style)  # fmt: skip
-        self.back = button(name="Back to the fit", visible=False, **style)
-        self.report_of = select(name="Report and curves of cycle", options=[0], visible=False,
-                                **style)  # fmt: skip
-        self.beside = select(name="Compare with a published set", options=["", *published],
-                             visible=False, **style)  # fmt: skip
-        self.saves = grid(
-            [
-                self._save("Save the result folder", "result.zip", lambda: self.desk.zipped()),
-                self._save("Save the report", "report.html", lambda: self._report().encode()),
-                self._save("Save the TOML", "test.toml", lambda: self.desk.toml),
-            ],
-            11.0,
+            name="Further TOML: name, [columns], [noise], [window]",
+            placeholder='[columns]\nforce = { column = "Load", unit = "kN" }',
+            rows=4,
+            max_length=20_000,
+            **STYLE,
         )
-
-    def _save(self, label: str, filename: str, content: Callable[[], bytes]) -> Any:
-        return pn.widgets.FileDownload(
-            callback=lambda: BytesIO(content()), filename=filename, label=label, embed=False,
-            auto=True, stylesheets=[FIELD], margin=(3, 0), sizing_mode="stretch_width",
-        )  # fmt: skip
+        self.as_before = button(name="Fill in as for the file before", visible=False)
+        self.check = button(name="Check the test")
+        lists = {"model": models(), "relaxation": [*range(RELAXATIONS)]}
+        self.options = {name: Field(name, lists.get(name), **STYLE) for name in (*SHOWN, *FOLDED)}
+        self.model, _, self.relaxation, self.cycle = (self.options[n].widget for n in SHOWN)
+        self.cycle.visible = False
+        self.run = button(name="Fit", button_type="primary", disabled=True)
+        self.stop = button(name="Stop, and keep the best", button_type="danger", visible=False)
+        self.back = button(name="Back to the fit", visible=False)
+        self.report_of = select(name="Report and curves of cycle", options=[0], visible=False)
+        self.beside = select(
+            name="Compare with a published set", options=["", *published], visible=False
+        )
+        files: dict[str, tuple[str, Callable[[], bytes]]] = {
+            "Save the result folder": ("result.zip", lambda: self.desk.zipped()),
+            "Save the report": ("report.html", lambda: self._report().encode()),
+            "Save the TOML": ("test.toml", lambda: self.desk.toml),
+        }
+        saves = [
+            pn.widgets.FileDownload(
+                callback=lambda content=content: BytesIO(content()),
+                filename=filename,
+                label=label,
+                embed=False,
+                auto=True,
+                **STYLE,
+            )
+            for label, (filename, content) in files.items()
+        ]
+        self.saves = grid(saves, 11.0)
 
     def _report(self) -> str:
-        """The report of the fit, or of the cycle that is chosen."""
+        """Return the report of the fit, or of the chosen cycle."""
         return (self.desk.fits[self.report_of.value] / "report.html").read_text(encoding="utf-8")
 
     def _outputs(self) -> None:
-        self.problem, self.progress, self.compiling = text_pane(), text_pane(), text_pane()
-        self.understood, self.ending = text_pane(), text_pane()
-        self.misfit, self.comparison, self.report = text_pane(), text_pane(), text_pane()
-        self.understood.object = paragraph("There is no test yet.", "soft")
-        self.ending.object = paragraph("There is no fit yet.", "soft")
+        """Make the places for text, which is put there already escaped."""
+        style = {"stylesheets": [TEXT], "sizing_mode": "stretch_width", "margin": (4, 0)}
+        places = [pn.pane.HTML("", **style) for _ in range(8)]
+        self.problem, self.progress, self.compiling, self.understood = places[:4]
+        self.ending, self.misfit, self.comparison, self.report = places[4:]
+        self.understood.object = piece("paragraph", "There is no test yet.", "soft")
+        self.ending.object = piece("paragraph", "There is no fit yet.", "soft")
 
     def _react(self) -> None:
         self.upload.on_msg(self._received)
@@ -218,7 +196,7 @@ class Window:
     def _allow(self) -> None:
         """Let a fit be begun where there is something to fit, and none is running."""
         compiled = self.first_use.needed(self.model.value, self.relaxation.value).done()
-        self.compiling.object = "" if compiled else busy(COMPILING)
+        self.compiling.object = "" if compiled else piece("busy", COMPILING)
         ready = self.desk.measurement is not None and compiled
         self.run.disabled = not ready or self.desk.running
 
@@ -264,7 +242,7 @@ class Window:
         try:
             self.desk.take(path)
         except (InputError, OSError) as error:
-            self.problem.object = paragraph(str(error), "error")
+            self.problem.object = piece("paragraph", str(error), "error")
             return
         self._read()
 
@@ -276,7 +254,7 @@ class Window:
         try:
             found = self.desk.dropped_toml()
         except InputError as error:
-            self.problem.object = paragraph(str(error), "error")
+            self.problem.object = piece("paragraph", str(error), "error")
             return
         self._filling = True  # one check after all of them
         if self.desk.worker is None:  # what is shown of a fit is of another test
@@ -324,16 +302,18 @@ class Window:
     def _show_checked(self, checked: Checked | Exception) -> None:
         if isinstance(checked, Exception):
             checked = Checked(error=defect(checked))
-        self.problem.object = paragraph(checked.error, "error") if checked.error else ""
+        self.problem.object = piece("paragraph", checked.error, "error") if checked.error else ""
         for name, field in self.quantities.items():
             field.stylesheets = [WRONG if name == checked.quantity else FIELD]
         if checked.error == BUSY:
             return
         if checked.error:
-            shown = paragraph("The test cannot be read yet: see what is wrong with it.", "soft")
+            shown = piece(
+                "paragraph", "The test cannot be read yet: see what is wrong with it.", "soft"
+            )
             self.understood.object = shown + excerpt_html(checked.excerpt)
         else:
-            self.understood.object = f'<pre tabindex="0">{html.escape(checked.text)}</pre>'
+            self.understood.object = piece("verbatim", checked.text)
         self._allow()
         if self.desk.measurement is not None:
             there = len(self.desk.measurement.cycles)
@@ -360,7 +340,7 @@ class Window:
 
     def _hide_curves(self, why: str = "") -> None:
         self.curves.hide()
-        self.misfit.object = paragraph(why, "error") if why else ""
+        self.misfit.object = piece("paragraph", why, "error") if why else ""
 
     def _turn_model(
         self, model: str, cycle: int, values: Mapping[str, float] | None = None, **options: Any
@@ -375,7 +355,7 @@ class Window:
 
         what = f"Preparing the curves of {law_in_words(model, options['relaxation'])} …"
         if self.curves.turning is None and not self.compiling.object:
-            self.misfit.object = busy(what)
+            self.misfit.object = piece("busy", what)
         else:
             self.curves.sliders.tell(what)
         self._beside(PREPARING, make, self._show_turning)
@@ -394,10 +374,8 @@ class Window:
         """Return the arguments of `foamfit fit` that ask for what is filled in."""
         auto = self.model.value == "auto"
         hidden = {"relaxation": auto, "cycle": not self.cycle.visible}
-        given = [
-            argument for name, field in self.options.items() if not hidden.get(name)
-            for argument in field.arguments()
-        ]  # fmt: skip
+        shown = (field for name, field in self.options.items() if not hidden.get(name))
+        given = [argument for field in shown for argument in field.arguments()]
         if auto or not ticked:
             return given
         held, varied = self.curves.chosen()
@@ -409,7 +387,7 @@ class Window:
             arguments = self._arguments()
             self.desk.fit(arguments)
         except InputError as error:
-            self.progress.object = paragraph(str(error), "error")
+            self.progress.object = piece("paragraph", str(error), "error")
             return
         self.run.disabled, self.stop.visible, self.stop.disabled = True, True, False
         self._hide_result("A fit is running.")
@@ -425,7 +403,7 @@ class Window:
         self.saves.visible = self.beside.visible = self.back.visible = False
         self.report_of.visible = False
         self.report.object = self.comparison.object = ""
-        self.ending.object = paragraph(why, "soft")
+        self.ending.object = piece("paragraph", why, "soft")
 
     def _stop(self, event: Any = None) -> None:
         if self.desk.worker is not None:
@@ -450,8 +428,7 @@ class Window:
         told = f"{what}, {share} %"
         if news.misfit:
             told += f"; best misfit {misfits_text(news.misfit)}"
-        bar = f'<progress max="100" value="{share}" aria-label="progress of the fit"></progress>'
-        self.progress.object = bar + paragraph(told)
+        self.progress.object = piece("progress", share, told)
         self._show_best(news)
 
     def _show_best(self, news: News) -> None:
@@ -479,20 +456,18 @@ class Window:
         """Show the result of the fit, or why there is none."""
         self._allow()
         self.stop.visible = False
-        self.progress.object = ENDED
+        self.progress.object = piece("ended")
         self._hold(False)
         if self.desk.result is None:
-            self.ending.object = paragraph(self.desk.ending(), "error")
+            self.ending.object = piece("paragraph", self.desk.ending(), "error")
             return
         told, picture = self.desk.told, self.desk.result / "cycles.png"
-        self.ending.object = paragraph(f"In a terminal: {self.desk.command}", "soft")
-        self.ending.object += f'<pre tabindex="0">{html.escape(told)}</pre>' if told else ""
+        self.ending.object = piece("paragraph", f"In a terminal: {self.desk.command}", "soft")
+        if told:
+            self.ending.object += piece("verbatim", told)
         if told and picture.is_file():
-            content = base64.b64encode(picture.read_bytes()).decode()
-            self.ending.object += (
-                '<img alt="Loops of the cycles, and their parameters by cycle" '
-                f'src="data:image/png;base64,{content}">'
-            )
+            png = base64.b64encode(picture.read_bytes()).decode()
+            self.ending.object += piece("cycles", png)
         fits = [*self.desk.fits]
         self.saves.visible = True
         self.beside.visible = self.back.visible = bool(fits)
@@ -506,10 +481,7 @@ class Window:
         """Show the report of the fit, and put the sliders back to it."""
         if self.report_of.value not in self.desk.fits:
             return
-        self.report.object = (
-            '<iframe sandbox="" title="Report of the fit: figures, parameters with their states, '
-            f'notes" srcdoc="{html.escape(self._report())}"></iframe>'
-        )
+        self.report.object = piece("report", self._report())
         fit = load_result(self.desk.fits[self.report_of.value])
         values = {name: one["value"] for name, one in fit["parameters"].items()}
         self._turn_fitted(
@@ -522,9 +494,9 @@ class Window:
             return
         try:
             text = self.desk.compared(event.new, self.report_of.value)
-            self.comparison.object = f'<pre tabindex="0">{html.escape(text)}</pre>'
+            self.comparison.object = piece("verbatim", text)
         except InputError as error:
-            self.comparison.object = paragraph(str(error), "error")
+            self.comparison.object = piece("paragraph", str(error), "error")
 
 
 def keywords(asked: Mapping[str, Any]) -> dict[str, Any]:
@@ -532,9 +504,10 @@ def keywords(asked: Mapping[str, Any]) -> dict[str, Any]:
     return {one: asked[one] for one in ("drive", "relaxation", "interior_mass", "time_shift")}
 
 
-def busy(text: str) -> str:
-    """Write what is being done, under a bar that moves."""
-    return f'<progress aria-label="busy"></progress>{paragraph(text, "soft")}'
+def models() -> list[str]:
+    """Return the models that are listed: each law alone, on a linear spring, and twice."""
+    alone = list(HYSTERETIC)
+    return ["auto", *alone, *(f"linear+{one}" for one in alone), *(f"{one}+{one}" for one in alone)]
 
 
 def send_at_once() -> None:
@@ -556,13 +529,13 @@ def excerpt_html(excerpt: Excerpt | None) -> str:
     """Show rows of a file as a table, the wrong cell, row or column marked."""
     if excerpt is None:
         return ""
-    lines = []
+    rows = []
     for k, (number, cells) in enumerate(zip(excerpt.numbers, excerpt.cells, strict=True)):
-        row = [f'<th scope="row">{number}</th>']
-        for j, cell in enumerate(cells):
-            hit = excerpt.column in (None, j) if excerpt.row == k else False
-            hit = hit or (excerpt.row is None and excerpt.column == j)
-            mark = ' class="wrong"' if hit else ""
-            row.append(f"<td{mark}>{html.escape(cell)}</td>")
-        lines.append(f"<tr>{''.join(row)}</tr>")
-    return f'<div class="wide" tabindex="0"><table>{"".join(lines)}</table></div>'
+        here = excerpt.row in (k, None)
+        column = excerpt.column
+        wrong = [
+            here and (column == j or (column is None and excerpt.row == k))
+            for j in range(len(cells))
+        ]
+        rows.append((number, list(zip(cells, wrong, strict=True))))
+    return piece("excerpt", rows)

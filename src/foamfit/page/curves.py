@@ -16,19 +16,13 @@ from bokeh.models import Band, ColumnDataSource, LabelSet, Range1d
 from bokeh.plotting import figure
 
 from foamfit.page.turning import PANELS, Drawn, Row, Turning
-from foamfit.page.widgets import Sliders, message
+from foamfit.page.widgets import Sliders, message, piece
 from foamfit.report.figures import GREY, VERMILION
 from foamfit.report.readable import readable_unit
 from foamfit.report.summary import CURVES
 from foamfit.text import percent
 
 MOST_DRAWN, MOST_MARKERS = 400, 150  # points of a curve, of a measured one
-LEGEND = (
-    '<p style="margin: 0; font: .9rem system-ui, sans-serif; color: #1d2327">'
-    f'<svg width="12" height="12" aria-hidden="true"><circle cx="6" cy="6" r="3" fill="white" '
-    f'stroke="{GREY}"/></svg> measured &ensp; <svg width="22" height="12" aria-hidden="true">'
-    f'<path d="M1 6H21" stroke="{VERMILION}" stroke-width="2"/></svg> springs</p>'
-)
 ASIDE = {"C1": -22}  # px from a point to its name, which is at the right edge
 NOTHING = np.empty(0), np.empty(0)
 AXES = {  # of each panel: x and y, with the SI units of both
@@ -67,7 +61,9 @@ class Curves:
         self.sliders = Sliders(sizing_mode="stretch_width", margin=(6, 0))
         # With the lock of the document, which a message does not always come with.
         self.sliders.on_msg(lambda event: pn.state.execute(partial(self._moved, event), True))
-        legend = pn.pane.HTML(LEGEND, sizing_mode="stretch_width", margin=0)
+        legend = pn.pane.HTML(
+            piece("legend", GREY, VERMILION), sizing_mode="stretch_width", margin=0
+        )
         self._panels = grid(
             [pn.pane.Bokeh(one, sizing_mode="stretch_width") for one in self._figures.values()],
             14.5,
@@ -117,27 +113,28 @@ class Curves:
 
     def _figure(self, name: str) -> Any:
         made = figure(
-            height=270, sizing_mode="stretch_width", title=CURVES[name], output_backend="canvas",
-            tools="pan,box_zoom,reset", toolbar_location="right",
-            x_range=Range1d(0.0, 1.0), y_range=Range1d(0.0, 1.0),
-        )  # fmt: skip
-        made.scatter("x", "y", source=self._measured[name], size=5, fill_color="white",
-                     line_color=GREY)  # fmt: skip
+            title=CURVES[name],
+            height=270,
+            sizing_mode="stretch_width",
+            output_backend="canvas",
+            tools="pan,box_zoom,reset",
+            toolbar_location="right",
+            x_range=Range1d(0.0, 1.0),
+            y_range=Range1d(0.0, 1.0),
+        )
+        measured = {"source": self._measured[name], "line_color": GREY}
+        made.scatter("x", "y", size=5, fill_color="white", **measured)
         # What moves lies on a canvas of its own: axes and measured curves are not drawn again.
         # Annotations are cut off there at the frame, glyphs are not; a band of no width is a line.
-        line = f"{name}_y"
-        made.add_layout(Band(
-            base=f"{name}_x", lower=line, upper=line, source=self._turned, level="overlay",
-            line_color=VERMILION, line_width=2, line_alpha=1.0, fill_alpha=0.0,
-        ))  # fmt: skip
+        above = {"source": self._turned, "level": "overlay", "line_color": VERMILION}
+        ends = {"base": f"{name}_x", "lower": f"{name}_y", "upper": f"{name}_y"}
+        made.add_layout(Band(line_width=2, line_alpha=1.0, fill_alpha=0.0, **above, **ends))
         if name == "stress_strain":
             at: dict[str, Any] = {"x": "x", "y": "y", "source": self._points, "level": "overlay"}
-            made.add_layout(LabelSet(
-                text=value("\u25cf"), text_align="center", text_baseline="middle", **at
-            ))  # fmt: skip
-            made.add_layout(LabelSet(
-                text="name", x_offset="aside", y_offset=-15, text_font_size="9pt", **at
-            ))  # fmt: skip
+            centred = {"text_align": "center", "text_baseline": "middle"}
+            made.add_layout(LabelSet(text=value("\u25cf"), **centred, **at))
+            beside = {"x_offset": "aside", "y_offset": -15, "text_font_size": "9pt"}
+            made.add_layout(LabelSet(text="name", **beside, **at))
         made.toolbar.logo = None
         made.toolbar.autohide = True
         return made
@@ -161,10 +158,8 @@ class Curves:
             # They stay while parameters are turned: what moves is the curve alone.
             for limits, values, beyond in ((made.x_range, x, 0.04), (made.y_range, y, 0.15)):
                 more = beyond * float(np.ptp(values))
-                limits.update(
-                    start=float(values.min()) - more, end=float(values.max()) + more,
-                    reset_start=float(values.min()) - more, reset_end=float(values.max()) + more,
-                )  # fmt: skip
+                low, high = float(values.min()) - more, float(values.max()) + more
+                limits.update(start=low, end=high, reset_start=low, reset_end=high)
         self._panels.visible = True
 
     def _moved(self, event: Any) -> None:

@@ -13,10 +13,11 @@ import shutil
 import tomllib
 import unicodedata
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+
+import tomli_w
 
 from foamfit.cli.fitting import cycles_of
 from foamfit.data.csv_file import read_test
@@ -137,8 +138,8 @@ class Desk:
         """
         if csv.stat().st_size > LARGEST:
             raise InputError(too_large(csv.name))
-        self.receive(f"{csv.stem}.csv" if csv.suffix.lower() not in TABLES else csv.name,
-                     csv.read_bytes())  # fmt: skip
+        known = csv.suffix.lower() in TABLES
+        self.receive(csv.name if known else f"{csv.stem}.csv", csv.read_bytes())
         toml = toml_beside(csv)
         if toml.is_file():
             (self.folder / "dropped.toml").write_bytes(toml.read_bytes())
@@ -308,7 +309,7 @@ def split_toml(text: str) -> tuple[dict[str, str], str]:
             found[q.name] = str(section.pop(q.key))
             if not section:
                 document.pop(q.section)
-    return found, _written(document)
+    return found, tomli_w.dumps(document)
 
 
 def join_toml(quantities: Mapping[str, str], rest: str) -> str:
@@ -327,34 +328,7 @@ def join_toml(quantities: Mapping[str, str], rest: str) -> str:
         if q.key in section:
             raise InputError(f"The further TOML: {q.name} is filled in above, too; give it once.")
         section[q.key] = value
-    return _written(document)
-
-
-def _written(document: Mapping[str, Any]) -> str:
-    """Write a TOML: single values first, then a table for each section."""
-    lines = [f"{_key(k)} = {_toml(v)}" for k, v in document.items() if not isinstance(v, dict)]
-    for name, section in document.items():
-        if isinstance(section, dict):
-            lines += ["", f"[{_key(name)}]"]
-            lines += [f"{_key(k)} = {_toml(v)}" for k, v in section.items()]
-    return "\n".join(lines).strip() + "\n" if lines else ""
-
-
-def _key(name: str) -> str:
-    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _toml(name)
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-        return '"' + re.sub(r"[\x00-\x1f\x7f]", lambda c: f"\\u{ord(c[0]):04x}", escaped) + '"'
-    if isinstance(value, dict):
-        return "{ " + ", ".join(f"{_key(k)} = {_toml(v)}" for k, v in value.items()) + " }"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(_toml, value)) + "]"
-    return str(value)
+    return tomli_w.dumps(document)
 
 
 # ------------------------------------------------------------------------- what is wrong, and where
@@ -363,47 +337,27 @@ def _toml(value: Any) -> str:
 def excerpt_of(path: Path, sentence: str) -> Excerpt | None:
     """Return the rows around the cell that a sentence of `read_test` names; None if it names none.
 
-    A sentence that names no row is about the columns: the first rows are shown then.
+    A sentence without a row is about the columns: the first rows are shown then.
     """
     try:
         text = read_text(path, "")
     except InputError:
         return None
     lines = text.raw.decode(text.encoding, errors="replace").splitlines()
-    separator, header = _separator(path, lines)
+    try:
+        table = find_table(text, set())
+        separator, header = table.separator, max(table.header_row - 1, 0)
+    except InputError:
+        separator, header = max("\t;,", key="\n".join(lines[:20]).count), 0
     row = re.search(r"\brow (\d+)", sentence)
     at = int(row[1]) - 1 if row else None
     first = header if at is None else max(at - AROUND, header)
     some = range(first, min(first + 2 * AROUND + 1, len(lines)))
     numbers = [header, *(n for n in some if n != header)]
-    cells = [_split(lines[n], separator) for n in numbers if n < len(lines)]
-    if not cells:
-        return None
-    column = _column(cells[0], sentence)
-    shift = 0 if column is None else max(0, column - ACROSS + 1)
-    shown = [[cell[:CELL] for cell in line[shift : shift + ACROSS]] for line in cells]
-    numbers = numbers[: len(shown)]
+    cells = [[cell.strip().strip('"') for cell in lines[n].split(separator)] for n in numbers]
+    named = (k for k, cell in enumerate(cells[0]) if cell and f"'{cell}'" in sentence)
+    column = next(named, None)
+    left = 0 if column is None else max(0, column - ACROSS + 1)
+    shown = [[cell[:CELL] for cell in line[left : left + ACROSS]] for line in cells]
     marked = numbers.index(at) if at in numbers else None
-    return Excerpt([n + 1 for n in numbers], shown, marked, column and column - shift)
-
-
-def _separator(path: Path, lines: Iterable[str]) -> tuple[str, int]:
-    """Return separator and line of the headers, as the reader finds them, or a guess."""
-    try:
-        table = find_table(read_text(path, ""), set())
-    except InputError:
-        head = "\n".join(list(lines)[:20])
-        return max(("\t", ";", ","), key=head.count), 0
-    return table.separator, max(table.header_row - 1, 0)
-
-
-def _split(line: str, separator: str) -> list[str]:
-    return [cell.strip().strip('"') for cell in line.split(separator)]
-
-
-def _column(headers: list[str], sentence: str) -> int | None:
-    """Return the column that a sentence names in quotation marks, the first if several."""
-    for k, header in enumerate(headers):
-        if header and f"'{header}'" in sentence:
-            return k
-    return None
+    return Excerpt([n + 1 for n in numbers], shown, marked, column and column - left)

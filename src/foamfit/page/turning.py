@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Unpack
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -61,9 +61,12 @@ class Turning:
     """A model over a test: its parameters, and its curves wherever they are turned to."""
 
     def __init__(
-        self, measurement: Measurement, model: str, values: Mapping[str, float] | None = None,
+        self,
+        measurement: Measurement,
+        model: str,
+        values: Mapping[str, float] | None = None,
         **options: Unpack[Keywords],
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Begin at these values (SI), or else at those read off the loop; options as of a fit."""
         thin = thinned(measurement)
         self.samples = thin.rows.used, _size(thin)
@@ -200,10 +203,8 @@ class Turning:
         if split_name(name)[1] == "time_shift":
             low, high = parameter.min, parameter.max
         low, high = max(low, parameter.min), min(high, parameter.max)
-        return Row(
-            name, shown, factor, value / factor, low / factor, high / factor,
-            parameter.min / factor, parameter.max / factor, held=not parameter.vary,
-        )  # fmt: skip
+        limits = (value, low, high, parameter.min, parameter.max)
+        return Row(name, shown, factor, *(one / factor for one in limits), held=not parameter.vary)
 
 
 def thinned(measurement: Measurement) -> Measurement:
@@ -213,20 +214,19 @@ def thinned(measurement: Measurement) -> Measurement:
         return measurement
     keep = np.unique(np.linspace(0, count - 1, MOST_SAMPLES).astype(int))
 
-    def some(values: Array | None) -> Array | None:
-        return None if values is None else values[keep]
-
+    channels: dict[str, Any] = {
+        name: None if (values := getattr(measurement, name)) is None else values[keep]
+        for name in ("time", "stress", "displacement", "acceleration")
+    }
     outliers = {
         channel: replace(found, left_out=found.left_out[keep])
         for channel, found in measurement.outliers.items()
     }
+    interior = {node: values[keep] for node, values in measurement.interior.items()}
+    sampled = {channel: taken[keep] for channel, taken in measurement.sampled.items()}
     return replace(
-        measurement, time=some(measurement.time), stress=some(measurement.stress),
-        displacement=some(measurement.displacement), acceleration=some(measurement.acceleration),
-        outliers=outliers, block=1,
-        interior={node: values[keep] for node, values in measurement.interior.items()},
-        sampled={channel: taken[keep] for channel, taken in measurement.sampled.items()},
-    )  # fmt: skip
+        measurement, outliers=outliers, block=1, interior=interior, sampled=sampled, **channels
+    )
 
 
 def _size(measurement: Measurement) -> int:

@@ -16,10 +16,11 @@ import tempfile
 import threading
 import time
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from foamfit.cli.progress import Progress
+from foamfit.cli.progress import APART, Progress, Watcher
 from foamfit.errors import InputError, SimulationError, as_signalled
 
 if TYPE_CHECKING:
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     from foamfit.fitting.problem import Problem
 
 PACKAGE = Path(__file__).parent.parent
-OFTEN = 0.2  # s between two lines of a fit
 COMPILING = "compiling the solver, once after installation"
 STOPPED_EARLY = "The fit was stopped before anything was found; start it again."
 
@@ -82,10 +82,13 @@ class Worker:
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  (closed when the process ends)
         self._process = subprocess.Popen(
             [sys.executable, "-m", "foamfit.page.worker"],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors, text=True,
-            encoding="utf-8", env=with_package(),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            encoding="utf-8",
+            env=with_package(),
             start_new_session=True,  # Ctrl-C in the terminal of the page is not for this one
-        )  # fmt: skip
+        )
         assert self._process.stdin is not None
         with contextlib.suppress(BrokenPipeError):
             self._process.stdin.write(json.dumps(vars(job)) + "\n")
@@ -146,60 +149,39 @@ class Worker:
 # --------------------------------------------------------------------- in the process of the fit
 
 
-class _Teller(Progress):
+class _Teller(Watcher):
     """What the page is told of a fit, a few times a second."""
 
     def __init__(self) -> None:
         super().__init__(says=False)
-        self.watch = self._watch
         self.told: dict[str, Any] = {}
-        self._best: tuple[Problem, Array] | None = None
-        self._last = 0.0
+        self._said = 0.0
 
-    def progress(self, fraction: float, what: str) -> None:
-        """Take how far the fit is."""
+    def progress(self, fraction: float, what: str, *, now: bool = False) -> None:
+        """Tell how far the fit is, `now` or if the last line is some time ago."""
         self.told |= {"fraction": fraction, "what": what}
-        self._tell()
+        if now and self._best is not None:
+            self._next = 0.0
+        self.look()
+        if now or time.monotonic() - self._said >= APART:
+            self._say()
 
-    def _watch(self, problem: Problem, values: Array) -> None:
-        """Take the best point so far."""
-        self._best = problem, values
-        self._tell()
+    def seen(self, problem: Problem, values: Array, misfit: dict[str, float | None]) -> None:
+        """Tell the parameters and misfits of the best point so far."""
+        named = zip(problem.names, (values + problem.origins).tolist(), strict=True)
+        self.told |= {
+            "model": problem.model.name,
+            "relaxation": problem.model.relaxation,
+            "drive": problem.objective.drive,
+            "cycle": problem.measurement.cycle,
+            "values": dict(named),
+            "misfit": misfit,
+        }
+        self._say()
 
-    def compiling(self) -> None:
-        """Tell that the solver is compiled first."""
-        self.finish(COMPILING, 0.0)
-
-    def finish(self, what: str, fraction: float = 1.0) -> None:
-        """Tell the last of what was found, and what comes after it."""
-        self.told |= {"fraction": fraction, "what": what}
-        self._last = 0.0
-        self._tell()
-
-    def _tell(self) -> None:
-        now = time.monotonic()
-        if now - self._last < OFTEN:
-            return
-        self._last = now
-        if self._best is not None:
-            self.told |= _standing(*self._best)
-            self._best = None
+    def _say(self) -> None:
+        self._said = time.monotonic()
         _say(self.told)
-
-
-def _standing(problem: Problem, values: Array) -> dict[str, Any]:
-    """Return parameters and misfits of a point; nothing of it is counted as a step of the fit."""
-    misfit = problem.objective.look(values, everything=True)
-    if misfit is None:
-        return {}
-    return {
-        "model": problem.model.name,
-        "relaxation": problem.model.relaxation,
-        "drive": problem.objective.drive,
-        "cycle": problem.measurement.cycle,
-        "values": dict(zip(problem.names, (values + problem.origins).tolist(), strict=True)),
-        "misfit": misfit,
-    }
 
 
 def _say(told: dict[str, Any]) -> None:
@@ -232,7 +214,8 @@ def _run(job: Job) -> tuple[str, str]:
 
         teller, asked = _Teller(), parsed(job.arguments)
         width = asked.pop("figure_width")
-        with at_first_use(asked["model"], asked["relaxation"], teller.compiling) as compile_rest:
+        tell = partial(teller.progress, 0.0, COMPILING, now=True)
+        with at_first_use(asked["model"], asked["relaxation"], tell) as compile_rest:
 
             def begin(_: float | None) -> contextlib.AbstractContextManager[Progress]:
                 compile_rest()
@@ -241,7 +224,7 @@ def _run(job: Job) -> tuple[str, str]:
             with as_signalled():
                 found = fit_as_asked(Path(job.csv), Path(job.toml), asked, begin)
         with without_ctrl_c():
-            teller.finish("writing the report")
+            teller.progress(1.0, "writing the report", now=True)
             found.save(job.folder, figure_width=width)
             told = "" if isinstance(found, Fit) else cycles_text(found)
     except (InputError, SimulationError) as error:
