@@ -391,7 +391,8 @@ def test_a_simpler_model_is_carried_into_its_relaxation():
     test = slow_loop()
     simple = ff.fit(test, model="microscale", starts=2)
     problem = make_problem(test, "microscale", None, None, None, False, relaxation=1)
-    auto._carry(problem.params, problem.model, simple)
+    tried = [SimpleNamespace(result=simple, chisqr=1.0)]
+    auto._carry(problem.params, problem.model, tried)
     assert problem.params["s1_g1"].value == 0.0
     there = problem.objective.simulate(problem.vector()).curves["stress_strain"]
     assert there == pytest.approx(simple.curves.stress_along, rel=1e-9)

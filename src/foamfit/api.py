@@ -107,24 +107,25 @@ def fit(
         raise InputError("params must be lmfit.Parameters, as foamfit.make_params returns them")
     chosen = Options.of("fit", options)
     progress, tell = progress or (lambda *_: None), tell or (lambda _: None)
-    if model == "auto":
-        if params is not None:
-            raise InputError("params belong to one model; name it instead of 'auto'")
-        if chosen.relaxation:
-            raise InputError(
-                f"relaxation = {chosen.relaxation} belongs to one model; name it instead of "
-                "'auto', which tries relaxation by itself"
-            )
-        from foamfit.auto import compare_models
+    if model != "auto":
 
-        found = compare_models(measurement, chosen, progress, tell)
-    else:
-        searched = identify(
-            measurement, model, params, chosen, lambda share, what: progress(SEARCHED * share, what)
-        )
-        found, _ = judge(
-            searched, chosen.choice, tell,
-            lambda share, what: progress(SEARCHED + (1.0 - SEARCHED) * share, what),
-        )  # fmt: skip
+        def search(share: float, what: str) -> None:
+            progress(SEARCHED * share, what)
+
+        def assess(share: float, what: str) -> None:
+            progress(SEARCHED + (1.0 - SEARCHED) * share, what)
+
+        searched = identify(measurement, model, params, chosen, search)
+        found, _ = judge(searched, chosen.choice, tell, assess)
         progress(1.0, "done")
-    return FitResult(**vars(found))
+        return FitResult(**vars(found))
+    if params is not None:
+        raise InputError("params belong to one model; name it instead of 'auto'")
+    if chosen.relaxation:
+        raise InputError(
+            f"relaxation = {chosen.relaxation} belongs to one model; name it instead of 'auto', "
+            "which tries relaxation by itself"
+        )
+    from foamfit.auto import compare_models
+
+    return FitResult(**vars(compare_models(measurement, chosen, progress, tell)))

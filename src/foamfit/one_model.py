@@ -112,16 +112,15 @@ class Options:
         return cls(**given)
 
     def __post_init__(self) -> None:
-        """Refuse what is of no use."""
-        for name, value, (least, most) in (
-            ("seed", self.seed, (0, math.inf)), ("starts", self.starts, (1, MOST_STARTS)),
-        ):  # fmt: skip
+        """Refuse inadmissible values."""
+        for name, least, most in (("seed", 0, math.inf), ("starts", 1, MOST_STARTS)):
+            value = getattr(self, name)
             whole = isinstance(value, Integral) and least <= int(value) <= most
             if not whole and (name == "seed" or value is not None):
-                up = "up" if most == math.inf else f"to {most}"
+                end = "up" if most == math.inf else f"to {most}"
                 raise InputError(
                     f"{name} = {value!r} is not admissible; it must be a whole number from {least} "
-                    f"{up}"
+                    f"{end}"
                 )
         limit = self.max_time
         if limit is not None and not (isinstance(limit, Real) and float(limit) > 0):
@@ -142,10 +141,9 @@ class Options:
         self, measurement: Measurement, model: str, params: lmfit.Parameters | None = None
     ) -> Problem:
         """Make the problem of one model ready."""
-        return make_problem(
-            measurement, model, self.drive, params, self.weights, self.interior_mass,
-            time_shift=self.time_shift, loss=self.loss, relaxation=self.relaxation,
-        )  # fmt: skip
+        more = {name: getattr(self, name) for name in ("time_shift", "loss", "relaxation")}
+        given = (self.drive, params, self.weights, self.interior_mass)
+        return make_problem(measurement, model, *given, **more)
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,9 +164,12 @@ class Found:
 
 
 def identify(
-    measurement: Measurement, model: str, params: lmfit.Parameters | None, options: Options,
+    measurement: Measurement,
+    model: str,
+    params: lmfit.Parameters | None,
+    options: Options,
     progress: Progress,
-) -> Found:  # fmt: skip
+) -> Found:
     """Search and refine; see `foamfit.fit` for the arguments and the errors."""
     began = time.perf_counter()
     problem = options.problem(measurement, model, params)
@@ -256,10 +257,14 @@ def _assess(
             made = Intervals(better=better)
             if better is None:
                 made = assess(
-                    best, choice, minima=[*tracker.ends, *left.minima],
-                    deadline=tracker.deadline, budget=budget, announce=announce,
+                    best,
+                    choice,
+                    minima=[*tracker.ends, *left.minima],
+                    deadline=tracker.deadline,
+                    budget=budget,
+                    announce=announce,
                     pulse=tracker.pulse,
-                )  # fmt: skip
+                )
             if made.better is None:
                 return best, record, replace(made, ranges=left.ranges)
             tracker.consider(made.better)
@@ -323,10 +328,9 @@ def _refine(problem: Problem, tracker: Tracker) -> None:
 
     with warnings.catch_warnings():  # of its covariance, which `trust.covariance` does better
         warnings.simplefilter("ignore", RuntimeWarning)
-        lmfit.minimize(
-            residual, params, method="least_squares", jac=jacobian, x_scale=best.sizes,
-            ftol=1e-10, xtol=1e-10, gtol=1e-12, max_nfev=60,
-        )  # fmt: skip
+        ends = {"ftol": 1e-10, "xtol": 1e-10, "gtol": 1e-12, "max_nfev": 60}
+        more = {"jac": jacobian, "x_scale": best.sizes} | ends
+        lmfit.minimize(residual, params, method="least_squares", **more)
 
 
 def weigh_motion(problem: Problem, tracker: Tracker) -> None:

@@ -25,10 +25,8 @@ if TYPE_CHECKING:
 
 SCHEMA = 1
 # Of an uncertainty budget.
-SOURCES = (
-    "noise", "contact and zero", "velocity", "mass", "height", "area", "calibration", "law",
-)  # fmt: skip
 STATED = ("mass", "height", "area", "calibration")  # by their ± in the TOML, not fitted
+SOURCES = ("noise", "contact and zero", "velocity", *STATED, "law")
 DERIVED_POINTS = ("sigma_a", "sigma_c", "eps_star", "eps_hat_a", "eps_hat_c")
 
 
@@ -60,13 +58,8 @@ class ParameterEstimate:
 
     def counted_from(self, zero: float) -> ParameterEstimate:
         """Count value, interval and range from another zero."""
-
-        def moved(ends: tuple[float, float] | None) -> tuple[float, float] | None:
-            return None if ends is None else (ends[0] - zero, ends[1] - zero)
-
-        if zero == 0.0:
-            return self
-        ci95, span = moved(self.ci95), moved(self.range)
+        ends = (self.ci95, self.range)
+        ci95, span = (one and (one[0] - zero, one[1] - zero) for one in ends)
         return replace(self, value=self.value - zero, ci95=ci95, range=span)
 
 
@@ -213,7 +206,7 @@ class Switch:
     """A change of branch in the fitted response: which spring, when, and where on the curves."""
 
     spring: int  # 1 at the base
-    source: str  # "a", "d", "c", "e", or "snap-through", … of a microscale spring
+    source: str  # name of a branch
     target: str
     time: float | None  # s
     displacement: float  # of the top, m
@@ -222,14 +215,13 @@ class Switch:
 
 @dataclass(frozen=True)
 class Check:
-    """One question to a fit."""
+    """One question of the checklist, put so that "yes" is good."""
 
     key: str  # Short name
-    question: str  # Put so that "yes" is good
-    answer: bool | None  # None where the test or the search does not allow to tell
+    question: str
+    answer: bool | None  # None where the test or the search cannot tell
     sentence: str  # What the answer rests on
-    # What a reader must know if the answer is no, one sentence each; empty otherwise.
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  # What a reader must know if the answer is no
     fatal: bool = False  # Whether a "no" means that no acceptable fit was found
 
 
@@ -412,65 +404,60 @@ class Fit:
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of ``fit.json``: SI, plain types, null for what is not there."""
-        content: dict[str, Any] = plain(
-            {
-                "schema": SCHEMA,
-                "foamfit": version("foamfit"),
-                "test": self.measurement.name,
-                "data_sha256": self.measurement.data_sha256,
-                "data": asdict(self.measurement.rows)
-                | {
-                    "cycle": self.measurement.cycle,
-                    "cycles": len(self.measurement.cycles),
-                    "start_strain": self.measurement.start_strain,
-                    "rate": loading_rate(self.measurement),
-                    "notes": self.measurement.notes,
-                },
-                "model": self.model,
-                "relaxation": self.relaxation,
-                "drive": self.drive,
-                "interior_mass": self.interior_mass,
-                "seed": self.seed,
-                "status": self.status,
-                "stopped": self.stopped,
-                "loss": self.loss,
-                "warnings": self.warnings,
-                "notes": self.notes,
-                "checklist": [
-                    {"question": c.question, "answer": c.answer, "sentence": c.sentence}
-                    for c in self.checklist
-                ],
-                "parameters": {name: asdict(p) for name, p in self.parameters.items()},
-                **({"correlation": vars(self.correlation)} if self.correlation else {}),
-                **({"budget": self.budget.contributions} if self.budget else {}),
-                "derived": {
-                    name: {point: getattr(spring, point) for point in DERIVED_POINTS}
-                    for name, spring in self.bistable_springs.items()
-                }
-                | {
-                    name: {
-                        "p_max": snapped.most,
-                        "p_max_stress": float(snapped.stress[snapped.turn]),
-                        "p_max_strain": None if self.strain is None else self.strain[snapped.turn],
-                        "snap_strain": self.microscale_springs[name].snap_strain,
-                    }
-                    for name, snapped in self.snapping.items()
-                },
-                "visited": self.visited,
-                "misfit": self.misfit,
-                "weights": self.weights,
-                "statistics": self.statistics,
-                "noise": self.noise,
-                "outliers": {
-                    channel: {name: getattr(found, name) for name in ("at", "values", "clipped_at")}
-                    for channel, found in self.measurement.outliers.items()
-                },
-                "energy": self.energy,
-                "runtime_s": self.runtime_s,
-                **({"ladder": asdict(self.ladder)} if self.ladder else {}),
+        test = self.measurement
+        asked = ("model", "relaxation", "drive", "interior_mass", "seed", "status", "stopped")
+        optional = {
+            "correlation": self.correlation and vars(self.correlation),
+            "budget": self.budget and self.budget.contributions,
+            "ladder": self.ladder and asdict(self.ladder),
+        }
+        content = {
+            "schema": SCHEMA,
+            "foamfit": version("foamfit"),
+            "test": test.name,
+            "data_sha256": test.data_sha256,
+            "data": asdict(test.rows)
+            | {
+                "cycle": test.cycle,
+                "cycles": len(test.cycles),
+                "start_strain": test.start_strain,
+                "rate": loading_rate(test),
+                "notes": test.notes,
+            },
+            **{name: getattr(self, name) for name in (*asked, "loss", "warnings", "notes")},
+            "checklist": [
+                {name: getattr(check, name) for name in ("question", "answer", "sentence")}
+                for check in self.checklist
+            ],
+            "parameters": {name: asdict(one) for name, one in self.parameters.items()},
+            "derived": self._derived(),
+            **{name: getattr(self, name) for name in ("visited", "misfit", "weights")},
+            **{name: getattr(self, name) for name in ("statistics", "noise", "energy")},
+            "outliers": {
+                channel: {name: getattr(found, name) for name in ("at", "values", "clipped_at")}
+                for channel, found in test.outliers.items()
+            },
+            "runtime_s": self.runtime_s,
+            **{name: one for name, one in optional.items() if one},
+        }
+        made: dict[str, Any] = plain(content)
+        return made
+
+    def _derived(self) -> dict[str, dict[str, Any]]:
+        """Return derived points of the springs, and how far they snapped."""
+        points = {
+            name: {point: getattr(spring, point) for point in DERIVED_POINTS}
+            for name, spring in self.bistable_springs.items()
+        }
+        return points | {
+            name: {
+                "p_max": snapped.most,
+                "p_max_stress": snapped.stress[snapped.turn],
+                "p_max_strain": None if self.strain is None else self.strain[snapped.turn],
+                "snap_strain": self.microscale_springs[name].snap_strain,
             }
-        )
-        return content
+            for name, snapped in self.snapping.items()
+        }
 
 
 def plain(value: Any) -> Any:

@@ -21,11 +21,9 @@ from foamfit.errors import InputError
 # they would move the cursor, colour the terminal or hide what stands there. And what Python makes
 # of file names that are no Unicode.
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
-# What stands for a character that an encoding does not have; Greek letters are named.
-_INSTEAD = {
-    "−": "-", "–": "-", "±": "+/-", "·": "*", "…": "...", "→": "->", "√": "sqrt", "µ": "u",
-    "²": "^2", "³": "^3", "⁻": "^-", "¹": "1", "∂": "d",
-}  # fmt: skip
+# What replaces a character that an encoding does not have; Greek letters are named.
+_PAIRS = "−- –- ±+/- ·* …... →-> √sqrt µu ²^2 ³^3 ⁻^- ¹1 ∂d"
+_INSTEAD = {pair[0]: pair[1:] for pair in _PAIRS.split()}
 
 
 def printable(text: str) -> str:

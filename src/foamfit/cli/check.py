@@ -92,9 +92,11 @@ def _outlook(
         relaxation=relaxation,
     )
     told, insight = [outlook_text(outlook)], outlook.planned.insight
-    if plot is not None and insight is None:
+    if plot is None:
+        return told
+    if insight is None:
         told.append("nothing is drawn: no parameter changes the curves")
-    elif plot is not None:
+    else:
         from foamfit.report.identifiability_plots import plot_insight
 
         title = (

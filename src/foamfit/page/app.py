@@ -19,7 +19,7 @@ import panel as pn
 
 from foamfit.errors import InputError, SimulationError
 from foamfit.page.curves import Curves, grid, misfits_text
-from foamfit.page.desk import BUSY, LARGEST, QUANTITIES, Checked, Desk, Excerpt
+from foamfit.page.desk import BUSY, LARGEST, QUANTITIES, Checked, Desk
 from foamfit.page.fields import RELAXATIONS, Field
 from foamfit.page.first_use import FirstUse
 from foamfit.page.turning import Turning
@@ -74,9 +74,8 @@ class Window:
         self._filling = False
         self._asked = {READING: 0, PREPARING: 0}
         self._before: tuple[dict[str, str], str] = {}, ""
-        self._inputs(address)
         self._outputs()
-        self._react()
+        self._inputs(address)
         self.template = pn.Template((TEMPLATES / "page.html").read_text(encoding="utf-8"))
         test_parts = [self.upload, self.chosen, self.as_before, *self.quantities.values()]
         result_parts = [self.saves, self.ending, self.report_of, self.beside, self.comparison]
@@ -89,10 +88,13 @@ class Window:
             "understood": [self.understood],
             "result": [*result_parts, self.report],
         }
-        for name, part in parts.items():
-            self.template.add_panel(name, pn.Column(*part, **WIDE))
+        for name, widgets in parts.items():
+            self.template.add_panel(name, pn.Column(*widgets, **WIDE))
         self._allow()
-        self._await()
+        document = pn.state.curdoc
+        for part in first_use.parts:  # what waits for the solver to be compiled
+            if not part.done():
+                part.add_done_callback(lambda _: document.add_next_tick_callback(self._allow))
         self._poll = pn.state.add_periodic_callback(self._follow, POLL, start=False)
         pn.state.on_session_destroyed(lambda _: gone())
         pn.state.onload(send_at_once)
@@ -102,11 +104,15 @@ class Window:
     # ------------------------------------------------------------------------------- the parts
 
     def _inputs(self, address: str) -> None:
-        text, select, button = (
-            partial(getattr(pn.widgets, name), **STYLE)
-            for name in ("TextInput", "Select", "Button")
-        )
+        text, select = (partial(getattr(pn.widgets, n), **STYLE) for n in ("TextInput", "Select"))
+
+        def button(name: str, do: Callable[[Any], None], kind: str = "default", **more: Any) -> Any:
+            made = pn.widgets.Button(name=name, button_type=kind, **more, **STYLE)
+            made.on_click(do)
+            return made
+
         self.upload = Upload(address=address, limit=LARGEST, sizing_mode="stretch_width")
+        self.upload.on_msg(self._received)
         listed = [sorted(one.glob("experiments/foam-*/*-reconstruction.csv")) for one in CHECKOUTS]
         found = next(filter(None, listed), [])
         self.reconstructions = {f"{one.parent.name}: {one.stem}": one for one in found}
@@ -115,6 +121,7 @@ class Window:
             options=["", *self.reconstructions],
             visible=bool(found),
         )
+        self.chosen.param.watch(self._choose, "value")
         self.quantities = {
             q.name: text(name=q.label, placeholder=f"like {q.example}") for q in QUANTITIES
         }
@@ -125,36 +132,39 @@ class Window:
             max_length=20_000,
             **STYLE,
         )
-        self.as_before = button(name="Fill in as for the file before", visible=False)
-        self.check = button(name="Check the test")
+        self.as_before = button(
+            "Fill in as for the file before", self._fill_as_before, visible=False
+        )
+        self.check = button("Check the test", self._check)
         lists = {"model": models(), "relaxation": [*range(RELAXATIONS)]}
         self.options = {name: Field(name, lists.get(name), **STYLE) for name in (*SHOWN, *FOLDED)}
         self.model, _, self.relaxation, self.cycle = (self.options[n].widget for n in SHOWN)
         self.cycle.visible = False
-        self.run = button(name="Fit", button_type="primary", disabled=True)
-        self.stop = button(name="Stop, and keep the best", button_type="danger", visible=False)
-        self.back = button(name="Back to the fit", visible=False)
+        self.run = button("Fit", self._run, "primary", disabled=True)
+        self.stop = button("Stop, and keep the best", self._stop, "danger", visible=False)
+        self.back = button("Back to the fit", self._back, visible=False)
         self.report_of = select(name="Report and curves of cycle", options=[0], visible=False)
         self.beside = select(
             name="Compare with a published set", options=["", *published], visible=False
         )
-        files: dict[str, tuple[str, Callable[[], bytes]]] = {
-            "Save the result folder": ("result.zip", lambda: self.desk.zipped()),
-            "Save the report": ("report.html", lambda: self._report().encode()),
-            "Save the TOML": ("test.toml", lambda: self.desk.toml),
+        self.report_of.param.watch(self._back, "value")
+        self.beside.param.watch(self._compare, "value")
+        self.fields = (*self.quantities.values(), self.rest, self.cycle)
+        for field in self.fields:
+            field.param.watch(self._edited, "value")
+        for name in ("model", "drive", "relaxation", "interior_mass", "time_shift"):
+            self.options[name].widget.param.watch(self._model_chosen, "value")
+        save = partial(pn.widgets.FileDownload, embed=False, auto=True, **STYLE)
+        saves = {
+            "the result folder": ("result.zip", lambda: BytesIO(self.desk.zipped())),
+            "the report": ("report.html", lambda: BytesIO(self._report().encode())),
+            "the TOML": ("test.toml", lambda: BytesIO(self.desk.toml)),
         }
-        saves = [
-            pn.widgets.FileDownload(
-                callback=lambda content=content: BytesIO(content()),
-                filename=filename,
-                label=label,
-                embed=False,
-                auto=True,
-                **STYLE,
-            )
-            for label, (filename, content) in files.items()
+        parts = [
+            save(label=f"Save {what}", filename=name, callback=content)
+            for what, (name, content) in saves.items()
         ]
-        self.saves = grid(saves, 11.0)
+        self.saves = grid(parts, 11.0)
 
     def _report(self) -> str:
         """Return the report of the fit, or of the chosen cycle."""
@@ -166,32 +176,10 @@ class Window:
         places = [pn.pane.HTML("", **style) for _ in range(8)]
         self.problem, self.progress, self.compiling, self.understood = places[:4]
         self.ending, self.misfit, self.comparison, self.report = places[4:]
-        self.understood.object = piece("paragraph", "There is no test yet.", "soft")
-        self.ending.object = piece("paragraph", "There is no fit yet.", "soft")
-
-    def _react(self) -> None:
-        self.upload.on_msg(self._received)
-        self.chosen.param.watch(self._choose, "value")
-        self.check.on_click(self._check)
-        self.as_before.on_click(self._fill_as_before)
-        self.run.on_click(self._run)
-        self.stop.on_click(self._stop)
-        self.back.on_click(self._back)
-        self.beside.param.watch(self._compare, "value")
-        self.report_of.param.watch(self._back, "value")
-        for field in (*self.quantities.values(), self.rest, self.cycle):
-            field.param.watch(self._edited, "value")
-        for name in ("model", "drive", "relaxation", "interior_mass", "time_shift"):
-            self.options[name].widget.param.watch(self._model_chosen, "value")
+        self.understood.object = soft("There is no test yet.")
+        self.ending.object = soft("There is no fit yet.")
 
     # ------------------------------------------------------------------------------- beside
-
-    def _await(self) -> None:
-        """Draw and allow again what waits for the solver to be compiled, when a part of it is."""
-        document = pn.state.curdoc
-        for part in self.first_use.parts:
-            if not part.done():
-                part.add_done_callback(lambda _: document.add_next_tick_callback(self._allow))
 
     def _allow(self) -> None:
         """Let a fit be begun where there is something to fit, and none is running."""
@@ -242,7 +230,7 @@ class Window:
         try:
             self.desk.take(path)
         except (InputError, OSError) as error:
-            self.problem.object = piece("paragraph", str(error), "error")
+            self.problem.object = wrong(error)
             return
         self._read()
 
@@ -254,7 +242,7 @@ class Window:
         try:
             found = self.desk.dropped_toml()
         except InputError as error:
-            self.problem.object = piece("paragraph", str(error), "error")
+            self.problem.object = wrong(error)
             return
         self._filling = True  # one check after all of them
         if self.desk.worker is None:  # what is shown of a fit is of another test
@@ -302,16 +290,15 @@ class Window:
     def _show_checked(self, checked: Checked | Exception) -> None:
         if isinstance(checked, Exception):
             checked = Checked(error=defect(checked))
-        self.problem.object = piece("paragraph", checked.error, "error") if checked.error else ""
+        self.problem.object = wrong(checked.error)
         for name, field in self.quantities.items():
             field.stylesheets = [WRONG if name == checked.quantity else FIELD]
         if checked.error == BUSY:
             return
         if checked.error:
-            shown = piece(
-                "paragraph", "The test cannot be read yet: see what is wrong with it.", "soft"
-            )
-            self.understood.object = shown + excerpt_html(checked.excerpt)
+            told = soft("The test cannot be read yet: see what is wrong with it.")
+            shown = piece("excerpt", checked.excerpt) if checked.excerpt else ""
+            self.understood.object = told + shown
         else:
             self.understood.object = piece("verbatim", checked.text)
         self._allow()
@@ -340,7 +327,7 @@ class Window:
 
     def _hide_curves(self, why: str = "") -> None:
         self.curves.hide()
-        self.misfit.object = piece("paragraph", why, "error") if why else ""
+        self.misfit.object = wrong(why)
 
     def _turn_model(
         self, model: str, cycle: int, values: Mapping[str, float] | None = None, **options: Any
@@ -387,23 +374,19 @@ class Window:
             arguments = self._arguments()
             self.desk.fit(arguments)
         except InputError as error:
-            self.progress.object = piece("paragraph", str(error), "error")
+            self.progress.object = wrong(error)
             return
         self.run.disabled, self.stop.visible, self.stop.disabled = True, True, False
         self._hide_result("A fit is running.")
-        self._hold(True)
+        for field in (*self.fields, self.chosen, self.check):  # nothing of the test may change
+            field.disabled = True
         self._poll.start()
-
-    def _hold(self, held: bool) -> None:
-        """Let nothing of the test be changed while it is fitted."""
-        for field in (*self.quantities.values(), self.rest, self.chosen, self.check, self.cycle):
-            field.disabled = held
 
     def _hide_result(self, why: str) -> None:
         self.saves.visible = self.beside.visible = self.back.visible = False
         self.report_of.visible = False
         self.report.object = self.comparison.object = ""
-        self.ending.object = piece("paragraph", why, "soft")
+        self.ending.object = soft(why)
 
     def _stop(self, event: Any = None) -> None:
         if self.desk.worker is not None:
@@ -457,12 +440,13 @@ class Window:
         self._allow()
         self.stop.visible = False
         self.progress.object = piece("ended")
-        self._hold(False)
+        for field in (*self.fields, self.chosen, self.check):
+            field.disabled = False
         if self.desk.result is None:
-            self.ending.object = piece("paragraph", self.desk.ending(), "error")
+            self.ending.object = wrong(self.desk.ending())
             return
         told, picture = self.desk.told, self.desk.result / "cycles.png"
-        self.ending.object = piece("paragraph", f"In a terminal: {self.desk.command}", "soft")
+        self.ending.object = soft(f"In a terminal: {self.desk.command}")
         if told:
             self.ending.object += piece("verbatim", told)
         if told and picture.is_file():
@@ -496,7 +480,7 @@ class Window:
             text = self.desk.compared(event.new, self.report_of.value)
             self.comparison.object = piece("verbatim", text)
         except InputError as error:
-            self.comparison.object = piece("paragraph", str(error), "error")
+            self.comparison.object = wrong(error)
 
 
 def keywords(asked: Mapping[str, Any]) -> dict[str, Any]:
@@ -520,22 +504,16 @@ def send_at_once() -> None:
             connection._socket.set_nodelay(True)
 
 
+def soft(text: str) -> str:
+    """Write a text as a soft paragraph."""
+    return piece("paragraph", text, "soft")
+
+
+def wrong(error: object) -> str:
+    """Write an error as a paragraph, nothing for none."""
+    return piece("paragraph", str(error), "error") if str(error) else ""
+
+
 def defect(error: Exception) -> str:
     """Say that what happened should not."""
     return f"This is a defect of foamfit, please report it ({type(error).__name__}: {error})."
-
-
-def excerpt_html(excerpt: Excerpt | None) -> str:
-    """Show rows of a file as a table, the wrong cell, row or column marked."""
-    if excerpt is None:
-        return ""
-    rows = []
-    for k, (number, cells) in enumerate(zip(excerpt.numbers, excerpt.cells, strict=True)):
-        here = excerpt.row in (k, None)
-        column = excerpt.column
-        wrong = [
-            here and (column == j or (column is None and excerpt.row == k))
-            for j in range(len(cells))
-        ]
-        rows.append((number, list(zip(cells, wrong, strict=True))))
-    return piece("excerpt", rows)

@@ -14,7 +14,7 @@ import tomllib
 import unicodedata
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import tomli_w
@@ -65,14 +65,8 @@ QUANTITIES = (
 )
 
 
-@dataclass(frozen=True)
-class Excerpt:
-    """Some rows of a file around what is wrong in it; `row` and `column` are marked, from 0."""
-
-    numbers: list[int]
-    cells: list[list[str]]
-    row: int | None
-    column: int | None
+# Rows of a file around what is wrong in it: their numbers, and their cells with marks on the wrong.
+Excerpt = list[tuple[int, list[tuple[str, bool]]]]
 
 
 @dataclass(frozen=True)
@@ -82,7 +76,7 @@ class Checked:
     text: str = ""
     error: str = ""
     quantity: str = ""
-    excerpt: Excerpt | None = None
+    excerpt: Excerpt = field(default_factory=list)
 
 
 class Desk:
@@ -334,30 +328,38 @@ def join_toml(quantities: Mapping[str, str], rest: str) -> str:
 # ------------------------------------------------------------------------- what is wrong, and where
 
 
-def excerpt_of(path: Path, sentence: str) -> Excerpt | None:
-    """Return the rows around the cell that a sentence of `read_test` names; None if it names none.
+def excerpt_of(path: Path, sentence: str) -> Excerpt:
+    """Return the headers and the rows around the cell that a sentence of `read_test` names.
 
-    A sentence without a row is about the columns: the first rows are shown then.
+    A sentence without a row is about a column, if any: the first rows are shown then.
     """
     try:
         text = read_text(path, "")
     except InputError:
-        return None
+        return []
     lines = text.raw.decode(text.encoding, errors="replace").splitlines()
     try:
         table = find_table(text, set())
         separator, header = table.separator, max(table.header_row - 1, 0)
     except InputError:
         separator, header = max("\t;,", key="\n".join(lines[:20]).count), 0
-    row = re.search(r"\brow (\d+)", sentence)
-    at = int(row[1]) - 1 if row else None
-    first = header if at is None else max(at - AROUND, header)
+    found = re.search(r"\brow (\d+)", sentence)
+    row = int(found[1]) - 1 if found else None
+    first = header if row is None else max(row - AROUND, header)
     some = range(first, min(first + 2 * AROUND + 1, len(lines)))
-    numbers = [header, *(n for n in some if n != header)]
-    cells = [[cell.strip().strip('"') for cell in lines[n].split(separator)] for n in numbers]
-    named = (k for k, cell in enumerate(cells[0]) if cell and f"'{cell}'" in sentence)
-    column = next(named, None)
+    cells = {
+        n: [cell.strip().strip('"') for cell in lines[n].split(separator)]
+        for n in dict.fromkeys([header, *some])
+    }
+    headers = enumerate(cells[header])
+    column = next((k for k, name in headers if name and f"'{name}'" in sentence), None)
     left = 0 if column is None else max(0, column - ACROSS + 1)
-    shown = [[cell[:CELL] for cell in line[left : left + ACROSS]] for line in cells]
-    marked = numbers.index(at) if at in numbers else None
-    return Excerpt([n + 1 for n in numbers], shown, marked, column and column - left)
+
+    def wrong(n: int, k: int) -> bool:
+        """Whether a cell is the wrong one, or in the row or column that is wrong as a whole."""
+        return {row, column} != {None} and row in (n, None) and column in (k, None)
+
+    return [
+        (n + 1, [(line[k][:CELL], wrong(n, k)) for k in range(left, min(left + ACROSS, len(line)))])
+        for n, line in cells.items()
+    ]

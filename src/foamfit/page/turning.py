@@ -203,8 +203,10 @@ class Turning:
         if split_name(name)[1] == "time_shift":
             low, high = parameter.min, parameter.max
         low, high = max(low, parameter.min), min(high, parameter.max)
-        limits = (value, low, high, parameter.min, parameter.max)
-        return Row(name, shown, factor, *(one / factor for one in limits), held=not parameter.vary)
+        value, low, high, least, most = (
+            one / factor for one in (value, low, high, parameter.min, parameter.max)
+        )
+        return Row(name, shown, factor, value, low, high, least, most, held=not parameter.vary)
 
 
 def thinned(measurement: Measurement) -> Measurement:
