@@ -1,8 +1,8 @@
 """The simplest model that follows the curves, and the evidence for each that was tried.
 
-Models are fitted from the simplest up, each without damping and then with it. They are compared by
-AICc and BIC with the effective numbers of samples and of parameters where one of them comes to the
-noise, else by how well they predict what they were not fitted to (`trust.evidence`). The comparison
+Models are fitted from the simplest up, each without damping and then with it. If one of them
+reaches the noise, AICc and BIC compare them, with the effective numbers of samples and parameters;
+otherwise their predictions of samples that were held back do (`trust.evidence`). The comparison
 ends where the residuals are random, or where two groups of models in a row bring no gain.
 """
 
@@ -50,7 +50,7 @@ LADDER = (
     (Model.parse("linear+bistable+bistable"),),
     (Model.parse("microscale+microscale", 1),),
 )
-# So many groups in a row without a gain end the comparison.
+# The comparison ends after so many groups in a row without a gain.
 WITHOUT_GAIN = 2
 # Chains with microscale springs, which take minutes in an impact, are not tried where one such
 # spring misses the curves by so many times more than one bistable spring.
@@ -58,23 +58,23 @@ HOPELESS = 1.1
 # Two of them take a minute even under a known motion: they are not tried where one, perhaps with
 # relaxation, misses the curves by no more than this share of the range.
 CLOSE = 0.01
-# Share of the time of a comparison after which what is left is to judge the chosen model.
+# Share of the time of a comparison after which only the chosen model is left to be judged.
 CHOSEN = 0.9
-# Of a model that is compared: ranges and better intervals are made of the chosen one alone. They
-# cost as much as its search, and the comparison does not go by them.
+# While models are compared: only the chosen one gets ranges and better intervals, which cost as much
+# as a search.
 COMPARED = Choice("local", ranges=False)
 
 
 def _dampers(params: lmfit.Parameters) -> list[str]:
-    """Names of the dampers that vary."""
+    """Return the names of the dampers that vary."""
     return [name for name in params if split_name(name)[1] == "eta" and params[name].vary]
 
 
 def _carry(params: lmfit.Parameters, model: Model, tried: Sequence[Tried]) -> None:
-    """Start from the springs of the best simpler model, the top one first; in place.
+    """Start from the best fit of a model that is contained in this one, top spring first; in place.
 
-    Simpler is one whose springs and relaxation this one has too. A new linear spring starts short
-    and stiff and new relaxation with a share of zero, so that the chain does what that one did.
+    A new linear spring starts short and stiff and new relaxation with a share of zero, so that the
+    chain starts with the curves of that fit.
     """
     inside = [
         one
@@ -112,9 +112,9 @@ def compare_models(
 ) -> Fit:
     """Fit ever richer models until one holds; this is `foamfit.fit` with model="auto".
 
-    The time limit is that of all models together; it and Ctrl-C keep what is done. Models have
-    local intervals and states by these alone; the intervals that were asked for, and ranges, are
-    made of the chosen one.
+    The time limit is that of all models together; it and Ctrl-C keep what is done. All models have
+    local intervals, and states by these alone; only the chosen one has ranges and the intervals
+    that were asked for.
     """
     state = _Comparison(measurement, options, progress)
     tried = state.tried
@@ -142,7 +142,7 @@ def compare_models(
 
 
 class _Comparison:
-    """What every model is fitted with, what was tried, and what stopped the comparison."""
+    """The test and options of all models, what was tried, and what stopped the comparison."""
 
     def __init__(self, measurement: Measurement, options: Options, progress: Progress) -> None:
         self.measurement, self.progress = measurement, progress
@@ -160,8 +160,8 @@ class _Comparison:
     def _models(self) -> list[list[Model]]:
         """Return the models that the test allows, in their groups.
 
-        They have as many springs as heights were given, or one, and every mass that was followed;
-        those with relaxation need the time.
+        They have as many springs as heights are given, or one, and every mass whose motion was
+        measured; relaxation needs the time.
         """
         test = self.measurement
         heights, inside = test.specimen.heights, max(test.interior, default=0)
@@ -189,7 +189,7 @@ class _Comparison:
         self.skipped.append(f"{rung_name(model.name, 'none', model.relaxation)}: {why}")
 
     def climb(self) -> None:
-        """Fit group after group, until one model holds, two groups gain nothing, or time is up."""
+        """Fit group after group until one model holds, two groups gain nothing, or time is up."""
         idle = 0
         for group in self.groups:
             below = len(self.tried)
@@ -220,7 +220,7 @@ class _Comparison:
                 return
             try:
                 one = self._fit(model, damping, left, i / len(dampings), 1.0 / len(dampings))
-            except SimulationError as error:  # a dashpot makes nothing easier to simulate
+            except SimulationError as error:  # a dashpot would not help
                 self._skip(model, str(error).removeprefix(f"{self.measurement.name}: "))
                 return
             self.tried.append(one)
@@ -255,7 +255,7 @@ class _Comparison:
         return Tried(result, damping, best, time.perf_counter() - began, predicted)
 
     def _predicted(self, best: BestPoint) -> float | None:
-        """Misfit of samples that are held back; None if the time is up."""
+        """Return the misfit of samples that are held back; None if the time is up."""
         try:
             return predicted_misfit(best, self.deadline)
         except SearchStoppedError:
@@ -284,7 +284,7 @@ def _hopeless(model: Model, tried: Sequence[Tried]) -> str:
 
 
 def _has_gained(tried: Sequence[Tried], below: int) -> bool:
-    """Whether one of the last models is chosen, or AICc or BIC strongly prefers it to all below."""
+    """Whether one of the last models is chosen, or AICc or BIC strongly prefers one."""
     if below == 0:
         return True
     decision = evidence.choose(tried)
@@ -370,14 +370,14 @@ class _Account:
         )
 
     def _gain(self, i: int) -> float | None:
-        """Share by which the predicted misfit of a model is below that of the one before."""
+        """Return the share by which a model predicts better than the one before."""
         before = self.decision.before[i]
         other = None if before is None else self.tried[before].predicted
         own = self.tried[i].predicted
         return None if own is None or other is None else 1.0 - own / other
 
     def _why(self, i: int) -> str:
-        """Why a model was chosen or not."""
+        """Say why a model was chosen or not."""
         one, found = self.tried[i], self.decision.criteria
         if (ruler := self.decision.ruled_out_by[i]) is not None:
             fewer = self.tried[ruler].varied < one.varied
@@ -396,7 +396,7 @@ class _Account:
         return told if one.varied <= self.best.varied else f"richer without evidence: {told}"
 
     def _why_by_prediction(self, i: int) -> str:
-        """Why a model was chosen or not, where what it predicts decides."""
+        """Say why a model was chosen or not, where predictions decide."""
         one, before, gain = self.tried[i], self.decision.before[i], self._gain(i)
         if one.predicted is None:
             said = f"{percent(one.misfit)} of the range is left (no prediction: the time was up)"

@@ -36,13 +36,12 @@ class ParameterEstimate:
 
     `stderr` and `ci95` are None where the test does not determine it; `state` is "determined",
     "weak", "not determined" or "fixed" (fixed by the user or the model), and `why` says so in a
-    sentence. `ci95_method` names what made the interval: "local covariance", "profile likelihood",
-    "block bootstrap", "MCMC" or "other minima" (ends of
-    the search's descents that noise could have made the best). `range` is the hull of its values
-    over descriptions that follow the curves about as well, which the error of the law leaves open;
-    None where only noise is left of the curves. `systematic` is one standard deviation from height,
-    area, mass and calibration, whose ± the TOML states; it is not in `stderr` and `ci95`, and is 0
-    where none is stated or the test does not determine the parameter.
+    sentence. `ci95_method` is the source of the interval: "local covariance", "profile likelihood",
+    "block bootstrap", "MCMC" or "other minima" (of the search, which noise could have made the
+    best). `range` includes model error: the values that fit almost equally well; None where the
+    residuals are noise. `systematic` is one standard deviation from the ± of height, area, mass and
+    calibration in the TOML; it is not in `stderr` and `ci95`, and is 0 where no ± is stated or the
+    test does not determine the parameter.
     """
 
     value: float
@@ -99,17 +98,17 @@ class Profile:
     rises: Array  # (m,): Rise of the cost there as a χ² of one degree of freedom
     points: Array  # (m, n): All parameters of the model at each
     cut: float  # χ² of the 95 % interval
-    # Outermost crossings of the cut; a limit of the parameter where there is none.
+    # Outermost crossings of the cut, or a limit of the parameter
     ci95: tuple[float, float]
-    # Whether the cost does not reach the cut on that side.
+    # Whether the cost stays below the cut on that side
     open_low: bool
     open_high: bool
-    # What ended it before its end on both sides: "the time limit", "Ctrl-C".
+    # What ended it early: "the time limit", "Ctrl-C"
     stopped: str | None = None
 
     @property
     def complete(self) -> bool:
-        """Whether it was followed to its end on both sides."""
+        """Whether it was followed to both ends."""
         return self.stopped is None
 
 
@@ -121,14 +120,14 @@ class Intervals:
     ends: dict[str, tuple[float, float]] = field(default_factory=dict)
     methods: dict[str, str] = field(default_factory=dict)
     profiles: tuple[Profile, ...] = ()  # All profiles that were followed, whole or not
-    # Parameters along which the cost is no parabola and whose interval is local all the same.
+    # Parameters with a local interval although the cost along them is not a parabola
     doubtful: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()  # Why they are not, or hardly, what was asked for
-    better: Array | None = None  # A point of lower cost: the fit should go on from there
-    # Values, far outside of the interval, at minima that are hardly worse than the best.
+    warnings: tuple[str, ...] = ()  # Why they differ from what was asked for
+    better: Array | None = None  # A point of lower cost from which the fit should continue
+    # Values, far outside the interval, at minima almost as good as the best
     elsewhere: dict[str, float] = field(default_factory=dict)
-    # Ends of the ranges that the error of the law leaves open; none where there is no such error.
+    # Ends of the ranges that include the error of the law, where there is one
     ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
@@ -146,12 +145,12 @@ class Snapping:
 
     @property
     def most(self) -> float:
-        """Largest fraction that has snapped; the test tells nothing of the ranks above."""
+        """Largest fraction that has snapped; the test says nothing about the others."""
         return float(self.fraction[self.turn])
 
     @property
     def halves(self) -> tuple[int | None, int | None]:
-        """Samples from which on half have snapped, and half have snapped back; None if never."""
+        """First samples at which half have snapped, and half have snapped back; None if never."""
         turn, snapped = self.turn, self.fraction >= 0.5
         if not snapped[turn]:
             return None, None
@@ -186,15 +185,15 @@ class Budget:
 
     @property
     def telling(self) -> bool:
-        """Whether it says more than the standard errors and ranges of the parameters."""
+        """Whether it has more than the standard errors and ranges of the parameters."""
         return bool(set(self.sources) - {"noise", "law"})
 
     def combined(self, name: str) -> float:
-        """Root of the sum of the squares of all contributions to a parameter, SI."""
+        """Combine all contributions to a parameter by their squares, SI."""
         return math.hypot(*self.contributions[name].values())
 
     def rows(self) -> Iterator[list[object]]:
-        """Rows of budget.csv, the header first: SI, but for what is over the scale."""
+        """Give the rows of budget.csv, the header first: SI, but for the last column."""
         yield ["name", *SOURCES, "combined", "scale", "combined over scale"]
         for name, row in self.contributions.items():
             total, scale = self.combined(name), self.scales[name]
@@ -238,22 +237,22 @@ class Rung:
     """One model that was tried and the evidence for it."""
 
     model: str  # Springs from the base up
-    # "with", "without" (every dashpot held at zero) or "none" where the drive has none to vary.
+    # "with", "without" (every dashpot held at zero) or "none" (the drive has none to vary)
     damping: str
     misfit: dict[str, float | None]  # As `Fit.misfit`
     chisqr: float  # Sum of the squared residuals
     n_vary: int  # Parameters that were varied
     rank: int  # How many combinations of them the curves fix: what AICc and BIC count
-    # Effective samples by its own residuals. AICc and BIC use `Ladder.n_eff`, one for all.
+    # Effective samples by its own residuals; AICc and BIC use `Ladder.n_eff`
     n_eff: float
-    # Infinite where there are too few effective samples for so many parameters.
+    # Infinite if there are too few effective samples for so many parameters
     aicc: float
     bic: float
     # p-value of the runs test: the chance that noise without structure has as few runs.
     runs_p: float
-    # p-value of the neighbours test: the same by size, where the runs test goes by sign.
+    # p-value of the neighbours test, which goes by size, the runs test by sign
     neighbours_p: float
-    # Names of the parameters in these states, by the 95 % intervals alone where it was not chosen.
+    # Parameters in these states; by the 95 % intervals alone if it was not chosen
     not_determined: tuple[str, ...]
     weak: tuple[str, ...]
     seconds: float  # Run time
@@ -261,12 +260,11 @@ class Rung:
     chosen: bool  # Whether the result is that of this model
     why: str  # Why it was chosen or not
     relaxation: int = 0  # Terms of each hysteretic spring
-    # RMS over the range, all counted curves together, of samples that were held back in blocks;
-    # None where the time did not allow it.
+    # RMS over the range of samples that were held back in blocks; None if there was no time
     predicted_misfit: float | None = None
-    # By what share that is below the one of `gain_over`; None where that is none.
+    # By what share that is below the one of `gain_over`, if any
     gain: float | None = None
-    # The model that was the best of those with no more parameters; None of the first.
+    # The best of the models before with no more parameters; None for the first
     gain_over: str | None = None
 
     @property
@@ -281,14 +279,13 @@ class Ladder:
 
     rungs: tuple[Rung, ...]  # In the order in which they were tried, from the simplest up
     n_eff: float  # Effective samples that AICc and BIC use
-    noise_from: str  # The model of the least chi-square: its residuals are taken for the noise
+    noise_from: str  # The model of the least chi-square, whose residuals are taken as noise
     ended: str  # Why the comparison ended
     stopped: str | None  # "the time limit" or "Ctrl-C" if that ended it
     skipped: tuple[str, ...]  # Models that could not be tried, and why
     sentences: tuple[str, ...]  # What the comparison says
     cautions: tuple[str, ...]  # Those of them that are warnings
-    # Whether models were compared by what they predict, because none reaches the noise; else by
-    # AICc and BIC.
+    # Whether models were compared by their predictions, as none reaches the noise, not by AICc, BIC
     by_prediction: bool = False
 
     @property
@@ -309,10 +306,10 @@ class Ladder:
 
 
 def snapping_of(chain: Chain, strain: Array | None, stress: Array | None) -> dict[str, Snapping]:
-    """How each microscale spring snaps along an overall strain and a base stress (Pa).
+    """Return how each microscale spring snaps along an overall strain and a base stress (Pa).
 
-    A single spring's snapping follows from its strain. In a chain it follows from the stress, if
-    all springs are in equilibrium under it, else there is none.
+    A single spring's snapping follows from its strain, that in a chain from the stress if all its
+    springs are in equilibrium, else it is not known.
     """
     out, springs = {}, chain.springs
     plain = not any(spring.eta or spring.relaxation for spring in springs)

@@ -30,17 +30,16 @@ from foamfit.results import law_in_words
 from foamfit.springs.parameters import HYSTERETIC
 from foamfit.springs.published import published
 
-# Where a checkout of the repository may be: the working directory, or around an editable package.
+# Where a checkout of the repository may be: the working directory, or around an editable install.
 CHECKOUTS = (Path(), Path(__file__).parents[3])
-# Options that hang together with the test and model, and those that are folded away; fixed and
-# varied parameters have ticks.
+# Options that are shown, and those that are folded away; --fix and --vary have ticks.
 SHOWN = ("model", "drive", "relaxation", "cycle")
 FOLDED = (
     *("starts", "max_time", "seed", "loss", "interior_mass", "time_shift"),
     *("profile", "bootstrap", "mcmc"),
 )
 POLL = 200  # ms
-# For all windows one test is read at a time, and the curves of one are prepared.
+# Over all windows, one test is read and the curves of one are prepared at a time.
 READING, PREPARING = (
     ThreadPoolExecutor(1, thread_name_prefix=f"foamfit-{name}") for name in ("reading", "preparing")
 )
@@ -182,7 +181,7 @@ class Window:
     # ------------------------------------------------------------------------------- beside
 
     def _allow(self) -> None:
-        """Let a fit be begun where there is something to fit, and none is running."""
+        """Enable a fit where there is a test, the solver is compiled and no fit runs."""
         compiled = self.first_use.needed(self.model.value, self.relaxation.value).done()
         self.compiling.object = "" if compiled else piece("busy", COMPILING)
         ready = self.desk.measurement is not None and compiled
@@ -191,9 +190,9 @@ class Window:
     def _beside(
         self, pool: ThreadPoolExecutor, work: Callable[[], Any], then: Callable[[Any], None]
     ) -> None:
-        """Do what takes a while beside the server, then show it; what is asked for later wins.
+        """Work in a thread, then show the result unless more was asked for since.
 
-        What is shown changes in a turn of the document only: threads know no lock of it.
+        Results are shown in a callback of the document, whose lock threads do not hold.
         """
         self._asked[pool] += 1
         asked, document = self._asked[pool], pn.state.curdoc
@@ -235,9 +234,9 @@ class Window:
         self._read()
 
     def _read(self) -> None:
-        """Fill in what a dropped TOML says, nothing for another file without one, and check.
+        """Fill in a dropped TOML, or clear the fields for another file without one, and check.
 
-        What was filled in for the file before is of its specimen; it is offered.
+        What was filled in belongs to the specimen of the file before; it is offered again.
         """
         try:
             found = self.desk.dropped_toml()
@@ -284,7 +283,7 @@ class Window:
         """Check the test as it is filled in, and show what is understood or wrong."""
         (given, rest), cycle = self._given(), self.cycle.value or ""
         self.run.disabled = True
-        self._asked[PREPARING] += 1  # what is being prepared is of the test as it was
+        self._asked[PREPARING] += 1  # curves in preparation are of the old test
         self._beside(READING, lambda: self.desk.check(given, rest, cycle), self._show_checked)
 
     def _show_checked(self, checked: Checked | Exception) -> None:
@@ -311,7 +310,7 @@ class Window:
     # ------------------------------------------------------------------------------- the curves
 
     def _model_chosen(self, event: Any = None) -> None:
-        """Put the model's parameters over the test, read off its loop."""
+        """Show the model over the test, with values read off its loop."""
         auto = self.model.value == "auto"
         self._allow()
         self.relaxation.disabled, self.curves.sliders.ticks = auto, not auto
@@ -332,12 +331,12 @@ class Window:
     def _turn_model(
         self, model: str, cycle: int, values: Mapping[str, float] | None = None, **options: Any
     ) -> None:
-        """Put other sliders under the curves; they begin at these values, or read off the loop."""
+        """Show other sliders under the curves, at these values or at values read off the loop."""
 
         def make() -> Turning:
             self.first_use.needed(model, options["relaxation"]).result()
             made = Turning(self.desk.measured(cycle), model, values, **options)
-            made.turn({})  # loads what is compiled
+            made.turn({})  # loads the compiled code
             return made
 
         what = f"Preparing the curves of {law_in_words(model, options['relaxation'])} …"
@@ -358,7 +357,7 @@ class Window:
     # ------------------------------------------------------------------------------- the fit
 
     def _arguments(self, ticked: bool = True) -> list[str]:
-        """Return the arguments of `foamfit fit` that ask for what is filled in."""
+        """Return the arguments of `foamfit fit` for what is filled in."""
         auto = self.model.value == "auto"
         hidden = {"relaxation": auto, "cycle": not self.cycle.visible}
         shown = (field for name, field in self.options.items() if not hidden.get(name))
@@ -394,7 +393,7 @@ class Window:
             self.stop.disabled = True
 
     def _follow(self) -> None:
-        """Show how far the fit is; when it has ended, its result."""
+        """Show the progress of the fit, and its result when it has ended."""
         worker = self.desk.worker
         if worker is None:
             return
@@ -415,7 +414,7 @@ class Window:
         self._show_best(news)
 
     def _show_best(self, news: News) -> None:
-        """Draw the curves of the best so far, and put the sliders there."""
+        """Draw the curves of the best point so far, and move the sliders there."""
         if not news.values or self.desk.measurement is None:
             return
         now = self.curves.turning
@@ -428,7 +427,7 @@ class Window:
     def _turn_fitted(
         self, model: str, relaxation: int, drive: str, cycle: int, values: Mapping[str, float]
     ) -> None:
-        """Put the curves of the fit there that was begun last, at these values."""
+        """Show the curves of the last fit at these values."""
         assert self.desk.worker is not None
         assert self.desk.measurement is not None
         options = keywords(parsed(self.desk.worker.job.arguments))
@@ -462,7 +461,7 @@ class Window:
         self._back()
 
     def _back(self, event: Any = None) -> None:
-        """Show the report of the fit, and put the sliders back to it."""
+        """Show the report of the fit, and move the sliders back to it."""
         if self.report_of.value not in self.desk.fits:
             return
         self.report.object = piece("report", self._report())
@@ -484,7 +483,7 @@ class Window:
 
 
 def keywords(asked: Mapping[str, Any]) -> dict[str, Any]:
-    """Take from options of the command those on which the curves of a model hang."""
+    """Return the options on which the curves of a model depend."""
     return {one: asked[one] for one in ("drive", "relaxation", "interior_mass", "time_shift")}
 
 
@@ -495,9 +494,9 @@ def models() -> list[str]:
 
 
 def send_at_once() -> None:
-    """Let no message of this window wait until the one before is acknowledged, 40 ms later.
+    """Send messages of this window without waiting for acknowledgements (40 ms each).
 
-    A curve is several small ones. Bokeh has no public way to its sockets; without it they are late.
+    Bokeh has no public way to its sockets; if this fails, curves come late.
     """
     with suppress(AttributeError):
         for connection in pn.state.curdoc.session_context.session._subscribed_connections:
@@ -515,5 +514,5 @@ def wrong(error: object) -> str:
 
 
 def defect(error: Exception) -> str:
-    """Say that what happened should not."""
+    """Say that an error is a defect."""
     return f"This is a defect of foamfit, please report it ({type(error).__name__}: {error})."

@@ -1,6 +1,6 @@
-"""The measured curves, those of springs over them, and a slider for each parameter.
+"""Measured curves, simulated ones over them, and a slider for each parameter.
 
-The page and the notebook `turn_the_parameters` show the same ones.
+The page and the notebook `turn_the_parameters` show the same panels.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from foamfit.report.readable import readable_unit
 from foamfit.report.summary import CURVES
 from foamfit.text import percent
 
-MOST_DRAWN, MOST_MARKERS = 400, 150  # points of a curve, of a measured one
-ASIDE = {"C1": -22}  # px from a point to its name, which is at the right edge
+MOST_DRAWN, MOST_MARKERS = 400, 150  # points of a simulated curve, and of a measured one
+ASIDE = {"C1": -22}  # px from a point at the right edge to its name
 NOTHING = np.empty(0), np.empty(0)
 AXES = {  # of each panel: x and y, with the SI units of both
     "stress_time": (("time", "s"), ("stress", "Pa")),
@@ -33,9 +33,9 @@ AXES = {  # of each panel: x and y, with the SI units of both
 
 
 def grid(parts: list[Any], width: float) -> pn.Column:
-    """Put parts side by side, none narrower than so many rem; hidden at first.
+    """Put parts side by side, each at least so many rem wide; hidden at first.
 
-    What is hidden is the column around it: a part that says itself how it is laid out stays.
+    The column around them is what is hidden, as a grid itself would stay visible.
     """
     style = (
         ":host { display: grid; gap: .4rem; "
@@ -50,16 +50,16 @@ class Curves:
 
     def __init__(self, turning: Turning | None = None) -> None:
         self.turning: Turning | None = None
-        self.held: dict[str, bool] = {}  # what was ticked by hand: whether a fit holds it
+        self.held: dict[str, bool] = {}  # by parameter: whether the user's tick holds it in a fit
         self._rows: dict[str, Row] = {}
         self._scales: dict[str, tuple[float, float]] = {}
         self._measured = {name: ColumnDataSource({"x": [], "y": []}) for name in PANELS}
-        # One source for all panels: one message for a move.
+        # One source for all panels makes one message per move.
         self._turned = ColumnDataSource({f"{name}_{axis}": [] for name in PANELS for axis in "xy"})
         self._points = ColumnDataSource({"x": [], "y": [], "name": [], "aside": []})
         self._figures = {name: self._figure(name) for name in PANELS}
         self.sliders = Sliders(sizing_mode="stretch_width", margin=(6, 0))
-        # With the lock of the document, which a message does not always come with.
+        # With the lock of the document, which not every message holds.
         self.sliders.on_msg(lambda event: pn.state.execute(partial(self._moved, event), True))
         legend = pn.pane.HTML(
             piece("legend", GREY, VERMILION), sizing_mode="stretch_width", margin=0
@@ -68,13 +68,15 @@ class Curves:
             [pn.pane.Bokeh(one, sizing_mode="stretch_width") for one in self._figures.values()],
             14.5,
         )
-        self._panels.insert(0, legend)  # of all panels: one of a figure's own is drawn each time
+        self._panels.insert(
+            0, legend
+        )  # one for all panels: a figure's own would be redrawn each time
         self.view = pn.Column(self._panels, self.sliders, sizing_mode="stretch_width", margin=0)
         if turning is not None:
             self.show(turning)
 
     def show(self, turning: Turning) -> None:
-        """Put another model or test there, with sliders of its own."""
+        """Show another model or test, with its sliders."""
         self.turning = turning
         self._rows = {row.name: row for row in turning.rows}
         self._show_measured()
@@ -90,15 +92,15 @@ class Curves:
         self.sliders.show({n: v / rows[n].factor for n, v in values.items() if n in rows})
 
     def hide(self) -> None:
-        """Take everything away."""
+        """Hide everything."""
         self.sliders.tell("")
         self.turning, self._rows, self.sliders.rows = None, {}, []
         self._panels.visible = False
 
     def chosen(self) -> tuple[dict[str, float], list[str]]:
-        """Return what a fit is to hold, with its values (SI), and what it is to vary.
+        """Return what a fit is to hold, with values (SI), and what it is to vary.
 
-        Left out is what it holds at this value, or varies, by itself.
+        Parameters that it holds at this value, or varies, by default are left out.
         """
         held, varied = dict[str, float](), list[str]()
         if self.turning is None:
@@ -124,8 +126,8 @@ class Curves:
         )
         measured = {"source": self._measured[name], "line_color": GREY}
         made.scatter("x", "y", size=5, fill_color="white", **measured)
-        # What moves lies on a canvas of its own: axes and measured curves are not drawn again.
-        # Annotations are cut off there at the frame, glyphs are not; a band of no width is a line.
+        # Moving curves have a canvas of their own, so that axes and measured curves are not redrawn.
+        # The frame clips annotations there, not glyphs; a band without width is a line.
         above = {"source": self._turned, "level": "overlay", "line_color": VERMILION}
         ends = {"base": f"{name}_x", "lower": f"{name}_y", "upper": f"{name}_y"}
         made.add_layout(Band(line_width=2, line_alpha=1.0, fill_alpha=0.0, **above, **ends))
@@ -155,7 +157,7 @@ class Curves:
             some = slice(None, None, -(-len(there[0]) // MOST_MARKERS))
             x, y = there[0] / fx, there[1] / fy
             self._measured[name].data = {"x": x[some], "y": y[some]}
-            # They stay while parameters are turned: what moves is the curve alone.
+            # The axes keep their ranges while parameters change.
             for limits, values, beyond in ((made.x_range, x, 0.04), (made.y_range, y, 0.15)):
                 more = beyond * float(np.ptp(values))
                 low, high = float(values.min()) - more, float(values.max()) + more
@@ -163,7 +165,7 @@ class Curves:
         self._panels.visible = True
 
     def _moved(self, event: Any) -> None:
-        """Draw the curves of the parameters that were moved; note what was ticked."""
+        """Draw the curves for sliders that were moved; note ticks."""
         told = message(event)
         moves, held = (
             one if isinstance(one, dict) else {} for one in (told.get("moves"), told.get("held"))
@@ -180,7 +182,7 @@ class Curves:
             self.sliders.drawn()
 
     def _draw(self, moves: Mapping[str, float]) -> None:
-        """Send the arrays of the curves alone; the figures stay as they are."""
+        """Send only the arrays of the curves."""
         assert self.turning is not None
         drawn = self.turning.turn(moves)
         data = dict[str, Any]()
@@ -189,7 +191,7 @@ class Curves:
             fx, fy = self._scales.get(name, (1.0, 1.0))
             some = slice(None, None, -(-len(x) // MOST_DRAWN) or 1)
             data |= {f"{name}_x": x[some] / fx, f"{name}_y": y[some] / fy}
-        # Of one length, as a source has it, and no finer than pixels are.
+        # A source needs arrays of one length; single precision resolves a pixel.
         sent = {name: np.full(max(map(len, data.values())), np.nan, np.float32) for name in data}
         for name, values in data.items():
             sent[name][: len(values)] = values
@@ -213,6 +215,6 @@ class Curves:
 
 
 def misfits_text(misfit: Mapping[str, float | None]) -> str:
-    """Name the misfits of the three panels that are there."""
+    """Return the misfits of the panels in words."""
     shown = {CURVES[name]: misfit.get(name) for name in PANELS}
     return ", ".join(f"{name} {percent(off)}" for name, off in shown.items() if off is not None)

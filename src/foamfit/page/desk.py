@@ -1,7 +1,6 @@
-"""What one window works on: its files, the test read from them, and its fit.
+"""The work of one window: its files, the test read from them, and its fit.
 
-Everything lies in a folder of the window's own, which goes with the window. Two windows share
-nothing.
+Everything lies in a folder of the window, which is removed with it. Windows share nothing.
 """
 
 from __future__ import annotations
@@ -36,13 +35,13 @@ LARGEST = 64 * 1024 * 1024  # bytes of a file that is dropped
 LONGEST = 80  # characters of the name of a file
 BUSY = "A fit is running; stop it before anything of the test is changed."
 TABLES = (".csv", ".txt", ".tsv", ".dat", ".gz", ".xlsx")
-# Rows and columns of a file that are shown around a cell that is wrong.
+# Rows on each side, columns, and characters of a cell shown around a wrong cell.
 AROUND, ACROSS, CELL = 2, 8, 24
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """A quantity that is filled in: its place in the TOML, what it is called, an example."""
+    """A quantity to fill in: its place in the TOML, its label, an example."""
 
     section: str
     key: str
@@ -51,7 +50,7 @@ class Quantity:
 
     @property
     def name(self) -> str:
-        """Its name as the sentences of `read_test` give it."""
+        """Its name in the messages of `read_test`."""
         return f"[{self.section}] {self.key}"
 
 
@@ -65,13 +64,13 @@ QUANTITIES = (
 )
 
 
-# Rows of a file around what is wrong in it: their numbers, and their cells with marks on the wrong.
+# Rows of a file around an error: their numbers, and their cells, each with whether it is wrong.
 Excerpt = list[tuple[int, list[tuple[str, bool]]]]
 
 
 @dataclass(frozen=True)
 class Checked:
-    """What was understood of a test, or the sentence that says why not and what it is about."""
+    """What was understood of a test, or why it cannot be read, and which quantity is wrong."""
 
     text: str = ""
     error: str = ""
@@ -86,7 +85,7 @@ class Desk:
         self.folder = folder
         folder.mkdir(mode=0o700)
         self.csv: Path | None = None
-        self.replaced = False  # whether the file has taken the place of another, not read since
+        self.replaced = False  # whether the file replaced another and was not read since
         self.measurement: Measurement | None = None
         self.worker: Worker | None = None
         self._fits = 0
@@ -100,9 +99,9 @@ class Desk:
     # ------------------------------------------------------------------------------- files
 
     def receive(self, name: str, content: bytes) -> str:
-        """Keep a file that was dropped under a name that is safe, which is returned.
+        """Keep a dropped file under a safe name, which is returned.
 
-        InputError if it is too large or of no kind that is read.
+        InputError if it is too large or not a table.
         """
         if self.running:
             raise InputError(BUSY)
@@ -128,7 +127,7 @@ class Desk:
     def take(self, csv: Path) -> None:
         """Copy a test that is on this machine, and the TOML beside it, onto the desk.
 
-        Only the command and the list of reconstructions name such a file, never the page.
+        Only the command and the list of reconstructions name such a file, never the browser.
         """
         if csv.stat().st_size > LARGEST:
             raise InputError(too_large(csv.name))
@@ -141,7 +140,7 @@ class Desk:
     def dropped_toml(self) -> tuple[dict[str, str], str] | None:
         """Split the TOML that was dropped last into quantities and the rest; None if there is none.
 
-        It is read once. InputError if it is no TOML.
+        It is read once. InputError if it is not valid.
         """
         place = self.folder / "dropped.toml"
         if not place.is_file():
@@ -170,7 +169,7 @@ class Desk:
             toml.write_text(join_toml(quantities, rest), encoding="utf-8")
             alone, several = cycles_of(cycle.strip() or None)
             measurement = read_test(self.csv, toml, several[0] if several else alone)
-            # By its own name: the folder of the window means nothing to who reads it.
+            # By its own name: the folder of the window means nothing to a user.
             text = describe(replace(measurement, path=Path(self.csv.name)), audit(measurement))
         except InputError as error:
             told = self._plain(str(error))
@@ -183,7 +182,7 @@ class Desk:
         return Checked(text)
 
     def measured(self, cycle: int) -> Measurement:
-        """Return a cycle of the test that was checked last, or that its fit has read."""
+        """Return a cycle of the test that was checked last."""
         assert self.csv is not None
         assert self.measurement is not None
         if cycle == self.measurement.cycle:
@@ -192,11 +191,11 @@ class Desk:
 
     @property
     def toml(self) -> bytes:
-        """The TOML as it is filled in."""
+        """The TOML as filled in."""
         return b"" if self.csv is None else self.csv.with_suffix(".toml").read_bytes()
 
     def _plain(self, text: str) -> str:
-        """Leave the folder of the window out of a sentence."""
+        """Remove the folder of the window from a sentence."""
         for folder in (self.folder / "test", self.folder):
             text = text.replace(f"{folder}/", "").replace(f"{folder}\\", "")
         return text
@@ -204,7 +203,7 @@ class Desk:
     # ------------------------------------------------------------------------------- the fit
 
     def fit(self, arguments: list[str]) -> Worker:
-        """Begin a fit of the test as it was checked last, with arguments of `foamfit fit`."""
+        """Start a fit of the test that was checked last, with arguments of `foamfit fit`."""
         if self.csv is None or self.measurement is None:
             raise InputError("There is no test that can be read yet; see what is wrong with it.")
         if self.running:
@@ -212,7 +211,7 @@ class Desk:
         parsed(arguments)
         self._fits += 1
         folder = self.folder / f"fit-{self._fits}"
-        toml = folder.with_suffix(".toml")  # as it is now, whatever is filled in later
+        toml = folder.with_suffix(".toml")  # the page may change it later
         toml.write_bytes(self.toml)
         job = Job(str(self.csv), str(toml), str(folder), arguments)
         self.worker = Worker(job)
@@ -232,31 +231,31 @@ class Desk:
 
     @property
     def fits(self) -> dict[int, Path]:
-        """The folders with a fit of the last result by the number of their cycle; 0 = the one."""
+        """The folders of the last result's fits by cycle; 0 for a single fit."""
         if self.result is None:
             return {}
         cycles = {int(one.name.split("-")[1]): one for one in self.result.glob("cycle-*")}
         return dict(sorted(cycles.items())) or {0: self.result}
 
     def ending(self) -> str:
-        """Say how the last fit ended, "" where it has a result."""
+        """Say why the last fit has no result, "" if it has one."""
         assert self.worker is not None
         return self._plain(self.worker.ended or "")
 
     @property
     def command(self) -> str:
-        """What asks for the last fit in a terminal, where the TOML lies beside the file."""
+        """The command of the last fit in a terminal, with the TOML beside the file."""
         assert self.csv is not None
         assert self.worker is not None
         return shlex.join(["foamfit", "fit", self.csv.name, *self.worker.job.arguments])
 
     @property
     def told(self) -> str:
-        """What the command prints of several cycles, "" of one fit."""
+        """The text that the command prints on several cycles, "" for one fit."""
         return "" if self.worker is None else self.worker.told
 
     def zipped(self) -> bytes:
-        """The result folder as a ZIP, with the TOML of the test."""
+        """Return the result folder as a ZIP, with the TOML of the test."""
         assert self.result is not None
         content = io.BytesIO()
         with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -266,7 +265,7 @@ class Desk:
         return content.getvalue()
 
     def compared(self, published: str, cycle: int = 0) -> str:
-        """A fit of the result beside a published set, as `foamfit compare` prints it."""
+        """Return a fit beside a published set, as `foamfit compare` prints it."""
         if cycle not in self.fits:
             raise InputError("There is no fit yet; run one to compare it.")
         return self._plain(comparison_text(compare([self.fits[cycle]], published)))
@@ -281,7 +280,7 @@ def too_large(name: str) -> str:
 
 
 def safe_name(name: str) -> str:
-    """Return a name of one file, without a folder, of characters that mean nothing to a shell."""
+    """Return a file name without folder, of characters that are harmless in a shell."""
     name = unicodedata.normalize("NFKC", name).replace("\\", "/").rsplit("/", 1)[-1]
     name = re.sub(r"[^\w.()+-]+", "_", name).lstrip("._-")
     stem, dot, suffix = name.rpartition(".")
@@ -294,7 +293,7 @@ def safe_name(name: str) -> str:
 
 
 def split_toml(text: str) -> tuple[dict[str, str], str]:
-    """Split a TOML into the quantities of the page, by their names, and a TOML of the rest."""
+    """Split a TOML into the quantities of the page, by name, and a TOML of the rest."""
     document = tomllib.loads(text)
     found = {}
     for q in QUANTITIES:
@@ -307,7 +306,7 @@ def split_toml(text: str) -> tuple[dict[str, str], str]:
 
 
 def join_toml(quantities: Mapping[str, str], rest: str) -> str:
-    """Join the quantities that are filled in to a TOML of the rest; InputError if that is none."""
+    """Join the quantities that are filled in to a TOML of the rest; InputError if invalid."""
     try:
         document = tomllib.loads(rest)
     except (tomllib.TOMLDecodeError, RecursionError) as error:

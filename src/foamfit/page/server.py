@@ -1,8 +1,7 @@
-"""The address of the page: on this machine alone, known to who was given it, and for no other page.
+"""The server of the page: for this machine alone, and only for those who know the address.
 
-Every request is looked at before anything else sees it: its Host and its Origin must be the page's
-own (another site that a name leads here, or that sends its visitors' browsers here, is refused),
-and its path begins with a random token.
+Every request is checked first: its Host and its Origin must be the page's own, which refuses DNS
+rebinding and requests from other sites, and its path must begin with a random token.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from foamfit.page.first_use import FirstUse
 from foamfit.terminal import say
 
 HOST = "127.0.0.1"
-UNUSED = 20_000  # ms after which the desk of a closed window is removed
+UNUSED = 20_000  # ms until the desk of a closed window is removed
 HEADERS = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
@@ -45,19 +44,19 @@ REFUSED = "This page is for the address that foamfit page has printed; open that
 
 @web.stream_request_body
 class Handler(web.RequestHandler):
-    """Refuse every request; what it sends is not read."""
+    """Refuses every request without reading its body."""
 
     def set_default_headers(self) -> None:
-        """Let nothing be guessed, kept or framed."""
+        """Forbid sniffing, caching and framing."""
         for name, value in HEADERS.items():
             self.set_header(name, value)
 
     def prepare(self) -> None:
-        """Answer before the rest of the request has come."""
+        """Answer before the body is read."""
         self.refuse(403, REFUSED)
 
     def data_received(self, chunk: bytes) -> None:
-        """Pass over a part of the request."""
+        """Ignore a part of the body."""
 
     def refuse(self, code: int, sentence: str) -> None:
         """Answer with a sentence, and close the connection."""
@@ -68,10 +67,10 @@ class Handler(web.RequestHandler):
 
 
 class Receive(Handler):
-    """Take a file that was dropped in a window onto its desk, if it is not too large."""
+    """Takes a file that was dropped in a window onto its desk, if it is not too large."""
 
     def initialize(self, desks: dict[str, Desk]) -> None:
-        """Know the desks of all windows by their random names."""
+        """Take the desks of all windows by their random names."""
         self.desks = desks
         self.content = bytearray()
 
@@ -101,7 +100,7 @@ class Receive(Handler):
 
 
 class Guard(routing.Router):
-    """Let through only what has the page's own Host, Origin and token."""
+    """Lets through only requests with the page's own Host, Origin and token."""
 
     def __init__(self, behind: web.Application, port: int, token: str) -> None:
         self.behind, self.token = behind, token
@@ -111,7 +110,7 @@ class Guard(routing.Router):
     def find_handler(
         self, request: httputil.HTTPServerRequest, **kwargs: Any
     ) -> httputil.HTTPMessageDelegate | None:
-        """Return what answers a request."""
+        """Return the handler of a request."""
         origins = request.headers.get_list("Origin")
         own = request.headers.get_list("Host") == [self.host]
         own = own and all(origin == f"http://{self.host}" for origin in origins)
@@ -144,13 +143,13 @@ class Page:
             check_unused_sessions_milliseconds=UNUSED // 4,
             http_server_kwargs={"max_body_size": 2 * LARGEST},
         )
-        # Before Bokeh's own application sees anything; it has no public way to stand in front.
+        # In front of Bokeh's own application, which has no public way for that.
         self.server._http.request_callback = Guard(self.server._tornado, self.port, self.token)
         self.server.start()
 
     @property
     def address(self) -> str:
-        """Where the page is, with the token that opens it."""
+        """The address of the page, with its token."""
         return f"http://{HOST}:{self.port}/{self.token}/"
 
     def close(self) -> None:
@@ -200,7 +199,7 @@ def serve(test: Path | None, port: int, browser: bool) -> None:
 
 
 def _pass_over_closed_windows(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """Report what went wrong in a task, but that a window was closed while a curve was sent."""
+    """Report errors in tasks, except that a window was closed while a curve was sent."""
     if not isinstance(context.get("exception"), StreamClosedError | WebSocketClosedError):
         loop.default_exception_handler(context)
 

@@ -1,4 +1,4 @@
-"""The curves of parameters that are turned by hand, over those that were measured."""
+"""Curves of parameters that are changed by hand, over the measured ones."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from foamfit.results import law_in_words
 from foamfit.springs.parameters import NUISANCE, split_name, unit_of
 from foamfit.springs.spring import BistableSpring
 
-MOST_SAMPLES = 1500  # of a curve that is drawn again at every move
-WIDE = 4.0  # times its value that a slider reaches
-# Of each panel: its curve, and what it is drawn over.
+MOST_SAMPLES = 1500  # of a curve that every move of a slider draws again
+WIDE = 4.0  # a slider reaches to so many times the value
+# The panels, in their order.
 PANELS = ("stress_time", "displacement_time", "stress_strain")
 
 
 @dataclass(frozen=True)
 class Row:
-    """A parameter to be turned: its value in a unit in which it reads well, and its limits there.
+    """A parameter with a slider: its value and limits in a readable unit.
 
-    `low` and `high` are the ends of the slider, `least` and `most` what is admissible.
+    `low` and `high` are the ends of the slider, `least` and `most` the admissible limits.
     """
 
     name: str
@@ -43,12 +43,12 @@ class Row:
     high: float
     least: float
     most: float
-    held: bool = False  # a fit does not vary it unless it is told to
+    held: bool = False  # whether a fit holds it by default
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """Curves at some parameters, by the name of their panel, x beside y; or why there are none."""
+    """Curves (x, y) by the name of their panel at some parameters, or why there are none."""
 
     curves: dict[str, tuple[Array, Array]]
     misfit: dict[str, float | None]
@@ -58,7 +58,7 @@ class Drawn:
 
 
 class Turning:
-    """A model over a test: its parameters, and its curves wherever they are turned to."""
+    """A model over a test: its parameters, and its curves at whatever values these are given."""
 
     def __init__(
         self,
@@ -67,7 +67,7 @@ class Turning:
         values: Mapping[str, float] | None = None,
         **options: Unpack[Keywords],
     ) -> None:
-        """Begin at these values (SI), or else at those read off the loop; options as of a fit."""
+        """Start at these values (SI), or at those read off the loop; options as of a fit."""
         thin = thinned(measurement)
         self.samples = thin.rows.used, _size(thin)
         self.problem: Problem = Options(**options).problem(thin, model)
@@ -76,7 +76,7 @@ class Turning:
 
     @property
     def drive(self) -> str:
-        """What drives the chain."""
+        """The drive of the chain."""
         return self.problem.objective.drive
 
     @property
@@ -86,14 +86,14 @@ class Turning:
 
     @property
     def named(self) -> dict[str, float]:
-        """The values (SI) by their names, in the numbers of the file."""
+        """The values (SI) by name; times and zeros are those of the file."""
         told = self.values + self.problem.origins
         return dict(zip(self.problem.names, told.tolist(), strict=True))
 
     def _own(self, name: str) -> bool:
-        """Whether a parameter is turned: it does not follow from others or the specimen.
+        """Whether a parameter has a slider: nothing else gives it, and it is not of the record.
 
-        Nor is it one of the record's own, such as the contact time, which is for a fit to find.
+        The contact time, for example, is of the record.
         """
         if name in NUISANCE and name != "time_shift":
             return False
@@ -103,7 +103,7 @@ class Turning:
         return self.problem.params[name].expr is None
 
     def _at(self, values: Array, moves: Mapping[str, float]) -> Array:
-        """Put some values into a vector; what hangs on them by expressions follows."""
+        """Put some values into a vector; parameters that depend on them by expressions follow."""
         values, problem = values.copy(), self.problem
         for name, value in moves.items():
             if name in problem.index and math.isfinite(value):
@@ -113,7 +113,7 @@ class Turning:
         return values if complete is None else complete(values)
 
     def turn(self, moves: Mapping[str, float]) -> Drawn:
-        """Turn some parameters (SI) and return the curves that follow."""
+        """Change some parameters (SI) and return the curves."""
         problem = self.problem
         self.values = values = self._at(self.values, moves)
         named = self.named
@@ -140,7 +140,7 @@ class Turning:
 
     @cached_property
     def measured(self) -> dict[str, tuple[Array, Array]]:
-        """The measured curves by the name of their panel, in SI, as far as they are there."""
+        """The measured curves by the name of their panel, in SI."""
         m = self.problem.measurement
         curves: dict[str, Array | None] = {
             "stress_time": None if m.time is None else m.stress,
@@ -150,11 +150,11 @@ class Turning:
         return {n: (self._along(n, m.displacement), y) for n, y in curves.items() if y is not None}
 
     def _curves(self, found: dict[str, Array]) -> dict[str, tuple[Array, Array]]:
-        """Give each panel its curve: of the loop that of the run, where the run has both."""
+        """Give each panel its curve; the loop is the simulated run if that has both channels."""
         m, drive = self.problem.measurement, self.drive
         stress = m.stress if drive == "stress" else found.get("stress_time")
         moved = m.displacement if drive == "displacement" else found.get("displacement_time")
-        if stress is None:  # no time: along the measured motion
+        if stress is None:  # without time: along the measured motion
             stress = found.get("stress_strain")
         there = {"stress_time": stress, "displacement_time": moved, "stress_strain": stress}
         return {
@@ -166,13 +166,13 @@ class Turning:
     def _along(self, panel: str, moved: Array | None) -> Array:
         m = self.problem.measurement
         if panel != "stress_strain":
-            assert m.time is not None  # no panel in time without it
+            assert m.time is not None  # panels in time need it
             return m.time
         assert moved is not None
         return moved / m.specimen.height
 
     def _why(self, error: SimulationError) -> str:
-        """Name the parameter that is not admissible, where one is."""
+        """Say which parameter is inadmissible, if one is."""
         model = self.problem.model
         try:
             model.springs(self.values[: len(model.names)])
@@ -181,7 +181,7 @@ class Turning:
         return str(error)
 
     def _guess(self) -> Array:
-        """Begin at the best of the fit's own starts, read off the measured loop."""
+        """Return the best of the starts that a fit reads off the measured loop."""
         problem, space = self.problem, self.problem.space()
         if problem.measurement.displacement is None:
             return problem.vector()
@@ -210,7 +210,7 @@ class Turning:
 
 
 def thinned(measurement: Measurement) -> Measurement:
-    """Leave out samples evenly where there are more than can be drawn at once."""
+    """Return the test with no more samples than can be drawn at once, evenly chosen."""
     count = _size(measurement)
     if count <= MOST_SAMPLES:
         return measurement

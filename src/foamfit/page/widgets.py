@@ -1,6 +1,6 @@
-"""The two inputs that the page's library has not: files that are dropped, and rows of sliders.
+"""Two inputs that Panel lacks, dropped files and rows of sliders, and pieces of HTML.
 
-Both are plain inputs of the browser, with labels and keys; what they do stands in `templates`.
+Both are plain inputs of the browser, with labels and keys; `templates` has their scripts.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def piece(name: str, *given: Any) -> str:
 
 
 class Upload(JSComponent):
-    """A place to drop files on; what the server says of each is shown beneath."""
+    """A place to drop files on; the server's answer to each is shown below."""
 
     address = param.String()
     limit = param.Integer()
@@ -42,7 +42,7 @@ class Upload(JSComponent):
 
 
 class Sliders(JSComponent):
-    """A slider and a number for each parameter; a message names those moved or ticked."""
+    """A slider and a number for each parameter; messages name those moved or ticked."""
 
     rows = param.List()
     ticks = param.Boolean(doc="Whether each has a tick for a fit to hold it.")
@@ -53,7 +53,7 @@ class Sliders(JSComponent):
     _stylesheets: ClassVar[list[str]] = [style("inputs"), style("sliders")]
 
     def show(self, values: Mapping[str, float]) -> None:
-        """Put the sliders elsewhere, in the units of their rows; nothing is drawn by that."""
+        """Move the sliders (in the units of their rows) without drawing."""
         self._send_msg({"values": dict(values)})
 
     def tell(self, sentence: str, wrong: bool = False) -> None:
@@ -61,10 +61,10 @@ class Sliders(JSComponent):
         self.param.update(told=sentence, wrong=wrong)
 
     def drawn(self) -> None:
-        """Say that the last move is drawn, and the next may come."""
+        """Say that the last move is drawn; the next may come."""
         self._send_msg({"drawn": True})
 
 
 def message(event: Any) -> dict[str, Any]:
-    """Return what a browser has sent, which may be anything, as a dictionary."""
+    """Return what a browser sent, which may be anything, as a dictionary."""
     return event.data if isinstance(event.data, dict) else {}

@@ -1,7 +1,7 @@
-"""A fit in a process of its own: begun, watched and stopped by the page.
+"""A fit in a process of its own, which the page starts, watches and stops.
 
-The process reads a job as one line of JSON and answers in lines of JSON; Ctrl-C (SIGINT) stops its
-search, which keeps the best point, as in the terminal.
+The process reads a job as one line of JSON and answers in lines of JSON; SIGINT stops its search,
+which keeps the best point, as Ctrl-C does in a terminal.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ STOPPED_EARLY = "The fit was stopped before anything was found; start it again."
 
 @dataclass(frozen=True)
 class Job:
-    """What is to be fitted, where the result goes, and the arguments of `foamfit fit`."""
+    """The test to fit, the folder of the result, and the arguments of `foamfit fit`."""
 
     csv: str
     toml: str
@@ -44,7 +44,7 @@ class Job:
 
 @dataclass(frozen=True)
 class News:
-    """What a fit has told last; `values` are by the names of the parameters of `model`, SI."""
+    """The last report of a fit; `values` are the parameters of `model` by name, SI."""
 
     fraction: float = 0.0
     what: str = "starting"
@@ -57,13 +57,13 @@ class News:
 
 
 def with_package() -> dict[str, str]:
-    """The environment of a process that is to find this very package."""
+    """Return the environment of a process that imports this very package."""
     paths = f"{PACKAGE.parent}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
     return os.environ | {"PYTHONPATH": paths.rstrip(os.pathsep)}
 
 
 def end_all(process: subprocess.Popen[Any]) -> None:
-    """End a process that leads a session at once, and what it has begun to compile in."""
+    """Kill a process that leads a session, with all that it started."""
     if process.poll() is None:
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(process.pid, signal.SIGKILL)
@@ -71,14 +71,14 @@ def end_all(process: subprocess.Popen[Any]) -> None:
 
 
 class Worker:
-    """A running fit, as the page sees it: the last news, and how it ended."""
+    """A running fit as the page sees it: its last report, and how it ended."""
 
     def __init__(self, job: Job) -> None:
         self.job, self.news = job, News()
         self.began = time.monotonic()
         self.stopping = False
         self.told = ""  # what the command prints of several cycles
-        self._done: str | None = None  # the sentence with which it ended, "" where all is well
+        self._done: str | None = None  # why there is no result, "" if there is one
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  (closed when the process ends)
         self._process = subprocess.Popen(
             [sys.executable, "-m", "foamfit.page.worker"],
@@ -87,7 +87,7 @@ class Worker:
             stderr=self._errors,
             encoding="utf-8",
             env=with_package(),
-            start_new_session=True,  # Ctrl-C in the terminal of the page is not for this one
+            start_new_session=True,  # Ctrl-C in the terminal of the page does not reach it
         )
         assert self._process.stdin is not None
         with contextlib.suppress(BrokenPipeError):
@@ -102,27 +102,27 @@ class Worker:
 
     @property
     def ended(self) -> str | None:
-        """None while it runs; then "" where a result is written, or else why there is none."""
+        """None while it runs, then why there is no result, "" if there is one."""
         return self._done
 
     def stop(self) -> None:
-        """End the search; the best point is kept, concluded and written."""
+        """End the search; the result of the best point is written."""
         if not self.stopping and self._process.poll() is None:
             self.stopping = True
             self._process.send_signal(signal.SIGINT)
 
     def kill(self) -> None:
-        """End the process at once."""
+        """Kill the process."""
         end_all(self._process)
 
     def _listen(self) -> None:
-        """Read what the process tells until it ends."""
+        """Read the reports of the process until it ends."""
         assert self._process.stdout is not None
         done: str | None = None
         for line in self._process.stdout:
             try:
                 told = json.loads(line)
-            except ValueError:  # what some library has printed, or half a line of one that died
+            except ValueError:  # printed by some library, or half a line
                 continue
             if "ended" in told:
                 done, self.told = told["ended"], told.get("told", "")
@@ -135,7 +135,7 @@ class Worker:
         self._done = done
 
     def _why(self, code: int) -> str:
-        """Say how a process ended that has not said it itself."""
+        """Say how a process ended that did not say so itself."""
         self._errors.seek(0)
         lines = self._errors.read().decode(errors="replace").strip().splitlines()
         last = lines[-1].strip() if lines else ""
@@ -150,7 +150,7 @@ class Worker:
 
 
 class _Teller(Watcher):
-    """What the page is told of a fit, a few times a second."""
+    """Reports a fit to the page a few times a second."""
 
     def __init__(self) -> None:
         super().__init__(says=False)
@@ -158,7 +158,7 @@ class _Teller(Watcher):
         self._said = 0.0
 
     def progress(self, fraction: float, what: str, *, now: bool = False) -> None:
-        """Tell how far the fit is, `now` or if the last line is some time ago."""
+        """Report the share done, `now` or if the last report is some time ago."""
         self.told |= {"fraction": fraction, "what": what}
         if now and self._best is not None:
             self._next = 0.0
@@ -167,7 +167,7 @@ class _Teller(Watcher):
             self._say()
 
     def seen(self, problem: Problem, values: Array, misfit: dict[str, float | None]) -> None:
-        """Tell the parameters and misfits of the best point so far."""
+        """Report the parameters and misfits of the best point so far."""
         named = zip(problem.names, (values + problem.origins).tolist(), strict=True)
         self.told |= {
             "model": problem.model.name,
@@ -204,7 +204,7 @@ def parsed(arguments: list[str]) -> dict[str, Any]:
 
 
 def _run(job: Job) -> tuple[str, str]:
-    """Fit and write the result; returns "" or why there is none, and what is told of cycles."""
+    """Fit and write the result; returns "" or why there is none, and the text on cycles."""
     try:
         from foamfit.cli.fitting import fit_as_asked
         from foamfit.report.studies.cycles import cycles_text
@@ -235,7 +235,7 @@ def _run(job: Job) -> tuple[str, str]:
 
 
 def main() -> None:
-    """Do the job that stands on stdin."""
+    """Do the job on stdin."""
     from foamfit.terminal import ending_cleanly
 
     job = Job(**json.loads(sys.stdin.readline()))
