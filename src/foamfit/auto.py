@@ -25,10 +25,11 @@ from foamfit.fitting.curves import choose_drive
 from foamfit.fitting.problem import make_params
 from foamfit.fitting.search import SearchStoppedError, what_stopped
 from foamfit.one_model import Found, Options, Progress
+from foamfit.report import render
 from foamfit.results import Fit, Ladder, Rung, rung_name
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE, split_name
-from foamfit.text import counted, percent
+from foamfit.text import percent
 from foamfit.trust import evidence
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.checklist import input_first
@@ -60,8 +61,8 @@ HOPELESS = 1.1
 CLOSE = 0.01
 # Share of the time of a comparison after which only the chosen model is left to be judged.
 CHOSEN = 0.9
-# While models are compared: only the chosen one gets ranges and better intervals, which cost as much
-# as a search.
+# While models are compared: only the chosen one gets ranges and better intervals, which cost as
+# much as a search.
 COMPARED = Choice("local", ranges=False)
 
 
@@ -302,30 +303,43 @@ def _has_gained(tried: Sequence[Tried], below: int) -> bool:
 def _conclude(state: _Comparison) -> Fit:
     """Return the result of the chosen model with the whole comparison."""
     tried, stopped = state.tried, state.stopped
-    said = _Account(tried)
-    best, result = said.best, said.best.result
-    ended, warned = state.ended, []
-    if stopped is not None:
-        ended = f"it was stopped by {stopped}"
-        warned.append(
-            f"The comparison was stopped by {stopped} on {tried[-1].name}; richer models were not "
-            "tried."
-        )
-    if best.states("not determined"):
-        warned.append(said.undetermined())
+    decision = evidence.choose(tried)
+    best, criteria = tried[decision.best], decision.criteria
+    result, ended = best.result, f"it was stopped by {stopped}" if stopped else state.ended
+    told = {"tried": tried, "decision": decision, "best": best, "ended": ended, "stopped": stopped}
+    others, lost = [], best.states("not determined")
+    for name in ("AICc", "BIC"):
+        values = [getattr(one, name.lower()) for one in criteria]
+        least = int(np.argmin(values))
+        if (off := values[least] - values[decision.best]) < -MARGIN:
+            others.append((name, tried[least].name, _signed(off)))
+    said = render.sentences(
+        "choice", part="choice", others=others, blocks=BLOCKS, share=SHARE, **told
+    )
+    sound = [i for i, one in enumerate(tried) if not one.states("not determined")]
+    if lost and sound:
+        misfits, bics = [one.misfit for one in tried], [one.bic for one in criteria]
+        costs = misfits if decision.by_prediction else bics
+        nearest = min(sound, key=lambda i: costs[i])
+        told |= {"sound": tried[nearest], "higher": bics[nearest] - bics[decision.best]}
     if result.at_noise is False and not any(one.structureless for one in tried):
-        warned.append(said.structure_left())
+        tests = [min(runs_test(part), neighbours_test(part)) for part in best.curves]
+        worst = int(np.argmin(tests))
+        left = find_structure(best.curves[worst], best.places[worst])
+        told |= {"left": left, "curve": best.counted[worst], "size": left.size / best.spans[worst]}
+    defaults = {"sound": None, "left": None}
+    warned = render.sentences("choice", part="cautions", lost=lost, bent=BENT, **(defaults | told))
     reference = evidence.reference_of(tried)
     ladder = Ladder(
-        rungs=tuple(said.rung(i) for i in range(len(tried))),
+        rungs=tuple(_rung(i, tried, decision) for i in range(len(tried))),
         n_eff=evidence.effective_samples(reference),
         noise_from=reference.name,
         ended=ended,
         stopped=stopped,
         skipped=tuple(state.skipped),
-        sentences=(*said.choice(ended), *warned),
-        cautions=tuple(warned),
-        by_prediction=said.decision.by_prediction,
+        sentences=(*said, *warned),
+        cautions=warned,
+        by_prediction=decision.by_prediction,
     )
     return replace(
         result,
@@ -337,155 +351,51 @@ def _conclude(state: _Comparison) -> Fit:
     )
 
 
-class _Account:
-    """The models that were tried, and the sentences on the choice among them."""
-
-    def __init__(self, tried: Sequence[Tried]) -> None:
-        self.tried, self.decision = tried, evidence.choose(tried)
-        self.at = self.decision.best
-        self.best = tried[self.at]
-
-    def rung(self, i: int) -> Rung:
-        """Return what was found of the `i`-th model."""
-        one, found, before = self.tried[i], self.decision.criteria[i], self.decision.before[i]
-        shared = ("damping", "chisqr", "runs_p", "neighbours_p", "seconds")
-        return Rung(
-            **{name: getattr(one, name) for name in shared},
-            model=one.result.model,
-            misfit=dict(one.result.misfit),
-            n_vary=one.varied,
-            rank=found.rank,
-            n_eff=evidence.effective_samples(one),
-            aicc=found.aicc,
-            bic=found.bic,
-            not_determined=one.states("not determined"),
-            weak=one.states("weak"),
-            stopped=one.result.stopped,
-            chosen=i == self.at,
-            why=self._why(i),
-            relaxation=one.result.relaxation,
-            predicted_misfit=one.predicted,
-            gain=self._gain(i),
-            gain_over=None if before is None else self.tried[before].name,
-        )
-
-    def _gain(self, i: int) -> float | None:
-        """Return the share by which a model predicts better than the one before."""
-        before = self.decision.before[i]
-        other = None if before is None else self.tried[before].predicted
-        own = self.tried[i].predicted
-        return None if own is None or other is None else 1.0 - own / other
-
-    def _why(self, i: int) -> str:
-        """Say why a model was chosen or not."""
-        one, found = self.tried[i], self.decision.criteria
-        if (ruler := self.decision.ruled_out_by[i]) is not None:
-            fewer = self.tried[ruler].varied < one.varied
-            told = "more closely with fewer"
-            told = told if fewer else f"over {evidence.WORSE:g} times better with as many"
-            return f"not considered: {self.tried[ruler].name} follows the curves {told} parameters"
-        if self.decision.by_prediction:
-            return self._why_by_prediction(i)
-        if i == self.at:
-            reason = "its residuals are random" if one.structureless else "best supported"
-            richest = one.varied >= max(each.varied for each in self.tried)
-            richer = "was tried" if richest else f"lowers AICc and BIC by {MARGIN:g}"
-            return f"{reason}, and no richer model {richer}"
-        bic, aicc = found[i].bic - found[self.at].bic, found[i].aicc - found[self.at].aicc
-        told = f"BIC {signed(bic)}, AICc {signed(aicc)}"
-        return told if one.varied <= self.best.varied else f"richer without evidence: {told}"
-
-    def _why_by_prediction(self, i: int) -> str:
-        """Say why a model was chosen or not, where predictions decide."""
-        one, before, gain = self.tried[i], self.decision.before[i], self._gain(i)
-        if one.predicted is None:
-            said = f"{percent(one.misfit)} of the range is left (no prediction: the time was up)"
-        else:
-            said = f"predicts held-back samples to {percent(one.predicted)} of the range"
-        if before is not None and gain is not None:
-            more = one.varied - self.tried[before].varied
-            side = "less" if gain >= 0.0 else "more"
-            said += f", {percent(abs(gain))} {side} than {self.tried[before].name}"
-            if more and i != self.at:
-                needed = 1.0 - (1.0 - SHARE) ** more
-                said += f" ({counted(more, 'more parameter')} must gain {percent(needed)})"
-        return f"{said}; none that was tried gains enough over it" if i == self.at else said
-
-    def choice(self, ended: str) -> list[str]:
-        """Say what was chosen, and what each criterion alone would choose."""
-        one, tried, found = self.best, self.tried, self.decision.criteria
-        if one.structureless:
-            reason = "it is the simplest whose residuals are random"
-        elif not self.decision.by_prediction:
-            reason = "the evidence supports it best"
-        elif any(each.predicted is None for each in tried):
-            reason = "for its number of parameters it follows the curves best"
-        else:
-            reason = "for its number of parameters it predicts best what was held back"
-        said = [
-            f"{one.name} was chosen of {counted(len(tried), 'model')}: {reason}. No more models "
-            f"were tried because {ended}."
-        ]
-        if any(item.range for item in one.result.parameters.values()):
-            said.append(
-                "Ranges were made of the chosen model alone; states of the others go by their 95 % "
-                "intervals."
-            )
-        if self.decision.by_prediction:
-            said.append(
-                "With every model systematic residuals remain, so AICc and BIC do not hold. Each "
-                f"was fitted without one of {BLOCKS} blocks in time, in turn, and predicted that "
-                "block; each further parameter must lower this predicted misfit by "
-                f"{percent(SHARE)}."
-            )
-            return said
-        if found[self.at].rank < one.varied:
-            said.append(
-                f"The curves fix {found[self.at].rank} combinations of its {one.varied} "
-                "parameters; AICc and BIC count those."
-            )
-        for name in ("AICc", "BIC"):
-            values = [getattr(each, name.lower()) for each in found]
-            least = int(np.argmin(values))
-            if (off := values[least] - values[self.at]) < -MARGIN:
-                said.append(f"{name} alone would choose {tried[least].name} ({signed(off)}).")
-        return said
-
-    def undetermined(self) -> str:
-        """Say which parameters of the chosen model the test does not determine."""
-        lost = ", ".join(self.best.states("not determined"))
-        told = f"The test does not determine {lost} of the chosen model {self.best.name}"
-        found = self.decision.criteria
-        sound = [i for i, one in enumerate(self.tried) if not one.states("not determined")]
-        if not sound:
-            return f"{told}; no model of the ladder has all parameters determined."
-        if self.decision.by_prediction:
-            nearest = min(sound, key=lambda i: self.tried[i].misfit)
-            cost = f"misfit of {percent(self.tried[nearest].misfit)} of the range"
-        else:
-            nearest = min(sound, key=lambda i: found[i].bic)
-            cost = f"BIC higher by {found[nearest].bic - found[self.at].bic:.1f}"
-        name = self.tried[nearest].name
-        return f"{told}; by their 95 % intervals all of {name} are determined, at a {cost}."
-
-    def structure_left(self) -> str:
-        """Say where systematic residuals of the chosen model are, and how large."""
-        one = self.best
-        tests = [min(runs_test(part), neighbours_test(part)) for part in one.curves]
-        worst = int(np.argmin(tests))
-        found = find_structure(one.curves[worst], one.places[worst])
-        told = (
-            f"With every model systematic residuals remain: those of {one.counted[worst]} are "
-            f"{percent(found.size / one.spans[worst])} of the range, {percent(found.share)} of "
-            f"them on {found.place}."
-        )
-        if found.bent > BENT and found.straight:
-            told += " The measured branch is curved where the law is a straight line."
-        return told
+def _rung(i: int, tried: Sequence[Tried], decision: evidence.Decision) -> Rung:
+    """Return what was found of the `i`-th model, and why it was chosen or not."""
+    one, best = tried[i], tried[decision.best]
+    found, chosen = decision.criteria[i], decision.criteria[decision.best]
+    before, ruler = (
+        None if j is None else tried[j] for j in (decision.before[i], decision.ruled_out_by[i])
+    )
+    gain = None
+    if before and one.predicted is not None and before.predicted is not None:
+        gain = 1.0 - one.predicted / before.predicted
+    why = render.words(
+        "why",
+        one=one,
+        best=best,
+        before=before,
+        ruler=ruler,
+        gain=gain,
+        by_prediction=decision.by_prediction,
+        chosen=one is best,
+        more=one.varied - before.varied if before else 0,
+        richest=one.varied >= max(each.varied for each in tried),
+        bic=_signed(found.bic - chosen.bic),
+        aicc=_signed(found.aicc - chosen.aicc),
+        worse=evidence.WORSE,
+        margin=MARGIN,
+        share=SHARE,
+    )
+    shared = ("damping", "chisqr", "runs_p", "neighbours_p", "seconds")
+    return Rung(
+        **{name: getattr(one, name) for name in shared},
+        **{name: getattr(found, name) for name in ("rank", "aicc", "bic")},
+        **{name: getattr(one.result, name) for name in ("model", "relaxation", "stopped")},
+        misfit=dict(one.result.misfit),
+        n_vary=one.varied,
+        n_eff=evidence.effective_samples(one),
+        not_determined=one.states("not determined"),
+        weak=one.states("weak"),
+        chosen=one is best,
+        why=why.replace("\n", ""),
+        predicted_misfit=one.predicted,
+        gain=gain,
+        gain_over=before and before.name,
+    )
 
 
-def signed(value: float) -> str:
-    """Write a difference of AICc or BIC with its sign."""
-    if not math.isfinite(value):  # too few effective samples for the correction of AICc
-        return "not defined"
-    return text.signed(value, 1)
+def _signed(value: float) -> str:
+    """Write a difference of AICc or BIC; AICc is not defined with too few effective samples."""
+    return text.signed(value, 1) if math.isfinite(value) else "not defined"

@@ -420,19 +420,18 @@ class Window:
         now = self.curves.turning
         there = None if now is None else (now.law, now.drive, now.problem.measurement.cycle)
         if there != (law_in_words(news.model, news.relaxation), news.drive, news.cycle):
-            self._turn_fitted(news.model, news.relaxation, news.drive, news.cycle, news.values)
-            return
-        self.curves.put(news.values)
+            self._turn_fitted(news)
+        else:
+            self.curves.put(news.values)
 
-    def _turn_fitted(
-        self, model: str, relaxation: int, drive: str, cycle: int, values: Mapping[str, float]
-    ) -> None:
-        """Show the curves of the last fit at these values."""
+    def _turn_fitted(self, news: News) -> None:
+        """Show the curves of the last fit at the values of a report."""
         assert self.desk.worker is not None
         assert self.desk.measurement is not None
         options = keywords(parsed(self.desk.worker.job.arguments))
-        options |= {"relaxation": relaxation, "drive": drive}
-        self._turn_model(model, cycle or self.desk.measurement.cycle, values, **options)
+        options |= {"relaxation": news.relaxation, "drive": news.drive}
+        cycle = news.cycle or self.desk.measurement.cycle
+        self._turn_model(news.model, cycle, news.values, **options)
 
     def _ended(self) -> None:
         """Show the result of the fit, or why there is none."""
@@ -462,14 +461,14 @@ class Window:
 
     def _back(self, event: Any = None) -> None:
         """Show the report of the fit, and move the sliders back to it."""
-        if self.report_of.value not in self.desk.fits:
+        cycle = self.report_of.value
+        if cycle not in self.desk.fits:
             return
         self.report.object = piece("report", self._report())
-        fit = load_result(self.desk.fits[self.report_of.value])
+        fit = load_result(self.desk.fits[cycle])
         values = {name: one["value"] for name, one in fit["parameters"].items()}
-        self._turn_fitted(
-            fit["model"], fit["relaxation"], fit["drive"], self.report_of.value, values
-        )
+        place = {name: fit[name] for name in ("model", "relaxation", "drive")}
+        self._turn_fitted(News(cycle=cycle, values=values, **place))
 
     def _compare(self, event: Any) -> None:
         if not event.new:

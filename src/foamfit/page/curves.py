@@ -126,7 +126,7 @@ class Curves:
         )
         measured = {"source": self._measured[name], "line_color": GREY}
         made.scatter("x", "y", size=5, fill_color="white", **measured)
-        # Moving curves have a canvas of their own, so that axes and measured curves are not redrawn.
+        # Moving curves have a canvas of their own, so axes and measured curves are not redrawn.
         # The frame clips annotations there, not glyphs; a band without width is a line.
         above = {"source": self._turned, "level": "overlay", "line_color": VERMILION}
         ends = {"base": f"{name}_x", "lower": f"{name}_y", "upper": f"{name}_y"}
