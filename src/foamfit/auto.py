@@ -392,7 +392,7 @@ def _rung(i: int, tried: Sequence[Tried], decision: evidence.Decision) -> Rung:
         why=why.replace("\n", ""),
         predicted_misfit=one.predicted,
         gain=gain,
-        gain_over=before and before.name,
+        gain_over=None if before is None else before.name,
     )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from foamfit.cli import options
 from foamfit.cli.group import main
@@ -30,10 +29,12 @@ def check(
     test: Path,
     specimen: Path | None,
     model: str | None,
+    drive: str | None,
+    relaxation: int,
+    published: str | None,
+    params: Path | None,
     plot: Path | None,
     figure_width: str,
-    relaxation: int,
-    **start: Any,
 ) -> None:
     """Say what the loader understood of TEST.csv: columns, contact, specimen, energy.
 
@@ -52,56 +53,34 @@ def check(
     from foamfit.data.energy import audit
 
     if model is None:
-        for name, value in (start | {"plot": plot, "relaxation": relaxation or None}).items():
+        given = {"drive": drive, "published": published, "params": params, "plot": plot}
+        for name, value in (given | {"relaxation": relaxation or None}).items():
             if value is not None:
                 raise InputError(f"--{name} needs --model; give one, as --model bistable")
     options.check_files(None, plot, ())
-    if start["published"] is not None and start["params"] is not None:
+    if published is not None and params is not None:
         raise InputError("--published and --params exclude each other; give one of them")
     told = []
     if model is None or test.suffix.lower() != ".toml":
         measurement = read_test(test, specimen)
         told.append(describe(measurement, audit(measurement), exact=model is None))
-    if model is not None:
-        told += _outlook(test, specimen, model, plot, figure_width, relaxation, start)
-    say("\n\n".join(told))
-
-
-def _outlook(
-    test: Path,
-    specimen: Path | None,
-    model: str,
-    plot: Path | None,
-    figure_width: str,
-    relaxation: int,
-    start: dict[str, Any],
-) -> list[str]:
-    """Estimate what a test determines of a model, and draw it if wanted; returns what to say."""
+    if model is None:
+        say(told[0])
+        return
+    from foamfit.report.identifiability_plots import plot_insight
     from foamfit.report.outlook import outlook_of
     from foamfit.report.outlook_text import outlook_text
 
     with options.compiling(False, model, relaxation) as compile_rest:
         compile_rest()
-    outlook = outlook_of(
-        test,
-        specimen,
-        model,
-        start["drive"],
-        published_set=start["published"],
-        result=start["params"],
-        relaxation=relaxation,
-    )
-    told, insight = [outlook_text(outlook)], outlook.planned.insight
-    if plot is None:
-        return told
-    if insight is None:
+    start = {"published_set": published, "result": params, "relaxation": relaxation}
+    outlook = outlook_of(test, specimen, model, drive, **start)
+    told.append(outlook_text(outlook))
+    insight, problem = outlook.planned.insight, outlook.problem
+    if plot is not None and insight is None:
         told.append("nothing is drawn: no parameter changes the curves")
-    else:
-        from foamfit.report.identifiability_plots import plot_insight
-
-        title = (
-            f"{outlook.problem.measurement.name} · {outlook.problem.model.name} · before the fit"
-        )
+    elif plot is not None and insight is not None:
+        title = f"{problem.measurement.name} · {problem.model.name} · before the fit"
         plot_insight(insight, title=title, path=plot, width=figure_width)
         told.append(f"drawn in {plot}, its data in {plot.with_suffix('.csv')}")
-    return told
+    say("\n\n".join(told))
