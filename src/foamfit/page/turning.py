@@ -121,8 +121,12 @@ class Turning:
             simulated = problem.objective.simulate(values, everything=True)
         except SimulationError as error:
             return Drawn({}, {}, named, error=self._why(error))
-        curves, misfit = self._curves(simulated.curves), problem.objective.misfit(simulated)
-        return Drawn(curves, misfit, named, self._points())
+        m, drive, found = problem.measurement, self.drive, simulated.curves
+        without_time = found.get("stress_strain")  # along the measured motion
+        stress = m.stress if drive == "stress" else found.get("stress_time", without_time)
+        moved = m.displacement if drive == "displacement" else found.get("displacement_time")
+        curves = {n: xy for n, xy in self._panels(stress, moved).items() if n in self.measured}
+        return Drawn(curves, problem.objective.misfit(simulated), named, self._points())
 
     def _points(self) -> dict[str, tuple[float, float]]:
         """Where the branches of a single bistable spring meet, by the names of the paper."""
@@ -141,35 +145,14 @@ class Turning:
     @cached_property
     def measured(self) -> dict[str, tuple[Array, Array]]:
         """The measured curves by the name of their panel, in SI."""
-        m = self.problem.measurement
-        curves: dict[str, Array | None] = {
-            "stress_time": None if m.time is None else m.stress,
-            "displacement_time": None if m.time is None else m.displacement,
-            "stress_strain": None if m.displacement is None else m.stress,
-        }
-        return {n: (self._along(n, m.displacement), y) for n, y in curves.items() if y is not None}
+        return self._panels(self.problem.measurement.stress, self.problem.measurement.displacement)
 
-    def _curves(self, found: dict[str, Array]) -> dict[str, tuple[Array, Array]]:
-        """Give each panel its curve; the loop is the simulated run if that has both channels."""
-        m, drive = self.problem.measurement, self.drive
-        stress = m.stress if drive == "stress" else found.get("stress_time")
-        moved = m.displacement if drive == "displacement" else found.get("displacement_time")
-        if stress is None:  # without time: along the measured motion
-            stress = found.get("stress_strain")
-        there = {"stress_time": stress, "displacement_time": moved, "stress_strain": stress}
-        return {
-            name: (self._along(name, moved), y)
-            for name, y in there.items()
-            if y is not None and name in self.measured and (moved is not None or "time" in name)
-        }
-
-    def _along(self, panel: str, moved: Array | None) -> Array:
+    def _panels(self, stress: Array | None, moved: Array | None) -> dict[str, tuple[Array, Array]]:
+        """Return the curves (x, y) of a stress (Pa) and a displacement (m) by panel."""
         m = self.problem.measurement
-        if panel != "stress_strain":
-            assert m.time is not None  # panels in time need it
-            return m.time
-        assert moved is not None
-        return moved / m.specimen.height
+        strain = None if moved is None else moved / m.specimen.height
+        pairs = zip(PANELS, (m.time, m.time, strain), (stress, moved, stress), strict=True)
+        return {n: (x, y) for n, x, y in pairs if x is not None and y is not None}
 
     def _why(self, error: SimulationError) -> str:
         """Say which parameter is inadmissible, if one is."""
@@ -215,20 +198,16 @@ def thinned(measurement: Measurement) -> Measurement:
     if count <= MOST_SAMPLES:
         return measurement
     keep = np.unique(np.linspace(0, count - 1, MOST_SAMPLES).astype(int))
-
-    channels: dict[str, Any] = {
-        name: None if (values := getattr(measurement, name)) is None else values[keep]
-        for name in ("time", "stress", "displacement", "acceleration")
+    outliers = measurement.outliers.items()
+    thin: dict[str, Any] = {
+        "outliers": {name: replace(one, left_out=one.left_out[keep]) for name, one in outliers}
     }
-    outliers = {
-        channel: replace(found, left_out=found.left_out[keep])
-        for channel, found in measurement.outliers.items()
-    }
-    interior = {node: values[keep] for node, values in measurement.interior.items()}
-    sampled = {channel: taken[keep] for channel, taken in measurement.sampled.items()}
-    return replace(
-        measurement, outliers=outliers, block=1, interior=interior, sampled=sampled, **channels
-    )
+    for name in ("interior", "sampled"):
+        thin[name] = {key: values[keep] for key, values in getattr(measurement, name).items()}
+    for name in ("time", "stress", "displacement", "acceleration"):
+        values = getattr(measurement, name)
+        thin[name] = None if values is None else values[keep]
+    return replace(measurement, block=1, **thin)
 
 
 def _size(measurement: Measurement) -> int:
