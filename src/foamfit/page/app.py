@@ -122,7 +122,8 @@ class Window:
         )
         self.chosen.param.watch(self._choose, "value")
         self.quantities = {
-            q.name: text(name=q.label, placeholder=f"like {q.example}") for q in QUANTITIES
+            name: text(name=label, placeholder=f"like {example}")
+            for name, (label, example) in QUANTITIES.items()
         }
         self.rest = pn.widgets.TextAreaInput(
             name="Further TOML: name, [columns], [noise], [window]",

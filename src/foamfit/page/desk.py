@@ -39,31 +39,15 @@ TABLES = (".csv", ".txt", ".tsv", ".dat", ".gz", ".xlsx")
 AROUND, ACROSS, CELL = 2, 8, 24
 
 
-@dataclass(frozen=True)
-class Quantity:
-    """A quantity to fill in: its place in the TOML, its label, an example."""
-
-    section: str
-    key: str
-    label: str
-    example: str
-
-    @property
-    def name(self) -> str:
-        """Its name in the messages of `read_test`."""
-        return f"[{self.section}] {self.key}"
-
-
-QUANTITIES = (
-    Quantity("specimen", "height", "Specimen height", "1.19 mm"),
-    Quantity("specimen", "diameter", "Specimen diameter", "5 mm"),
-    Quantity("specimen", "area", "or its area", "19.6 mm^2"),
-    Quantity("specimen", "mass", "Specimen mass (optional)", "5.56 mg"),
-    Quantity("striker", "mass", "Striker mass (optional)", "7 g"),
-    Quantity("striker", "velocity", "Striker velocity (optional)", "1.75 m/s"),
-)
-
-
+# Quantities to fill in, by their names in messages: label and example.
+QUANTITIES = {
+    "[specimen] height": ("Specimen height", "1.19 mm"),
+    "[specimen] diameter": ("Specimen diameter", "5 mm"),
+    "[specimen] area": ("or its area", "19.6 mm^2"),
+    "[specimen] mass": ("Specimen mass (optional)", "5.56 mg"),
+    "[striker] mass": ("Striker mass (optional)", "7 g"),
+    "[striker] velocity": ("Striker velocity (optional)", "1.75 m/s"),
+}
 # Rows of a file around an error: their numbers, and their cells, each with whether it is wrong.
 Excerpt = list[tuple[int, list[tuple[str, bool]]]]
 
@@ -85,6 +69,7 @@ class Desk:
         self.folder = folder
         folder.mkdir(mode=0o700)
         self.csv: Path | None = None
+        self.dropped: bytes | None = None  # a TOML that was not read yet
         self.replaced = False  # whether the file replaced another and was not read since
         self.measurement: Measurement | None = None
         self.worker: Worker | None = None
@@ -110,7 +95,7 @@ class Desk:
         name = safe_name(name)
         suffix = Path(name).suffix.lower()
         if suffix == ".toml":
-            (self.folder / "dropped.toml").write_bytes(content)
+            self.dropped = content
             return name
         if suffix not in TABLES:
             raise InputError(
@@ -135,18 +120,16 @@ class Desk:
         self.receive(csv.name if known else f"{csv.stem}.csv", csv.read_bytes())
         toml = toml_beside(csv)
         if toml.is_file():
-            (self.folder / "dropped.toml").write_bytes(toml.read_bytes())
+            self.dropped = toml.read_bytes()
 
     def dropped_toml(self) -> tuple[dict[str, str], str] | None:
         """Split the TOML that was dropped last into quantities and the rest; None if there is none.
 
         It is read once. InputError if it is not valid.
         """
-        place = self.folder / "dropped.toml"
-        if not place.is_file():
+        if self.dropped is None:
             return None
-        raw = place.read_bytes()
-        place.unlink()
+        raw, self.dropped = self.dropped, None
         try:
             return split_toml(raw.decode("utf-8-sig"))
         except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
@@ -173,7 +156,7 @@ class Desk:
             text = describe(replace(measurement, path=Path(self.csv.name)), audit(measurement))
         except InputError as error:
             told = self._plain(str(error))
-            quantity = next((q.name for q in QUANTITIES if f"{q.name} " in told), "")
+            quantity = next((name for name in QUANTITIES if f"{name} " in told), "")
             if "[specimen] needs a diameter" in told:
                 quantity = "[specimen] diameter"
             excerpt = excerpt_of(self.csv, told)
@@ -296,12 +279,13 @@ def split_toml(text: str) -> tuple[dict[str, str], str]:
     """Split a TOML into the quantities of the page, by name, and a TOML of the rest."""
     document = tomllib.loads(text)
     found = {}
-    for q in QUANTITIES:
-        section = document.get(q.section)
-        if isinstance(section, dict) and isinstance(section.get(q.key), str | int | float):
-            found[q.name] = str(section.pop(q.key))
+    for name in QUANTITIES:
+        table, key = name[1:].split("] ")
+        section = document.get(table)
+        if isinstance(section, dict) and isinstance(section.get(key), str | int | float):
+            found[name] = str(section.pop(key))
             if not section:
-                document.pop(q.section)
+                document.pop(table)
     return found, tomli_w.dumps(document)
 
 
@@ -311,16 +295,15 @@ def join_toml(quantities: Mapping[str, str], rest: str) -> str:
         document = tomllib.loads(rest)
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise InputError(f"The further TOML is no valid TOML: {error}.") from None
-    for q in QUANTITIES:
-        value = quantities.get(q.name, "").strip()
-        if not value:
-            continue
-        section = document.setdefault(q.section, {})
-        if not isinstance(section, dict):
-            raise InputError(f"The further TOML: {q.section} must be a table, [{q.section}].")
-        if q.key in section:
-            raise InputError(f"The further TOML: {q.name} is filled in above, too; give it once.")
-        section[q.key] = value
+    for name in QUANTITIES:
+        if value := quantities.get(name, "").strip():
+            table, key = name[1:].split("] ")
+            section = document.setdefault(table, {})
+            if not isinstance(section, dict):
+                raise InputError(f"The further TOML: {table} must be a table, [{table}].")
+            if key in section:
+                raise InputError(f"The further TOML: {name} is filled in above, too; give it once.")
+            section[key] = value
     return tomli_w.dumps(document)
 
 
