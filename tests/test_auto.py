@@ -457,7 +457,7 @@ def test_chains_of_microscale_springs_need_one_that_follows_the_curves(microscal
         ""
         if tried
         else "one microscale spring misses the curves by 2.3 % of the range, "
-        "one bistable spring by 2 %"
+        "one bistable spring misses the curves by 2 % of the range"
     )
     for model in (Model.parse("linear+bistable"), Model.parse("microscale", 1)):
         assert auto._hopeless(model, before) == ""

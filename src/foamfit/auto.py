@@ -20,15 +20,15 @@ import numpy as np
 from foamfit import one_model, text
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError
-from foamfit.fitting.box import is_share
 from foamfit.fitting.curves import choose_drive
 from foamfit.fitting.problem import make_params
 from foamfit.fitting.search import SearchStoppedError, what_stopped
 from foamfit.one_model import Found, Options, Progress
 from foamfit.report import render
 from foamfit.results import Fit, Ladder, Rung, rung_name
+from foamfit.springs import laws
 from foamfit.springs.model import Model
-from foamfit.springs.parameters import NUISANCE, split_name
+from foamfit.springs.parameters import NUISANCE, family, split_name
 from foamfit.text import percent
 from foamfit.trust import evidence
 from foamfit.trust.best_point import BestPoint
@@ -40,21 +40,24 @@ from foamfit.trust.residuals.residual_tests import BENT, find_structure, neighbo
 
 # From the simplest up, in groups: one spring; a linear spring below it or its relaxation; two
 # springs; three; two that relax. More springs have more parameters (23 and more) than a loop has
-# features.
-LADDER = (
-    (Model.parse("bistable"), Model.parse("microscale")),
-    (
-        *(Model.parse("linear+bistable"), Model.parse("linear+microscale")),
-        *(Model.parse("bistable", 1), Model.parse("microscale", 1)),
-    ),
-    (Model.parse("bistable+bistable"), Model.parse("microscale+microscale")),
-    (Model.parse("linear+bistable+bistable"),),
-    (Model.parse("microscale+microscale", 1),),
+# features. Springs that remember take too long in three, others gain nothing in the last group.
+_OWN = [kind for kind in laws.kinds() if laws.law(kind).hysteretic and not laws.is_registered(kind)]
+_SLOW = [kind for kind in _OWN if laws.law(kind).remembers]
+_QUICK = [kind for kind in _OWN if kind not in _SLOW]
+LADDER = tuple(
+    tuple(Model.parse(name, terms) for name, terms in group)
+    for group in (
+        [(kind, 0) for kind in _OWN],
+        [*((f"linear+{kind}", 0) for kind in _OWN), *((kind, 1) for kind in _OWN)],
+        [(f"{kind}+{kind}", 0) for kind in _OWN],
+        [(f"linear+{kind}+{kind}", 0) for kind in _QUICK],
+        [(f"{kind}+{kind}", 1) for kind in _SLOW],
+    )
 )
 # The comparison ends after so many groups in a row without a gain.
 WITHOUT_GAIN = 2
-# Chains with microscale springs, which take minutes in an impact, are not tried where one such
-# spring misses the curves by so many times more than one bistable spring.
+# Chains with springs that remember, which take minutes in an impact, are not tried where one such
+# spring misses the curves by so many times more than one spring that does not.
 HOPELESS = 1.1
 # Two of them take a minute even under a known motion: they are not tried where one, perhaps with
 # relaxation, misses the curves by no more than this share of the range.
@@ -99,7 +102,7 @@ def _carry(params: lmfit.Parameters, model: Model, tried: Sequence[Tried]) -> No
         source = name if spring < 0 else f"s{sources.get(spring, -1) + 1}_{short}"
         if source in values:
             params[name].value = values[source]
-        elif spring in sources and is_share(short):
+        elif spring in sources and family(short) == "g":
             params[name].value = 0.0
         elif spring >= 0 and spring not in sources and model.kinds[spring] == "linear":
             params[name].value = params[name].min if short == "height" else 0.1 * params[name].max
@@ -264,24 +267,28 @@ class _Comparison:
 
 
 def _hopeless(model: Model, tried: Sequence[Tried]) -> str:
-    """Why a chain with microscale springs cannot win; "" where it may, and of other models."""
+    """Say why a chain with springs that remember cannot win; "" where it may, and of others."""
 
-    def least(kind: str, most: float = math.inf) -> float:
-        """Misfit of one such spring that has no more relaxation terms."""
-        alone = (t for t in tried if t.result.model == kind and t.result.relaxation <= most)
-        return min((one.misfit for one in alone), default=math.nan)
+    def least(kinds: Sequence[str], most: float = math.inf) -> tuple[float, str]:
+        """Misfit of one spring of these kinds with no more relaxation terms, and its name."""
+        alone = (t for t in tried if t.result.model in kinds and t.result.relaxation <= most)
+        found = min(alone, key=lambda one: one.misfit, default=None)
+        if found is None:
+            return math.nan, ""
+        title = laws.law(found.result.model).title
+        return (
+            found.misfit,
+            f"one {title} misses the curves by {percent(found.misfit)} of the range",
+        )
 
-    if len(model.kinds) == 1 or "microscale" not in model.kinds:
+    slow = [kind for kind in model.kinds if kind in _SLOW]
+    if len(model.kinds) == 1 or not slow:
         return ""
-    one, other = least("microscale", 0), least("bistable", 0)
-    if model.kinds.count("microscale") > 1 and (near := least("microscale")) <= CLOSE:
-        return f"one microscale spring misses the curves by {percent(near)} of the range only"
-    if not one > HOPELESS * other:
-        return ""
-    return (
-        f"one microscale spring misses the curves by {percent(one)} of the range, "
-        f"one bistable spring by {percent(other)}"
-    )
+    near, told = least(slow)
+    if len(slow) > 1 and near <= CLOSE:
+        return f"{told} only"
+    (one, told), (other, against) = least(slow, 0), least(_QUICK, 0)
+    return f"{told}, {against}" if one > HOPELESS * other else ""
 
 
 def _has_gained(tried: Sequence[Tried], below: int) -> bool:

@@ -14,8 +14,7 @@ from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.data.rate import loading_rate
 from foamfit.springs.chain import Chain
-from foamfit.springs.microscale import follow_fractions
-from foamfit.springs.spring import BistableSpring, MicroscaleSpring
+from foamfit.springs.spring import Spring
 from foamfit.text import counted
 
 if TYPE_CHECKING:
@@ -27,7 +26,6 @@ SCHEMA = 1
 # Of an uncertainty budget.
 STATED = ("mass", "height", "area", "calibration")  # by their ± in the TOML, not fitted
 SOURCES = ("noise", "contact and zero", "velocity", *STATED, "law")
-DERIVED_POINTS = ("sigma_a", "sigma_c", "eps_star", "eps_hat_a", "eps_hat_c")
 
 
 @dataclass(frozen=True)
@@ -306,22 +304,22 @@ class Ladder:
 
 
 def snapping_of(chain: Chain, strain: Array | None, stress: Array | None) -> dict[str, Snapping]:
-    """Return how each microscale spring snaps along an overall strain and a base stress (Pa).
+    """Return how each spring of micro-springs snaps along an overall strain and a base stress (Pa).
 
     A single spring's snapping follows from its strain, that in a chain from the stress if all its
     springs are in equilibrium, else it is not known.
     """
     out, springs = {}, chain.springs
-    plain = not any(spring.eta or spring.relaxation for spring in springs)
     for i, spring in enumerate(springs, start=1):
-        if not isinstance(spring, MicroscaleSpring):
+        if not spring.law.remembers:
             continue
-        own = stress if plain else None
+        own = None if any(one.eta or one.relaxation for one in springs) else stress
         if len(springs) == 1:
             own = None if strain is None else np.asarray(spring.stress(strain))
         if own is not None and np.all(np.isfinite(own)):
-            fraction = follow_fractions(own, spring.snapped_below, spring.left_below)
-            out[f"s{i}"] = Snapping(fraction, own)
+            fraction = spring.fraction_along(own)
+            if fraction is not None:
+                out[f"s{i}"] = Snapping(fraction, own)
     return out
 
 
@@ -365,16 +363,9 @@ class Fit:
     budget: Budget | None = None
 
     @property
-    def bistable_springs(self) -> dict[str, BistableSpring]:
-        """The bistable springs of the chain by their prefix, "s1" at the base."""
-        springs = enumerate(self.chain.springs, start=1)
-        return {f"s{i}": one for i, one in springs if isinstance(one, BistableSpring)}
-
-    @property
-    def microscale_springs(self) -> dict[str, MicroscaleSpring]:
-        """The microscale springs of the chain by their prefix, "s1" at the base."""
-        springs = enumerate(self.chain.springs, start=1)
-        return {f"s{i}": one for i, one in springs if isinstance(one, MicroscaleSpring)}
+    def springs(self) -> dict[str, Spring]:
+        """The springs of the chain by their prefix, "s1" at the base."""
+        return {f"s{i}": one for i, one in enumerate(self.chain.springs, start=1)}
 
     @property
     def at_noise(self) -> bool | None:
@@ -442,19 +433,17 @@ class Fit:
 
     def _derived(self) -> dict[str, dict[str, Any]]:
         """Return derived points of the springs, and how far they snapped."""
-        points = {
-            name: {point: getattr(spring, point) for point in DERIVED_POINTS}
-            for name, spring in self.bistable_springs.items()
-        }
-        return points | {
-            name: {
-                "p_max": snapped.most,
-                "p_max_stress": snapped.stress[snapped.turn],
-                "p_max_strain": None if self.strain is None else self.strain[snapped.turn],
-                "snap_strain": self.microscale_springs[name].snap_strain,
-            }
-            for name, snapped in self.snapping.items()
-        }
+        found = dict[str, dict[str, Any]]()
+        for name, spring in self.springs.items():
+            points = {one.attribute: getattr(spring, one.attribute) for one in spring.law.points}
+            if (snapped := self.snapping.get(name)) is not None:
+                points["p_max"] = snapped.most
+                points["p_max_stress"] = snapped.stress[snapped.turn]
+                points["p_max_strain"] = None if self.strain is None else self.strain[snapped.turn]
+                points["snap_strain"] = getattr(spring, "snap_strain", None)
+            if points:
+                found[name] = points
+        return found
 
 
 def plain(value: Any) -> Any:

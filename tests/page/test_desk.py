@@ -251,7 +251,7 @@ def test_a_fit_that_is_stopped_keeps_the_best(ready):
 
 def test_a_worker_that_dies_says_so(ready):
     worker = ready.fit(["--starts", "100000"])
-    os.kill(worker.pid, signal.SIGKILL)
+    os.kill(worker.process.pid, signal.SIGKILL)
     wait(worker)
     assert ready.ending() == "The process of the fit has died by SIGKILL; start the fit again."
     assert ready.result is None
@@ -301,7 +301,7 @@ def test_a_closed_window_ends_its_fit(ready):
     ready.close()
     wait(worker)
     with pytest.raises(ProcessLookupError):
-        os.kill(worker.pid, 0)
+        os.kill(worker.process.pid, 0)
 
 
 # ------------------------------------------------------------------------------------- curves

@@ -27,7 +27,7 @@ from foamfit.page.widgets import TEMPLATES, Upload, message, piece, style
 from foamfit.page.worker import News, parsed
 from foamfit.report.folder import load_result
 from foamfit.results import law_in_words
-from foamfit.springs.parameters import HYSTERETIC
+from foamfit.springs import laws
 from foamfit.springs.published import published
 
 # Where a checkout of the repository may be: the working directory, or around an editable install.
@@ -322,7 +322,7 @@ class Window:
             asked = parsed(self._arguments(ticked=False))
         except InputError:  # said when it is fitted
             asked = parsed([])
-        model = "bistable" if auto else self.model.value
+        model = models()[1] if auto else self.model.value
         self._turn_model(model, self.desk.measurement.cycle, **keywords(asked))
 
     def _hide_curves(self, why: str = "") -> None:
@@ -489,7 +489,7 @@ def keywords(asked: Mapping[str, Any]) -> dict[str, Any]:
 
 def models() -> list[str]:
     """Return the models that are listed: each law alone, on a linear spring, and twice."""
-    alone = list(HYSTERETIC)
+    alone = [kind for kind in laws.kinds() if laws.law(kind).hysteretic]
     return ["auto", *alone, *(f"linear+{one}" for one in alone), *(f"{one}+{one}" for one in alone)]
 
 

@@ -26,9 +26,10 @@ from foamfit.data.energy import audit
 from foamfit.data.measurement import Measurement
 from foamfit.data.toml_file import toml_beside
 from foamfit.errors import InputError
-from foamfit.page.worker import Job, Worker, parsed
+from foamfit.page.worker import Job, Worker, end_all, parsed
 from foamfit.report.comparison import compare
 from foamfit.report.comparison_text import comparison_text
+from foamfit.springs import laws
 from foamfit.text import listed
 
 LARGEST = 64 * 1024 * 1024  # bytes of a file that is dropped
@@ -78,7 +79,7 @@ class Desk:
     def close(self) -> None:
         """End the fit and remove the folder."""
         if self.worker is not None:
-            self.worker.kill()
+            end_all(self.worker.process)
         shutil.rmtree(self.folder, ignore_errors=True)
 
     # ------------------------------------------------------------------------------- files
@@ -196,7 +197,7 @@ class Desk:
         folder = self.folder / f"fit-{self._fits}"
         toml = folder.with_suffix(".toml")  # the page may change it later
         toml.write_bytes(self.toml)
-        job = Job(str(self.csv), str(toml), str(folder), arguments)
+        job = Job(str(self.csv), str(toml), str(folder), arguments, laws.texts())
         self.worker = Worker(job)
         return self.worker
 

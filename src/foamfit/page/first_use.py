@@ -8,6 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 from foamfit.page.worker import end_all, with_package
 from foamfit.solve import cache
+from foamfit.springs.model import Model
 
 # Compiled one after the other, for springs without memory and with it: a model, its relaxation, and
 # the loop that is cached last.
@@ -31,7 +32,9 @@ class FirstUse:
 
     def needed(self, model: str, relaxation: int) -> Future[None]:
         """Return what must be done before a model is simulated."""
-        memory = model == "auto" or "microscale" in model or relaxation > 0
+        memory = (
+            model == "auto" or relaxation or any(one.remembers for one in Model.parse(model).laws)
+        )
         return self.parts[-1 if memory else 0]
 
     def _compile(self, model: str, relaxation: int, loop: str) -> None:

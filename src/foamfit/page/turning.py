@@ -20,7 +20,6 @@ from foamfit.one_model import Keywords, Options
 from foamfit.report.readable import readable_unit
 from foamfit.results import law_in_words
 from foamfit.springs.parameters import NUISANCE, split_name, unit_of
-from foamfit.springs.spring import BistableSpring
 
 MOST_SAMPLES = 1500  # of a curve that every move of a slider draws again
 WIDE = 4.0  # a slider reaches to so many times the value
@@ -129,18 +128,11 @@ class Turning:
         return Drawn(curves, problem.objective.misfit(simulated), named, self._points())
 
     def _points(self) -> dict[str, tuple[float, float]]:
-        """Where the branches of a single bistable spring meet, by the names of the paper."""
+        """Return where the branches of a single spring meet, by the names of the paper."""
         model = self.problem.model
-        if model.kinds != ("bistable",) or model.relaxation:
+        if len(model.kinds) > 1 or model.relaxation:
             return {}
-        spring = model.springs(self.values[: len(model.names)])[0]
-        assert isinstance(spring, BistableSpring)
-        ends = {
-            "A1": (spring.eps_a, spring.sigma_a), "C1": (spring.eps_hat_c, spring.sigma_hat_c),
-            "C2": (spring.eps_c, spring.sigma_c), "A2": (spring.eps_hat_a, spring.sigma_hat_a),
-        }  # fmt: skip
-        # A2 is missing where the branches e and a do not meet.
-        return {n: (x, y) for n, (x, y) in ends.items() if x is not None and y is not None}
+        return model.springs(self.values[: len(model.names)])[0].corners
 
     @cached_property
     def measured(self) -> dict[str, tuple[Array, Array]]:

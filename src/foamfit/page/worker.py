@@ -40,6 +40,7 @@ class Job:
     toml: str
     folder: str
     arguments: list[str] = field(default_factory=list)
+    laws: dict[str, str] = field(default_factory=dict)  # the texts of law files, by path
 
 
 @dataclass(frozen=True)
@@ -75,12 +76,11 @@ class Worker:
 
     def __init__(self, job: Job) -> None:
         self.job, self.news = job, News()
-        self.began = time.monotonic()
         self.stopping = False
         self.told = ""  # what the command prints of several cycles
-        self._done: str | None = None  # why there is no result, "" if there is one
+        self.ended: str | None = None  # then why there is no result, "" if there is one
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  (closed when the process ends)
-        self._process = subprocess.Popen(
+        self.process = subprocess.Popen(
             [sys.executable, "-m", "foamfit.page.worker"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -89,37 +89,23 @@ class Worker:
             env=with_package(),
             start_new_session=True,  # Ctrl-C in the terminal of the page does not reach it
         )
-        assert self._process.stdin is not None
+        assert self.process.stdin is not None
         with contextlib.suppress(BrokenPipeError):
-            self._process.stdin.write(json.dumps(vars(job)) + "\n")
-            self._process.stdin.close()
+            self.process.stdin.write(json.dumps(vars(job)) + "\n")
+            self.process.stdin.close()
         threading.Thread(target=self._listen, daemon=True).start()
-
-    @property
-    def pid(self) -> int:
-        """The number of the process."""
-        return self._process.pid
-
-    @property
-    def ended(self) -> str | None:
-        """None while it runs, then why there is no result, "" if there is one."""
-        return self._done
 
     def stop(self) -> None:
         """End the search; the result of the best point is written."""
-        if not self.stopping and self._process.poll() is None:
+        if not self.stopping and self.process.poll() is None:
             self.stopping = True
-            self._process.send_signal(signal.SIGINT)
-
-    def kill(self) -> None:
-        """Kill the process."""
-        end_all(self._process)
+            self.process.send_signal(signal.SIGINT)
 
     def _listen(self) -> None:
         """Read the reports of the process until it ends."""
-        assert self._process.stdout is not None
+        assert self.process.stdout is not None
         done: str | None = None
-        for line in self._process.stdout:
+        for line in self.process.stdout:
             try:
                 told = json.loads(line)
             except ValueError:  # printed by some library, or half a line
@@ -128,11 +114,11 @@ class Worker:
                 done, self.told = told["ended"], told.get("told", "")
             else:
                 self.news = News(**told)
-        code = self._process.wait()
-        self._process.stdout.close()
+        code = self.process.wait()
+        self.process.stdout.close()
         done = self._why(code) if done is None else done
         self._errors.close()
-        self._done = done
+        self.ended = done
 
     def _why(self, code: int) -> str:
         """Say how a process ended that did not say so itself."""
@@ -195,8 +181,10 @@ def parsed(arguments: list[str]) -> dict[str, Any]:
     from foamfit.cli.fit import fit as command
     from foamfit.cli.options import Output
 
+    # What a browser sends names no law file: that is code.
+    own = click.Command("fit", params=[one for one in command.params if one.name != "law"])
     try:
-        context = command.make_context("fit", ["TEST.csv", *arguments])
+        context = own.make_context("fit", ["TEST.csv", *arguments])
     except click.ClickException as error:
         raise InputError(error.format_message()) from None
     others = {"test", "specimen", "verbose", *Output.__dataclass_fields__} - {"figure_width"}
@@ -236,9 +224,11 @@ def _run(job: Job) -> tuple[str, str]:
 
 def main() -> None:
     """Do the job on stdin."""
+    from foamfit.springs import laws
     from foamfit.terminal import ending_cleanly
 
     job = Job(**json.loads(sys.stdin.readline()))
+    laws.load_texts(job.laws)
     with ending_cleanly():
         ended, told = _run(job)
     _say({"ended": ended, "told": told})
