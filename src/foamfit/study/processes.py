@@ -127,7 +127,9 @@ class Processes(Executor):
         pool: ProcessPoolExecutor | None = getattr(self._here, "pool", None)
         if pool is not None:
             return pool.submit(fn, *args, **kwargs)
-        pool = ProcessPoolExecutor(1, self._context, _begin, (self._stop,))
+        from foamfit.springs import laws
+
+        pool = ProcessPoolExecutor(1, self._context, _begin, (self._stop, laws.texts()))
         self._here.pool = pool
         self._pools.append(pool)
         with _starting():
@@ -157,7 +159,7 @@ def _set(values: MutableMapping[str, Any], for_now: Mapping[str, Any]) -> Iterat
             del values[name]
 
 
-def _begin(stop: connection.Connection) -> None:
+def _begin(stop: connection.Connection, law_files: Mapping[str, str]) -> None:
     """Make a process ready: Ctrl-C is for the one that started it, whose end is its own."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     gc.freeze()  # what the imports have made stays
@@ -165,6 +167,10 @@ def _begin(stop: connection.Connection) -> None:
     logging.getLogger("foamfit").setLevel(logging.ERROR)
     warnings.simplefilter("ignore")  # NumPy's would come once for each test
     threading.Thread(target=_end_with, args=(stop,), daemon=True).start()
+    if law_files:
+        from foamfit.springs import laws
+
+        laws.load_texts(law_files)
 
 
 def _end_with(stop: connection.Connection) -> None:
