@@ -143,7 +143,7 @@ def test_a_registered_law_is_fitted_and_shown(bouc_wen: Law, tmp_path: Path) -> 
         assert found.ci95 is not None
         assert abs(found.value - true) < 4.0 * found.stderr  # type: ignore[operator]
     result.save(tmp_path / "result")
-    assert "stiffness" in (tmp_path / "result" / "report.html").read_text()
+    assert "bouc-wen" in (tmp_path / "result" / "report.html").read_text()
 
 
 # ---------------------------------------------------------------------------- what is refused
