@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from foamfit.cli import options
 from foamfit.cli.group import main
@@ -73,7 +74,7 @@ def check(
 
     with options.compiling(False, model, relaxation) as compile_rest:
         compile_rest()
-    start = {"published_set": published, "result": params, "relaxation": relaxation}
+    start: dict[str, Any] = {"published_set": published, "result": params, "relaxation": relaxation}
     outlook = outlook_of(test, specimen, model, drive, **start)
     told.append(outlook_text(outlook))
     insight, problem = outlook.planned.insight, outlook.problem
