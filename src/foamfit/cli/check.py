@@ -69,8 +69,7 @@ def check(
         say(told[0])
         return
     from foamfit.report.identifiability_plots import plot_insight
-    from foamfit.report.outlook import outlook_of
-    from foamfit.report.outlook_text import outlook_text
+    from foamfit.report.outlook import outlook_of, outlook_text
 
     with options.compiling(False, model, relaxation) as compile_rest:
         compile_rest()
