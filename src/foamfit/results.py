@@ -368,16 +368,6 @@ class Fit:
         return {f"s{i}": one for i, one in enumerate(self.chain.springs, start=1)}
 
     @property
-    def bistable_springs(self) -> dict[str, Any]:
-        """The bistable springs of the chain by their prefix."""
-        return {name: one for name, one in self.springs.items() if one.law.kind == "bistable"}
-
-    @property
-    def microscale_springs(self) -> dict[str, Any]:
-        """The microscale springs of the chain by their prefix."""
-        return {name: one for name, one in self.springs.items() if one.law.kind == "microscale"}
-
-    @property
     def at_noise(self) -> bool | None:
         """Whether the residuals are at the estimated noise; None where that is not known."""
         return next((check.answer for check in self.checklist if check.key == "noise"), None)
