@@ -145,7 +145,8 @@ def _spring(given: _Part) -> Spring:
         tuple(term.only("g", "tau").number(key, COMMON[key]) for key in ("g", "tau"))
         for term in given.parts("relaxation", "relaxation term", wrong)
     ]
-    return given.made(law.make, values, relaxation)
+    spring: Spring = given.made(law.make, values, relaxation)
+    return spring
 
 
 def _drive(path: Path, document: dict[str, Any]) -> tuple[Drive, Array]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib.util
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from importlib.metadata import entry_points
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from foamfit.springs.laws.microscale import MicroscaleSpring as MicroscaleSpring
 from foamfit.springs.laws.record import Functions as Functions
 from foamfit.springs.laws.record import Law as Law
 from foamfit.springs.laws.record import Param as Param
+from foamfit.springs.spring import LawSpring, Relaxation
 
 ENTRY_POINTS = "foamfit.laws"
 _LAWS = {law.kind: law for law in (bistable.LAW, linear.LAW, linear.UNILATERAL_LAW, microscale.LAW)}
@@ -65,7 +67,7 @@ def register(law: Law) -> Law:
     Returns
     -------
     Law
-        The same record.
+        The record as it is known; `make` makes springs of it.
 
     Raises
     ------
@@ -76,8 +78,14 @@ def register(law: Law) -> Law:
     from foamfit.springs.laws.checked import check
 
     check(law, _OWN)
-    _LAWS[law.kind] = law
-    return law
+    if law.spring is None:
+
+        def make(*values: float, relaxation: Relaxation = ()) -> LawSpring:
+            return LawSpring(known, values, relaxation)
+
+        law = replace(law, spring=make)
+    known = _LAWS[law.kind] = law
+    return known
 
 
 def load_file(path: str | Path) -> tuple[Law, ...]:
@@ -136,10 +144,9 @@ def _run(path: str, text: str) -> tuple[Law, ...]:
     try:
         exec(compile(text, path, "exec"), module.__dict__)
         given = [one for one in vars(module).values() if isinstance(one, Law)]
-        found = {one.kind: one for one in given if one.kind not in _OWN}
-        for one in found.values():
-            register(one)
-    except Exception as error:
+        kinds_of = {one.kind: one for one in given if one.kind not in _OWN}
+        found = tuple(register(one) for one in kinds_of.values())
+    except (Exception, SystemExit) as error:
         _LAWS.clear()
         _LAWS.update(before)
         if isinstance(error, InputError):
@@ -148,7 +155,7 @@ def _run(path: str, text: str) -> tuple[Law, ...]:
         raise InputError(f"{path}: the file cannot be run ({what})") from None
     if not found:
         raise InputError(f"{path}: the file defines no law; make a foamfit.Law at its top level")
-    return tuple(found.values())
+    return found
 
 
 def _load_packages() -> None:
