@@ -33,7 +33,7 @@ needs_data = pytest.mark.skipif(
 
 # What compiles, in a process of its own, loops that a first fit does not need, and these loops.
 FIRST_USE = Path(__file__).with_name("first_use.py")
-LOOPS = {"implicit": "integrate_implicit", "memory": "integrate_with_memory"}
+LOOPS = {"many": "integrate_aggregate", "memory": "integrate_with_memory"}
 
 
 def first_use(part: str) -> subprocess.Popen[bytes]:
@@ -69,14 +69,14 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 def compiled() -> Iterator[None]:
     """Compile once, in two processes, what most tests need; no command then says that it does.
 
-    The loops of implicit steps are compiled beside the first tests.
+    The loops of many springs are compiled beside the first tests.
     """
     if cache.compiled():
         yield
         return
     with precompile.side_by_side() as compile_rest:
         compile_rest()
-    with first_use("implicit"):
+    with first_use("many"):
         yield
 
 

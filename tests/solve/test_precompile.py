@@ -23,9 +23,8 @@ import foamfit as ff
 from conftest import EXPERIMENTS, synthetic_loop, without_pictures
 from foamfit import api
 from foamfit.cli import main
-from foamfit.solve import cache, polynomial, precompile, relaxation
+from foamfit.solve import cache, polynomial, precompile, rates, relaxation
 from foamfit.solve.explicit import memory, taylor
-from foamfit.solve.implicit import vibration
 from foamfit.springs import kernels, microscale_kernels, sensitivities
 
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
@@ -36,7 +35,7 @@ def keep_in(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     loop = SimpleNamespace(stats=SimpleNamespace(cache_path=str(folder)))
     for module, name in (
         (kernels, "fault"), (polynomial, "first_crossing"),
-        (taylor, "integrate"), (vibration, "fastest_rates"),
+        (taylor, "integrate"), (rates, "fastest_rates"),
     ):  # fmt: skip
         monkeypatch.setattr(module, name, loop)
 
@@ -53,7 +52,7 @@ def test_a_fit_calls_what_was_compiled_and_nothing_else() -> None:
     assert taylor.integrate.signatures == [precompile._calls()[taylor.integrate]]
     for function in (
         kernels.fill_bistable, kernels.stress_along, kernels.fault, kernels.total,
-        sensitivities.equilibrium_tangents, vibration.fastest_rates,
+        sensitivities.equilibrium_tangents, rates.fastest_rates,
     ):  # fmt: skip
         assert len(function.signatures) == 1, function.py_func.__name__
 
@@ -66,9 +65,11 @@ def test_a_fit_of_springs_with_memory_calls_what_was_compiled_and_nothing_else()
     ff.fit(timed, model="microscale", relaxation=1, starts=1, intervals="local")
     ff.fit(timed, model="microscale", starts=1, intervals="local")
     for function in (
-        relaxation.relaxed_along, microscale_kernels.fill_microscale,
-        microscale_kernels.stress_along, microscale_kernels.stress_tangents_along,
-    ):  # fmt: skip
+        relaxation.relaxed_along,
+        microscale_kernels.fill_microscale,
+        microscale_kernels.stress_along,
+        microscale_kernels.stress_tangents_along,
+    ):
         assert len(function.signatures) == 1, function.py_func.__name__
 
 

@@ -116,7 +116,7 @@ def test_a_chaotic_motion_is_refused() -> None:
 def test_vibrations_that_cannot_be_followed_are_refused_by_size(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    point = Point(springs=2, kinds="unilateral+bistable", mass=1e-11, velocity=4.0)
+    point = Point(springs=2, kinds="unilateral+bistable", mass=1e-12, velocity=4.0)
     chain, drive, time = scene_of(point)
     rows = np.array([spring.row for spring in chain.springs])
     motion = plan(chain, drive, time).run(rows, np.array(chain.heights), 1e-9)

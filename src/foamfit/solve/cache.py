@@ -17,12 +17,11 @@ FOLDERS = ("springs", "solve")
 
 def _caches() -> set[Path]:
     """Folders in which numba keeps what it compiled of this package: one beside each of its own."""
-    from foamfit.solve import polynomial
+    from foamfit.solve import polynomial, rates
     from foamfit.solve.explicit import taylor
-    from foamfit.solve.implicit import vibration
     from foamfit.springs import kernels
 
-    loops = (kernels.fault, polynomial.first_crossing, taylor.integrate, vibration.fastest_rates)
+    loops = (kernels.fault, polynomial.first_crossing, taylor.integrate, rates.fastest_rates)
     return {Path(loop.stats.cache_path or ".") for loop in loops}
 
 

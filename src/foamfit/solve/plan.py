@@ -11,11 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
-from foamfit.solve import cache, many, relaxation
+from foamfit.solve import cache, many, rates, relaxation
 from foamfit.solve import scene as scenes
 from foamfit.solve.any_law import AnyLawPlan, plan_of
 from foamfit.solve.explicit import taylor
-from foamfit.solve.implicit import steps, vibration
+from foamfit.solve.implicit import steps
 from foamfit.springs import equilibrium, kernels
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.springs.law import BISTABLE, LINEAR
@@ -30,7 +30,7 @@ TAYLOR, RADAU, AGGREGATE = "Taylor series", "Radau IIA", "aggregate"
 MAX_STEPS = 2_000_000
 # Explicit steps are given up where something relaxes, or vibrates, so many times (in radians) while
 # the scene lasts, or after so many steps.
-MOST_RELAXATION, MOST_VIBRATION, MOST_EXPLICIT = 1e4, 1e5, 200_000
+MOST_RELAXATION, MOST_VIBRATION, MOST_EXPLICIT = 1e4, 3e5, 200_000
 # Bounds on steps times springs (seconds, not hours): for all but the samples of a drive, before
 # explicit steps are given up, and for everything.
 MOST_WORK, MOST_EXPLICIT_WORK, MOST_SAMPLED = 1_500_000, 500_000, 10_000_000
@@ -40,8 +40,9 @@ MOST_WORK, MOST_EXPLICIT_WORK, MOST_SAMPLED = 1_500_000, 500_000, 10_000_000
 # and without; of springs that count as one, whose errors add up.
 OF_MASSES, OF_IMPACT, ALONG_DRIVE = 1e-4, 1e-3, 1e-4
 OF_MASSES_IMPLICIT, IMPLICIT, AS_ONE = 3e-2, 3e-4, 1e-4
-# Least truncation of implicit steps: less is rounding.
-LEAST_IMPLICIT = 1e-14
+# Least truncation of implicit steps: less is rounding. The most of them: each takes half a
+# millisecond.
+LEAST_IMPLICIT, MOST_IMPLICIT = 1e-14, 250_000
 # From so many springs on, those that carry one stress in an impact count as one.
 LEAST_AGGREGATE = 9
 # Switches that are kept, of springs that do not count as one.
@@ -75,7 +76,6 @@ _NOTHING = np.zeros(1)
 _RESTING, _AT_REST = (scenes.FREE, scenes.VISCOUS), np.zeros((1, 0))
 # Outcomes of explicit steps after which implicit ones are tried.
 _STIFF = (scenes.TOO_MANY_STEPS, scenes.STEP_UNDERFLOW)
-NO_SLOPES = np.empty((0, 0, 0))
 
 
 class Slopes(NamedTuple):
@@ -177,46 +177,48 @@ class Plan(NamedTuple):
         if self.solver == CLOSED_FORM:
             return self._closed_form(rows, heights, rtol, everything, directions)
         p, time = len(directions), self.time
-        curves = np.empty((1 + len(heights) if everything else 2, time.size))
-        slopes = np.empty((p, *curves.shape)) if p else NO_SLOPES
+        out = np.empty((1 + p, 1 + len(heights) if everything else 2, time.size))
+        log = np.empty((LOGGED, 5)) if everything else NO_SWITCHES
         if self.memory:
-            log = np.empty((LOGGED, 5)) if everything else NO_SWITCHES
-            scene = self.given(rows, heights, drag)
-            return self._remembered(scene, rtol, directions, curves, slopes, log)
+            return self._remembered(self.given(rows, heights, drag), rtol, directions, out, log)
+        drag = self.drag if drag is None else drag
         bounces = self.plain and not drag and self.implicit is None
         stiff = not bounces and self._is_stiff(self.given(rows, heights, drag))
         one = self.speed > 0.0 and self.top == scenes.FREE and len(self.ends) == 1
         one = one and p == 0 and not stiff and len(heights) >= LEAST_AGGREGATE
         if one and many.holds(rows):
-            return self._aggregate(self.given(rows, heights, drag), rtol, curves)
+            return self._aggregate(self.given(rows, heights, drag), rtol, out)
         start = _AT_REST if self.top in _RESTING else self._start(rows, heights, directions)
-        log = np.empty((LOGGED, 5)) if everything else NO_SWITCHES
         if not stiff:
             cache.announce(taylor.integrate, "the solver")
             most = self.max_explicit if self.implicit is None else self.max_steps
             ending: Sequence[Any] = taylor.integrate(
-                rows, heights, self.ends, self.mass, self.drag if drag is None else drag, self.top,
-                self.values, self.speed, time, self.margin * rtol, most, directions, start, curves,
-                slopes, log,
-            )  # fmt: skip
+                rows,
+                heights,
+                self.ends,
+                self.mass,
+                np.array((drag, self.top, self.speed, self.margin * rtol, most)),
+                self.values,
+                time,
+                directions,
+                start,
+                out,
+                log,
+            )
             if self.implicit is False or ending[0] not in _STIFF:
-                return _motion(TAYLOR, ending, curves, slopes, log)
+                return _motion(TAYLOR, ending, out, log)
         margin = OF_MASSES_IMPLICIT if len(self.ends) > 1 else IMPLICIT
-        cache.announce(steps.integrate_implicit, "the solver of stiff scenes")
-        *ending, lost = steps.integrate_implicit(
-            self.given(rows, heights, drag), max(margin * rtol, LEAST_IMPLICIT),
-            self.max_steps, directions, start, curves, slopes, log, np.zeros(2, np.int64),
-        )  # fmt: skip
-        return _motion(RADAU, ending, curves, slopes, log, lost)
+        scene, tol = (
+            scenes.Scene(*self.given(rows, heights, drag)),
+            max(margin * rtol, LEAST_IMPLICIT),
+        )
+        most = min(self.max_steps, MOST_IMPLICIT)
+        samples = scenes.Samples(time, out[0], out[1:])
+        *ending, lost = steps.integrate_implicit(scene, tol, most, directions, start, samples, log)
+        return _motion(RADAU, ending, out, log, lost)
 
     def _remembered(
-        self,
-        given: scenes.SceneTuple,
-        rtol: float,
-        directions: Directions,
-        curves: Array,
-        slopes: Array,
-        log: Array,
+        self, given: scenes.SceneTuple, rtol: float, directions: Directions, out: Array, log: Array
     ) -> Motion:
         """Springs with memory: by explicit steps, which must follow all that is fast."""
         start = _AT_REST
@@ -226,9 +228,8 @@ class Plan(NamedTuple):
         cache.announce(taylor.integrate_with_memory, "the solver of springs with memory")
         for most in (min(FEW_EXPLICIT, self.max_steps), self.max_steps):
             ending: Sequence[Any] = taylor.integrate_with_memory(
-                given, self.unit, self.margin * rtol, most, directions, start, curves, slopes, log,
-                one_sided,
-            )  # fmt: skip
+                given, self.unit, self.margin * rtol, most, directions, start, out, log, one_sided
+            )
             if ending[0] not in _STIFF:
                 break
             rate, culprit = self._fastest(given)
@@ -240,7 +241,7 @@ class Plan(NamedTuple):
                 raise SimulationError(message)
             if ending[0] == scenes.STEP_UNDERFLOW:  # more steps would end there too
                 break
-        return _motion(TAYLOR, ending, curves, slopes, log, one_sided=one_sided)
+        return _motion(TAYLOR, ending, out, log, one_sided=one_sided)
 
     def _fastest(self, given: scenes.SceneTuple) -> tuple[float, str]:
         """What of springs with memory is fastest, in radians while the scene lasts; its name."""
@@ -250,7 +251,7 @@ class Plan(NamedTuple):
         steep = np.where(bistable, np.maximum(rows[:, k.KH_PLUS], rows[:, k.KC]), rows[:, k.KC])
         elastic[:, k.KIND], elastic[:, k.ETA] = LINEAR, rows[:, k.ETA]
         elastic[:, k.K0] = np.maximum(rows[:, k.K0], steep) * (1.0 + terms[:, ::2].sum(axis=1))
-        swings, decays = vibration.fastest_rates((elastic, heights, *given[2:]))
+        swings, decays = rates.fastest_rates((elastic, heights, *given[2:]))
         found = [(swings, "a light mass"), (decays, "a light mass or a dashpot")]
         lasts = float(given[8][-1] - (0.0 if self.speed > 0.0 else given[8][0]))
         for i, term in zip(*np.nonzero(terms[:, ::2]), strict=True):
@@ -335,15 +336,15 @@ class Plan(NamedTuple):
             raise SimulationError(_OUTCOMES[scenes.NOT_FINITE])
         return stress, strain, branches
 
-    def _aggregate(self, given: scenes.SceneTuple, rtol: float, curves: Array) -> Motion:
+    def _aggregate(self, given: scenes.SceneTuple, rtol: float, out: Array) -> Motion:
         """Springs under one stress count as one: one step to a switch."""
         count = len(given[0])
         log, tolerance = np.empty((4 * count + 64, 5)), AS_ONE * rtol / count
         cache.announce(many.integrate_aggregate, "the solver of many springs")
         ending = many.integrate_aggregate(
-            given, tolerance, self.max_steps, curves, log, np.zeros(2, np.int64)
+            given, tolerance, self.max_steps, out[0], log, np.zeros(2, np.int64)
         )
-        return _motion(AGGREGATE, ending, curves, NO_SLOPES, log)
+        return _motion(AGGREGATE, ending, out, log)
 
     def _start(self, rows: Array, heights: Array, directions: Directions) -> Array:
         """Strains (1 + p, springs) in equilibrium with the first sample, and their derivatives.
@@ -375,13 +376,13 @@ class Plan(NamedTuple):
 
     def fastest_rates(self, rows: Array, heights: Array) -> tuple[float, float]:
         """Vibration and relaxation (radians) that explicit steps would have to go through."""
-        return vibration.fastest_rates(self.given(rows, heights))
+        return rates.fastest_rates(self.given(rows, heights))
 
     def _is_stiff(self, given: scenes.SceneTuple) -> bool:
         """Whether explicit steps would have to follow rates that have long died out."""
         if self.implicit is not None:
             return self.implicit
-        vibrates, relaxes = vibration.fastest_rates(given)
+        vibrates, relaxes = rates.fastest_rates(given)
         return bool(vibrates > MOST_VIBRATION or relaxes > MOST_RELAXATION)
 
 
@@ -402,8 +403,7 @@ def _on_one_plateau(rows: Array, branches: NDArray[np.int64], directions: Direct
 def _motion(
     method: str,
     ending: Sequence[Any],
-    curves: Array,
-    slopes: Array,
+    out: Array,
     log: Array,
     lost: float = 0.0,
     one_sided: Array = _NOTHING[:0],
@@ -412,9 +412,9 @@ def _motion(
     outcome, time, steps, switches = ending
     if outcome != scenes.DONE:
         raise SimulationError(_OUTCOMES[outcome].format(steps=steps, time=time))
-    slope = None if slopes is NO_SLOPES else Slopes(slopes[:, 1:], slopes[:, 0], one_sided)
+    slopes = Slopes(out[1:, 1:], out[1:, 0], one_sided) if len(out) > 1 else None
     seen = log if log is NO_SWITCHES else log[:switches]
-    return Motion(curves[1:], curves[0], time, seen, steps, method, slope, lost)
+    return Motion(out[0, 1:], out[0, 0], time, seen, steps, method, slopes, lost)
 
 
 def _new_history(count: int, n: int) -> tuple[Array, NDArray[np.int64]]:

@@ -12,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,8 +21,8 @@ from foamfit.solve import cache
 from foamfit.solve.cache import PACKAGE
 
 
-def _run(drive: str, count: int = 1, eta: float = 0.0) -> None:
-    """Simulate a few samples of a small chain, and a derivative, by explicit steps."""
+def _scene(drive: str, count: int = 1, eta: float = 0.0) -> Callable[[], object]:
+    """Prepare a few samples of a small chain, and a derivative, by explicit steps."""
     from foamfit.solve.plan import Plan, plan
     from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
     from foamfit.springs.laws import BistableSpring
@@ -35,8 +36,8 @@ def _run(drive: str, count: int = 1, eta: float = 0.0) -> None:
     }
     scene = plan(chain, drives[drive], np.linspace(0.0, 1e-3, 4))
     assert isinstance(scene, Plan)
-    directions = np.zeros((1, 2), np.int64)
-    scene._replace(implicit=False).run(*chain.arrays[:2], 1e-2, directions=directions)
+    run, directions = scene._replace(implicit=False).run, np.zeros((1, 2), np.int64)
+    return partial(run, *chain.arrays[:2], 1e-2, directions=directions)
 
 
 def _calls() -> dict[Any, tuple[Any, ...]]:
@@ -62,20 +63,18 @@ def _calls() -> dict[Any, tuple[Any, ...]]:
 
         return call
 
+    small = _scene("impact"), _scene("impact", eta=50.0), _scene("displacement", 2, eta=50.0)
+    modules = (kernels, microscale_kernels, equilibrium, sensitivities, polynomial, scene, series)
     with ExitStack() as uncompiled, np.errstate(all="ignore"):
-        for module in (
-            kernels, microscale_kernels, equilibrium, sensitivities, polynomial, scene, series,
-            tangents, samples, taylor, plan,
-        ):  # fmt: skip
+        for module in (*modules, tangents, samples, taylor, plan):
             names = {name: loop for name, loop in vars(module).items() if hasattr(loop, "py_func")}
             called = {}
             for name, loop in names.items():
                 own = loop.targetoptions.get("inline") != "always"  # else a part of another
                 called[name] = plain(loop, own and module is taylor)
             uncompiled.enter_context(patch.dict(vars(module), called))
-        _run("impact")
-        _run("impact", eta=50.0)
-        _run("displacement", 2, eta=50.0)
+        for run in small:
+            run()
     return calls
 
 
@@ -107,18 +106,16 @@ def _memory(relaxed: bool) -> None:
 
 def _rest() -> None:
     """Call what else a fit calls; last what an impact on one spring does not need."""
-    from foamfit.solve import scene
-    from foamfit.solve.implicit import vibration
+    from foamfit.solve import rates, scene
     from foamfit.springs import kernels
     from foamfit.springs.model import Model
 
     Model(("linear",)).rows(np.ones(2))
     one, rows = np.ones(1), np.ones((1, kernels.N_COLUMNS))
     groups = np.ones(1, np.int64)
-    vibration.fastest_rates((rows, one, groups, one, 0.0, scene.FREE, one, 1.0, one))
-    _run("displacement")
-    _run("displacement", 2)
-    _run("stress")
+    rates.fastest_rates((rows, one, groups, one, 0.0, scene.FREE, one, 1.0, one))
+    for run in (_scene("displacement"), _scene("displacement", 2), _scene("stress")):
+        run()
 
 
 @contextmanager

@@ -41,6 +41,8 @@ _UNRESOLVED = (
 # inside, or dashpots below a mass, a motion is run again to check it; so it is where a strain comes
 # so close to the end of its branch.
 FEW_STEPS, FEW_SWITCHES, CLOSE = 1000, 32, 1e-3
+# Vibrations that took more implicit steps than this are followed by explicit ones, if at all.
+MOST_FOLLOWED = 10_000
 ROUNDING = 1e-12  # of a sum of elongations
 LOST = 0.03  # so large a difference is not mended by still shorter steps
 
@@ -113,7 +115,11 @@ def _verified(
     if scene.speed > 0.0 and not many and not _hard(scene, rows, heights):
         return motion
     for factor in (1e-2, 1e-4):  # shorter implicit steps may follow what longer ones have lost
-        if motion.unresolved > 0.7 * rtol and rtol * factor >= 1e-14:
+        if (
+            motion.steps < MOST_FOLLOWED
+            and motion.unresolved > 0.7 * rtol
+            and rtol * factor >= 1e-14
+        ):
             with suppress(SimulationError):
                 finer = scene._replace(implicit=True).run(
                     rows, heights, rtol * factor, directions=directions

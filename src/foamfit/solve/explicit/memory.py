@@ -74,12 +74,8 @@ EQ, RELAXED, BELOW_A, BELOW_C, BETWEEN, SNAPPED, PACE, SCORE, DENSITY, BEND, N_M
 # Rows of `Memory.partials`: the derivatives of the strain at fixed stress by the seven parameters
 # of the law, by p, and by the stress; then what these are made of.
 BY_RANK, BY_STRESS, SQUARE_A, SQUARE_C, WIDTH, STEEP, N_PARTIALS = range(7, 14)
-# Columns of `Memory.tangents` that each spring has: the derivatives of its s and its strain; of Σ,
-# but for what its strain adds, and but for what both s and strain add. Then follow those of the z
-# of the terms. Behind those of all springs each group has three: displacement and velocity of its
-# node, and its stress.
-D_EQ, D_EPS, KNOWN, APART, N_TANGENTS = range(5)
-D_W, D_V, D_GROUP, N_MOTION = range(4)
+# Rows of `Memory.tangents`: the derivatives of s, and those of the z of the terms.
+D_EQ, N_TANGENTS = range(2)
 # Columns of `Memory.now`: place and scale of the normal distribution that is followed, p and 1 - p
 # where the step starts, 1 + Σ g and its inverse; dε/ds there, its inverse, and dε/dΣ; what of a
 # derivative of Σ is not of s. Then what the orders of a step share: 1/(k0 + s) (on a curved branch
@@ -110,8 +106,8 @@ class Memory(NamedTuple):
     now (springs, N_NOW) the numbers above, series (springs, order + 2, N_MEMORY + terms) also those
     of the relaxation. `partials` (N_PARTIALS, springs, order + 2) are filled where
     derivatives are wanted; of these, in p `directions` (p, 2), `ranks` (p, springs) are those of
-    what is held. `tangents` (order + 2, columns, p or up to three more) are their series, all
-    directions of a quantity side by side. `one_sided` (p,) marks derivatives that do not exist.
+    what is held, and `tangents` (p, springs, N_TANGENTS + terms, order + 2) the series of what
+    changes. `one_sided` (p,) marks derivatives that do not exist.
     `scratch` is (2, CARRIED).
     """
 
@@ -131,7 +127,6 @@ class Memory(NamedTuple):
 def make_memory(rows: Array, order: int, directions: Branches, one_sided: Array) -> Memory:
     """Make the memory of springs at rest."""
     count, terms, size = rows.shape[0], (rows.shape[1] - N_COLUMNS) // 2, directions.shape[0]
-    columns, wide = count * (N_TANGENTS + terms + N_MOTION), (size + 3) // 4 * 4
     memory = Memory(
         rows,
         np.zeros((count, STATE)),
@@ -140,7 +135,7 @@ def make_memory(rows: Array, order: int, directions: Branches, one_sided: Array)
         np.zeros((N_PARTIALS, count, order + 2)),
         directions,
         np.zeros((size, count)),
-        np.zeros((order + 2, columns, wide)),
+        np.zeros((size, count, N_TANGENTS + terms, order + 2)),
         one_sided,
         np.empty((2, CARRIED)),
     )
@@ -250,12 +245,6 @@ def start_relaxed(memory: Memory, i: int, s: float) -> None:
     memory.series[i, 0, RELAXED] = total
 
 
-@inlined
-def column_of(memory: Memory, i: int) -> int:
-    """First column of a spring in `Memory.tangents`; past the last spring, that of the motion."""
-    return i * (N_TANGENTS + memory.series.shape[2] - N_MEMORY)
-
-
 @inner
 def start_relaxed_tangent(memory: Memory, p: int, i: int, change: float) -> None:
     """Derivative in direction p of what `start_relaxed` writes, from that of the stress."""
@@ -264,7 +253,7 @@ def start_relaxed_tangent(memory: Memory, p: int, i: int, change: float) -> None
         dz = -memory.rows[i, N_COLUMNS + 2 * k] * change
         if own == OWN_RELAXATION + 2 * k:
             dz -= memory.series[i, 0, EQ]
-        memory.tangents[0, column_of(memory, i) + N_TANGENTS + k, p] = dz
+        memory.tangents[p, i, N_TANGENTS + k, 0] = dz
 
 
 # ---------------------------------------------------------------- the motion
@@ -487,7 +476,7 @@ def tangent_of_mixture(memory: Memory, k: int, i: int, moving: bool, slope: floa
 
     `slope` is dΣ/dε.
     """
-    d_s = memory.tangents[:, column_of(memory, i) + D_EQ, k]
+    d_s = memory.tangents[k, i, D_EQ]
     soft, own = memory.partials[BY_STRESS, i], memory.directions[k, 1]
     even = odd = 0.0  # two sums at once
     if memory.directions[k, 0] == i and own < OWN_ETA:
@@ -505,9 +494,9 @@ def tangent_of_mixture(memory: Memory, k: int, i: int, moving: bool, slope: floa
 @inlined
 def relaxed_tangent(memory: Memory, k: int, i: int, n: int) -> float:
     """Order n of the derivative of Σ z_k, and of g s at fixed s, in direction k."""
-    total, first = 0.0, column_of(memory, i) + N_TANGENTS
+    total = 0.0
     for term in range(memory.series.shape[2] - N_MEMORY):
-        total += memory.tangents[n, first + term, k]
+        total += memory.tangents[k, i, N_TANGENTS + term, n]
         own = OWN_RELAXATION + 2 * term
         if memory.directions[k, 0] == i and memory.directions[k, 1] == own:
             total += memory.series[i, n, EQ]
@@ -518,11 +507,10 @@ def relaxed_tangent(memory: Memory, k: int, i: int, n: int) -> float:
 def keep_tangent(memory: Memory, k: int, i: int, n: int, d_sig: float) -> None:
     """Write order n of the derivative of the equilibrium stress, and the next of what relaxes."""
     d_s = (d_sig - memory.now[i, BASE]) * memory.now[i, PER_GAIN]
-    first = column_of(memory, i)
-    memory.tangents[n, first + D_EQ, k] = d_s
+    memory.tangents[k, i, D_EQ, n] = d_s
     for term in range(memory.series.shape[2] - N_MEMORY):
         g, tau = memory.rows[i, N_COLUMNS + 2 * term], memory.rows[i, N_COLUMNS + 2 * term + 1]
-        dz = memory.tangents[:, first + N_TANGENTS + term, k]
+        dz = memory.tangents[k, i, N_TANGENTS + term]
         flow = dz[n] + g * d_s
         own = OWN_RELAXATION + 2 * term
         if memory.directions[k, 0] == i and memory.directions[k, 1] == own:
@@ -536,9 +524,8 @@ def keep_tangent(memory: Memory, k: int, i: int, n: int, d_sig: float) -> None:
 def advance_memory_tangents(memory: Memory, k: int, order: int, span: float) -> None:
     """Carry the derivatives in direction k of what relaxes over a step."""
     for i in range(memory.now.shape[0]):
-        first = column_of(memory, i) + N_TANGENTS
         for term in range(memory.series.shape[2] - N_MEMORY):
-            dz = memory.tangents[:, first + term, k]
+            dz = memory.tangents[k, i, N_TANGENTS + term]
             dz[0] = value_at(dz, order, span)
 
 
@@ -571,81 +558,3 @@ def mark_one_sided(
             for p in range(series.shape[0]):
                 if not stands(series[p, i], order, span) and series[p, i, 1] != 0.0:
                     memory.one_sided[p] = 1.0
-
-
-@inner
-def start_tangents(memory: Memory, order: int) -> None:
-    """Set to zero the series of all derivatives, but for what has relaxed so far."""
-    x = memory.tangents
-    for n in range(1, order + 2):
-        for column in range(x.shape[1]):
-            for p in range(x.shape[2]):
-                x[n, column, p] = 0.0
-    for i in range(memory.now.shape[0]):
-        for column in range(column_of(memory, i), column_of(memory, i) + N_TANGENTS):
-            for p in range(x.shape[2]):
-                x[0, column, p] = 0.0
-
-
-@inner
-def drive_tangents(memory: Memory, i: int, mixture: bool, slope: float, order: int) -> None:
-    """Add to the series what directions do to a spring's stress at a fixed strain, and fixed s.
-
-    `slope` is dΣ/dε. The law of a spring that is no `mixture` is not done here.
-    """
-    x, m, row, first = memory.tangents, memory.series[i], memory.rows[i], column_of(memory, i)
-    for p in range(memory.directions.shape[0]):
-        rank, own = memory.ranks[p, i], memory.directions[p, 1]
-        if mixture and rank != 0.0 and memory.state[i, BRANCH] == HELD:
-            for n in range(order + 1):
-                x[n, first + KNOWN, p] -= slope * memory.partials[BY_RANK, i, n] * rank
-        if memory.directions[p, 0] != i:
-            continue
-        if own < OWN_ETA and mixture:
-            for n in range(order + 1):
-                x[n, first + KNOWN, p] -= slope * memory.partials[own, i, n]
-        elif own >= OWN_RELAXATION:
-            term, of_tau = (own - OWN_RELAXATION) // 2, (own - OWN_RELAXATION) % 2 == 1
-            per_tau = 1.0 / row[N_COLUMNS + 2 * term + 1]
-            for n in range(order + 1):
-                z = m[n + 1, N_MEMORY + term] if of_tau else m[n, EQ] / (n + 1)
-                x[n + 1, first + N_TANGENTS + term, p] = -z * per_tau
-                x[n, first + APART, p] = 0.0 if of_tau else m[n, EQ]
-
-
-@inlined
-def know_tangents(memory: Memory, i: int, n: int) -> None:
-    """Sum up order n of what is known of the derivatives of a spring's stress."""
-    x, first = memory.tangents[n], column_of(memory, i)
-    apart, known = x[first + APART], x[first + KNOWN]
-    for term in range(memory.series.shape[2] - N_MEMORY):
-        dz = x[first + N_TANGENTS + term]
-        for p in range(dz.size):
-            apart[p] += dz[p]
-    for p in range(known.size):
-        known[p] += apart[p]
-
-
-@inlined
-def pass_tangents(
-    memory: Memory, i: int, d_sig: Array, n: int, order: int, c: Array, scale: float, column: int
-) -> None:
-    """Write order n of the derivatives of a spring's s, and what follows from it in the next.
-
-    Σ_j c_j x_{n-j} of a column, times a scale, is a part of what is known of later orders.
-    """
-    x, first = memory.tangents, column_of(memory, i)
-    d_s, apart, gain = x[n, first + D_EQ], x[n, first + APART], memory.now[i, PER_GAIN]
-    for p in range(d_s.size):
-        d_s[p] = (d_sig[p] - apart[p]) * gain
-    for term in range(memory.series.shape[2] - N_MEMORY):
-        g, tau = memory.rows[i, N_COLUMNS + 2 * term], memory.rows[i, N_COLUMNS + 2 * term + 1]
-        dz, more = x[n, first + N_TANGENTS + term], x[n + 1, first + N_TANGENTS + term]
-        share = 1.0 / (tau * (n + 1))
-        for p in range(dz.size):
-            more[p] -= (dz[p] + g * d_s[p]) * share
-    source = x[n, first + column]
-    for j in range(1, order - n + 1):
-        c_j, known = scale * c[j], x[n + j, first + KNOWN]
-        for p in range(known.size):
-            known[p] += c_j * source[p]

@@ -201,8 +201,12 @@ def _law_stress(law: Array, i: int, eps: Array, sig: Array, n: int) -> float:
 
 
 @inlined
-def _remembered_stress(law: Array, i: int, eps: Array, n: int, memory: Memory) -> float:
-    """Order n of the stress of a spring in a chain with memory; see `_stress_term`."""
+def _stress_term(
+    law: Array, i: int, eps: Array, sig: Array, n: int, memory: Memory | None
+) -> float:
+    """Order n of a spring's stress from its strain up to order n."""
+    if memory is None:
+        return _law_stress(law, i, eps, sig, n)
     moving, now, m = law[i, CURVED] > HELD, memory.now[i], memory.series[i]
     if law[i, CURVED] < HELD:
         s_n = _law_stress(law, i, eps, memory.series[:, :, EQ], n)
@@ -222,38 +226,13 @@ def _remembered_stress(law: Array, i: int, eps: Array, n: int, memory: Memory) -
 
 
 @inlined
-def _stress_term(
-    law: Array, i: int, eps: Array, sig: Array, n: int, memory: Memory | None
-) -> float:
-    """Order n of a spring's stress from its strain up to order n."""
-    if memory is None:
-        return _law_stress(law, i, eps, sig, n)
-    return _remembered_stress(law, i, eps, n, memory)
-
-
-@inlined
-def _law_strain(law: Array, i: int, eps: Array, sig: Array, n: int) -> tuple[float, float]:
-    """Order n >= 1 of a strain on a branch as (known part, compliance), as `_strain_term` does."""
-    k = law[i, SLOPE]
+def _softness(law: Array, i: int, eps: Array, sig: Array, memory: Memory | None) -> float:
+    """Compliance dε/dΣ of a spring where the step starts; infinite on a flat branch."""
+    if memory is not None:
+        return memory.now[i, SOFT]
     if law[i, CURVED] == 0.0:
-        return 0.0, (1.0 / k if k > 0.0 else math.inf)
-    stiff = k + sig[i, 0]
-    known = product(eps, sig, i, n)
-    return -known / stiff, (1.0 - (eps[i, 0] - law[i, ORIGIN])) / stiff
-
-
-@inlined
-def _remembered_strain(
-    law: Array, i: int, eps: Array, n: int, memory: Memory
-) -> tuple[float, float]:
-    """Order n >= 1 of the strain of a spring in a chain with memory; see `_strain_term`."""
-    now, m, known = memory.now[i], memory.series[i], 0.0
-    if law[i, CURVED] >= HELD:
-        known = strain_of_mixture(now, m, law[i, CURVED] > HELD, n)
-    elif law[i, CURVED] != 0.0:
-        known = -product(eps, memory.series[:, :, EQ], i, n) * now[PER_A]
-    soft = now[SOFT]
-    return (known - soft * m[n, RELAXED] if soft < math.inf else known), soft
+        return 1.0 / law[i, SLOPE] if law[i, SLOPE] > 0.0 else math.inf
+    return (1.0 - (eps[i, 0] - law[i, ORIGIN])) / (law[i, SLOPE] + sig[i, 0])
 
 
 @inlined
@@ -264,9 +243,17 @@ def _strain_term(
 
     The compliance of a flat branch is infinite.
     """
+    soft = _softness(law, i, eps, sig, memory)
     if memory is None:
-        return _law_strain(law, i, eps, sig, n)
-    return _remembered_strain(law, i, eps, n, memory)
+        if law[i, CURVED] == 0.0:
+            return 0.0, soft
+        return -product(eps, sig, i, n) / (law[i, SLOPE] + sig[i, 0]), soft
+    now, m, known = memory.now[i], memory.series[i], 0.0
+    if law[i, CURVED] >= HELD:
+        known = strain_of_mixture(now, m, law[i, CURVED] > HELD, n)
+    elif law[i, CURVED] != 0.0:
+        known = -product(eps, memory.series[:, :, EQ], i, n) * now[PER_A]
+    return (known - soft * m[n, RELAXED] if soft < math.inf else known), soft
 
 
 @inlined
@@ -281,13 +268,7 @@ def _settle_stress(law: Array, i: int, n: int, s_n: float, memory: Memory) -> No
 
 @once
 def _share_elongation(
-    law: Array,
-    i0: int,
-    i1: int,
-    eps: Array,
-    sig: Array,
-    u_n: float,
-    n: int,
+    law: Array, i0: int, i1: int, eps: Array, sig: Array, u_n: float, n: int, memory: Memory | None
 ) -> float:
     """Order n >= 1 of the common stress of a group that has springs without dashpot.
 
@@ -298,54 +279,25 @@ def _share_elongation(
         if law[i, DASHPOT] > 0.0:
             rest -= law[i, HEIGHT] * eps[i, n]
             continue
-        known, soft = _law_strain(law, i, eps, sig, n)
+        known, soft = _strain_term(law, i, eps, sig, n, memory)
         eps[i, n] = known  # so far
         rest -= law[i, HEIGHT] * known
         if soft < math.inf:
             compliance += law[i, HEIGHT] * soft
         elif flat < 0:
             flat = i
-    s_n = 0.0 if flat >= 0 else rest / compliance
-    for i in range(i0, i1):
-        if law[i, DASHPOT] == 0.0:
-            sig[i, n] = s_n
-            if law[i, CURVED] != 0.0:
-                x = eps[i, 0] - law[i, ORIGIN]
-                eps[i, n] += (1.0 - x) / (law[i, SLOPE] + sig[i, 0]) * s_n
-            elif law[i, SLOPE] > 0.0:
-                eps[i, n] += s_n / law[i, SLOPE]
+    s_n = rest / compliance
     if flat >= 0:
-        eps[flat, n] = rest / law[flat, HEIGHT]
-    return s_n
-
-
-@inlined
-def _share_remembered(
-    law: Array, i0: int, i1: int, eps: Array, sig: Array, u_n: float, n: int, memory: Memory
-) -> float:
-    """Share an elongation among springs with memory as `_share_elongation` does."""
-    compliance, rest, flat = 0.0, u_n, -1
-    for i in range(i0, i1):
-        if law[i, DASHPOT] > 0.0:
-            rest -= law[i, HEIGHT] * eps[i, n]
-            continue
-        known, soft = _remembered_strain(law, i, eps, n, memory)
-        eps[i, n] = known  # so far
-        rest -= law[i, HEIGHT] * known
-        if soft < math.inf:
-            compliance += law[i, HEIGHT] * soft
-        elif flat < 0:
-            flat = i
-    s_n = rest * (1.0 / compliance)
-    if flat >= 0:
-        s_n = memory.series[flat, n, RELAXED]
+        s_n = 0.0 if memory is None else memory.series[flat, n, RELAXED]
         rest -= s_n * compliance
     for i in range(i0, i1):
         if law[i, DASHPOT] == 0.0:
             sig[i, n] = s_n
-            if memory.now[i, SOFT] < math.inf:
-                eps[i, n] += memory.now[i, SOFT] * s_n
-            _settle_stress(law, i, n, s_n, memory)
+            soft = _softness(law, i, eps, sig, memory)
+            if soft < math.inf:
+                eps[i, n] += soft * s_n
+            if memory is not None:
+                _settle_stress(law, i, n, s_n, memory)
     if flat >= 0:
         eps[flat, n] = rest / law[flat, HEIGHT]
     return s_n
@@ -410,9 +362,7 @@ def _group_term(
         return _damped_term(law, i0, i1, sig, rate_n, push_n, drag, n)
     if n == 0:
         return sig[first, 0]
-    if memory is None:
-        return _share_elongation(law, i0, i1, eps, sig, u_n, n)
-    return _share_remembered(law, i0, i1, eps, sig, u_n, n, memory)
+    return _share_elongation(law, i0, i1, eps, sig, u_n, n, memory)
 
 
 @once
@@ -488,13 +438,13 @@ def expand_remembered(links: Links, s: Array, push: Array, order: int, memory: M
             i0, i1 = springs_of(links.ends, g)
             u_n = w[g, n] - (w[g - 1, n] if g > 0 else 0.0)
             if n > 0 and i1 - i0 > 1:
-                group[g, n] = _share_remembered(law, i0, i1, eps, sig, u_n, n, memory)
+                group[g, n] = _share_elongation(law, i0, i1, eps, sig, u_n, n, memory)
                 continue
             if i1 - i0 == 1:
                 eps[i0, n] = u_n * (1.0 / law[i0, HEIGHT])
             common = i0
             for i in range(i0, i1):
-                sig[i, n] = _remembered_stress(law, i, eps, n, memory)
+                sig[i, n] = _stress_term(law, i, eps, sig, n, memory)
                 if law[i, CURVED] == 0.0 and law[i, SLOPE] == 0.0:
                     common = i  # see `_group_term`
             group[g, n] = sig[common, n]
@@ -638,6 +588,51 @@ def _share_under(
     return total, size, compliance
 
 
+@once
+def _common_stress(
+    law: Array,
+    i0: int,
+    i1: int,
+    eps: Array,
+    softs: Array,
+    stress: float,
+    rest: float,
+    stressed: bool,
+    memory: Memory,
+) -> tuple[bool, float, float]:
+    """Search the stress at which the undamped springs of a group share an elongation `rest`.
+
+    Returns whether it was found, their elongation, and what is left to add to the stress. Newton's
+    method within the bracket that it meets; a prescribed stress is taken as it is.
+    """
+    before, low, high = math.inf, -math.inf, math.inf
+    total, more = 0.0, 0.0
+    for trial in range(120):
+        total, size, compliance = _share_under(law, i0, i1, eps, softs, stress, memory)
+        if stressed:
+            return True, total, 0.0
+        miss = abs(total - rest)
+        more = (rest - total) / compliance
+        if miss <= 4e-16 * (size + abs(rest)) or abs(more) <= 4e-15 * abs(stress):
+            return True, total, more
+        if 0.5 * before <= miss <= 1e-14 * size:  # no better than rounding allows
+            return True, total, more
+        if total > rest:
+            high = stress
+        else:  # also where a law has ended: then nothing can be said but that this is too low
+            low = stress
+        before, more = miss, more if math.isfinite(total + more) else 0.0
+        stress += more
+        if not low < stress < high or trial % 8 == 7:
+            if math.isfinite(high - low):
+                stress = 0.5 * (low + high)
+            else:
+                step = max(abs(more), 1e-6 * abs(low if low > -math.inf else high), 1.0)
+                step *= 2.0 ** (trial + 1)
+                stress = low + step if low > -math.inf else high - step
+    return False, total, more
+
+
 @piece
 def settle_together(
     links: Links, s: Array, order: int, span: float, push: Array, memory: Memory
@@ -667,31 +662,7 @@ def settle_together(
         stress = push[0] + push[1] * span if stressed else value_at(s[GROUP, g], order, span)
         for i in range(i0, i1):
             s[TILT, i, 0] = eps[i, 0]
-        found, before, more, low, high = False, math.inf, 0.0, -math.inf, math.inf
-        for trial in range(120):
-            total, size, compliance = _share_under(law, i0, i1, eps, softs, stress, memory)
-            if stressed:
-                found = True
-                break
-            miss = abs(total - rest)
-            more = (rest - total) / compliance
-            found = miss <= 4e-16 * (size + abs(rest)) or abs(more) <= 4e-15 * abs(stress)
-            found = found or 0.5 * before <= miss <= 1e-14 * size  # no better than rounding allows
-            if found:
-                break
-            if total > rest:
-                high = stress
-            else:  # also where a law has ended: then nothing can be said but that this is too low
-                low = stress
-            before, more = miss, more if math.isfinite(total + more) else 0.0
-            stress += more
-            if not low < stress < high or trial % 8 == 7:
-                if not math.isfinite(high - low):
-                    step = max(abs(more), 1e-6 * abs(low if low > -math.inf else high), 1.0)
-                    step *= 2.0 ** (trial + 1)
-                    stress = low + step if low > -math.inf else high - step
-                else:
-                    stress = 0.5 * (low + high)
+        found, total, more = _common_stress(law, i0, i1, eps, softs, stress, rest, stressed, memory)
         lost = not (found and math.isfinite(total))
         for i in range(i0, i1):
             if lost:

@@ -12,29 +12,15 @@ The law is continuous at its switches, so the derivatives pass from branch to br
 from __future__ import annotations
 
 from foamfit.solve.explicit.memory import (
-    APART,
     BASE,
-    BY_STRESS,
-    D_EPS,
-    D_EQ,
-    D_GROUP,
-    D_V,
-    D_W,
     EQ,
     GAIN,
-    KNOWN,
-    N_MOTION,
     Memory,
-    column_of,
-    drive_tangents,
     fill_partials,
     keep_tangent,
-    know_tangents,
-    pass_tangents,
     relaxed_tangent,
     start_relaxed,
     start_relaxed_tangent,
-    start_tangents,
     tangent_of_mixture,
 )
 from foamfit.solve.explicit.series import (
@@ -53,7 +39,6 @@ from foamfit.solve.explicit.series import (
     V,
     W,
     _stress_term,
-    is_bare,
     product,
     springs_of,
 )
@@ -71,7 +56,6 @@ from foamfit.springs.kernels import (
     once,
     piece,
 )
-from foamfit.springs.parameters import DRAG, OWN_ETA, OWN_HEIGHT
 
 
 @inner
@@ -249,156 +233,6 @@ def _expand_tangent(
                 w[g, n + 1] = v[g, n] * share
 
 
-# ---------------------------------------------------------------- all directions at once
-
-
-@inner
-def _drive_law(links: Links, s: Array, d: SeriesTangents, order: int, memory: Memory) -> None:
-    """Add what directions do to laws that are no mixture, to dashpots, heights, and onsite damper.
-
-    As do the functions above one by one; `Memory.tangents` then also starts with the motion.
-    """
-    law, x, last = links.law, memory.tangents, links.ends.size - 1
-    eps, tilt = s[EPS], s[TILT]
-    motion = column_of(memory, law.shape[0])
-    for p in range(d.drag.size):
-        for g in range(last + 1):
-            x[0, motion + N_MOTION * g + D_W, p] = d.series[p, W, g, 0]
-            x[0, motion + N_MOTION * g + D_V, p] = d.series[p, V, g, 0]
-        i, own = memory.directions[p, 0], memory.directions[p, 1]
-        if own == DRAG:
-            for n in range(order + 1):
-                x[n + 1, motion + N_MOTION * last + D_V, p] = -s[V, last, n]
-            continue
-        first = column_of(memory, i)
-        if own == OWN_HEIGHT:
-            for n in range(order + 1):
-                x[n, first + D_EPS, p] = -eps[i, n]
-        elif own == OWN_ETA:  # a dashpot of zero: what it would take
-            for n in range(min(order + 1, tilt.shape[1] - 2)):
-                x[n, first + APART, p] = (n + 1) * eps[i, n + 1]
-        elif own < OWN_ETA and law[i, CURVED] < HELD:
-            m, gain = d.law[p, i], memory.now[i, GAIN]
-            curved, by_slope = law[i, CURVED] != 0.0, gain * m[SLOPE]
-            for n in range(order + 1):
-                factor = eps[i, n] - (law[i, ORIGIN] if n == 0 else 0.0)
-                if curved:
-                    factor = memory.series[i, n, EQ] / law[i, SLOPE]
-                x[n, first + KNOWN, p] = factor * by_slope - tilt[i, n] * m[ORIGIN]
-            if not curved:
-                x[0, first + KNOWN, p] += gain * m[OFFSET]
-
-
-@inlined
-def _share_tangents(
-    law: Array, tilt: Array, i0: int, i1: int, x: Array, w: Array, memory: Memory
-) -> None:
-    """Share the derivatives `w` of a group's elongation, as `_share_tangent` does; w is the stress.
-
-    x (columns, p) is their order of `Memory.tangents`.
-    """
-    if i1 - i0 == 1:
-        first, soft, stiff = column_of(memory, i0), 1.0 / law[i0, HEIGHT], tilt[i0, 0]
-        eps, known = x[first + D_EPS], x[first + KNOWN]
-        for p in range(w.size):
-            eps[p] = (w[p] + eps[p]) * soft
-            w[p] = known[p] + stiff * eps[p]
-        return
-    compliance, flat = 0.0, -1
-    for i in range(i0, i1):
-        first, soft = column_of(memory, i), 0.0
-        if tilt[i, 0] > 0.0:
-            soft = law[i, HEIGHT] / tilt[i, 0]
-        elif flat < 0:
-            flat = i
-        compliance += soft
-        eps, known = x[first + D_EPS], x[first + KNOWN]
-        for p in range(w.size):
-            w[p] += eps[p] + soft * known[p]
-    stiff = 1.0 / compliance
-    if flat >= 0:  # the flat branch takes up all that the others leave
-        first = column_of(memory, flat)
-        eps, known, soft = x[first + D_EPS], x[first + KNOWN], 1.0 / law[flat, HEIGHT]
-        for p in range(w.size):
-            eps[p] = (w[p] - known[p] * compliance) * soft
-            w[p] = known[p]
-    else:
-        for p in range(w.size):
-            w[p] *= stiff
-    for i in range(i0, i1):
-        if i != flat:
-            first, soft = column_of(memory, i), 1.0 / tilt[i, 0] if tilt[i, 0] > 0.0 else 0.0
-            eps, known = x[first + D_EPS], x[first + KNOWN]
-            for p in range(w.size):
-                eps[p] = (w[p] - known[p]) * soft
-
-
-@inner
-def _expand_together(links: Links, s: Array, d: SeriesTangents, order: int, memory: Memory) -> None:
-    """Do what `_expand_tangent` does in all directions of a chain with memory that `is_bare`."""
-    law, tilt, last = links.law, s[TILT], links.ends.size - 1
-    motion = column_of(memory, law.shape[0])
-    start_tangents(memory, order)
-    for i in range(law.shape[0]):
-        drive_tangents(memory, i, law[i, CURVED] >= HELD, tilt[i, 0], order)
-    _drive_law(links, s, d, order, memory)
-    for n in range(order + 1):
-        x, later, share = memory.tangents[n], memory.tangents[n + 1], 1.0 / (n + 1)
-        for g in range(last + 1):
-            i0, i1 = springs_of(links.ends, g)
-            for i in range(i0, i1):
-                know_tangents(memory, i, n)
-            at = motion + N_MOTION * g
-            w, group = x[at + D_W], x[at + D_GROUP]
-            for p in range(w.size):
-                group[p] = w[p]
-            if g > 0:
-                under = x[at - N_MOTION + D_W]
-                for p in range(w.size):
-                    group[p] -= under[p]
-            _share_tangents(law, tilt, i0, i1, x, group, memory)
-            for i in range(i0, i1):
-                c, scale, column = memory.partials[BY_STRESS, i], -tilt[i, 0], D_EQ
-                if law[i, CURVED] < HELD:
-                    c, scale, column = tilt[i], 1.0, D_EPS
-                until = n if law[i, CURVED] == 0.0 else order
-                pass_tangents(memory, i, group, n, until, c, scale, column)
-        for g in range(last + 1):
-            at = motion + N_MOTION * g
-            v, group, faster, further = (
-                x[at + D_V],
-                x[at + D_GROUP],
-                later[at + D_V],
-                later[at + D_W],
-            )
-            rate, drag = share / links.mass[g], links.drag if g == last else 0.0
-            for p in range(v.size):
-                faster[p] = (faster[p] - group[p] - drag * v[p]) * rate
-                further[p] = v[p] * share
-            if g < last:
-                above = x[at + N_MOTION + D_GROUP]
-                for p in range(v.size):
-                    faster[p] += above[p] * rate
-    for p in range(d.drag.size):
-        if d.live[p] > 0.0:
-            _take_down(d.series[p], memory, p, links.ends.size, order)
-
-
-@inner
-def _take_down(d: Array, memory: Memory, p: int, groups: int, order: int) -> None:
-    """Copy the series of one direction to where those of chains without memory are."""
-    x, motion = memory.tangents, column_of(memory, memory.now.shape[0])
-    for g in range(groups):
-        at = motion + N_MOTION * g
-        w, v, group = x[:, at + D_W, p], x[:, at + D_V, p], x[:, at + D_GROUP, p]
-        for n in range(order + 1):
-            d[W, g, n], d[V, g, n], d[GROUP, g, n] = w[n], v[n], group[n]
-    for i in range(memory.now.shape[0]):
-        eps = x[:, column_of(memory, i) + D_EPS, p]
-        for n in range(order + 1):
-            d[EPS, i, n] = eps[n]
-
-
 @piece
 def expand_tangents(
     links: Links, s: Array, d: SeriesTangents, order: int, memory: Memory | None
@@ -417,9 +251,6 @@ def expand_tangents(
                 _fill_tilt(links.law, i, memory.series[:, :, EQ], s[TILT], order)
                 for n in range(order + 1):
                     s[TILT, i, n] *= memory.now[i, GAIN]
-    if memory is not None and is_bare(links, memory):
-        _expand_together(links, s, d, order, memory)
-        return
     for p in range(d.drag.size):
         if d.live[p] > 0.0:
             _expand_tangent(links, s, d.law[p], d.drag[p], d.series[p], order, memory, p)

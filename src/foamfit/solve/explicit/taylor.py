@@ -9,6 +9,7 @@ changes inside a step. Derivatives by parameters are carried along where they ar
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,13 +23,7 @@ from foamfit.solve.explicit.memory import (
     make_memory,
     mark_one_sided,
 )
-from foamfit.solve.explicit.samples import (
-    delay,
-    depart,
-    mend_kink,
-    sample,
-    sample_tangents,
-)
+from foamfit.solve.explicit.samples import delay, depart, mend_kink, sample, sample_tangents
 from foamfit.solve.explicit.series import (
     DASHPOT,
     EPS,
@@ -55,10 +50,7 @@ from foamfit.solve.explicit.series import (
     settle_together,
     share_a_stress,
 )
-from foamfit.solve.explicit.tangents import (
-    expand_tangents,
-    start_relaxing,
-)
+from foamfit.solve.explicit.tangents import expand_tangents, start_relaxing
 from foamfit.solve.polynomial import (
     LEAST_TRUNCATION,
     first_crossing,
@@ -110,6 +102,26 @@ TURN = 2
 MOST_ORDERS = 24
 # Truncation of derivatives, relative to what they were so far, over that of the motion.
 OF_TANGENTS = 1e3
+
+
+class Run(NamedTuple):
+    """A chain on its way over the samples of a scene.
+
+    Loops that take it at every step are `inlined`: to pass it would take longer than they do.
+
+    `rows` (springs, columns) are the springs, `links` with their `branches` (springs,) the chain,
+    `s` and `d` its series and their derivatives in `directions` (p, 2), `out` the samples to fill,
+    `log` the switches to note.
+    """
+
+    rows: Array
+    branches: Branches
+    links: Links
+    s: Array
+    d: SeriesTangents
+    directions: Branches
+    out: Samples
+    log: Array
 
 
 @inlined
@@ -261,56 +273,63 @@ def _enough(
 
 
 @inner
+def _side(
+    run: Run,
+    order: int,
+    span: float,
+    spring: int,
+    side: int,
+    turned: int,
+    i: int,
+    memory: Memory | None,
+) -> int:
+    """On which side (0: on none) spring i leaves its branch where `spring` leaves the `turned`."""
+    low, high, eps = run.links.law[i, LOW], run.links.law[i, HIGH], run.s[EPS, i, 0]
+    near = 1.0
+    if run.rows[i, KIND] == MICROSCALE:  # its first micro-spring may snap at any strain above 0
+        near = min(abs(eps), 1.0)
+    if i == spring:
+        return side
+    if memory is not None:
+        both = side == TURN and run.branches[i] == turned
+        if both and share_a_stress(run.links.law, run.links.ends, i, spring, memory):
+            return TURN  # the stress turns for both
+    if eps >= high - CLOSE * near and slope_at(run.s[EPS, i], order, span) > 0.0:
+        return 1
+    if eps <= low + CLOSE * near and slope_at(run.s[EPS, i], order, span) < 0.0:
+        return -1
+    return 0
+
+
+@inner
 def switch(
-    rows: Array,
-    branches: Branches,
-    law: Array,
-    s: Array,
-    d: SeriesTangents,
-    directions: Branches,
+    run: Run,
     order: int,
     span: float,
     now: float,
     spring: int,
     side: int,
-    log: Array,
     switches: int,
-    ends: Branches,
     memory: Memory | None,
 ) -> int:
     """Change the branch of a spring, and of all that end theirs at the same time; counts them."""
+    rows, branches, law, eps = run.rows, run.branches, run.links.law, run.s[EPS]
     turned = branches[spring]
     for i in range(branches.size):
-        low, high, eps = law[i, LOW], law[i, HIGH], s[EPS, i, 0]
-        out, near = 0, 1.0
-        if rows[i, KIND] == MICROSCALE:  # its first micro-spring may snap at any strain above 0
-            near = min(abs(eps), 1.0)
-        if i == spring:
-            out = side
-        elif (
-            memory is not None
-            and side == TURN
-            and branches[i] == turned
-            and share_a_stress(law, ends, i, spring, memory)
-        ):
-            out = TURN  # the stress turns for both
-        elif eps >= high - CLOSE * near and slope_at(s[EPS, i], order, span) > 0.0:
-            out = 1
-        elif eps <= low + CLOSE * near and slope_at(s[EPS, i], order, span) < 0.0:
-            out = -1
+        out = _side(run, order, span, spring, side, turned, i, memory)
         if out == 0:
             continue
         left = branches[i]
         if out != TURN:
-            s[EPS, i, 0] = high if out > 0 else low
+            eps[i, 0] = law[i, HIGH] if out > 0 else law[i, LOW]
         branches[i] = above(left) if out > 0 else below(left)
         if memory is not None and rows[i, KIND] == MICROSCALE:
             up = left == BACK if out == TURN else out > 0
-            moved = d.series[:, EPS, :, 0]
-            branches[i] = leave(memory, i, s[EPS, i, 0], up, out == TURN, moved)
-        switches = log_switch(log, switches, now, i, left, branches[i], s[EPS, i, 0])
+            moved = run.d.series[:, EPS, :, 0]
+            branches[i] = leave(memory, i, eps[i, 0], up, out == TURN, moved)
+        switches = log_switch(run.log, switches, now, i, left, branches[i], eps[i, 0])
         enter(rows, i, branches[i], law, memory)
-        enter_tangents(rows, i, branches[i], directions, d)
+        enter_tangents(rows, i, branches[i], run.directions, run.d)
     return switches
 
 
@@ -359,18 +378,9 @@ def first_lift(s: Array, order: int, first: bool, pressed: bool, span: float) ->
 
 
 @inner
-def begin(
-    rows: Array,
-    heights: Array,
-    start: Array,
-    directions: Branches,
-    branches: Branches,
-    law: Array,
-    s: Array,
-    d: SeriesTangents,
-    memory: Memory | None,
-) -> None:
-    """Write the state at the first sample: branches, strains and their derivatives."""
+def begin(run: Run, heights: Array, start: Array, speed: float, memory: Memory | None) -> int:
+    """Write the state at the first sample; returns how many samples lie before an impact."""
+    rows, branches, law, s, d = run.rows, run.branches, run.links.law, run.s, run.d
     for i in range(branches.size):
         branches[i] = first_branch(rows[i])
         if start.shape[1] > 0:
@@ -384,9 +394,15 @@ def begin(
         if memory is not None and rows[i, KIND] == MICROSCALE:
             branches[i] = A if start.shape[1] == 0 else load(memory, i, start[0, i])
         enter(rows, i, branches[i], law, memory)
-        enter_tangents(rows, i, branches[i], directions, d)
+        enter_tangents(rows, i, branches[i], run.directions, d)
         if memory is not None and start.shape[1] > 0:
             start_relaxing(law, i, s, d, memory)
+    if speed == 0.0:
+        return 0
+    s[V, run.links.ends.size - 1, 0] = speed
+    for p in range(d.drag.size):
+        before_contact(run.out.slopes[p], run.out.t, 0.0)
+    return before_contact(run.out.curves, run.out.t, speed)
 
 
 @inner
@@ -410,6 +426,54 @@ def _reached(links: Links, s: Array, w_scale: float) -> tuple[float, float]:
     return w_scale, total
 
 
+@inlined
+def _first_end(
+    run: Run, order: int, tol: float, span: float, c: Array, memory: Memory | None
+) -> tuple[float, int, int]:
+    """First end of a branch within `span`, or turn of a spring that snaps; see `first_switch`."""
+    if memory is not None:
+        for i in range(run.branches.size):
+            if run.branches[i] > HELD:
+                span = longest(memory.series[i], memory.now[i], order, tol, span)
+    span, spring, side = first_switch(run.links.law, run.s, order, span)
+    if memory is not None:
+        span, turning = first_turn(run.branches, run.s[EPS], order, span, c)
+        if turning >= 0:
+            spring, side = turning, TURN
+    return span, spring, side
+
+
+@inlined
+def _expand_tangents(
+    run: Run, order: int, tol: float, span: float, sizes: Array, memory: Memory | None
+) -> float:
+    """Fill the derivatives of a step; returns the longest step within `span` that is good."""
+    expand_tangents(run.links, run.s, run.d, order, memory)
+    if memory is not None:
+        eps, moved = run.s[EPS], run.d.series[:, EPS]
+        mark_one_sided(memory, run.branches, eps, moved, order, span)
+    heights = run.links.law[:, HEIGHT]
+    return tangent_length(heights, run.d, order, OF_TANGENTS * tol, span, sizes, memory)
+
+
+@inlined
+def _carry(
+    run: Run, order: int, more: int, span: float, push: Array, shared: bool, memory: Memory | None
+) -> None:
+    """Carry the state over a step, the derivatives by `more` orders, and share elongations anew."""
+    groups = run.links.ends.size
+    advance(run.s, groups, order, span)
+    if memory is not None:
+        advance_memory(memory.state, memory.series, order, span)
+    if run.directions.shape[0] > 0:
+        advance_tangents(run.d, groups, more, span, memory)
+    if shared:
+        if memory is None:
+            settle(run.links, run.s)
+        else:
+            settle_together(run.links, run.s, order, span, push, memory)
+
+
 @once
 def _integrated(
     given: SceneTuple,
@@ -417,41 +481,32 @@ def _integrated(
     max_steps: int,
     directions: Branches,
     start: Array,
-    curves: Array,
-    slopes: Array,
+    out: Array,
     log: Array,
     memory: Memory | None,
 ) -> tuple[int, float, int, int]:
     """Integrate a chain of springs with or without memory; see `integrate`."""
     rows, heights, ends, mass, drag, top, values, speed, t = given
     tol = max(tol, LEAST_TRUNCATION)
-    count, groups, size = heights.size, ends.size, directions.shape[0]
+    count, size = heights.size, directions.shape[0]
     struck, tangent, order = speed > 0.0, size > 0, order_for(tol, MOST_ORDERS)
     links = Links(np.empty((count, N_LAW)), ends, mass, drag, top)
     clock = t if struck else np.empty(t.size)
     if not struck:
         _clock(t, clock)
-    law, out = links.law, Samples(clock, curves, slopes)
     s, d = make_series(count, order, directions)
-    branches = np.empty(count, np.int64)
-    scratch = np.empty((6, max(order + 1, max(size, curves.shape[0]))))
+    branches, samples = np.empty(count, np.int64), Samples(clock, out[0], out[1:])
+    run = Run(rows, branches, links, s, d, directions, samples, log)
+    scratch = np.zeros((6, max(order + 1, max(size, out.shape[1]))))
     late, c, push, motion = scratch[0], scratch[3], scratch[4], scratch[5]
     sizes = np.zeros((size, 2))
-    push[0] = push[1] = 0.0
-    for p in range(size):
-        late[p] = 0.0
-    begin(rows, heights, start, directions, branches, law, s, d, memory)
+    done = begin(run, heights, start, speed, memory)
     bare, apart = is_bare(links, memory), is_apart(links)
-    shared = groups < count or top == STRESS  # springs have one stress, or are given it
+    shared = ends.size < count or top == STRESS  # springs have one stress, or are given it
     fine = 0.0 if tangent else tol  # a derivative may be of what is negligible
-    w_scale, s_scale, b_scale, pressed, knot, stalled, done = 0.0, 0.0, math.inf, False, 0, 0, 0
+    w_scale, s_scale, b_scale, pressed, knot, stalled = 0.0, 0.0, math.inf, False, 0, 0
     switches = count - count  # a whole number, and no constant: one type to compile for
     now = since = 0.0  # of a drive, since the sample where it last had a kink
-    if struck:
-        s[V, groups - 1, 0] = speed
-        done = before_contact(curves, t, speed)
-        for p in range(size):
-            before_contact(slopes[p], t, 0.0)
     for step in range(max_steps):
         if done == t.size:
             return DONE, math.nan, step, switches
@@ -472,17 +527,9 @@ def _integrated(
         if apart:
             b_scale = max(b_scale if step > 0 else 0.0, abs(s[GROUP, 0, 0]))
         span = step_length(links, s, push, order, tol, horizon - now, w_scale, s_scale, b_scale)
-        if not math.isfinite(span) or not math.isfinite(s[GROUP, 0, order]):
+        if not math.isfinite(span + s[GROUP, 0, order]):
             return NOT_FINITE, since + now, step, switches
-        if memory is not None:
-            for i in range(count):
-                if branches[i] > HELD:
-                    span = longest(memory.series[i], memory.now[i], order, fine, span)
-        span, spring, side = first_switch(law, s, order, span)
-        if memory is not None:
-            span, turning = first_turn(branches, s[EPS], order, span, c)
-            if turning >= 0:
-                spring, side = turning, TURN
+        span, spring, side = _first_end(run, order, fine, span, c, memory)
         leaves = False
         if struck:
             pressed = pressed or s[GROUP, 0, 0] > tol * s_scale
@@ -490,13 +537,10 @@ def _integrated(
             spring = -1 if leaves else spring
         least = order
         if spring >= 0 or leaves or now + span >= horizon:  # not its own error ended the step
-            least = _enough(law, s, order, span, 1e-3 * tol, w_scale, s_scale, b_scale)
+            least = _enough(links.law, s, order, span, 1e-3 * tol, w_scale, s_scale, b_scale)
         more = min(least + 2, order)  # for what is, in time, a derivative of these
         if tangent:
-            expand_tangents(links, s, d, more, memory)
-            if memory is not None:
-                mark_one_sided(memory, branches, s[EPS], d.series[:, EPS], more, span)
-            shorter = tangent_length(heights, d, more, OF_TANGENTS * tol, span, sizes, memory)
+            shorter = _expand_tangents(run, more, tol, span, sizes, memory)
             if shorter < span:
                 span, spring, leaves = shorter, -1, False
         end = now + span
@@ -505,8 +549,8 @@ def _integrated(
             return STEP_UNDERFLOW, since + now, step, switches
         last = end >= horizon and not leaves and spring < 0
         end = horizon if last else end
-        if top == MOTION and knot > 0 and fresh:
-            mend_kink(out, s, d, knot)
+        if fresh and knot > 0 and top == MOTION:
+            mend_kink(samples, s, d, knot)
         first = done
         if struck:
             done = first_past(t, done, end, last)
@@ -515,33 +559,21 @@ def _integrated(
         elif end > 0.0:
             done = max(done, 1)
         if first < done:
-            sample(links, s, least, out, first, done, now, c)
+            sample(links, s, least, samples, first, done, now, c)
         if tangent:
-            sample_tangents(links, s, d, more, out, first, done, now, c)
+            sample_tangents(links, s, d, more, samples, first, done, now, c)
             if leaves or spring >= 0:  # the base stress may end with this step
                 delay(s, d, more, span, late)
         if leaves:
-            depart(links, s, d, order, more, span, end, out, done, scratch)
+            depart(links, s, d, order, more, span, end, samples, done, scratch)
             return DONE, end, step + 1, switches
         now = end
-        advance(s, groups, order, span)
-        if memory is not None:
-            advance_memory(memory.state, memory.series, order, span)
-        if tangent:
-            advance_tangents(d, groups, more, span, memory)
+        _carry(run, order, more, span, push, shared, memory)
         w_scale, total = _reached(links, s, w_scale)
         if not math.isfinite(total):
             return NOT_FINITE, since + now, step, switches
-        if shared:  # where there is no memory, what asks for it is not compiled
-            if memory is None:
-                settle(links, s)
-            else:
-                settle_together(links, s, order, span, push, memory)
         if spring >= 0:
-            switches = switch(
-                rows, branches, law, s, d, directions, order, span, since + now, spring, side, log,
-                switches, ends, memory,
-            )  # fmt: skip
+            switches = switch(run, order, span, since + now, spring, side, switches, memory)
             if memory is not None and shared:
                 settle_together(links, s, order, span, push, memory)
     return TOO_MANY_STEPS, since + now, max_steps, switches
@@ -553,34 +585,31 @@ def integrate(
     heights: Array,
     ends: Branches,
     mass: Array,
-    drag: float,
-    top: int,
+    numbers: Array,
     values: Array,
-    speed: float,
     t: Array,
-    tol: float,
-    max_steps: int,
     directions: Branches,
     start: Array,
-    curves: Array,
-    slopes: Array,
+    out: Array,
     log: Array,
 ) -> tuple[int, float, int, int]:
     """Integrate a chain over the samples of a scene.
 
     Parameters
     ----------
-    rows … t
-        Field by field a `Scene`, which itself would cost a call a tenth more. An impact ends
-        when the base stress is back at zero.
-    tol, max_steps
-        Truncation of a step relative to the motion so far; bound on steps.
+    rows, heights, ends, mass, values, t
+        Fields of a `Scene`, which itself would cost a call as much as a short run.
+    numbers : (5,) array
+        The scene's `drag`, `top` and `speed`, the truncation of a step relative to the motion so
+        far, and the bound on steps. An impact ends when the base stress is back at zero.
     directions : (p, 2) array
         What derivatives are carried along; see `springs.parameters`.
     start : (1 + p, springs or 0) array
         Strains, and their derivatives, from which springs never loaded before start; none: rest.
-    curves, slopes, log : arrays
-        Filled; see `Samples`. The derivatives have p = 0 where none are wanted.
+    out : (1 + p, …) array
+        Filled with the curves and their derivatives; see `Samples`.
+    log : array
+        Filled with the switches.
 
     Returns
     -------
@@ -588,8 +617,8 @@ def integrate(
         Outcome, end of contact (NaN if none; where there is no answer, how far it came), steps
         taken, switches (also those past the log).
     """
-    given = (rows, heights, ends, mass, drag, top, values, speed, t)
-    return _integrated(given, tol, max_steps, directions, start, curves, slopes, log, None)
+    given = (rows, heights, ends, mass, numbers[0], int(numbers[1]), values, numbers[2], t)
+    return _integrated(given, numbers[3], int(numbers[4]), directions, start, out, log, None)
 
 
 @compiled
@@ -600,8 +629,7 @@ def integrate_with_memory(
     max_steps: int,
     directions: Branches,
     start: Array,
-    curves: Array,
-    slopes: Array,
+    out: Array,
     log: Array,
     one_sided: Array,
 ) -> tuple[int, float, int, int]:
@@ -622,7 +650,7 @@ def integrate_with_memory(
     )  # fmt: skip
     memory = make_memory(rows, order, directions, one_sided)
     outcome, end, steps, switches = _integrated(
-        scene, tol, max_steps, directions, start, curves, slopes, log, memory
+        scene, tol, max_steps, directions, start, out, log, memory
     )
     for j in range(min(switches, log.shape[0])):
         log[j, 0] *= unit
@@ -630,5 +658,5 @@ def integrate_with_memory(
         what = directions[p, 1]
         of_tau = what > OWN_RELAXATION and (what - OWN_RELAXATION) % 2 == 1
         if of_tau or what in (OWN_ETA, DRAG):
-            slopes[p] /= unit
+            out[1 + p] /= unit
     return outcome, end * unit, steps, switches

@@ -6,38 +6,31 @@ node holds exactly:
     μ_i d²w_i/dt² + c dw_i/dt + Σ_i - Σ_{i+1} = p,      Σ_i = σ_i(ε_i) + η_i dε_i/dt
 
 A node without mass or a spring without dashpot only lacks its term, so massless, undamped and mixed
-chains are one case. The unknowns are the displacements of all nodes at the points. Newton's method
-with the exact Jacobian finds them; it is block tridiagonal over the nodes, and its elimination goes
-once up the chain and once down: cost grows with the number of springs. The derivatives by
-parameters solve the same equations, linearised at the points that were found.
+chains are one case. Newton's method with the exact Jacobian finds the displacements of all nodes at
+the points. Its linear systems also keep the stresses of the springs as unknowns: so a soft spring
+beside a stiff one loses no digits. They are banded, and cost grows with the number of springs. The
+derivatives by parameters solve the same equations, linearised at the points that were found.
 """
-
-# mypy: disallow-untyped-decorators=False, warn-return-any=False
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lapack
 
-from foamfit.solve.polynomial import value_at
-from foamfit.springs.kernels import (
-    ETA,
-    K0,
-    Array,
-    Branches,
-    branch_shape,
-    inner,
-    maker,
-    once,
-    slope_on,
-    stress_on,
-)
+from foamfit.arrays import Array
+from foamfit.solve.scene import FREE, MOTION, Scene
+from foamfit.springs import kernels
 from foamfit.springs.parameters import DRAG, OWN_ETA, OWN_HEIGHT
-from foamfit.springs.sensitivities import stress_tangent
+from foamfit.springs.sensitivities import branch_derivative
 
 STAGES = 5
+# Diagonals of the linear systems beside the main one, on each side.
+_BAND = 2 * STAGES - 1
+_ROWS = 3 * _BAND + 1  # of LAPACK's storage of a band: it needs room for its factors
 
 
 def radau(stages: int) -> tuple[Array, Array]:
@@ -58,435 +51,251 @@ RATES = np.linalg.inv(WEIGHTS)
 RATES_2 = RATES @ RATES
 # From increments at the points to the coefficients 1 … 5 of the polynomial over the step [0, 1].
 COEFFICIENTS = np.linalg.inv(NODES[:, None] ** np.arange(1, STAGES + 1))
-
-
 # From values at the points to the coefficients 0 … 4 of the polynomial through them alone.
 THROUGH = np.linalg.inv(NODES[:, None] ** np.arange(STAGES))
 
 
-class Body(NamedTuple):
-    """A chain, as a step knows it.
+def plain(loop: Any) -> Any:
+    """Return the Python function of a compiled one."""
+    return getattr(loop, "py_func", loop)
 
-    rows (springs, columns) are the springs, heights (springs,) is in m, mass (springs,) the areal
-    mass above each spring, kg/m², or 0; `drag` is the onsite damping of the top, Pa·s/m; the first
-    `moving` nodes are free.
+
+def relative(nodes: Array) -> Array:
+    """From quantities of the nodes, along the second last axis, to those of the springs below."""
+    out = nodes.copy()
+    out[..., 1:, :] -= nodes[..., :-1, :]
+    return out
+
+
+def polynomial(first: Array | float, points: Array) -> Array:
+    """Coefficients over [0, 1] of the polynomials through `first` at 0 and the values at points."""
+    out = np.empty((*points.shape[:-1], STAGES + 1))
+    out[..., 0] = first
+    out[..., 1:] = (points - out[..., :1]) @ COEFFICIENTS.T
+    return out
+
+
+class Step:
+    """A chain, the state that a step starts from, and what it finds at its points.
+
+    Of the state, `w` and `v` (springs,) are displacements and velocities of the nodes, `v0` those
+    of nodes with a mass (0 of the others) or a prescribed motion, `eps0` the strains, `branches`
+    the branches, between the strains `low` and `high`, `stress0` and `slope0` the stresses of the
+    law and their slopes dσ/dε; `moves` (springs, 6) are the polynomials of the nodes' motion in
+    the last step. At the points, (springs, points), z is what the nodes move beyond v0 times time,
+    `eps` the strains, `vel` the velocities of the nodes, `stress` that of the law, `total` that
+    with the dashpots, `slope` dσ/dε.
+
+    Of p derivatives, `d_w`, `d_v0`, `d_eps0` are (p, springs), `d_z`, `d_eps`, `d_total` (p,
+    springs, points), and `d_base` (p,) is that of the base stress where the last step ended.
     """
 
-    rows: Array
-    heights: Array
-    mass: Array
-    drag: float
-    moving: int
+    def __init__(self, scene: Scene, directions: kernels.Branches) -> None:
+        self.rows, self.heights, self.drag = scene.rows, scene.heights, scene.drag
+        count, p = scene.heights.size, len(directions)
+        self.height, self.eta = self.heights[:, None], self.rows[:, kernels.ETA, None]
+        self.mass = np.zeros(count)
+        inside = slice(None, None if scene.top == FREE else -1)
+        self.mass[scene.ends[inside] - 1] = scene.mass[inside]
+        self.heavy, self.held = self.mass > 0.0, scene.top == MOTION
+        self.branches, self.low, self.high = np.empty(count, np.int64), *np.zeros((2, count))
+        self._shape = np.zeros((4, count, 1))  # curved, k, x0, s0
+        self.w, self.v, self.v0, self.eps0 = np.zeros((4, count))
+        self.z, self.moves = np.zeros((count, STAGES)), np.zeros((count, STAGES + 1))
+        self.directions = directions
+        self.d_shape = np.zeros((3, p, count, 1))  # of k, x0, s0
+        self.d_w, self.d_v0, self.d_eps0 = np.zeros((3, p, count))
+        self.d_base = np.zeros(p)
+        own, what = directions[:, :1], directions[:, 1:]
+        mine = own == np.arange(count)
+        self._longer = np.where(mine & (what == OWN_HEIGHT), 1.0, 0.0)[..., None]
+        self._damped = np.where(mine & (what == OWN_ETA), 1.0, 0.0)[..., None]
+        self._dragged = np.where(what == DRAG, 1.0, 0.0)
+        self._lay_out(count)
 
+    def enter(self, i: int, branch: int) -> None:
+        """Put spring i on a branch."""
+        row = self.rows[i]
+        self.branches[i] = branch
+        self.low[i], self.high[i] = plain(kernels.interval)(row, branch)
+        self._shape[:, i, 0] = plain(kernels.branch_shape)(row, branch)
+        for p, (spring, what) in enumerate(self.directions):
+            if spring == i and what < OWN_ETA:
+                self.d_shape[:, p, i, 0] = plain(branch_derivative)(row, branch, what)
 
-class Work(NamedTuple):
-    """Arrays of linear systems: residual (columns, springs, points) in, delta (the same) out.
+    def settle(self) -> None:
+        """Find stresses and slopes where the next step starts."""
+        stress, slope = self.law(self.eps0[:, None])
+        self.stress0, self.slope0 = stress[:, 0], slope[:, 0]
 
-    lift (springs, points, points), stiff and spring (points, points) and m (points, 2 points +
-    columns) are scratch.
-    """
+    def law(self, eps: Array) -> tuple[Array, Array]:
+        """Stress and slope dσ/dε at strains (springs, …); infinite past the end of a branch."""
+        curved, k, x0, s0 = self._shape
+        x = eps - x0
+        rest = 1.0 - x
+        bent = np.where(rest > 0.0, k * x / rest, math.inf)
+        return np.where(curved, bent, s0 + k * x), np.where(curved, k / (rest * rest), k)
 
-    residual: Array
-    delta: Array
-    lift: Array
-    stiff: Array
-    spring: Array
-    m: Array
+    def stress_tangents(self, d_eps: Array) -> Array:
+        """Derivatives of the stresses at the points, at which the strains move by d_eps."""
+        (curved, k, x0, _), (dk, dx0, ds0) = self._shape, self.d_shape
+        x = self.eps - x0
+        at_rest = np.where(curved, x / (1.0 - x), x) * dk + ds0
+        slope = np.where(curved, k / (1.0 - x) ** 2, k)
+        out: Array = at_rest + slope * (d_eps - dx0)
+        return out
 
+    def ahead(self) -> Array:
+        """How far, in strain, the springs are from the end of their curved branches."""
+        curved, _, x0, _ = self._shape[..., 0]
+        return np.where(curved > 0.0, 1.0 - (self.eps0 - x0), math.inf)
 
-class Points(NamedTuple):
-    """What a step finds at its points, all (springs, points) but for the last.
+    def _fill(self, span: float) -> bool:
+        """Fill what follows from z at the points; false past the end of a branch."""
+        self.vel = self.v0[:, None] + self.z @ RATES.T / span
+        moved = relative(self.z + self.v0[:, None] * (span * NODES))
+        self.stretching = relative(self.vel) / self.height
+        self.eps = self.eps0[:, None] + moved / self.height
+        self.stress, self.slope = self.law(self.eps)
+        self.total = self.stress + self.eta * self.stretching
+        return bool(np.isfinite(self.stress).all())
 
-    z is what the nodes move beyond v0 times time, eps the strains, vel the velocities of the nodes,
-    total the stresses with those of the dashpots, slope dσ/dε; `work` is that of Newton's method.
-    """
+    # ---------------------------------------------------------------- the linear systems
 
-    z: Array
-    eps: Array
-    vel: Array
-    total: Array
-    slope: Array
-    work: Work
+    def _lay_out(self, count: int) -> None:
+        """Places of the entries in LAPACK's storage of a band.
 
+        Equations and unknowns of spring i: its stresses at the points, the displacements above it.
+        """
+        i, j, k = np.ogrid[:count, :STAGES, :STAGES]
+        spring, node = 2 * STAGES * i, 2 * STAGES * i + STAGES
 
-class State(NamedTuple):
-    """What a step starts from, all (springs,).
+        def place(row: Any, column: Any) -> NDArray[np.int64]:
+            return np.asarray(column * _ROWS + 2 * _BAND + row - column).ravel()
 
-    Displacements and velocities w and v of the nodes, v0 of those with a mass (0 of the others),
-    strains and branches.
-    """
+        self._entries = np.concatenate(
+            [
+                place(spring + j, node + k),
+                place(spring + j, node - 2 * STAGES + k)[STAGES * STAGES :],
+                place(node + j, node + k),
+            ]
+        )
+        self._empty = np.zeros(2 * STAGES * count * _ROWS)
+        i, j = np.ogrid[:count, :STAGES]
+        spring, node = 2 * STAGES * i + j, 2 * STAGES * i + STAGES + j
+        self._empty[place(spring, spring)] = -1.0
+        self._empty[place(node, spring)] = 1.0
+        self._empty[place(node, spring + 2 * STAGES)[:-STAGES]] = -1.0
+        if self.held:
+            self._empty[place(node, spring)[-STAGES:]] = 0.0
+        self._soft = 1e-12 * self.rows[:, kernels.K0, None]
 
-    w: Array
-    v: Array
-    v0: Array
-    eps0: Array
-    branches: Branches
+    def _solve(self, residual: Array, span: float) -> Array | None:
+        """Displacements (…, springs, points) that balance forces; None if there are none."""
+        count = self.heights.size
+        stiff = self.eta[..., None] / (self.height[..., None] * span) * RATES
+        # On a flat branch the step would have no bound; the force has.
+        diagonal = np.maximum(self.slope, self._soft) / self.height
+        stiff[:, range(STAGES), range(STAGES)] += diagonal
+        unit = float(np.abs(stiff).max())
+        stiff /= unit
+        heavy = (self.mass / (span * span * unit))[:, None, None] * RATES_2
+        if self.held:
+            heavy[-1] = np.eye(STAGES)
+        elif self.drag > 0.0:
+            heavy[-1] += self.drag / (span * unit) * RATES
+        band = self._empty.copy()
+        entries = (stiff.ravel(), -stiff[1:].ravel(), heavy.ravel())
+        band[self._entries] = np.concatenate(entries)
+        columns = math.prod(residual.shape[:-2])
+        right = np.zeros((columns, count, 2, STAGES))
+        right[:, :, 1] = (residual / unit).reshape(columns, count, STAGES)
+        if self.held:
+            right[:, -1] = 0.0
+        matrix, known = band.reshape(-1, _ROWS).T, right.reshape(columns, -1).T
+        found, info = lapack.dgbsv(_BAND, _BAND, matrix, known, overwrite_ab=1, overwrite_b=1)[2:]
+        if info != 0:
+            return None
+        out: Array = found.T.reshape(columns, count, 2, STAGES)[:, :, 1].reshape(residual.shape)
+        return out
 
+    def _net(self, total: Array) -> Array:
+        """What the stresses of the springs do to the nodes."""
+        out = -total
+        out[..., :-1, :] += total[..., 1:, :]
+        return out
 
-class PointTangents(NamedTuple):
-    """Derivatives by p parameters of a state and of what a step finds at its points.
+    # ---------------------------------------------------------------- Newton's method
 
-    directions (p, 2) are those of `springs.parameters`. w, v0 and eps0 are (springs, p); eps and
-    total are (p, springs, points), like z, which is `work.delta`; base (p,) is the base stress at
-    the last step's end.
-    """
-
-    directions: Branches
-    w: Array
-    v0: Array
-    eps0: Array
-    eps: Array
-    total: Array
-    base: Array
-    work: Work
-
-
-@maker
-def _make_work(count: int, columns: int) -> Work:
-    """Allocate linear systems."""
-    n = STAGES
-    return Work(
-        np.zeros((columns, count, n)), np.zeros((columns, count, n)), np.zeros((count, n, n)),
-        np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, 2 * n + columns)),
-    )  # fmt: skip
-
-
-@maker
-def make_points(count: int) -> Points:
-    """Allocate the points of a step."""
-    s = (count, STAGES)
-    return Points(
-        np.zeros(s), np.zeros(s), np.zeros(s), np.zeros(s), np.zeros(s), _make_work(count, 1)
-    )
-
-
-@maker
-def make_tangents(count: int, directions: Branches) -> PointTangents:
-    """Make derivatives of a chain at rest."""
-    p = directions.shape[0]
-    at, points = (count, p), (p, count, STAGES)
-    return PointTangents(
-        directions, np.zeros(at), np.zeros(at), np.zeros(at), np.zeros(points), np.zeros(points),
-        np.zeros(p), _make_work(count if p > 0 else 0, p),
-    )  # fmt: skip
-
-
-@inner
-def _fill(body: Body, state: State, span: float, at: Points) -> bool:
-    """Fill strains, velocities, stresses, slopes at the points; false past the end of a branch."""
-    for i in range(body.heights.size):
-        row, branch, height = body.rows[i], state.branches[i], body.heights[i]
-        for j in range(STAGES):
-            rate = 0.0
-            for k in range(STAGES):
-                rate += RATES[j, k] * at.z[i, k]
-            at.vel[i, j] = state.v0[i] + rate / span
-            move = at.z[i, j] + NODES[j] * span * state.v0[i]
-            stretching = at.vel[i, j]
-            if i > 0:
-                move -= at.z[i - 1, j] + NODES[j] * span * state.v0[i - 1]
-                stretching -= at.vel[i - 1, j]
-            at.eps[i, j] = state.eps0[i] + move / height
-            at.slope[i, j] = slope_on(row, branch, at.eps[i, j])
-            stress = stress_on(row, branch, at.eps[i, j])
-            if not math.isfinite(stress):
+    def collocate(self, push: float, push_rate: float, span: float, reach: float) -> bool:
+        """Solve one step by Newton's method from the guess in z; false if it does not converge."""
+        if not self._fill(span):
+            self.z[:] = 0.0
+            if not self._fill(span):
                 return False
-            at.total[i, j] = stress + row[ETA] * stretching / height
-    return True
-
-
-@inner
-def _solve(m: Array, n: int, columns: int) -> bool:
-    """Solve n equations in place, right-hand sides in the columns past n; false if singular."""
-    for p in range(n):
-        best = p
-        for q in range(p + 1, n):
-            if abs(m[q, p]) > abs(m[best, p]):
-                best = q
-        if not abs(m[best, p]) > 0.0:
-            return False
-        if best != p:
-            for k in range(p, columns):
-                m[p, k], m[best, k] = m[best, k], m[p, k]
-        for q in range(p + 1, n):
-            factor = m[q, p] / m[p, p]
-            if factor != 0.0:
-                for k in range(p + 1, columns):
-                    m[q, k] -= factor * m[p, k]
-    for k in range(n, columns):
-        for p in range(n - 1, -1, -1):
-            rest = m[p, k]
-            for q in range(p + 1, n):
-                rest -= m[p, q] * m[q, k]
-            m[p, k] = rest / m[p, p]
-    return True
-
-
-@inner
-def _stiffness(rows: Array, i: int, height: float, span: float, slope: Array, out: Array) -> None:
-    """Force of spring i at the points per displacement of its upper node at the points."""
-    soft = 1e-12 * rows[i, K0]  # a flat branch: the step would have no bound, the force has
-    damp = rows[i, ETA] / (height * span)
-    for j in range(STAGES):
-        for k in range(STAGES):
-            out[j, k] = damp * RATES[j, k]
-        out[j, j] += max(slope[i, j], soft) / height
-
-
-@inner
-def _put(delta: Array, i: int, m: Array, first: int) -> None:
-    """Put the columns of node i beside the matrix of a linear system."""
-    for c in range(delta.shape[0]):
-        for j in range(STAGES):
-            m[j, first + c] = delta[c, i, j]
-
-
-@inner
-def _get(delta: Array, i: int, m: Array, first: int) -> None:
-    """Get the columns of node i from where `_put` put them."""
-    for c in range(delta.shape[0]):
-        for j in range(STAGES):
-            delta[c, i, j] = m[j, first + c]
-
-
-@inner
-def _correct(body: Body, span: float, slope: Array, work: Work) -> bool:
-    """Displacements `delta` of the first `moving` nodes that balance the forces in `residual`.
-
-    Both are (columns, springs, points): every column is a system of its own with the same matrix.
-    False if the equations are singular. Going up, the chain below a node acts on it through a
-    stiffness K and a force r. Written so that nothing cancels: under a spring of stiffness S,
-    (K, r) become (S D⁻¹ K, S D⁻¹ r), D = K + S.
-    """
-    rows, heights, mass, drag, moving = body
-    residual, delta, lift, stiff, spring, m = work  # stiff: the chain below, as it acts on the node
-    s, columns = STAGES, residual.shape[0]
-    for i in range(moving):
-        _stiffness(rows, i, heights[i], span, slope, spring)
-        if i == 0:
-            for j in range(s):
-                for k in range(s):
-                    stiff[j, k] = spring[j, k]
-        else:
-            for j in range(s):
-                for k in range(s):
-                    m[j, k] = stiff[j, k] + spring[j, k]
-                    m[j, s + k] = stiff[j, k]
-            _put(delta, i - 1, m, 2 * s)
-            if not _solve(m, s, 2 * s + columns):
-                return False
-            _get(delta, i - 1, m, 2 * s)
-            for j in range(s):
-                for k in range(s):
-                    lift[i - 1, j, k] = (1.0 if j == k else 0.0) - m[j, s + k]
-            for j in range(s):
-                for k in range(s):
-                    stiff[j, k] = 0.0
-                    for q in range(s):
-                        stiff[j, k] += spring[j, q] * m[q, s + k]
-        resist = drag if i == heights.size - 1 else 0.0
-        for j in range(s):
-            for k in range(s):
-                stiff[j, k] += mass[i] * RATES_2[j, k] / span**2 + resist * RATES[j, k] / span
-        for c in range(columns):
-            for j in range(s):
-                force = residual[c, i, j]
-                if i > 0:
-                    for k in range(s):
-                        force += spring[j, k] * delta[c, i - 1, k]
-                delta[c, i, j] = force
-    last = moving - 1
-    if moving < heights.size:  # the spring above the last free node is held by the driven top
-        _stiffness(rows, moving, heights[moving], span, slope, spring)
-        for j in range(s):
-            for k in range(s):
-                stiff[j, k] += spring[j, k]
-    for j in range(s):
-        for k in range(s):
-            m[j, k] = stiff[j, k]
-    _put(delta, last, m, s)
-    if not _solve(m, s, s + columns):
-        return False
-    _get(delta, last, m, s)
-    for c in range(columns):
-        for i in range(last - 1, -1, -1):
-            for j in range(s):
-                gain = 0.0
-                for k in range(s):
-                    gain += lift[i, j, k] * delta[c, i + 1, k]
-                delta[c, i, j] += gain
-    return True
-
-
-@once
-def collocate(
-    body: Body,
-    state: State,
-    push: float,
-    push_rate: float,
-    span: float,
-    reach: float,
-    at: Points,
-    tally: Branches,
-) -> bool:
-    """Solve one step by Newton's method from the guess in z; false if it does not converge."""
-    rows, heights, mass, drag, moving = body
-    z, eps, vel, total, slope, work = at
-    residual, delta = work.residual, work.delta
-    count = heights.size
-    if not _fill(body, state, span, at):
-        for i in range(moving):
-            for j in range(STAGES):
-                z[i, j] = 0.0
-        if not _fill(body, state, span, at):
-            return False
-    before = math.inf
-    slow = 0
-    for _ in range(30):
-        if moving == 0:
+        if self.held and self.heights.size == 1:
             return True
-        for i in range(moving):
-            for j in range(STAGES):
-                force = -total[i, j]
-                if i < count - 1:
-                    force += total[i + 1, j]
-                else:
-                    force += push + push_rate * NODES[j] * span - drag * vel[i, j]
-                if mass[i] > 0.0:
-                    pull = 0.0
-                    for k in range(STAGES):
-                        pull += RATES_2[j, k] * z[i, k]
-                    force -= mass[i] * pull / span**2
-                residual[0, i, j] = force
-        tally[0] += 1
-        tally[1] += moving
-        if not _correct(body, span, slope, work):
-            return False
-        part, size, moved = 1.0, 0.0, 0.0
-        for i in range(count):
-            curved, _, x0, _ = branch_shape(rows[i], state.branches[i])
-            for j in range(STAGES):
-                gain = delta[0, i, j] if i < moving else 0.0
-                size = max(size, abs(gain))
-                if not math.isfinite(gain):
-                    return False
-                moved = max(moved, abs(z[i, j] + NODES[j] * span * state.v0[i]))
-                if i > 0:
-                    gain -= delta[0, i - 1, j]
-                most = 0.9 * (1.0 - (eps[i, j] - x0))
-                if curved and gain / heights[i] > most:
-                    part = min(part, most * heights[i] / gain)
-        for i in range(moving):
-            for j in range(STAGES):
-                z[i, j] += part * delta[0, i, j]
-        if not _fill(body, state, span, at):
-            return False
-        if part == 1.0:
-            if size <= 1e-8 * moved + 1e-15 * reach:
-                return True
-            slow = slow + 1 if size > 0.5 * before else 0
-            if slow > 5:  # near a pole corrections double before they halve
+        before, slow = math.inf, 0
+        pushed = push + push_rate * span * NODES
+        for _ in range(30):
+            residual = self._net(self.total)
+            residual[-1] += pushed - self.drag * self.vel[-1]
+            residual -= (self.mass / (span * span))[:, None] * (self.z @ RATES_2.T)
+            delta = self._solve(residual, span)
+            if delta is None or not np.isfinite(delta).all():
                 return False
-            before = size
-    return False
-
-
-@once
-def linearise(body: Body, state: State, span: float, at: Points, d: PointTangents) -> bool:
-    """Derivatives at the points of a step that was found, and at its end; false if singular.
-
-    The equations of the step, linearised: first what the parameters and the derivatives at the
-    start of the step do to the forces while z rests, then the z that balances them.
-    """
-    heights, moving = body.heights, body.moving
-    count, last = heights.size, heights.size - 1
-    for i in range(count):
-        for c in range(d.base.size):
-            _rest(body, state, span, at, d, i, c)
-    for i in range(moving):
-        for j in range(STAGES):
-            for c in range(d.base.size):
-                net = -d.total[c, i, j]
-                if i < last:
-                    net += d.total[c, i + 1, j]
-                else:
-                    net -= body.drag * d.v0[i, c]
-                    if d.directions[c, 1] == DRAG:
-                        net -= at.vel[i, j]
-                d.work.residual[c, i, j] = net
-    if moving > 0 and not _correct(body, span, at.slope, d.work):
+            size = float(np.abs(delta).max())
+            moved = float(np.abs(self.z + self.v0[:, None] * (span * NODES)).max())
+            gain = relative(delta) / self.height
+            most = 0.9 * (1.0 - (self.eps - self._shape[2]))
+            ahead = (gain > most) & (self._shape[0] > 0.0)
+            part = float((most / gain)[ahead].min()) if ahead.any() else 1.0
+            self.z += part * delta
+            if not self._fill(span):
+                return False
+            if part == 1.0:
+                if size <= 1e-8 * moved + 1e-15 * reach:
+                    return True
+                slow = slow + 1 if size > 0.5 * before else 0
+                if slow > 5:  # near a pole corrections double before they halve
+                    return False
+                before = size
         return False
-    for i in range(count):
-        for j in range(STAGES):
-            for c in range(d.base.size):
-                move, stretching = _relative(d.work.delta, i, j, c)
-                d.eps[c, i, j] += move / heights[i]
-                damp = body.rows[i, ETA] * stretching / span
-                d.total[c, i, j] += (at.slope[i, j] * move + damp) / heights[i]
-    return True
 
+    def linearise(self, span: float) -> bool:
+        """Derivatives at the points of a step that was found; false if there are none.
 
-@inner
-def _relative(z: Array, i: int, j: int, c: int) -> tuple[float, float]:
-    """Elongation of spring i at a point, and its rate times the step, of column c of z."""
-    move, rate = z[c, i, j], 0.0
-    for k in range(STAGES):
-        rate += RATES[j, k] * z[c, i, k]
-    if i > 0:
-        move -= z[c, i - 1, j]
-        for k in range(STAGES):
-            rate -= RATES[j, k] * z[c, i - 1, k]
-    return move, rate
+        The equations of the step, linearised: first what the parameters and the derivatives at the
+        start of the step do to the forces while z rests, then the z that balances them.
+        """
+        d_v = relative(self.d_v0[..., None])
+        moved = d_v * (span * NODES) - (self.eps - self.eps0[:, None]) * self._longer
+        self.d_eps = self.d_eps0[..., None] + moved / self.height
+        self.d_total = self.stress_tangents(self.d_eps)
+        self.d_total += self.eta * (d_v - self.stretching * self._longer) / self.height
+        self.d_total += self.stretching * self._damped
+        net = self._net(self.d_total)
+        net[:, -1] -= self.drag * self.d_v0[:, -1:] + self.vel[-1] * self._dragged
+        found = self._solve(net, span)
+        if found is None:
+            return False
+        self.d_z = found
+        moved = relative(found) / self.height
+        self.d_eps += moved
+        self.d_total += self.slope * moved + self.eta * (moved @ RATES.T) / span
+        return True
 
+    # ---------------------------------------------------------------- the end of a step
 
-@inner
-def _rest(
-    body: Body, state: State, span: float, at: Points, d: PointTangents, i: int, c: int
-) -> None:
-    """Derivatives of strain and stress of spring i at the points in direction c, while z rests."""
-    row, branch, height = body.rows[i], state.branches[i], body.heights[i]
-    own = d.directions[c, 1] if d.directions[c, 0] == i else -1
-    longer = 1.0 if own == OWN_HEIGHT else 0.0
-    dv = d.v0[i, c] - (d.v0[i - 1, c] if i > 0 else 0.0)
-    for j in range(STAGES):
-        rate = (at.vel[i, j] - (at.vel[i - 1, j] if i > 0 else 0.0)) / height
-        part = NODES[j] * span * dv - (at.eps[i, j] - state.eps0[i]) * longer
-        d.eps[c, i, j] = d.eps0[i, c] + part / height
-        stress = stress_tangent(row, branch, at.eps[i, j], d.eps[c, i, j], own)
-        stress += row[ETA] * (dv - rate * longer) / height
-        d.total[c, i, j] = stress + (rate if own == OWN_ETA else 0.0)
+    def carry(self, span: float) -> None:
+        """Carry the state over a step."""
+        self.w += self.z[:, -1] + span * self.v0
+        self.eps0, self.v = self.eps[:, -1].copy(), self.vel[:, -1].copy()
+        self.v0 = np.where(self.heavy, self.v, self.v0)
 
-
-@inner
-def polynomial(first: float, points: Array, out: Array) -> None:
-    """Coefficients over [0, 1] of the polynomial through `first` at 0 and the values at points."""
-    out[0] = first
-    for k in range(STAGES):
-        out[k + 1] = 0.0
-        for j in range(STAGES):
-            out[k + 1] += COEFFICIENTS[k, j] * (points[j] - first)
-
-
-@inner
-def truncation(c: Array) -> float:
-    """Size of the first Legendre term that a step's polynomial leaves out."""
-    fifth = abs(c[5]) / 252.0
-    fourth = abs(c[4] + 2.5 * c[5]) / 70.0
-    if fifth >= fourth:
-        return fifth
-    return fifth * max(fifth / fourth, 0.02)
-
-
-@inner
-def guess(moves: Array, state: State, moving: int, span: float, taken: float, z: Array) -> None:
-    """Fill z with the motion of the last step, of length `taken`, carried on over the next."""
-    for i in range(state.v.size):
-        ahead = i < moving and 0.0 < span <= 2.0 * taken
-        last = value_at(moves[i], STAGES, 1.0)
-        for j in range(STAGES):
-            time = NODES[j] * span
-            if ahead:
-                z[i, j] = value_at(moves[i], STAGES, 1.0 + time / taken) - last
-                z[i, j] -= time * state.v0[i]
-            else:
-                z[i, j] = time * (state.v[i] - state.v0[i]) if i < moving else 0.0
+    def carry_tangents(self, span: float) -> None:
+        """Carry the derivatives of the state over a step."""
+        self.d_w += self.d_z[..., -1] + span * self.d_v0
+        self.d_eps0 = self.d_eps[..., -1].copy()
+        self.d_v0 += np.where(self.heavy, self.d_z @ RATES[-1] / span, 0.0)
+        self.d_base = self.d_total[:, 0, -1].copy()

@@ -1,4 +1,4 @@
-"""The compiled integrator for stiff scenes: implicit collocation from switch to switch.
+"""The integrator for stiff scenes: implicit collocation from switch to switch.
 
 Light masses and heavy or very light dashpots make rates that explicit steps must follow. The steps
 of `implicit.collocation` (Radau IIA, order 9) need not: the method is L-stable, what relaxes or
@@ -8,443 +8,382 @@ No branch changes inside a step. A switch, or the end of contact, is the first c
 polynomial; the step is then taken again, shorter, until it ends there. Derivatives by parameters
 are carried along where they are asked for; the law is continuous at its switches, so they pass
 from branch to branch without a jump.
-"""
 
-# mypy: disallow-untyped-decorators=False, warn-return-any=False
+Stiff scenes are rare, and compiling these steps would take longer than thousands of them: they are
+plain NumPy, over all springs and points at once.
+"""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from foamfit.solve.implicit.collocation import (
-    STAGES,
-    Body,
-    Points,
-    PointTangents,
-    State,
-    collocate,
-    guess,
-    make_points,
-    make_tangents,
-)
+from foamfit.arrays import Array
+from foamfit.solve import scene as scenes
+from foamfit.solve.implicit.collocation import NODES, STAGES, THROUGH, Step, plain, polynomial
 from foamfit.solve.implicit.control import (
     AGAIN,
-    CONTROL,
     FREELY,
-    SHORT,
     SMALL_BASE_ERROR,
     Control,
-    Limits,
-    Polynomials,
+    Event,
     Start,
-    aim,
-    allowed_length,
-    error_of,
-    raise_floor,
+    slope_at_end,
 )
-from foamfit.solve.implicit.recording import (
-    fly_on,
-    mend_kink,
-    record_rest,
-    record_step,
-)
-from foamfit.solve.implicit.vibration import (
-    Unresolved,
-    contact_time,
-    is_overdamped,
-    remember,
-)
-from foamfit.solve.polynomial import slope_at
-from foamfit.solve.scene import (
-    DONE,
-    FLAT_UNDER_STRESS,
-    FREE,
-    MOTION,
-    NOT_FINITE,
-    STEP_UNDERFLOW,
-    STRESS,
-    TOO_MANY_STEPS,
-    VISCOUS,
-    Samples,
-    Scene,
-    SceneTuple,
-    before_contact,
-    first_past,
-    log_switch,
-)
-from foamfit.springs.kernels import (
-    ETA,
-    OPEN,
-    Array,
-    Branches,
-    above,
-    below,
-    branch_at_strain,
-    branch_shape,
-    compiled,
-    first_branch,
-    inner,
-    interval,
-    once,
-    slope_on,
-    stress_on,
-)
-from foamfit.springs.parameters import OWN_HEIGHT
-from foamfit.springs.sensitivities import stress_tangent
+from foamfit.solve.implicit.vibration import Vibrations
+from foamfit.solve.rates import OVERDAMPED
+from foamfit.springs import kernels
+from foamfit.springs.kernels import ETA, K0, OPEN
+from foamfit.springs.parameters import OWN_ETA, OWN_HEIGHT
 
 
-@inner
-def _base_stress(scene: Scene, state: State, push: float) -> float:
-    """Stress that the springs below the lowest node with a state carry together."""
-    first, below_top = scene.ends[0], scene.ends.size > 1
-    if not below_top and scene.top == STRESS:
-        return push
-    driven = not below_top and scene.top == VISCOUS
-    flow, rate = 0.0, 0.0 if driven else state.v0[first - 1]
-    for i in range(first):
-        stress = stress_on(scene.rows[i], state.branches[i], state.eps0[i])
-        if scene.rows[i, ETA] == 0.0:
-            return stress
-        flow += scene.heights[i] / scene.rows[i, ETA]
-        rate += scene.heights[i] * stress / scene.rows[i, ETA]
-    if driven:
-        return (rate + push / scene.drag) / (flow + 1.0 / scene.drag)
-    return rate / flow
+class Ending(NamedTuple):
+    """How a run ends: as of the explicit integrator, and what it damped out.
 
-
-@once
-def _step(
-    scene: Scene,
-    limits: Limits,
-    body: Body,
-    state: State,
-    at: Points,
-    out: Polynomials,
-    rates: Array,
-    control: Control,
-    start: Start,
-    span: float,
-    tally: Branches,
-) -> tuple[int, float, bool, int, int]:
-    """Find the longest step within `span` that is exact enough and ends no later than an event.
-
-    Returns the outcome (DONE if there is one), its length, whether it ends at an event, which
-    spring (or the base, one past the last) has it, and on which side.
+    `lost` is the size, relative to motion and stress, of the vibrations that were damped out
+    because they could not be followed.
     """
-    count, struck, now = body.heights.size, scene.speed > 0.0, start.now
-    zero: int = body.heights.size - count  # not the literal: every type is compiled on its own
-    longest, trials, which, side = span, zero, zero - 1, zero
-    weight = limits.base_weight if start.pressed else 0.0
-    first, first_error = span, math.inf
-    for _ in range(200):
-        if now + span <= now:
-            break
-        guess(out.moves, state, body.moving, span, control.taken, at.z)
-        if not collocate(body, state, start.push, start.push_rate, span, control.motion, at, tally):
-            span *= 0.3
-            longest, trials, which = span, zero, zero - 1
-            continue
-        error = error_of(body, state, at, start, weight, control, out)
-        if trials == 0:
-            if first_error == math.inf:
-                first, first_error = span, error
-            rounded = span <= 1e-6 * first and error > 0.3 * first_error
-            allowed = allowed_length(limits, rates, control, now, span, error, rounded)
-            if allowed < span:
-                longest = span = allowed
-                continue
-        for i in range(count):
-            out.slack[i] = max(1e-12, limits.tol * control.step_motion / body.heights[i])
-        out.slack[count] = min(control.worst * limits.tol, 1e-3) * control.step_stress
-        trials += 1
-        what, span, which, side = aim(
-            body, state, at, out, start, struck, span, longest, trials > 13, which, side
-        )
-        if what != AGAIN:
-            return DONE, span, what != FREELY, which, side
-    for i in range(count):
-        curved, _, x0, _ = branch_shape(body.rows[i], state.branches[i])
-        if curved and 1.0 - (state.eps0[i] - x0) < 1e-3:
-            return NOT_FINITE, 0.0, False, -1, 0
-    return STEP_UNDERFLOW, 0.0, False, -1, 0
+
+    outcome: int
+    time: float
+    steps: int
+    switches: int
+    lost: float = 0.0
 
 
-# ---------------------------------------------------------------- the state between steps
+class _EndError(Exception):
+    """The end of a run."""
+
+    def __init__(self, outcome: int, time: float) -> None:
+        self.outcome, self.time = outcome, time
 
 
-@inner
-def _begin(
-    i0: int, start: Array, top: int, body: Body, state: State, d: PointTangents, control: Control
-) -> None:
-    """Fill the state at the start and its scales; the nodes below spring i0 are at rest."""
-    node = 0.0
-    for i in range(body.heights.size):
-        row = body.rows[i]
-        state.branches[i] = first_branch(row)
-        if start.shape[1] > 0:
-            state.eps0[i] = start[0, i]
-            state.branches[i] = branch_at_strain(row, state.branches[i], start[0, i])
-            node += body.heights[i] * start[0, i]
-        state.w[i] = node if i >= i0 else 0.0
-        control.stress = max(control.stress, abs(stress_on(row, state.branches[i], state.eps0[i])))
-        control.motion = max(control.motion, body.heights[i] * abs(state.eps0[i]))
-        for c in range(d.base.size):
-            d.eps0[i, c] = start[1 + c, i] if start.shape[1] > 0 else 0.0
-            d.w[i, c] = body.heights[i] * d.eps0[i, c] + (d.w[i - 1, c] if i > i0 else 0.0)
-            if d.directions[c, 0] == i and d.directions[c, 1] == OWN_HEIGHT:
-                d.w[i, c] += state.eps0[i]
-    for c in range(d.base.size):
-        if top == MOTION and i0 == 0:
-            own = d.directions[c, 1] if d.directions[c, 0] == 0 else -1
-            d.base[c] = stress_tangent(
-                body.rows[0], state.branches[0], state.eps0[0], d.eps0[0, c], own
-            )
-
-
-@inner
-def _drive(
-    scene: Scene,
-    body: Body,
-    state: State,
-    knot: int,
-    fresh: bool,
-    now: float,
-    d: PointTangents,
-    out: Samples,
-) -> tuple[float, float, float]:
-    """Prescribe motion or stress from sample `knot` on, which may be reached just now (`fresh`).
-
-    Returns when that ends, and the stress on the top with its rate.
-    """
-    t, values, top = scene.t, scene.values, body.heights.size - 1
-    horizon, rate = t[t.size - 1], 0.0
-    if t.size > 1:
-        horizon = t[knot + 1]
-        rate = (values[knot + 1] - values[knot]) / (t[knot + 1] - t[knot])
-    if scene.top != MOTION:
-        return horizon, values[knot] + rate * (now - t[knot]), rate
-    if fresh:
-        if knot > 0 and scene.ends.size == 1:
-            mend_kink(scene, body, knot, rate - state.v0[top], d, out)
-        state.eps0[top] += (values[knot] - state.w[top]) / body.heights[top]  # without rounding
-        state.w[top] = values[knot]
-    state.v0[top] = state.v[top] = rate
-    return horizon, 0.0, 0.0
-
-
-@inner
-def _carry(body: Body, state: State, at: Points, span: float, top: int, control: Control) -> None:
-    """Carry the state over a step, and the scales of motion and stress with it."""
-    end, last = STAGES - 1, body.heights.size - 1
-    for i in range(last + 1):
-        state.w[i] += at.z[i, end] + span * state.v0[i]
-        state.eps0[i] = at.eps[i, end]
-        state.v[i] = at.vel[i, end]
-        control.motion = max(control.motion, body.heights[i] * abs(state.eps0[i]))
-        stress = stress_on(body.rows[i], state.branches[i], state.eps0[i])
-        control.stress = max(control.stress, abs(stress))
-    for i in range(last + 1):
-        if body.mass[i] > 0.0:
-            state.v0[i] = state.v[i]
-    if top != STRESS:
-        control.motion = max(control.motion, abs(state.w[last]))
-    control.base = max(control.base, abs(at.total[0, end]))
-    control.stress = max(control.stress, control.base)
-
-
-@inner
-def _switch(
-    body: Body,
-    state: State,
-    strains: Array,
-    spring: int,
-    side: int,
-    span: float,
-    now: float,
-    first: int,
-    log: Array,
-    switches: int,
-) -> tuple[int, bool]:
-    """Change the branch of a spring, and of all that end theirs at the same time.
-
-    Returns the switches so far, and whether a spring of the first group without dashpot opened:
-    nothing presses on the base then.
-    """
-    opened = False
-    for i in range(body.heights.size):
-        low, high = interval(body.rows[i], state.branches[i])
-        out = 0
-        if i == spring:
-            out = side
-        elif span > 0.0:
-            tilt = slope_at(strains[i], STAGES, 1.0)
-            if tilt > 0.0 and state.eps0[i] >= high - 1e-12:
-                out = 1
-            elif tilt < 0.0 and state.eps0[i] <= low + 1e-12:
-                out = -1
-        if out == 0:
-            continue
-        left = state.branches[i]
-        entered = above(left) if out > 0 else below(left)
-        opened = opened or (entered == OPEN and i < first and body.rows[i, ETA] == 0.0)
-        eps = high if out > 0 else low
-        switches = log_switch(log, switches, now, i, left, entered, eps)
-        state.branches[i] = entered
-    return switches, opened
-
-
-@inner
-def _is_flat(body: Body, state: State, i0: int) -> bool:
-    """Whether a spring from i0 on that nothing slows is on a flat branch."""
-    for i in range(i0, body.heights.size):
-        slope = slope_on(body.rows[i], state.branches[i], state.eps0[i])
-        if body.rows[i, ETA] == 0.0 and slope == 0.0:
-            return True
-    return False
-
-
-@once
-def _follow(
-    scene: Scene,
-    limits: Limits,
-    body: Body,
-    state: State,
-    at: Points,
-    out: Polynomials,
-    r: Unresolved,
-    control: Control,
-    d: PointTangents,
-    samples: Samples,
-    log: Array,
-    start: Array,
-    tally: Branches,
-) -> tuple[int, float, int, int]:
-    """Step from event to event; see `integrate_implicit`."""
-    t, top, struck = scene.t, scene.top, scene.speed > 0.0
-    count, groups, first = body.heights.size, scene.ends.size, scene.ends[0]
-    i0 = scene.ends[groups - 2] if groups > 1 else 0
-    now = 0.0 if struck else t[0]
-    _begin(i0, start, top, body, state, d, control)
-    done = 0
-    if struck:
-        state.v0[count - 1] = state.v[count - 1] = scene.speed
-        done = before_contact(samples.curves, t, scene.speed)
-        for c in range(d.base.size):
-            before_contact(samples.slopes[c], t, 0.0)
-    pressed, switches = scene.speed < 0.0, done - done  # no, and none: not literals
-    knot, step, stalled, fall = done - done, 0, 0, 0.0
-    while step < limits.max_steps:
-        if done == t.size:
-            return DONE, math.nan, step, switches
-        horizon, push, push_rate = t[t.size - 1], 0.0, 0.0
-        if not struck:
-            fresh = step == 0 and stalled == 0
-            while knot < t.size - 2 and now >= t[knot + 1]:
-                knot += 1
-                fresh = True
-            horizon, push, push_rate = _drive(scene, body, state, knot, fresh, now, d, samples)
-        if top == STRESS and _is_flat(body, state, i0):
-            return FLAT_UNDER_STRESS, now, step, switches
-        base = _base_stress(scene, state, push)
-        if horizon <= now:  # a single sample, or the last one
-            record_rest(done, state, base, d, samples)
-            return DONE, math.nan, step, switches
-        span = min(horizon - now, control.proposed)
-        begin = Start(now, base, pressed, push, push_rate)
-        outcome, span, arrived, target, side = _step(
-            scene, limits, body, state, at, out, r.rates, control, begin, span, tally
-        )
-        if outcome != DONE:
-            return outcome, now, step, switches
-        leaves = arrived and target == count
-        stalled += 1
-        if span > 0.0 and now + span > now:
-            step, stalled = step + 1, 0
-            last = span >= horizon - now or now + span >= horizon
-            end = horizon if last else now + span
-            begun, done = done, first_past(t, done, end, last)
-            if not record_step(body, state, at, out, now, span, begun, done, d, samples):
-                return NOT_FINITE, now, step, switches
-            remember(scene, state, at, span, t[min(begun, t.size - 1)] - now, r)
-            _carry(body, state, at, span, top, control)
-            fall = slope_at(out.base, STAGES, 1.0) / span
-            pressed = pressed or (not leaves and at.total[0, STAGES - 1] > 10.0 * out.slack[count])
-            now = end
-            raise_floor(span, last, limits, control)
-        elif stalled > 4 * count + 8:
-            return STEP_UNDERFLOW, now, step, switches
-        if not arrived:
-            continue
-        if not leaves:
-            switches, opened = _switch(
-                body, state, out.strains, target, side, span, now, first, log, switches
-            )
-            leaves = opened and struck and pressed
-        if leaves:
-            fly_on(body, state, at, fall, now, done, d, samples, out.slack)
-            return DONE, now, step, switches
-    return TOO_MANY_STEPS, now, limits.max_steps, switches
-
-
-@compiled
 def integrate_implicit(
-    given: SceneTuple,
+    scene: scenes.Scene,
     tol: float,
     max_steps: int,
-    directions: Branches,
+    directions: kernels.Branches,
     start: Array,
-    curves: Array,
-    slopes: Array,
+    out: scenes.Samples,
     log: Array,
-    tally: Branches,
-) -> tuple[int, float, int, int, float]:
+) -> Ending:
     """Integrate a chain from rest (or struck) over the samples of a scene, by implicit steps.
 
     The arguments are those of `explicit.taylor.integrate`, as are the outcomes; `tol` is the
-    truncation of a step relative to the motion so far. `tally` (2,) is filled with the
-    linear systems solved and with the blocks eliminated in them.
-
-    Returns
-    -------
-    tuple
-        Outcome, end of contact (NaN if none; where there is no answer, how far it came), steps
-        taken, switches (also those past the log), and the size, relative to the motion and stress,
-        of the vibrations that were damped out because they could not be followed.
+    truncation of a step relative to the motion so far.
     """
-    scene = Scene(*given)
-    rows, heights, ends, top, t = scene.rows, scene.heights, scene.ends, scene.top, scene.t
-    count, groups, struck = heights.size, ends.size, scene.speed > 0.0
-    areal = np.zeros(count)
-    for g in range(groups):
-        if g < groups - 1 or top == FREE:
-            areal[ends[g] - 1] = scene.mass[g]
-    duration = t[t.size - 1] - (0.0 if struck else t[0])
-    if struck:
-        duration = min(duration, 5.0 * contact_time(scene))
-    weight = min(1.0, tol / SMALL_BASE_ERROR) if is_overdamped(scene) else 0.0
-    short = SHORT * duration * (tol / 3e-8) ** (1.0 / 6.0)
-    limits = Limits(tol, max_steps, short, weight)
-    body = Body(rows, heights, areal, scene.drag, count - 1 if top == MOTION else count)
-    at, d = make_points(count), make_tangents(count, directions)
-    shape = (count, STAGES + 1)
-    out = Polynomials(
-        np.zeros(shape), np.zeros(shape), np.zeros(STAGES + 1), np.zeros(count + 1),
-        np.zeros((count, STAGES)), np.zeros(STAGES + 1),
-    )  # fmt: skip
-    r = Unresolved(
-        np.zeros(groups), np.zeros(groups), np.zeros(2), np.zeros((groups, 3)), np.zeros(count)
-    )
-    moving = np.zeros((4, count))
-    state = State(moving[0], moving[1], moving[2], moving[3], np.empty(count, np.int64))
-    memory = np.zeros(1, CONTROL)  # used again below: it would be freed after its last use
-    memory[0].worst, memory[0].proposed = 1.0, 0.02 * duration if struck else math.inf
-    outcome, end, steps, switches = _follow(
-        scene, limits, body, state, at, out, r, memory[0], d, Samples(t, curves, slopes), log,
-        start, tally,
-    )  # fmt: skip
-    lost = memory[0].damped
-    if r.worst[1] > 0.0:
-        lost += max(r.worst[0] / memory[0].motion, r.worst[1] / memory[0].stress)
-    return outcome, end, steps, switches, lost
+    with np.errstate(all="ignore"):
+        run = _Run(scene, tol, directions, start, out, log)
+        try:
+            run.follow(max_steps)
+        except _EndError as end:
+            lost = run.control.damped
+            if run.vibrations.worst[1] > 0.0:
+                scales = run.control.motion, run.control.stress
+                lost += float((run.vibrations.worst / scales).max())
+            return Ending(end.outcome, end.time, run.steps, run.switches, lost)
+    raise AssertionError  # a run ends by `_EndError`
+
+
+class _Run:
+    """One run over the samples: the state of a chain between steps."""
+
+    def __init__(
+        self,
+        scene: scenes.Scene,
+        tol: float,
+        directions: kernels.Branches,
+        start: Array,
+        out: scenes.Samples,
+        log: Array,
+    ) -> None:
+        self.scene, self.out, self.log = scene, out, log
+        self.t, self.struck = scene.t, scene.speed > 0.0
+        self.step = Step(scene, directions)
+        self.count, self.first = scene.heights.size, int(scene.ends[0])
+        # The springs above the last mass inside, whose nodes start where the drive wants them.
+        self.above = slice(int(scene.ends[-2]) if scene.ends.size > 1 else 0, None)
+        self.nodes = slice(None) if len(out.curves) > 2 else slice(-1, None)
+        duration, weight = float(self.t[-1] - (0.0 if self.struck else self.t[0])), 0.0
+        soft, eta = scene.heights / scene.rows[:, K0], scene.rows[:, ETA]
+        if self.struck:
+            contact = math.sqrt(scene.mass[-1] * soft.sum()) + scene.drag * soft.sum()
+            duration = min(duration, 5.0 * (contact + float((eta / scene.rows[:, K0]).max())))
+            flow = float((scene.heights / eta).sum())
+            if soft.sum() > OVERDAMPED * flow * flow * scene.mass[-1]:
+                weight = min(1.0, tol / SMALL_BASE_ERROR)
+        self.vibrations = Vibrations(scene)
+        self.control = Control(self.step, self.vibrations, tol, duration, weight)
+        if self.struck:
+            self.control.proposed = 0.02 * duration
+        self.steps = self.switches = self.knot = self.done = 0
+        self.now, self.fall, self.pressed = 0.0 if self.struck else float(self.t[0]), 0.0, False
+        self._begin(start)
+
+    def _begin(self, start: Array) -> None:
+        """Fill the state at the start and its scales; the nodes below the last mass are at rest."""
+        step, heights = self.step, self.scene.heights
+        for i, row in enumerate(self.scene.rows):
+            branch = plain(kernels.first_branch)(row)
+            if start.shape[1] > 0:
+                branch = plain(kernels.branch_at_strain)(row, branch, start[0, i])
+            step.enter(i, branch)
+        if start.shape[1] > 0:
+            step.eps0, step.d_eps0 = start[0].copy(), start[1:].copy()
+        longer = step.d_eps0 * heights
+        own, what = step.directions.T
+        longer += (
+            (own[:, None] == np.arange(self.count)) * (what == OWN_HEIGHT)[:, None] * (step.eps0)
+        )
+        step.w[self.above] = np.cumsum(heights * step.eps0)[self.above]
+        step.d_w[:, self.above] = np.cumsum(longer[:, self.above], axis=1)
+        self.control.motion = float(np.abs(heights * step.eps0).max())
+        step.settle()
+        self.control.stress = float(np.abs(step.stress0).max())
+        if len(own) and self.scene.top == scenes.MOTION and self.scene.ends.size == 1:
+            step.z[:] = 0.0
+            step.eps = np.repeat(step.eps0[:, None], STAGES, axis=1)
+            step.d_base = step.stress_tangents(step.d_eps0[..., None])[:, 0, 0]
+        if self.struck:
+            step.v0[-1] = step.v[-1] = self.scene.speed
+            self.done = int(np.searchsorted(self.t, 0.0))
+            before = slice(0, self.done)
+            self.out.curves[:, before], self.out.slopes[:, :, before] = 0.0, 0.0
+            self.out.curves[-1, before] = self.scene.speed * self.t[before]
+
+    def follow(self, max_steps: int) -> None:
+        """Step from event to event until the run ends."""
+        step, stalled = self.step, 0
+        while self.steps < max_steps:
+            if self.done == self.t.size:
+                raise _EndError(scenes.DONE, math.nan)
+            horizon, push, push_rate = float(self.t[-1]), 0.0, 0.0
+            if not self.struck:
+                horizon, push, push_rate = self._drive(self.steps == 0 and stalled == 0)
+            step.settle()
+            if self.scene.top == scenes.STRESS and self._is_flat():
+                raise _EndError(scenes.FLAT_UNDER_STRESS, self.now)
+            base = self._base_stress(push)
+            if horizon <= self.now:  # a single sample, or the last one
+                self._record_rest(base)
+                raise _EndError(scenes.DONE, math.nan)
+            start = Start(self.now, base, self.pressed, push, push_rate)
+            span = min(horizon - self.now, self.control.proposed)
+            span, arrived, event = self._longest_step(start, span)
+            leaves = arrived and event.which == self.count
+            stalled += 1
+            if span > 0.0 and self.now + span > self.now:
+                stalled = 0
+                self._take(span, horizon, leaves)
+            elif stalled > 4 * self.count + 8:
+                raise _EndError(scenes.STEP_UNDERFLOW, self.now)
+            if arrived and not leaves:
+                opened = self._switch(event, span)
+                leaves = opened and self.struck and self.pressed
+            if leaves:
+                self._fly()
+                raise _EndError(scenes.DONE, self.now)
+        raise _EndError(scenes.TOO_MANY_STEPS, self.now)
+
+    def _longest_step(self, start: Start, span: float) -> tuple[float, bool, Event]:
+        """Find the longest step within `span` that is exact enough and ends no later than an event.
+
+        Returns its length, whether it ends at an event, and this.
+        """
+        step, control, now = self.step, self.control, start.now
+        longest, trials, event = span, 0, Event(1.0, -1, 0)
+        first, first_error = span, math.inf
+        for _ in range(200):
+            if now + span <= now:
+                break
+            self._guess(span)
+            if not step.collocate(start.push, start.push_rate, span, control.motion):
+                span *= 0.3
+                longest, trials, event = span, 0, Event(1.0, -1, 0)
+                continue
+            error = control.error(start)
+            if trials == 0:
+                if first_error == math.inf:
+                    first, first_error = span, error
+                rounded = span <= 1e-6 * first and error > 0.3 * first_error
+                allowed = control.allowed(now, span, error, rounded)
+                if allowed < span:
+                    longest = span = allowed
+                    continue
+            trials += 1
+            what, span, event = control.aim(start, self.struck, span, longest, trials > 13, event)
+            if what != AGAIN:
+                return span, what != FREELY, event
+        if (step.ahead() < 1e-3).any():
+            raise _EndError(scenes.NOT_FINITE, now)
+        raise _EndError(scenes.STEP_UNDERFLOW, now)
+
+    def _guess(self, span: float) -> None:
+        """Fill z with the motion of the last step carried on over the next."""
+        step, taken = self.step, self.control.taken
+        times = span * NODES
+        if 0.0 < span <= 2.0 * taken:
+            powers = (1.0 + times / taken) ** np.arange(STAGES + 1)[:, None] - 1.0
+            step.z = step.moves @ powers - step.v0[:, None] * times
+        else:
+            step.z = (step.v - step.v0)[:, None] * times
+        if step.held:
+            step.z[-1] = 0.0
+
+    def _take(self, span: float, horizon: float, leaves: bool) -> None:
+        """Take a step that was found: write its samples, and carry the state."""
+        step, control = self.step, self.control
+        last = span >= horizon - self.now or self.now + span >= horizon
+        end = horizon if last else self.now + span
+        begun = self.done
+        self.done = max(begun, int(np.searchsorted(self.t, end, "right" if last else "left")))
+        step.moves = polynomial(0.0, step.z + step.v0[:, None] * (span * NODES))
+        if not self._record(slice(begun, self.done), span):
+            raise _EndError(scenes.NOT_FINITE, self.now)
+        self.steps += 1
+        wait = float(self.t[min(begun, self.t.size - 1)]) - self.now
+        self.vibrations.remember(step, span, wait)
+        step.carry(span)
+        if self.scene.top != scenes.STRESS:
+            control.motion = max(control.motion, abs(float(step.w[-1])))
+        self.fall = slope_at_end(control.ending) / span
+        risen = float(step.total[0, -1]) > 10.0 * control.slack()[1]
+        self.pressed = self.pressed or (not leaves and risen)
+        self.now = end
+        control.note(span, last)
+
+    # ---------------------------------------------------------------- the state between steps
+
+    def _drive(self, fresh: bool) -> tuple[float, float, float]:
+        """Prescribe motion or stress from the last sample on, which may be reached just now.
+
+        Returns when that ends, and the stress on the top with its rate.
+        """
+        t, values, step = self.t, self.scene.values, self.step
+        while self.knot < t.size - 2 and self.now >= t[self.knot + 1]:
+            self.knot, fresh = self.knot + 1, True
+        knot, rate, horizon = self.knot, 0.0, float(t[-1])
+        if t.size > 1:
+            horizon = float(t[knot + 1])
+            rate = float(values[knot + 1] - values[knot]) / (horizon - float(t[knot]))
+        if self.scene.top != scenes.MOTION:
+            return horizon, float(values[knot]) + rate * (self.now - float(t[knot])), rate
+        if fresh:
+            if knot > 0 and self.scene.ends.size == 1:
+                self._mend_kink(rate - float(step.v0[-1]))
+            # Without rounding.
+            step.eps0[-1] += (values[knot] - step.w[-1]) / self.scene.heights[-1]
+            step.w[-1] = values[knot]
+        step.v0[-1] = step.v[-1] = rate
+        return horizon, 0.0, 0.0
+
+    def _is_flat(self) -> bool:
+        """Whether a spring under the prescribed stress that nothing slows is on a flat branch."""
+        return bool(
+            ((self.step.slope0 == 0.0) & (self.scene.rows[:, ETA] == 0.0))[self.above].any()
+        )
+
+    def _base_stress(self, push: float) -> float:
+        """Stress that the springs below the lowest node with a state carry together."""
+        scene, first = self.scene, self.first
+        alone = scene.ends.size == 1
+        if alone and scene.top == scenes.STRESS:
+            return push
+        stress = self.step.stress0[:first]
+        eta = scene.rows[:first, ETA]
+        if (eta == 0.0).any():
+            return float(stress[eta == 0.0][0])
+        share = scene.heights[:first] / eta
+        rate, flow = float((share * stress).sum()), float(share.sum())
+        if alone and scene.top == scenes.VISCOUS:
+            return (rate + push / scene.drag) / (flow + 1.0 / scene.drag)
+        return (rate + float(self.step.v0[first - 1])) / flow
+
+    def _switch(self, event: Event, span: float) -> bool:
+        """Change the branch of a spring, and of all that end theirs at the same time.
+
+        Returns whether a spring of the first group without dashpot opened: nothing presses on the
+        base then.
+        """
+        step, opened = self.step, False
+        out = np.zeros(self.count)
+        if span > 0.0:
+            tilt = self.control.strains[:, 1:] @ np.arange(1.0, STAGES + 1.0)
+            out[(tilt > 0.0) & (step.eps0 >= step.high - 1e-12)] = 1.0
+            out[(tilt < 0.0) & (step.eps0 <= step.low + 1e-12)] = -1.0
+        out[event.which] = event.side
+        for i in np.flatnonzero(out):
+            left, up = int(step.branches[i]), out[i] > 0.0
+            entered = plain(kernels.above if up else kernels.below)(left)
+            undamped = self.scene.rows[i, ETA] == 0.0
+            opened = opened or bool(entered == OPEN and i < self.first and undamped)
+            eps = (step.high if up else step.low)[i]
+            if self.switches < len(self.log):
+                self.log[self.switches] = self.now, i, left, entered, eps
+            self.switches += 1
+            step.enter(i, entered)
+        return opened
+
+    # ---------------------------------------------------------------- what is recorded
+
+    def _record(self, done: slice, span: float) -> bool:
+        """Write the samples of a step and its derivatives; false if these are not finite."""
+        step, (_, curves, slopes) = self.step, self.out
+        at = (self.t[done] - self.now) / span
+        powers = at ** np.arange(STAGES + 1)[:, None]
+        curves[0, done] = self.control.ending @ powers
+        curves[1:, done] = step.w[self.nodes, None] + step.moves[self.nodes] @ powers
+        if not len(slopes):
+            return True
+        if not step.linearise(span):
+            return False
+        # Where nothing has inertia or a dashpot, derivatives by a dashpot jump at switches and
+        # kinks: the polynomial through the points alone does not start where the last one ended.
+        through = THROUGH.T @ powers[:-1]
+        slopes[:, 0, done] = step.d_total[:, 0] @ through
+        start = step.d_w[:, self.nodes, None] + step.d_v0[:, self.nodes, None] * (at * span)
+        slopes[:, 1:, done] = start + step.d_z[:, self.nodes] @ through
+        step.carry_tangents(span)
+        return True
+
+    def _record_rest(self, base: float) -> None:
+        """Write a single sample, or one that is left where the steps have ended."""
+        step, (_, curves, slopes) = self.step, self.out
+        curves[0, self.done :] = base
+        curves[1:, self.done :] = step.w[self.nodes, None]
+        if len(slopes):
+            slopes[:, 0, self.done :] = step.d_base[:, None]
+            slopes[:, 1:, self.done :] = step.d_w[:, self.nodes, None]
+
+    def _mend_kink(self, jump: float) -> None:
+        """Dashpots feel the mean rate where the prescribed motion has a kink of `jump`."""
+        t, k, heights, eta = self.t, self.knot, self.scene.heights, self.scene.rows[:, ETA]
+        flow = float((heights / eta).sum())
+        share = jump * float((t[k] - t[k - 1]) / (t[k + 1] - t[k - 1]))
+        self.out.curves[0, k] += share / flow
+        for p, (i, what) in enumerate(self.step.directions if flow < math.inf else ()):
+            if what in (OWN_ETA, OWN_HEIGHT):
+                more = 1.0 / eta[i] if what == OWN_HEIGHT else -heights[i] / (eta[i] * eta[i])
+                self.out.slopes[p, 0, k] -= share / (flow * flow) * more
+
+    def _fly(self) -> None:
+        """Fill the samples after contact, which ended now.
+
+        A later end leaves the nodes as they move until then, and the top with the velocity that it
+        has then.
+        """
+        step, (_, curves, slopes) = self.step, self.out
+        done = slice(self.done, None)
+        later = self.t[done] - self.now
+        curves[0, done] = 0.0
+        curves[1:, done] = step.w[self.nodes, None] + step.v[-1] * later
+        if not len(slopes):
+            return
+        pull = -(float(step.total[-1, -1]) + step.drag * step.v[-1]) / step.mass[-1]
+        late = -step.d_base[:, None] / self.fall if self.fall != 0.0 else 0.0 * step.d_base[:, None]
+        place = step.d_w + (step.v - step.v[-1]) * late
+        speed = step.d_v0[:, -1:] + pull * late
+        slopes[:, 0, done] = 0.0
+        slopes[:, 1:, done] = place[:, self.nodes, None] + speed[..., None] * later
