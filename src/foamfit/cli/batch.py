@@ -78,15 +78,8 @@ def batch(
     from foamfit.study.batch_work import Recipe
 
     cycles = alone if several is None else several
-    recipe = Recipe(
-        asked["model"],
-        {},
-        cycles,
-        asked["fix"] or None,
-        asked["vary"],
-        not output.no_report,
-        output.figure_width,
-    )
+    pages, fix = not output.no_report, asked["fix"] or None
+    recipe = Recipe(asked["model"], {}, cycles, fix, asked["vary"], pages, output.figure_width)
     if scheduler is None:
         with options.compiling(output.silent, recipe.model, search["relaxation"]) as compile_rest:
             compile_rest()

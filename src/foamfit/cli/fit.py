@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -65,26 +67,18 @@ def fit(test: Path, specimen: Path | None, output: Output, verbose: bool, **aske
         from foamfit.report.summary import summary_text
         from foamfit.results import Fit
 
-        drawn = {"width": output.figure_width, "mapped": drawers.map}
+        save: Callable[..., object]
         if isinstance(found, Fit):
-            failed, which = found.status == "failed", ""
-            output.finish(
-                lambda *to, **how: result_folder.save_result(found, *to, **how),
-                folder / "report.html",
-                found.to_json_dict,
-                lambda: summary_text(found, verbose=verbose),
-                **drawn,
-            )
+            page, which, failed = "report.html", "", found.status == "failed"
+            save, content = result_folder.save_result, found.to_json_dict
+            text = partial(summary_text, found, verbose=verbose)
         else:
+            page, which = "cycles.png", " of any cycle"
             failed = all(one.status == "failed" for one in found.results.values())
-            which = " of any cycle"
-            output.finish(
-                lambda *to, **how: cycles.save_cycles(found, *to, **how),
-                folder / "cycles.png",
-                lambda: _content(found),
-                lambda: cycles.cycles_text(found),
-                **drawn,
-            )
+            save, content = cycles.save_cycles, partial(_content, found)
+            text = partial(cycles.cycles_text, found)
+        drawn = {"width": output.figure_width, "mapped": drawers.map}
+        output.finish(partial(save, found), folder / page, content, text, **drawn)
     if failed:
         say(f"foamfit: no acceptable fit{which} was found; see {folder}", err=True)
     return NOT_ACCEPTABLE if failed else 0
