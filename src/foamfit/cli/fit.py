@@ -70,15 +70,15 @@ def fit(test: Path, specimen: Path | None, output: Output, verbose: bool, **aske
         save: Callable[..., object]
         if isinstance(found, Fit):
             page, which, failed = "report.html", "", found.status == "failed"
-            save, content = result_folder.save_result, found.to_json_dict
+            save, content = partial(result_folder.save_result, found), found.to_json_dict
             text = partial(summary_text, found, verbose=verbose)
         else:
             page, which = "cycles.png", " of any cycle"
             failed = all(one.status == "failed" for one in found.results.values())
-            save, content = cycles.save_cycles, partial(_content, found)
+            save, content = partial(cycles.save_cycles, found), partial(_content, found)
             text = partial(cycles.cycles_text, found)
         drawn = {"width": output.figure_width, "mapped": drawers.map}
-        output.finish(partial(save, found), folder / page, content, text, **drawn)
+        output.finish(save, folder / page, content, text, **drawn)
     if failed:
         say(f"foamfit: no acceptable fit{which} was found; see {folder}", err=True)
     return NOT_ACCEPTABLE if failed else 0
