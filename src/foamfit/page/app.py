@@ -216,14 +216,12 @@ class Window:
     # ------------------------------------------------------------------------------- the test
 
     def _received(self, event: Any) -> None:
-        """Read what was dropped."""
         if message(event).get("received"):
             self.chosen.value = ""
             self._read()
 
     def _choose(self, event: Any) -> None:
-        """Take a reconstruction; only those of the list can be."""
-        if event.new in self.reconstructions:
+        if event.new in self.reconstructions:  # no other path comes from a browser
             self._take(self.reconstructions[event.new])
 
     def _take(self, path: Path) -> None:

@@ -61,17 +61,11 @@ class Curves:
         self.sliders = Sliders(sizing_mode="stretch_width", margin=(6, 0))
         # With the lock of the document, which not every message holds.
         self.sliders.on_msg(lambda event: pn.state.execute(partial(self._moved, event), True))
-        legend = pn.pane.HTML(
-            piece("legend", GREY, VERMILION), sizing_mode="stretch_width", margin=0
-        )
-        self._panels = grid(
-            [pn.pane.Bokeh(one, sizing_mode="stretch_width") for one in self._figures.values()],
-            14.5,
-        )
-        self._panels.insert(
-            0, legend
-        )  # one for all panels: a figure's own would be redrawn each time
-        self.view = pn.Column(self._panels, self.sliders, sizing_mode="stretch_width", margin=0)
+        wide: dict[str, Any] = {"sizing_mode": "stretch_width"}
+        legend = pn.pane.HTML(piece("legend", GREY, VERMILION), margin=0, **wide)
+        self._panels = grid([pn.pane.Bokeh(one, **wide) for one in self._figures.values()], 14.5)
+        self._panels.insert(0, legend)  # a figure's own would be redrawn each time
+        self.view = pn.Column(self._panels, self.sliders, margin=0, **wide)
         if turning is not None:
             self.show(turning)
 
