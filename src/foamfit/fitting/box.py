@@ -172,21 +172,30 @@ class Space:
     high: Array
     # Completes a vector in which some parameters hang on others.
     tied: Callable[[Array], Array] | None
+    # Free parameters that are their own coordinates (SI) rather than relative to others: what is
+    # shared by tests would not be one value else. Not every point is admissible then.
+    absolute: tuple[str, ...] = ()
 
     @cached_property
     def coordinates(self) -> list[tuple[int, str, int]]:
-        """Place, short name, place of the spring's first parameter; what others need is first."""
+        """Place, short name, place of the spring's first parameter; what others need is first.
+
+        An absolute one has no short name.
+        """
         out, shorts = [], list(BOX)
         for name in sorted(self.free, key=lambda name: shorts.index(family(split_name(name)[1]))):
             spring, short = split_name(name)
             first = self.model.index[f"s{spring + 1}_k0"] if spring >= 0 else -1
-            out.append((self.names.index(name), short, first))
+            out.append((self.names.index(name), "" if name in self.absolute else short, first))
         return out
 
     @cached_property
     def box(self) -> tuple[Array, Array]:
         """Lowest and highest coordinates, (n_free,) each."""
-        pairs = np.array([BOX[family(short)] for _, short, _ in self.coordinates]).reshape(-1, 2)
+        pairs = np.array([
+            BOX[family(short)] if short else (self.low[i], self.high[i])
+            for i, short, _ in self.coordinates
+        ]).reshape(-1, 2)  # fmt: skip
         return pairs[:, 0], pairs[:, 1]
 
     def _unit(self, short: str) -> float:

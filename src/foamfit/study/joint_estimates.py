@@ -22,14 +22,15 @@ LARGEST = 300.0
 
 def common_covariance(fit: JointFit) -> tuple[tuple[str, ...], Array]:
     """Covariance of the common values and slopes, SI; see `JointData.to_json_dict`."""
-    spread, scales = fit.covariance, []
-    for name in spread.names:
+    point, scales = fit.point, []
+    for name in point.names:
         one = fit.spreads.get(name)
         value = math.exp(min(one.mean, LARGEST)) if one else fit.found.common.get(name, (1.0,))[0]
-        before = spread.of_common(name)[0]
+        before = point.of_common(name)[0]
         factor = one.stderr / before if one and before > 0.0 else 1.0
         scales.append(value * factor if fit.found.links.kind(name) == "scatter" else 1.0)
-    return spread.names, spread.matrix * np.outer(scales, scales)
+    s = len(scales)
+    return point.names, point.covariance.matrix[:s, :s] * np.outer(scales, scales)
 
 
 def parameters_of(fit: JointFit, tests: tuple[str, ...]) -> dict[str, JointParameter]:
@@ -62,13 +63,13 @@ def parameter_of(fit: JointFit, tests: tuple[str, ...], name: str) -> JointParam
         return _scattering(fit, tests, name)
     first = found.problems[there[0]]
     (value, *slope) = found.common[name]
-    stderr, freedom = fit.covariance.of_common(name)
+    stderr, freedom = fit.point.of_common(name)
     span = fit.ranges.get(name)
     judged = _judged(first, name, value, stderr, freedom, found.values[there[0]], span)
     words = f"one value for {counted(len(there), 'test')}"
     if not slope:
         return replace(_estimate(kind, value, unit, judged, words), range=span)
-    b_error, b_freedom = fit.covariance.of_common(f"{name}:b")
+    b_error, b_freedom = fit.point.of_common(f"{name}:b")
     half = covariance.half_width(b_error, b_freedom)
     known = math.isfinite(half)
     one = _estimate(kind, value, unit, judged, f"at the rate of the median test; {words}")
@@ -149,7 +150,7 @@ def _values(fit: JointFit, tests: tuple[str, ...], name: str) -> dict[str, TestV
             why = f"branch {branch} was never reached"
             out[test] = TestValue(value, None, None, "not determined", why)
             continue
-        error, freedom = fit.covariance.of_test(t, name)
+        error, freedom = fit.point.of_test(t, name)
         stderr, ci95, state, why = _judged(problem, name, value, error, freedom, values)
         ends = None if ci95 is None else (ci95[0] - zero, ci95[1] - zero)
         out[test] = TestValue(value - zero, stderr, ends, state, why)

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -25,7 +24,7 @@ from foamfit.fitting.together import Together, fit_linked
 from foamfit.springs.parameters import NUISANCE, split_name
 from foamfit.study.shared import bic, effective_samples
 from foamfit.trust import covariance
-from foamfit.trust.joint_covariance import JointCovariance, JointPoint
+from foamfit.trust.joint_covariance import JointPoint
 from foamfit.trust.ranges import ALIKE, ITERATIONS, TRIALS
 from foamfit.trust.residuals.law_error import CurveError, curve_errors
 from foamfit.trust.residuals.noise_process import noise_processes
@@ -62,11 +61,6 @@ class JointFit:
     def found(self) -> Together:
         """The fit itself."""
         return self.point.found
-
-    @cached_property
-    def covariance(self) -> JointCovariance:
-        """Covariance of all parameters."""
-        return self.point.covariance
 
 
 def fit_jointly(
@@ -260,21 +254,14 @@ def _held(point: JointPoint, name: str, sign: float) -> float:
 
 def _without(found: Together, kept: Sequence[int]) -> dict[str, tuple[float, ...]] | None:
     """What the kept tests have in common; None where they cannot be fitted alone."""
-    links, rates = found.links, found.links.log_rates
-    some = replace(
-        links,
-        log_rates=None if rates is None else rates[kept],
-        rate_errors=None if links.rate_errors is None else links.rate_errors[kept],
-        pulls={name: pull[kept] for name, pull in links.pulls.items()},
-    )
-    laws = any(links.kind(name) in RATES for name in found.shared)
+    some = found.links.of(list(kept))
+    laws = any(some.kind(name) in RATES for name in found.shared)
     if laws and some.log_rates is not None and not np.ptp(some.log_rates) > 0.0:
         return None
     try:
         near = [[found.values[t] for t in kept]]
-        return fit_linked(
-            [found.problems[t] for t in kept], some, near, iterations=REFIT
-        ).common  # fmt: skip
+        others = [found.problems[t] for t in kept]
+        return dict(fit_linked(others, some, near, iterations=REFIT).common)
     except SimulationError:
         return None
 
@@ -321,7 +308,7 @@ def choose_kinds(
     All are shared at first; in each round the change of one kind that lowers BIC most is taken. A
     law of rate is none of the kinds where the tests leave its slope open (`open_slope`).
     """
-    links = replace(links, kinds={**links.kinds, **dict.fromkeys(names, "shared")})
+    links = links.having(**dict.fromkeys(names, "shared"))
     now = fit_linked(problems, links, starts)
     score = bic(now.cost, now.n_data, now.n_vary, n_eff)
     while True:
@@ -353,7 +340,7 @@ def _kinds_of(
         if kind in RATES and kind != mine and name in wide:
             continue
         try:
-            links = replace(fit.links, kinds={**fit.links.kinds, name: kind})
+            links = fit.links.having(**{name: kind})
             one = fit if kind == mine else fit_linked(fit.problems, links, near)
         except SimulationError:
             continue

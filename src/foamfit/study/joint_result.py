@@ -271,7 +271,7 @@ class JointData:
             "n_vary": found.n_vary,
             "chisqr": found.cost,
             "redchi": found.cost / max(found.n_data - found.n_vary, 1),
-            "n_effective": self.fit.covariance.effective,
+            "n_effective": self.fit.point.covariance.effective,
             "n_eff": self.n_eff,
             "bic": self.bic,
             "bic_alone": self.alone.bic,

@@ -14,8 +14,9 @@ from functools import cached_property
 import numpy as np
 
 from foamfit.arrays import Array
+from foamfit.fitting.links import Links
 from foamfit.fitting.problem import Problem
-from foamfit.fitting.together import Together, fit_together
+from foamfit.fitting.together import Together, fit_linked
 from foamfit.springs.parameters import NUISANCE
 
 Progress = Callable[[float, str], None]
@@ -209,12 +210,14 @@ def step_of(
 ) -> Step:  # fmt: skip
     """Fit all groups with these own parameters.
 
-    `starts` holds those of each group, as `fit_together` takes them; by default `Group.starts`.
+    `starts` holds those of each group, as `fit_linked` takes them; by default `Group.starts`.
     """
     starts = [group.starts for group in groups] if starts is None else starts
+    names = {name for group in groups for one in group.problems for name in one.free()}
+    links = Links({name: "shared" for name in names if name not in (*own, *NUISANCE)})
     limit = {} if iterations is None else {"iterations": iterations}
     fits = tuple(
-        fit_together(group.problems, own, start, **limit)
+        fit_linked(group.problems, links, start, **limit)
         for group, start in zip(groups, starts, strict=True)
     )
     bic = sum(_bic(group, fit.cost, fit.n_vary) for group, fit in zip(groups, fits, strict=True))

@@ -5,6 +5,7 @@ All that is concluded from a fit reads this: one plain simulation and one with s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -17,7 +18,7 @@ from foamfit.fitting.losses import influence, soften
 from foamfit.fitting.objective import Simulated
 from foamfit.fitting.problem import Problem
 from foamfit.trust import covariance
-from foamfit.trust.covariance import Covariance
+from foamfit.trust.covariance import Block, Covariance, Uncertainty
 from foamfit.trust.residuals.law_error import CurveError, curve_errors
 from foamfit.trust.residuals.noise_process import noise_processes, parts
 
@@ -108,44 +109,38 @@ class BestPoint:
         """Whether the law misses more of some curve than its noise."""
         return any(error.found for error in self.errors)
 
+    def block(self, errors: Sequence[CurveError]) -> Block:
+        """Its part in a covariance, by the errors of its curves; as estimated with the loss."""
+        jacobian, pseudo = self._weighted
+        values = self.values[[self.index[name] for name in self.names]]
+        limits = np.array([self.limits(name) for name in self.names]).reshape(-1, 2)
+        room = np.column_stack([values - limits[:, 0], limits[:, 1] - values])
+        return Block(
+            jacobian * self.sizes,
+            pseudo,
+            self.problem.objective.sizes,
+            [error.noise for error in errors],
+            np.eye(len(self.names)),
+            self.gradient if any(error.found for error in errors) else None,
+            room / self.sizes[:, None],
+        )
+
+    def gradient(self, places: NDArray[np.intp], step: Array) -> Array:
+        """Half the gradient of the cost by some of the parameters, all scaled, at a step of them.
+
+        The step ends at their limits.
+        """
+        names = tuple(self.names[i] for i in places)
+        at, values = [self.index[name] for name in names], self.values.copy()
+        low, high = np.array([self.limits(name) for name in names]).T
+        values[at] = np.clip(values[at] + step * self.sizes[places], low, high)
+        slopes = self.problem.slopes(values, names) * self.sizes[places]
+        return np.asarray(slopes.T @ self.problem.objective.residual(values))
+
     @cached_property
     def spread(self) -> Covariance:
-        """Their local covariance, as estimated with the loss."""
-        jacobian, pseudo = self._weighted
-        noise, curves = [error.noise for error in self.errors], self.problem.objective.sizes
-        plain = covariance.covariance(jacobian, pseudo, curves, self.sizes, noise)
-        if not self.misfits:
-            return plain
-        held = self._held(jacobian, pseudo, plain)
-        if held.all():
-            return plain
-        free = np.flatnonzero(~held)
-
-        def gradient(step: Array) -> Array:
-            values = self.values.copy()
-            places = [self.index[self.names[i]] for i in free]
-            low, high = np.array([self.limits(self.names[i]) for i in free]).T
-            values[places] = np.clip(values[places] + step * self.sizes[free], low, high)
-            names = tuple(self.names[i] for i in free)
-            slopes = self.problem.slopes(values, names) * self.sizes[free]
-            return np.asarray(slopes.T @ self.problem.objective.residual(values))
-
-        bent = covariance.covariance(
-            jacobian[:, free], pseudo, curves, self.sizes[free], noise, gradient
-        )
-        return plain.with_some(free, bent)
-
-    def _held(self, jacobian: Array, residual: Array, spread: Covariance) -> NDArray[np.bool_]:
-        """Parameters that the residual presses to a limit by more than its noise could, (k,)."""
-        pull = jacobian.T @ residual
-        noise = zip(spread.noise, parts(self.problem.objective.sizes), strict=True)
-        sure = np.sum([process.forms(jacobian[part]) for process, part in noise], axis=0)
-        sure += np.sum(jacobian[self.problem.objective.n_data :] ** 2, axis=0)
-        limits = np.array([self.limits(name) for name in self.names])
-        there = self.values[[self.index[name] for name in self.names]]
-        near = np.abs(limits.T - there) <= covariance.AT_LIMIT * self.sizes
-        outward = np.where(near[0], pull, np.where(near[1], -pull, 0.0))
-        return np.asarray(outward > 1.96 * np.sqrt(sure))
+        """Their local covariance."""
+        return Uncertainty((self.block(self.errors),), self.sizes).covariance
 
     @cached_property
     def soft(self) -> Array:

@@ -18,7 +18,7 @@ from foamfit.arrays import Array
 from foamfit.data.measurement import Specimen
 from foamfit.errors import InputError
 from foamfit.fitting.box import is_logarithmic
-from foamfit.fitting.links import RATES, law
+from foamfit.fitting.links import RATES, factor
 from foamfit.springs.parameters import split_name
 from foamfit.study.prediction.identified import Identified, Pair, Source
 from foamfit.trust.scatter import correlation
@@ -257,7 +257,7 @@ class Population:
 
     def _at_rate(self, name: str, value: float, b: float) -> float:
         kind = self.source.parameters[name].kind
-        return law(kind, value, b, self._log_rate) if kind in RATES else value
+        return value * factor(kind, b, self._log_rate)[0] if kind in RATES else value
 
     def _vector(self, values: dict[str, float]) -> Array:
         """Flat vector, with the heights of a chain those of the test's specimen."""
