@@ -131,7 +131,6 @@ class JointData:
     """Everything that a joint fit found; arrays are in the order of `tests`."""
 
     study: Study
-    seed: int
     tests: tuple[str, ...]
     files: tuple[Path, ...]
     rates: tuple[float | None, ...]  # Mean strain rate on loading, 1/s
@@ -143,12 +142,12 @@ class JointData:
     n_eff: int  # Effective samples that the evidence counts
     alone: Alone
     refused: Mapping[str, str]  # File and sentence
-    status: str
-    warnings: tuple[str, ...]
-    sentences: tuple[str, ...]
-    runtime_s: float
     # Parameters whose slope by rate the tests leave open, and by how much; see `open_slope`.
     open_slopes: Mapping[str, float] = field(default_factory=dict)
+    status: str = "ok"
+    warnings: tuple[str, ...] = ()
+    sentences: tuple[str, ...] = ()
+    runtime_s: float = 0.0
 
     @property
     def problems(self) -> tuple[Problem, ...]:
@@ -223,7 +222,7 @@ class JointData:
             "model": self.study.model,
             "relaxation": self.study.relaxation,
             "drive": self.drive,
-            "seed": self.seed,
+            "seed": self.study.seed,
             "status": self.status,
             "warnings": self.warnings,
             "sentences": self.sentences,
@@ -259,7 +258,7 @@ class JointData:
         for t, (problem, values) in enumerate(
             zip(self.problems, self.fit.found.values, strict=True)
         ):
-            yield TestFit(problem, values, self.estimates(t), note, self.seed)
+            yield TestFit(problem, values, self.estimates(t), note, self.study.seed)
 
     @property
     def statistics(self) -> dict[str, float | int]:

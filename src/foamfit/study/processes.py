@@ -20,9 +20,11 @@ from concurrent.futures import ThreadPoolExecutor as Threads
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import connection
+from numbers import Integral
 from types import ModuleType
 from typing import Any
 
+from foamfit.errors import InputError
 from foamfit.terminal import without_ctrl_c
 
 # What fits and their pages import.
@@ -48,6 +50,12 @@ def cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def check_jobs(jobs: int | None) -> None:
+    """Refuse a number of processes that is none."""
+    if jobs is not None and (not isinstance(jobs, Integral) or jobs < 1):
+        raise InputError(f"jobs = {jobs!r} is not admissible; it must be a whole number from 1 up")
 
 
 def prepare(preload: Iterable[str]) -> None:
@@ -101,6 +109,13 @@ class Processes(Executor):
             pool.shutdown(wait)
         self._stopping.close()
         self._stop.close()
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """End the processes; at once if anything went wrong."""
+        if kind is None:
+            self.shutdown()
+        else:
+            self.stop()
 
     def stop(self) -> None:
         """End the processes at once, whatever they are at."""
