@@ -19,7 +19,7 @@ from foamfit.fitting.problem import Problem
 from foamfit.trust import covariance
 from foamfit.trust.covariance import Covariance
 from foamfit.trust.residuals.law_error import CurveError, curve_errors
-from foamfit.trust.residuals.noise_process import noise_processes, parts
+from foamfit.trust.residuals.noise_process import noise_processes, parts, variance_of
 
 
 def m_estimate(residual: Array, sizes: tuple[int, ...], loss: str) -> tuple[Array, Array]:
@@ -32,7 +32,7 @@ def m_estimate(residual: Array, sizes: tuple[int, ...], loss: str) -> tuple[Arra
     """
     psi, slope = influence(residual, loss)
     weights, data = np.ones(residual.size), sum(sizes)
-    psi = np.append(psi[:data], residual[data:])
+    psi[data:] = residual[data:]
     for part in parts(sizes):
         weights[part] = max(float(slope[part].mean()), 0.05) ** 0.5
     return weights, psi / weights
@@ -57,8 +57,19 @@ class BestPoint:
 
     @cached_property
     def residual(self) -> Array:
-        """Residual of curves and priors before its loss gives way to large ones."""
+        """Residual of curves and priors before the loss reduces large ones."""
         return self.problem.objective.compare(self.simulated, self.values)
+
+    @cached_property
+    def soft(self) -> Array:
+        """Residual of curves and priors, softened by the loss."""
+        objective = self.problem.objective
+        return soften(self.residual, objective.loss, objective.n_data)
+
+    @cached_property
+    def cost(self) -> float:
+        """Sum of squares of the softened residual."""
+        return float(self.soft @ self.soft)
 
     @cached_property
     def unreached(self) -> dict[str, str]:
@@ -72,10 +83,30 @@ class BestPoint:
             return self.chosen
         return tuple(name for name in self.problem.free() if name not in self.unreached)
 
+    @property
+    def index(self) -> dict[str, int]:
+        """Place of each parameter in `values`."""
+        return self.problem.index
+
+    @cached_property
+    def places(self) -> NDArray[np.intp]:
+        """Places of the k parameters in `values`."""
+        return np.array([self.index[name] for name in self.names], dtype=np.intp)
+
     @cached_property
     def sizes(self) -> Array:
         """Their characteristic sizes, (k,)."""
         return self.problem.sizes(self.names, self.values)
+
+    def limits(self, name: str) -> tuple[float, float]:
+        """Limits of a parameter, SI."""
+        parameter = self.problem.params[name]
+        return float(parameter.min), float(parameter.max)
+
+    @cached_property
+    def box(self) -> Array:
+        """Lower and upper limits of the k parameters, SI, (2, k)."""
+        return np.array([self.limits(name) for name in self.names]).reshape(-1, 2).T
 
     @cached_property
     def jacobian(self) -> Array:
@@ -83,7 +114,7 @@ class BestPoint:
         return self.problem.linear.slopes(self.values, self.names)
 
     @cached_property
-    def _weighted(self) -> tuple[Array, Array]:
+    def weighted(self) -> tuple[Array, Array]:
         """Jacobian and residual whose least squares have the covariance of the loss."""
         objective = self.problem.objective
         weights, pseudo = m_estimate(self.residual, objective.sizes, objective.loss)
@@ -91,12 +122,12 @@ class BestPoint:
 
     @cached_property
     def errors(self) -> tuple[CurveError, ...]:
-        """What the residual of each counted curve is made of: noise, or an error of the law too.
+        """Whether the residual of each counted curve is noise, or holds an error of the law too.
 
         The noise of a driving stress comes through the springs as slow waves of the displacement,
-        which look like an error of the law and are none.
+        which look like an error of the law but are none.
         """
-        jacobian, pseudo = self._weighted
+        jacobian, pseudo = self.weighted
         scaled, objective = jacobian * self.sizes, self.problem.objective
         if objective.drive == "stress":
             noise = noise_processes(pseudo, scaled, objective.sizes)
@@ -110,58 +141,38 @@ class BestPoint:
 
     @cached_property
     def spread(self) -> Covariance:
-        """Their local covariance, as estimated with the loss."""
-        jacobian, pseudo = self._weighted
+        """Their local covariance, as estimated with the loss.
+
+        Where the law has an error it goes by the curvature of the cost itself, and what the
+        residual presses to a limit is held.
+        """
+        jacobian, pseudo = self.weighted
         noise, curves = [error.noise for error in self.errors], self.problem.objective.sizes
         plain = covariance.covariance(jacobian, pseudo, curves, self.sizes, noise)
-        if not self.misfits:
+        free = np.arange(len(self.names))
+        if self.misfits:
+            free = np.flatnonzero(~self._held(jacobian, pseudo, plain))
+        if not self.misfits or not free.size:
             return plain
-        held = self._held(jacobian, pseudo, plain)
-        if held.all():
-            return plain
-        free = np.flatnonzero(~held)
+        places, sizes, (low, high) = self.places[free], self.sizes[free], self.box[:, free]
+        names = tuple(self.names[i] for i in free)
 
         def gradient(step: Array) -> Array:
             values = self.values.copy()
-            places = [self.index[self.names[i]] for i in free]
-            low, high = np.array([self.limits(self.names[i]) for i in free]).T
-            values[places] = np.clip(values[places] + step * self.sizes[free], low, high)
-            names = tuple(self.names[i] for i in free)
-            slopes = self.problem.slopes(values, names) * self.sizes[free]
+            values[places] = np.clip(values[places] + step * sizes, low, high)
+            slopes = self.problem.slopes(values, names) * sizes
             return np.asarray(slopes.T @ self.problem.objective.residual(values))
 
-        bent = covariance.covariance(
-            jacobian[:, free], pseudo, curves, self.sizes[free], noise, gradient
-        )
+        bent = covariance.covariance(jacobian[:, free], pseudo, curves, sizes, noise, gradient)
         return plain.with_some(free, bent)
 
     def _held(self, jacobian: Array, residual: Array, spread: Covariance) -> NDArray[np.bool_]:
         """Parameters that the residual presses to a limit by more than its noise could, (k,)."""
         pull = jacobian.T @ residual
-        noise = zip(spread.noise, parts(self.problem.objective.sizes), strict=True)
-        sure = np.sum([process.forms(jacobian[part]) for process, part in noise], axis=0)
-        sure += np.sum(jacobian[self.problem.objective.n_data :] ** 2, axis=0)
-        limits = np.array([self.limits(name) for name in self.names])
-        there = self.values[[self.index[name] for name in self.names]]
-        near = np.abs(limits.T - there) <= covariance.AT_LIMIT * self.sizes
+        sure = variance_of(spread.noise, jacobian, self.problem.objective.sizes)
+        near = np.abs(self.box - self.values[self.places]) <= covariance.AT_LIMIT * self.sizes
         outward = np.where(near[0], pull, np.where(near[1], -pull, 0.0))
         return np.asarray(outward > 1.96 * np.sqrt(sure))
-
-    @cached_property
-    def soft(self) -> Array:
-        """Residual of curves and priors, softened by the loss."""
-        objective = self.problem.objective
-        return soften(self.residual, objective.loss, objective.n_data)
-
-    @cached_property
-    def cost(self) -> float:
-        """Sum of squares of the residual, softened by the loss."""
-        return float(self.soft @ self.soft)
-
-    @property
-    def index(self) -> dict[str, int]:
-        """Place of each parameter in `values`."""
-        return self.problem.index
 
     @cached_property
     def quantiles(self) -> Array:
@@ -179,13 +190,6 @@ class BestPoint:
         told = self.halves <= covariance.NOTHING * self.sizes
         return [name for name, known in zip(self.names, told, strict=True) if known]
 
-    def limits(self, name: str) -> tuple[float, float]:
-        """Limits of a parameter, SI."""
-        parameter = self.problem.params[name]
-        return float(parameter.min), float(parameter.max)
-
-    def along(self, name: str) -> Array:
-        """Change of all k parameters per change of one, as their correlation has it, (k,)."""
-        column = self.names.index(name)
-        row = self.spread.matrix[:, column]
-        return np.asarray(np.nan_to_num(row / row[column]))
+    def rises(self, residual: Array) -> Array:
+        """Rise of the cost at another point, from its softened residual, as χ² of each, (k,)."""
+        return np.asarray((float(residual @ residual) - self.cost) / self.spread.inflation)
