@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import chain, groupby
 
@@ -81,8 +81,10 @@ def input_first(warnings: Iterable[str]) -> tuple[str, ...]:
 
 
 def make_checklist(findings: Findings) -> tuple[Check, ...]:
-    """Answer all questions, the most important first."""
-    return tuple(ask(findings) for ask in QUESTIONS)
+    """Answer all questions, in the order of `sentences.toml`."""
+    groups = (_of_search, _of_curves, _of_parameters, _of_test, _of_what_is_left_out)
+    found = {check.key: check for answers in groups for check in answers(findings)}
+    return tuple(found[key] for key in SENTENCES["check"])
 
 
 def _check(
@@ -98,41 +100,25 @@ def _check(
     table = SENTENCES["check"][key]
     said = table[case or {True: "yes", False: "no", None: "unknown"}[answer]].format(**facts)
     if warnings is None:
-        warnings = (
-            [table["warning"].format(**facts)] if answer is False and "warning" in table else []
-        )
+        told = table.get("warning") if answer is False else None
+        warnings = [told.format(**facts)] if told else []
     return Check(key, table["question"], answer, said, tuple(warnings), fatal)
 
 
-# ---------------------------------------------------------------- the search
+def _of_search(e: Findings) -> Iterator[Check]:
+    by, objective = e.record.stopped, e.objective
+    yield _check("ended", by is None, by=by, count=objective.evaluations)
+    total, agreeing = sum(count for _, count in e.record.costs), 0
+    if by is None and total:
+        agreeing = e.record.agreeing
+    yield _check("agree", agreeing > 1 if agreeing else None, total=total, agreeing=agreeing)
+    failed, tried = objective.failures, max(objective.evaluations, 1)
+    yield _check("simulated", failed <= 0.5 * tried, failed=failed, tried=tried)
+    vibrates = objective.interior_mass and len(e.best.problem.model.kinds) > 1
+    yield _check("vibration", not vibrates)
 
 
-def _ended(e: Findings) -> Check:
-    by = e.record.stopped
-    return _check("ended", by is None, by=by, count=e.objective.evaluations)
-
-
-def _agree(e: Findings) -> Check:
-    if e.record.stopped is not None or not e.record.costs:
-        return _check("agree", None)
-    total, agreeing = sum(count for _, count in e.record.costs), e.record.agreeing
-    return _check("agree", agreeing > 1, total=total, agreeing=agreeing)
-
-
-def _simulated(e: Findings) -> Check:
-    failed, tried = e.objective.failures, max(e.objective.evaluations, 1)
-    return _check("simulated", failed <= 0.5 * tried, failed=failed, tried=tried)
-
-
-def _vibration(e: Findings) -> Check:
-    vibrates = e.objective.interior_mass and len(e.best.problem.model.kinds) > 1
-    return _check("vibration", not vibrates)
-
-
-# ---------------------------------------------------------------- the curves
-
-
-def _followed(e: Findings) -> Check:
+def _of_curves(e: Findings) -> Iterator[Check]:
     told, warnings, fatal = [], [], False
     for name in e.objective.counted:
         off, measured = e.misfit[name] or 0.0, e.objective.measured[name]
@@ -142,10 +128,11 @@ def _followed(e: Findings) -> Check:
         if off > POOR or lost:
             warnings.append(say("check.followed", "lost" if lost else "large", curve=name, off=off))
     found = ", ".join(told)
-    return _check("followed", not warnings, warnings=warnings, fatal=fatal, misfits=found)
+    yield _check("followed", not warnings, warnings=warnings, fatal=fatal, misfits=found)
+    yield _at_noise(e)
 
 
-def _noise(e: Findings) -> Check:
+def _at_noise(e: Findings) -> Check:
     """Whether the residuals are noise: by their size, an error of the law, and their correlation.
 
     This is the only verdict on the noise; `Fit.at_noise` has its answer.
@@ -184,9 +171,6 @@ def _noise(e: Findings) -> Check:
     return _check("noise", not warnings, warnings=warnings, found=sentence)
 
 
-# ---------------------------------------------------------------- the parameters
-
-
 def _determined(e: Findings) -> Check:
     """Whether the springs' parameters are; a small upper bound of one that may vanish is enough.
 
@@ -222,13 +206,6 @@ def _vanishes(e: Findings, name: str) -> bool:
     return bool(min(ends) <= 0.0 <= max(ends) and max(map(abs, ends)) <= WEAK * size)
 
 
-def _intervals(e: Findings) -> Check:
-    counts = Counter(item.ci95_method for item in e.estimates.values() if item.ci95_method)
-    made = ", ".join(f"{n} by {method}" for method, n in counts.items()) or "There are none"
-    answer = False if e.intervals.warnings else True if counts else None
-    return _check("intervals", answer, warnings=e.intervals.warnings, made=made)
-
-
 def _visited(e: Findings) -> Check:
     problem = e.best.problem
     wanted = [tuple(dict.fromkeys(BRANCHES.get(k, {}).values())) for k in problem.model.kinds]
@@ -250,11 +227,16 @@ def _visited(e: Findings) -> Check:
     return _check("visited", answer, wanted=every, lost=", ".join(lost))
 
 
-def _bounds(e: Findings) -> Check:
-    varied = tuple(name for name in e.known if e.estimates[name].vary)
-    sizes = e.best.problem.sizes(varied, e.best.values)
+def _of_parameters(e: Findings) -> Iterator[Check]:
+    yield _determined(e)
+    yield _visited(e)
+    counts = Counter(item.ci95_method for item in e.estimates.values() if item.ci95_method)
+    made = ", ".join(f"{n} by {method}" for method, n in counts.items()) or "There are none"
+    answer = False if e.intervals.warnings else True if counts else None
+    yield _check("intervals", answer, warnings=e.intervals.warnings, made=made)
     stuck, natural = [], []
-    for name, size in zip(varied, sizes, strict=True):
+    varied = tuple(name for name in e.known if e.estimates[name].vary)
+    for name, size in zip(varied, e.best.problem.sizes(varied, e.best.values), strict=True):
         for bound in e.best.limits(name):
             if abs(e.best.values[e.best.index[name]] - bound) > AT_LIMIT * size:
                 continue
@@ -262,39 +244,33 @@ def _bounds(e: Findings) -> Check:
                 natural.append(f"{name} is zero, which it may be")
             else:
                 stuck.append(f"{name} lies at {bound:g}")
-    return _check("bounds", not stuck, at=", ".join([*stuck, *natural]) or "None lies at one")
+    yield _check("bounds", not stuck, at=", ".join([*stuck, *natural]) or "None lies at one")
 
 
-# ---------------------------------------------------------------- the test itself
-
-
-def _velocity(e: Findings) -> Check:
-    test = e.best.problem.measurement
-    if e.objective.drive != "impact" or test.displacement is None:
-        return _check("velocity", None)
+def _of_test(e: Findings) -> Iterator[Check]:
+    test, balance = e.best.problem.measurement, e.balance
     wrong = [note for note in test.notes if CONTRADICTED in note]
-    return _check("velocity", not wrong, warnings=wrong)
+    asked = [note for note in test.notes if note.startswith(ASKED) and note not in wrong]
+    moves = e.objective.drive == "impact" and test.displacement is not None
+    yield _check("velocity", not wrong if moves else None, warnings=wrong if moves else ())
+    yield _check("input", not asked, warnings=asked)
+    taken, warnings = balance.absorbed_over_striker, balance.energy_warnings()
+    if not warnings and (taken is None or balance.motion == INTEGRATED):
+        yield _check("energy", None, "unknown" if taken is None else "integrated")
+    else:
+        case = "returns" if taken is None else ""
+        yield _check("energy", not warnings, case, warnings=warnings, taken=taken)
+    ratio, warnings = balance.impulse_ratio, balance.impulse_warnings()
+    answer = None if ratio is None else not warnings
+    yield _check("impulse", answer, warnings=() if ratio is None else warnings, ratio=ratio)
 
 
-def _input(e: Findings) -> Check:
-    notes = e.best.problem.measurement.notes
-    asked = [note for note in notes if note.startswith(ASKED) and CONTRADICTED not in note]
-    return _check("input", not asked, warnings=asked)
-
-
-def _energy(e: Findings) -> Check:
-    taken, warnings = e.balance.absorbed_over_striker, e.balance.energy_warnings()
-    if not warnings and (taken is None or e.balance.motion == INTEGRATED):
-        return _check("energy", None, "unknown" if taken is None else "integrated")
-    case = "returns" if taken is None else ""
-    return _check("energy", not warnings, case, warnings=warnings, taken=taken)
-
-
-def _impulse(e: Findings) -> Check:
-    if (ratio := e.balance.impulse_ratio) is None:
-        return _check("impulse", None)
-    warnings = e.balance.impulse_warnings()
-    return _check("impulse", not warnings, warnings=warnings, ratio=ratio)
+def _of_what_is_left_out(e: Findings) -> Iterator[Check]:
+    yield _time_shift(e)
+    known = e.objective.drive == "displacement" and e.best.names
+    found = damping_hint(e.best, e.known) if known else None
+    answer = found is None if known else None
+    yield _check("damping", answer, size=engineering(found or 0.0, "Pa·s"))
 
 
 def _time_shift(e: Findings) -> Check:
@@ -314,30 +290,3 @@ def _time_shift(e: Findings) -> Check:
     found = shift_hint(e.best, e.known)
     told = f"{'late' if (found or 0.0) > 0.0 else 'early'} by {engineering(abs(found or 0.0), 's')}"
     return _check("time_shift", found is None, late=told)
-
-
-def _damping(e: Findings) -> Check:
-    if e.objective.drive != "displacement" or not e.best.names:
-        return _check("damping", None)
-    found = damping_hint(e.best, e.known)
-    return _check("damping", found is None, size=engineering(found or 0.0, "Pa·s"))
-
-
-QUESTIONS: tuple[Callable[[Findings], Check], ...] = (
-    _ended,
-    _followed,
-    _input,
-    _velocity,
-    _noise,
-    _determined,
-    _intervals,
-    _visited,
-    _bounds,
-    _agree,
-    _vibration,
-    _simulated,
-    _energy,
-    _impulse,
-    _time_shift,
-    _damping,
-)

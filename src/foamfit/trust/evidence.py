@@ -17,7 +17,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -96,105 +95,57 @@ def predicted_misfit(best: BestPoint, deadline: float | None = None) -> float:
     return misfit_of(best, predicted[: objective.n_data])
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Tried:
-    """A fitted model: its result, "with" or "without" damping, its best point, and its run time."""
+    """A fitted model: its result, "with" or "without" damping, its best point, and its run time.
+
+    `predicted` is the RMS over the range of samples that were held back, None where the time did
+    not allow it; `misfit` that of all samples, not less than the simulation's own error, like the
+    chi-square `chisqr`. `residual` (n_data,) is in the order of its `curves`, and `grams` are JᵀJ
+    of each curve, J the derivative by relative changes, (n_curves, k, k).
+    """
 
     result: Fit
     damping: str
     best: BestPoint
     seconds: float
-    # RMS over the range of samples that were held back; None where the time did not allow it.
     predicted: float | None = None
 
-    @property
-    def counted(self) -> tuple[str, ...]:
-        """Names of the curves."""
-        return self.best.problem.objective.counted
-
-    @property
-    def sizes(self) -> tuple[int, ...]:
-        """Samples of each curve."""
-        return self.best.problem.objective.sizes
-
-    @cached_property
-    def spans(self) -> tuple[float, ...]:
-        """Measured range of each curve, in the unit of its residual."""
-        return tuple(map(self.best.problem.objective.span, self.counted))
+    def __post_init__(self) -> None:
+        """Compute what the comparison goes by."""
+        best, objective = self.best, self.best.problem.objective
+        self.name = rung_name(self.result.model, self.damping, self.result.relaxation)
+        self.varied = sum(item.vary for item in self.result.parameters.values())
+        self.counted, self.sizes, slices = (
+            objective.counted,
+            objective.sizes,
+            parts(objective.sizes),
+        )
+        self.spans = [objective.span(name) for name in self.counted]  # in the unit of the residual
+        self.residual = soften(best.residual[: objective.n_data], objective.loss)
+        self.curves = [self.residual[part] for part in slices]
+        self.taus = [autocorrelation_time(curve) for curve in self.curves]
+        soft = softness(best.residual, objective.loss)
+        jacobian = soft[:, None] * best.jacobian * best.sizes
+        self.grams = np.array([jacobian[part].T @ jacobian[part] for part in slices])
+        pairs = zip(self.sizes, self.spans, strict=True)
+        floor = sum(n * (EXACT * span) ** 2 for n, span in pairs)
+        self.chisqr = max(float(self.residual @ self.residual), floor)
+        self.misfit = max(misfit_of(best, self.residual), EXACT)
+        # p-values of all curves together (Bonferroni)
+        self.runs_p, self.neighbours_p = (
+            min(1.0, len(self.sizes) * min(map(test, self.curves)))
+            for test in (runs_test, neighbours_test)
+        )
+        least = min(self.runs_p, self.neighbours_p)
+        self.structureless = self.chisqr <= floor or least >= LEVEL  # only noise is left
+        self.errs = self.chisqr > floor and least < SURE  # an error of the model is left for sure
 
     @property
     def places(self) -> list[NDArray[np.str_]]:
         """Branches that the springs are on at each counted sample of each curve."""
         words = branch_of_samples(self.best.problem, self.best.simulated)
         return [words[self.best.problem.objective.kept(name)] for name in self.counted]
-
-    @cached_property
-    def residual(self) -> Array:
-        """At the best point, curve after curve, (n_data,)."""
-        objective = self.best.problem.objective
-        return soften(self.best.residual[: objective.n_data], objective.loss)
-
-    @cached_property
-    def curves(self) -> list[Array]:
-        """Residual of each curve."""
-        return [self.residual[part] for part in parts(self.sizes)]
-
-    @cached_property
-    def grams(self) -> Array:
-        """JᵀJ of each curve, J the derivative by relative changes, (n_curves, k, k)."""
-        soft = softness(self.best.residual, self.best.problem.objective.loss)
-        jacobian = soft[:, None] * self.best.jacobian * self.best.sizes
-        return np.array([jacobian[part].T @ jacobian[part] for part in parts(self.sizes)])
-
-    @cached_property
-    def taus(self) -> list[float]:
-        """Autocorrelation time of each curve, samples."""
-        return [autocorrelation_time(part) for part in self.curves]
-
-    @property
-    def name(self) -> str:
-        """Model, relaxation and damping in words."""
-        return rung_name(self.result.model, self.damping, self.result.relaxation)
-
-    @property
-    def floor(self) -> float:
-        """Chi-square of the simulation's own error."""
-        return sum(n * (EXACT * span) ** 2 for n, span in zip(self.sizes, self.spans, strict=True))
-
-    @property
-    def chisqr(self) -> float:
-        """Chi-square, not less than that of the simulation's own error."""
-        return max(float(self.residual @ self.residual), self.floor)
-
-    @cached_property
-    def misfit(self) -> float:
-        """RMS over the range, all curves together, not less than the simulation's own error."""
-        return max(misfit_of(self.best, self.residual), EXACT)
-
-    @cached_property
-    def runs_p(self) -> float:
-        """p-value of the runs tests of all curves together (Bonferroni)."""
-        return min(1.0, len(self.sizes) * min(map(runs_test, self.curves)))
-
-    @cached_property
-    def neighbours_p(self) -> float:
-        """p-value of the neighbours tests of all curves together (Bonferroni)."""
-        return min(1.0, len(self.sizes) * min(map(neighbours_test, self.curves)))
-
-    @property
-    def structureless(self) -> bool:
-        """Whether only noise is left."""
-        return self.chisqr <= self.floor or min(self.runs_p, self.neighbours_p) >= LEVEL
-
-    @property
-    def errs(self) -> bool:
-        """Whether an error of the model is left for sure."""
-        return self.chisqr > self.floor and min(self.runs_p, self.neighbours_p) < SURE
-
-    @property
-    def varied(self) -> int:
-        """How many parameters vary."""
-        return sum(item.vary for item in self.result.parameters.values())
 
     def states(self, state: str) -> tuple[str, ...]:
         """Names of the parameters in a state."""

@@ -6,6 +6,7 @@ import importlib.util
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -36,38 +37,27 @@ def block_length(process: NoiseProcess, n: int) -> int:
     return int(min(max(round(length), 1), max(n // 4, 1)))
 
 
-@dataclass(frozen=True, eq=False)
-class _Source:
-    """What the noise of one curve is drawn from: blocks of its residual, or a process."""
+def _source(
+    residual: Array, like: Array, process: NoiseProcess, law: bool
+) -> Callable[[np.random.Generator], Array]:
+    """What draws the noise of one curve: its process beside an error of the law, else its residual.
 
-    residual: Array
-    length: int  # of a block
-    process: NoiseProcess | None  # where the residual holds an error of the law
+    From the residual, circular blocks with random starts (Politis & Romano 1992). A factor corrects
+    that residuals are smaller than the noise was, which was read off `like`, and that blocks break
+    correlation at their ends: sums over the curve vary as those of its noise.
+    """
+    n, length = residual.size, block_length(process, residual.size)
+    lags = process.autocovariance(length) / process.variance
+    within = 1.0 + 2.0 * float((1.0 - np.arange(1, length) / length) @ lags[1:])
+    power = max(float(np.var(like)), 1e-300)
+    factor = process.variance / power * max(process.tau / within, 1.0)
+    scaled = (residual - residual.mean()) * math.sqrt(factor)
 
-    @classmethod
-    def of(cls, residual: Array, like: Array, process: NoiseProcess, law: bool) -> _Source:
-        """Scale the residual for circular blocks (Politis & Romano 1992).
+    def blocks(rng: np.random.Generator) -> Array:
+        starts = rng.integers(0, n, -(-n // length))
+        return np.asarray(scaled[((starts[:, None] + np.arange(length)) % n).ravel()[:n]])
 
-        A factor corrects that residuals are smaller than the noise was, which was read off `like`,
-        and that blocks break correlation at their ends: sums over the curve vary as those of its
-        noise.
-        """
-        length = block_length(process, residual.size)
-        lags = process.autocovariance(length) / process.variance
-        within = 1.0 + 2.0 * float((1.0 - np.arange(1, length) / length) @ lags[1:])
-        power = max(float(np.var(like)), 1e-300)
-        factor = process.variance / power * max(process.tau / within, 1.0)
-        scaled = (residual - residual.mean()) * math.sqrt(factor)
-        return cls(scaled, length, process if law else None)
-
-    def draw(self, rng: np.random.Generator) -> Array:
-        """As many samples as the curve has; blocks have random starts."""
-        n = self.residual.size
-        if self.process is not None:
-            return self.process.draw(n, rng)
-        starts = rng.integers(0, n, -(-n // self.length))
-        drawn = (starts[:, None] + np.arange(self.length)) % n
-        return np.asarray(self.residual[drawn.ravel()[:n]])
+    return partial(process.draw, n) if law else blocks
 
 
 class Refits(NamedTuple):
@@ -94,14 +84,14 @@ def bootstrap(best: BestPoint, draws: int, seed: int, tracker: Tracker | None = 
     for part, process, error in zip(
         parts(objective.sizes), best.spread.noise, best.errors, strict=True
     ):
-        sources.append(_Source.of(best.residual[part], pseudo[part], process, error.found))
+        sources.append(_source(best.residual[part], pseudo[part], process, error.found))
         if error.found:
             fitted[part] = 0.0
     out: list[Array] = []
     stopped = None
     try:
         for _ in range(draws):
-            left = fitted - np.concatenate([source.draw(rng) for source in sources])
+            left = fitted - np.concatenate([draw(rng) for draw in sources])
             refit = Refit(best, tracker, np.append(left, rng.standard_normal(priors)))
             end = refit.run(best.values)
             assert end is not None  # the best point can be simulated
