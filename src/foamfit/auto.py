@@ -32,6 +32,7 @@ from foamfit.text import counted, percent
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.checklist import input_first
 from foamfit.trust.evidence import (
+    BLOCKS,
     MARGIN,
     SHARE,
     WORSE,
@@ -39,10 +40,10 @@ from foamfit.trust.evidence import (
     Tried,
     choose,
     effective_samples,
+    predicted_misfit,
     reference_of,
 )
 from foamfit.trust.intervals import Announce, Choice
-from foamfit.trust.prediction import BLOCKS, predicted_misfit
 from foamfit.trust.residuals.residual_tests import BENT, find_structure, neighbours_test, runs_test
 
 # From the simplest up, in groups: one spring; a linear spring below it or its relaxation; two

@@ -11,7 +11,7 @@ from foamfit.data.measurement import INTEGRATED, Measurement, interior_channel
 from foamfit.errors import InputError
 from foamfit.springs.model import Model
 
-# Of every objective; to them come displacement_1_time … where masses inside were followed.
+# Those of every objective, besides displacement_1_time … where masses inside were followed.
 CURVES = ("stress_time", "displacement_time", "stress_strain")
 # Of an impact whose striker carries an accelerometer and whose displacement was not measured.
 ACCELERATION = "acceleration_time"
@@ -41,20 +41,15 @@ def check_drive(measurement: Measurement, drive: str) -> None:
     """Refuse a drive that the test cannot feed (InputError, naming what is missing)."""
     if drive not in DRIVES:
         raise InputError(f"drive '{drive}' is unknown; it must be one of {', '.join(DRIVES)}")
-    striker = measurement.striker
-    missing = []
-    if measurement.stress is None:
-        missing.append("a force or stress column")
-    if drive == "impact":
-        if measurement.time is None:
-            missing.append("a time column")
-        if striker is None or striker.mass is None:
-            missing.append("[striker] mass")
-        if striker is None or not striker.velocity:
-            missing.append("[striker] velocity greater than zero")
-    elif measurement.displacement is None:
-        missing.append("a displacement or strain column")
-    if missing:
+    striker, impact = measurement.striker, drive == "impact"
+    needed = {
+        "a force or stress column": measurement.stress is not None,
+        "a time column": not impact or measurement.time is not None,
+        "[striker] mass": not impact or (striker is not None and striker.mass is not None),
+        "[striker] velocity greater than zero": not impact or (striker and striker.velocity),
+        "a displacement or strain column": impact or measurement.displacement is not None,
+    }
+    if missing := [what for what, there in needed.items() if not there]:
         raise InputError(f"{measurement.name}: the {drive} drive needs {' and '.join(missing)}")
     force = measurement.outliers.get("stress")
     if drive == "stress" and force is not None and force.clipped_at is not None:
@@ -75,10 +70,10 @@ def check_interior(measurement: Measurement, springs: int) -> None:
 
     A single spring has nothing inside; the result's notes say so.
     """
-    wrong = [node for node in sorted(measurement.interior) if node >= springs]
+    wrong = min((node for node in measurement.interior if node >= springs), default=0)
     if wrong and springs > 1:
         raise InputError(
-            f"{measurement.name}: {interior_channel(wrong[0])} is no mass inside a chain of "
+            f"{measurement.name}: {interior_channel(wrong)} is not a mass inside a chain of "
             f"{springs} springs: node {springs} of a {springs}-spring chain is the top, which is "
             "the 'displacement' column; take a model of more springs, or rename or leave out that "
             "column"
@@ -136,11 +131,13 @@ def driving_stress(stress: Array, model: Model) -> Array:
 
 def check_time_shift(measurement: Measurement, drive: str) -> None:
     """Refuse a time shift where the test has no two channels in time (InputError)."""
-    missing = "it has no time" if measurement.time is None else None
-    if missing is None and (measurement.displacement is None or measurement.motion == INTEGRATED):
-        missing = "its motion is not measured apart from the force"
-    if missing:
-        raise InputError(
-            f"{measurement.name}: a time shift between force and motion cannot be fitted in the "
-            f"{drive} drive, {missing}; both channels must be measured in time"
-        )
+    if measurement.time is None:
+        why = "it has no time"
+    elif measurement.displacement is None or measurement.motion == INTEGRATED:
+        why = "its motion is not measured apart from the force"
+    else:
+        return
+    raise InputError(
+        f"{measurement.name}: a time shift between force and motion cannot be fitted in the "
+        f"{drive} drive, {why}; both channels must be measured in time"
+    )

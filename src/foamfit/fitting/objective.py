@@ -32,8 +32,7 @@ from foamfit.fitting.curves import (
     driving_stress,
     interior_curves,
 )
-from foamfit.fitting.losses import LOSSES, soften, softness
-from foamfit.fitting.weighing import Weighing
+from foamfit.fitting.losses import LOSSES, Weighing, soften, softness
 from foamfit.solve.plan import Motion, Plan
 from foamfit.solve.plan import plan as make_plan
 from foamfit.springs import kernels

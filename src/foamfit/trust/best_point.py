@@ -33,7 +33,7 @@ def m_estimate(residual: Array, sizes: tuple[int, ...], loss: str) -> tuple[Arra
     """
     psi, slope = influence(residual, loss)
     weights, data = np.ones(residual.size), sum(sizes)
-    psi = np.append(psi[:data], residual[data:])
+    psi[data:] = residual[data:]
     for part in parts(sizes):
         weights[part] = max(float(slope[part].mean()), 0.05) ** 0.5
     return weights, psi / weights
@@ -58,8 +58,19 @@ class BestPoint:
 
     @cached_property
     def residual(self) -> Array:
-        """Residual of curves and priors before its loss gives way to large ones."""
+        """Residual of curves and priors before the loss reduces large ones."""
         return self.problem.objective.compare(self.simulated, self.values)
+
+    @cached_property
+    def soft(self) -> Array:
+        """Residual of curves and priors, softened by the loss."""
+        objective = self.problem.objective
+        return soften(self.residual, objective.loss, objective.n_data)
+
+    @cached_property
+    def cost(self) -> float:
+        """Sum of squares of the softened residual."""
+        return float(self.soft @ self.soft)
 
     @cached_property
     def unreached(self) -> dict[str, str]:
@@ -73,10 +84,30 @@ class BestPoint:
             return self.chosen
         return tuple(name for name in self.problem.free() if name not in self.unreached)
 
+    @property
+    def index(self) -> dict[str, int]:
+        """Place of each parameter in `values`."""
+        return self.problem.index
+
+    @cached_property
+    def places(self) -> NDArray[np.intp]:
+        """Places of the k parameters in `values`."""
+        return np.array([self.index[name] for name in self.names], dtype=np.intp)
+
     @cached_property
     def sizes(self) -> Array:
         """Their characteristic sizes, (k,)."""
         return self.problem.sizes(self.names, self.values)
+
+    def limits(self, name: str) -> tuple[float, float]:
+        """Limits of a parameter, SI."""
+        parameter = self.problem.params[name]
+        return float(parameter.min), float(parameter.max)
+
+    @cached_property
+    def box(self) -> Array:
+        """Lower and upper limits of the k parameters, SI, (2, k)."""
+        return np.array([self.limits(name) for name in self.names]).reshape(-1, 2).T
 
     @cached_property
     def jacobian(self) -> Array:
@@ -84,7 +115,7 @@ class BestPoint:
         return self.problem.linear.slopes(self.values, self.names)
 
     @cached_property
-    def _weighted(self) -> tuple[Array, Array]:
+    def weighted(self) -> tuple[Array, Array]:
         """Jacobian and residual whose least squares have the covariance of the loss."""
         objective = self.problem.objective
         weights, pseudo = m_estimate(self.residual, objective.sizes, objective.loss)
@@ -92,12 +123,12 @@ class BestPoint:
 
     @cached_property
     def errors(self) -> tuple[CurveError, ...]:
-        """What the residual of each counted curve is made of: noise, or an error of the law too.
+        """Whether the residual of each counted curve is noise, or holds an error of the law too.
 
         The noise of a driving stress comes through the springs as slow waves of the displacement,
-        which look like an error of the law and are none.
+        which look like an error of the law but are none.
         """
-        jacobian, pseudo = self._weighted
+        jacobian, pseudo = self.weighted
         scaled, objective = jacobian * self.sizes, self.problem.objective
         if objective.drive == "stress":
             noise = noise_processes(pseudo, scaled, objective.sizes)
@@ -111,10 +142,7 @@ class BestPoint:
 
     def block(self, errors: Sequence[CurveError]) -> Block:
         """Its part in a covariance, by the errors of its curves; as estimated with the loss."""
-        jacobian, pseudo = self._weighted
-        values = self.values[[self.index[name] for name in self.names]]
-        limits = np.array([self.limits(name) for name in self.names]).reshape(-1, 2)
-        room = np.column_stack([values - limits[:, 0], limits[:, 1] - values])
+        jacobian, pseudo = self.weighted
         return Block(
             jacobian * self.sizes,
             pseudo,
@@ -122,7 +150,7 @@ class BestPoint:
             [error.noise for error in errors],
             np.eye(len(self.names)),
             self.gradient if any(error.found for error in errors) else None,
-            room / self.sizes[:, None],
+            (np.abs(self.box - self.values[self.places]) / self.sizes).T,
         )
 
     def gradient(self, places: NDArray[np.intp], step: Array) -> Array:
@@ -130,33 +158,16 @@ class BestPoint:
 
         The step ends at their limits.
         """
-        names = tuple(self.names[i] for i in places)
-        at, values = [self.index[name] for name in names], self.values.copy()
-        low, high = np.array([self.limits(name) for name in names]).T
-        values[at] = np.clip(values[at] + step * self.sizes[places], low, high)
-        slopes = self.problem.slopes(values, names) * self.sizes[places]
+        at, sizes, (low, high) = self.places[places], self.sizes[places], self.box[:, places]
+        values = self.values.copy()
+        values[at] = np.clip(values[at] + step * sizes, low, high)
+        slopes = self.problem.slopes(values, tuple(self.names[i] for i in places)) * sizes
         return np.asarray(slopes.T @ self.problem.objective.residual(values))
 
     @cached_property
     def spread(self) -> Covariance:
-        """Their local covariance."""
+        """Their local covariance, as estimated with the loss."""
         return Uncertainty((self.block(self.errors),), self.sizes).covariance
-
-    @cached_property
-    def soft(self) -> Array:
-        """Residual of curves and priors, softened by the loss."""
-        objective = self.problem.objective
-        return soften(self.residual, objective.loss, objective.n_data)
-
-    @cached_property
-    def cost(self) -> float:
-        """Sum of squares of the residual, softened by the loss."""
-        return float(self.soft @ self.soft)
-
-    @property
-    def index(self) -> dict[str, int]:
-        """Place of each parameter in `values`."""
-        return self.problem.index
 
     @cached_property
     def quantiles(self) -> Array:
@@ -174,13 +185,6 @@ class BestPoint:
         told = self.halves <= covariance.NOTHING * self.sizes
         return [name for name, known in zip(self.names, told, strict=True) if known]
 
-    def limits(self, name: str) -> tuple[float, float]:
-        """Limits of a parameter, SI."""
-        parameter = self.problem.params[name]
-        return float(parameter.min), float(parameter.max)
-
-    def along(self, name: str) -> Array:
-        """Change of all k parameters per change of one, as their correlation has it, (k,)."""
-        column = self.names.index(name)
-        row = self.spread.matrix[:, column]
-        return np.asarray(np.nan_to_num(row / row[column]))
+    def rises(self, residual: Array) -> Array:
+        """Rise of the cost at another point, from its softened residual, as χ² of each, (k,)."""
+        return np.asarray((float(residual @ residual) - self.cost) / self.spread.inflation)

@@ -7,6 +7,7 @@ samples, τ the autocorrelation time.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -37,42 +38,44 @@ class NoiseProcess:
 
     def autocovariance(self, n: int) -> Array:
         """Autocovariance at the lags 0 … n-1."""
-        size = 4 * max(n, 256)
-        transfer = np.abs(np.fft.rfft(np.append(1.0, -self.coefficients), size)) ** -2
-        lags = np.fft.irfft(transfer)[:n]
+        lags = self._response(4 * max(n, 256))[:n]
         return np.asarray(lags * (self.variance / lags[0]))
+
+    def _response(self, size: int) -> Array:
+        """Autocovariance if the driving white noise has unit variance, at so many lags."""
+        transfer = np.abs(np.fft.rfft(np.append(1.0, -self.coefficients), size)) ** -2
+        return np.asarray(np.fft.irfft(transfer))
+
+    @cached_property
+    def white(self) -> float:
+        """Variance of the driving white noise over that of the process."""
+        return float(1.0 / self._response(1 << 14)[0])
 
     @cached_property
     def tau(self) -> float:
         """Autocorrelation time 1 + 2 Σ ρ_k, at least one, in samples."""
         if not self.coefficients.size:
             return 1.0
-        white = self._white_share()
-        return max(white / (1.0 - float(self.coefficients.sum())) ** 2, 1.0)
+        return max(self.white / (1.0 - float(self.coefficients.sum())) ** 2, 1.0)
 
-    def _white_share(self) -> float:
-        """Variance of the driving white noise over that of the process."""
-        size = 1 << 14
-        transfer = np.abs(np.fft.rfft(np.append(1.0, -self.coefficients), size)) ** -2
-        return float(1.0 / np.fft.irfft(transfer)[0])
+    def _circulant(self, n: int) -> Array:
+        """Eigenvalues of the circulant matrix that has the covariance of n samples in a corner."""
+        lags = self.autocovariance(n)
+        return np.asarray(np.fft.rfft(np.concatenate([lags, [0.0], lags[:0:-1]])))
 
     def times(self, columns: Array) -> Array:
         """Covariance matrix of n samples times the columns of an (n, k) array."""
         if not self.coefficients.size:
             return self.variance * columns
         n = len(columns)
-        lags = self.autocovariance(n)
-        around = np.fft.rfft(np.concatenate([lags, [0.0], lags[:0:-1]]))
-        spectrum = np.fft.rfft(columns, 2 * n, axis=0) * around[:, None]
+        spectrum = np.fft.rfft(columns, 2 * n, axis=0) * self._circulant(n)[:, None]
         product: Array = np.fft.irfft(spectrum, axis=0)[:n]
         return product
 
     def draw(self, n: int, rng: np.random.Generator) -> Array:
         """So many samples of normal noise, (n,)."""
-        lags = self.autocovariance(n)
-        around = np.fft.rfft(np.concatenate([lags, [0.0], lags[:0:-1]])).real
-        white = np.fft.rfft(rng.standard_normal(2 * n))
-        return np.asarray(np.fft.irfft(np.sqrt(np.maximum(around, 0.0)) * white)[:n])
+        root = np.sqrt(np.maximum(self._circulant(n).real, 0.0))
+        return np.asarray(np.fft.irfft(root * np.fft.rfft(rng.standard_normal(2 * n)))[:n])
 
     def forms(self, columns: Array, mix: Array | None = None) -> Array:
         """Variance lᵀΣl of the noise times each column l of an (n, m) product, (m,).
@@ -97,16 +100,26 @@ class NoiseProcess:
         out = 2.0 * here**2
         order = self.coefficients.size
         if order:
-            white = self.variance * self._white_share()
-            step = 1e-4 * (1.0 - np.max(np.abs(np.roots(np.append(1.0, -self.coefficients)))))
+            white = self.variance * self.white
+            step = 1e-4 * (1.0 - _radius(self.coefficients))
             moved = [
-                NoiseProcess(phi, white / NoiseProcess(phi, 1.0)._white_share())
+                NoiseProcess(phi, white / NoiseProcess(phi, 1.0).white)
                 for phi in self.coefficients + step * np.eye(order)
             ]
             slopes = np.array([(other.forms(columns, mix) - here) / step for other in moved])
             gamma = toeplitz(self.autocovariance(order))
             out += white * np.einsum("ik,ik->k", slopes, np.linalg.solve(gamma, slopes))
         return np.asarray(out / self.samples)
+
+
+def variance_of(noise: Sequence[NoiseProcess], columns: Array, sizes: tuple[int, ...]) -> Array:
+    """Variance of the noise times each column l of an (n, k) array, (k,).
+
+    The rows are those of all curves, so many samples each, and of priors of unit variance.
+    """
+    pairs = zip(noise, parts(sizes), strict=True)
+    data = np.sum([process.forms(columns[part]) for process, part in pairs], axis=0)
+    return np.asarray(data + np.sum(columns[sum(sizes) :] ** 2, axis=0))
 
 
 def levinson(lags: Array) -> list[tuple[Array, float]]:
@@ -206,12 +219,14 @@ def _corrected(
     return replace(process, coefficients=coefficients, variance=float(lags[0]))
 
 
+def _radius(coefficients: Array) -> float:
+    """Largest factor from sample to sample of the waves of an autoregression."""
+    return float(np.max(np.abs(np.roots(np.append(1.0, -coefficients))), initial=0.0))
+
+
 def _damped(coefficients: Array, n: int) -> Array:
     """Coefficients of an autoregression none of whose waves lives longer than a quarter of n."""
-    if not coefficients.size:
-        return coefficients
-    radius = float(np.max(np.abs(np.roots(np.append(1.0, -coefficients)))))
-    share = min(1.0, (1.0 - 4.0 / n) / max(radius, 1e-300))
+    share = min(1.0, (1.0 - 4.0 / n) / max(_radius(coefficients), 1e-300))
     return np.asarray(coefficients * share ** np.arange(1, coefficients.size + 1))
 
 
