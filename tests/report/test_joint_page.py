@@ -15,9 +15,7 @@ from foamfit.fitting.links import Links
 from foamfit.fitting.problem import make_problem
 from foamfit.report.figures import STYLE, image, laid_out
 from foamfit.report.plotted import plotted, table
-from foamfit.report.studies.joint_page import joint_page
-from foamfit.report.studies.joint_plot import plot_joint
-from foamfit.report.studies.joint_text import joint_text
+from foamfit.report.studies.joint import joint_page, joint_text, plot_joint
 from foamfit.study.joint_estimates import common_covariance, parameters_of
 from foamfit.study.joint_fit import Alternative, fit_jointly
 from foamfit.study.joint_result import Alone, JointData

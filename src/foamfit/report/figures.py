@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from foamfit.errors import InputError
 from foamfit.files import write_file
 from foamfit.report import plotted
+from foamfit.text import wrapped
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -77,17 +78,26 @@ def abreast(width: float, panels: int, least: float = 2.1) -> int:
     return max(1, min(panels, int(width / least)))
 
 
+def title_lines(width: float, *parts: str) -> list[str]:
+    """Break the parts of a title into lines for a figure of a width in inches."""
+    return [line for part in parts for line in wrapped(part, 0, int(16 * width))]
+
+
 @contextmanager
-def drawing(width: float, height: float) -> Iterator[Figure]:
+def drawing(width: float, height: float, title: Sequence[str] = ()) -> Iterator[Figure]:
     """Give an empty figure of a size in inches, and the style of all figures to draw it in.
 
-    Long lines are thinned in the end to what can be seen of them.
+    Long lines are thinned in the end to what can be seen of them. `title` has its lines.
     """
     import matplotlib
     from matplotlib.figure import Figure
 
     with matplotlib.rc_context(STYLE):
-        yield (figure := Figure(figsize=(width, height), layout="constrained"))
+        figure = Figure(figsize=(width, height), layout="constrained")
+        if title:  # a name may hold a dollar sign: it is no formula
+            style: Any = {"fontsize": 8, "parse_math": False}
+            figure.suptitle("\n".join(title), x=0.01, ha="left", **style)
+        yield figure
         for line in (line for ax in figure.axes for line in ax.lines):
             x, y = np.asarray(line.get_xdata()), np.asarray(line.get_ydata())
             if x.size > MOST_POINTS:
@@ -118,7 +128,8 @@ def legend_below(figure: Figure, entries: dict[str, Any]) -> int:
         widths = [max(sizes[i : i + lines]) for i in range(0, len(names), lines)]
         if sum(widths) <= room:
             break
-    figure.legend(handles, names, loc="outside lower center", ncols=len(widths))
+    told = [name.replace("$", r"\$") for name in names]
+    figure.legend(handles, told, loc="outside lower center", ncols=len(widths))
     return lines
 
 
@@ -184,10 +195,38 @@ def write_haloed(ax: Axes, name: str, at: Array, offset: tuple[float, float], **
     ax.add_artist(text)
 
 
-def say_nothing_there(ax: Axes) -> None:
+def draw_estimates(
+    ax: Axes, points: Sequence[tuple[float, Any]], factor: float, size: float = 3.5
+) -> tuple[list[float], list[float]]:
+    """Draw values of a parameter, hollow if not determined, and their 95 % intervals.
+
+    `points` are (x, estimate), `factor` is the unit; with a size of 0 there are intervals alone.
+    Returns the values and the ends as drawn.
+    """
+    bars = [(x, *p.ci95) for x, p in points if p.ci95 is not None and np.all(np.isfinite(p.ci95))]
+    ends = np.array(bars, dtype=float).reshape(-1, 3) / (1.0, factor, factor)
+    ax.vlines(*ends.T, color=GREY, linewidth=0.8, zorder=1, label="_95 % interval")
+    for sure, face in ((True, BLUE), (False, "white")) if size else ():
+        chosen = [(x, p.value / factor) for x, p in points if (p.state == "determined") == sure]
+        style: Any = {"color": BLUE, "markerfacecolor": face, "markersize": size}
+        style["label"] = "_determined" if sure else "_not well determined"
+        ax.plot(*np.array(chosen).reshape(-1, 2).T, "o", **style)
+    return [p.value / factor for _, p in points], ends[:, 1:].ravel().tolist()
+
+
+def limit(ax: Axes, values: Sequence[float], ends: Sequence[float]) -> None:
+    """Let wide intervals run out of a panel rather than flatten the values."""
+    low, high = min(values), max(values)
+    room = max(1.5 * (high - low), 0.1 * max(abs(low), abs(high)), 1e-12)
+    bottom, top = max(min([low, *ends]), low - room), min(max([high, *ends]), high + room)
+    edge = 0.08 * max(top - bottom, room)
+    ax.set_ylim(bottom - edge, top + 2.0 * edge)
+
+
+def say_nothing_there(ax: Axes, told: str = "no curve to compare") -> None:
     """Write into an empty panel that there is no curve."""
     ax.set_axis_off()
-    ax.text(0.5, 0.5, "no curve to compare", ha="center", va="center", transform=ax.transAxes)
+    ax.text(0.5, 0.5, told, ha="center", va="center", transform=ax.transAxes)
 
 
 def figure_format(path: str | Path) -> Literal["png", "pdf", "svg"]:

@@ -3,32 +3,21 @@
 from __future__ import annotations
 
 import base64
-import functools
 import math
 from collections.abc import Iterator, Mapping
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any
 
 from foamfit.fitting.branches import covered
 from foamfit.report.plots import origin_word
 from foamfit.report.readable import number, readable, readable_unit
+from foamfit.report.render import page
 from foamfit.report.result_figures import Images, draw_all
 from foamfit.report.summary import ANSWERS, LADDER, conclusions, ladder_cells, misfits
 from foamfit.results import Fit
 from foamfit.springs.parameters import KINDS
 from foamfit.springs.spring import BistableSpring, MicroscaleSpring
-from foamfit.text import engineering, percent
 from foamfit.trust.covariance import RULE
 
-if TYPE_CHECKING:
-    from jinja2 import Environment
-
-DRIVES = {
-    "impact": "The motion follows from the mass and the velocity of the striker; nothing measured "
-    "enters the simulation.",
-    "stress": "The measured stress acts on the chain, which is in equilibrium at every sample.",
-    "displacement": "The measured displacement of the top is prescribed.",
-}
 # By kind of spring: its branches, and the points or marks that the figure has of it.
 BRANCHES = {
     "bistable": {"a": "elastic", "d": "snap-buckling", "c": "densified", "e": "snap-back"},
@@ -55,46 +44,7 @@ POINTS = (  # attribute of the spring, symbol and its index, meaning, unit
     ("eps_hat_c", ("ε̂", "c"), "strain at C1, where branches d and c meet", ""),
     ("sigma_hat_c", ("σ̂", "c"), "stress at C1", "Pa"),
 )
-STATISTICS = {
-    "n_data": "data points", "n_effective": "effective samples", "n_vary": "parameters varied",
-    "chisqr": "χ²", "redchi": "reduced χ²", "aic": "AIC", "aicc": "AICc", "bic": "BIC",
-    "n_failed": "trials that could not be simulated", "n_descents": "local minima refined",
-    "n_agreeing": "descents that reached the best", "n_left_out": "outliers left out",
-}  # fmt: skip
-ENERGY = {  # of the audit: label and unit
-    "striker_energy": ("striker's energy", "J/m³"),
-    "absorbed_energy": ("absorbed energy", "J/m³"),
-    "dissipated_energy": ("dissipated energy", "J/m³"),
-    "dissipated_fraction": ("dissipated over absorbed", ""),
-    "absorbed_over_striker": ("absorbed over striker's", ""),
-    "rebound_velocity": ("rebound velocity", "m/s"),
-    "impulse": ("impulse of the force", "N·s"),
-    "momentum_change": ("change of momentum", "N·s"),
-    "impulse_ratio": ("impulse over change of momentum", ""),
-}
 Point = tuple[tuple[str, str], str, str, str]  # symbol and its index, meaning, value, unit
-BADGES = {True: "ok", False: "weak", None: "fixed"}  # of the answers to the checklist
-CITATION = (
-    "Thevamaran, R., Fraternali, F., Daraio, C. (2014). Multiscale Mass-Spring Model for "
-    "High-Rate Compression of Vertically Aligned Carbon Nanotube Foams. "
-    "Journal of Applied Mechanics 81, 121006."
-)
-
-
-@functools.cache
-def environment() -> Environment:
-    """The templates of all pages."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    made = Environment(
-        loader=PackageLoader("foamfit.report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    made.filters |= {"number": number, "percent": percent}
-    return made
 
 
 def render_report(result: Fit, figures: Mapping[str, Images | None] | None = None) -> str:
@@ -105,47 +55,37 @@ def render_report(result: Fit, figures: Mapping[str, Images | None] | None = Non
     drawn = dict(draw_all(result)) if figures is None else figures
     plain = result.to_json_dict()
     energy = plain["energy"]
-    return (
-        environment()
-        .get_template("report.html")
-        .render(
-            result=result,
-            version=version("foamfit"),
-            origin=origin_word(result),
-            conclusions=conclusions(result),
-            misfits=misfits(result),
-            statistics={
-                STATISTICS.get(name, name.replace("_", " ")): value
-                for name, value in plain["statistics"].items()
-                if name not in ("nfev", "n_starts")  # the page says these where it says how
-            },
-            visited=_visited(result),
-            marks=[MARKS[kind] for kind in MARKS if kind in result.model.split("+")],
-            parameters=[readable(name, p) for name, p in result.parameters.items()],
-            systematic=any(p.systematic > 0.0 for p in result.parameters.values()),
-            budget=_budget(result),
-            ranged=any(p.range for p in result.parameters.values()),
-            rule=RULE,
-            points={
-                f"Points of the law, spring {name}": _points(spring)
-                for name, spring in result.bistable_springs.items()
-            }
-            | {
-                f"Snapping of spring {name}": list(_snapping(result, name, spring))
-                for name, spring in result.microscale_springs.items()
-            },
-            energy_sentences=energy.pop("sentences", None) or [],
-            energy=dict(_energies(energy)),
-            drive_meaning=DRIVES.get(result.drive, ""),
-            ladder=result.ladder,
-            ladder_header=LADDER,
-            ladder_rows=[] if result.ladder is None else ladder_cells(result.ladder),
-            answers=ANSWERS,
-            badges=BADGES,
-            kept=figures is not None,
-            figures={name: images and _figure(images) for name, images in drawn.items()},
-            citation=CITATION,
-        )
+    return page(
+        "report",
+        result=result,
+        version=version("foamfit"),
+        origin=origin_word(result),
+        conclusions=conclusions(result),
+        misfits=misfits(result),
+        statistics=plain["statistics"],
+        visited=_visited(result),
+        marks=[MARKS[kind] for kind in MARKS if kind in result.model.split("+")],
+        parameters=[readable(name, p) for name, p in result.parameters.items()],
+        systematic=any(p.systematic > 0.0 for p in result.parameters.values()),
+        budget=_budget(result),
+        ranged=any(p.range for p in result.parameters.values()),
+        rule=RULE,
+        points={
+            f"Points of the law, spring {name}": _points(spring)
+            for name, spring in result.bistable_springs.items()
+        }
+        | {
+            f"Snapping of spring {name}": list(_snapping(result, name, spring))
+            for name, spring in result.microscale_springs.items()
+        },
+        energy_sentences=energy.get("sentences") or [],
+        energy={name: x for name, x in energy.items() if type(x) in (int, float)},
+        ladder=result.ladder,
+        ladder_header=LADDER,
+        ladder_rows=[] if result.ladder is None else list(ladder_cells(result.ladder)),
+        answers=ANSWERS,
+        kept=figures is not None,
+        figures={name: images and _figure(images) for name, images in drawn.items()},
     )
 
 
@@ -197,14 +137,6 @@ def _snapping(result: Fit, name: str, spring: MicroscaleSpring) -> Iterator[Poin
         time = f"{number(tau / factor)} {unit}"
         share = f"g/(1+Σg), share of a sudden change of stress that relaxes, with τ = {time}"
         yield ("g", str(k)), share, number(g / (1.0 + total)), "–"
-
-
-def _energies(energy: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    """Give label and value of the numbers of an audit; its texts are in its sentences."""
-    for name, value in energy.items():
-        if isinstance(value, int | float) and not isinstance(value, bool):
-            label, unit = ENERGY.get(name, (name.replace("_", " "), ""))
-            yield label, engineering(value, unit) if unit else number(value)
 
 
 def _visited(result: Fit) -> dict[str, list[tuple[str, str, bool]]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from foamfit import text
@@ -73,6 +74,10 @@ class Readable:
         """The value with its standard error, where there is one."""
         return f"{self.value} ± {self.stderr}" if self.stderr else self.value
 
+    def with_unit(self, told: str) -> str:
+        """Numbers of this parameter with its unit, where there are any."""
+        return f"{told} {self.unit}".removesuffix(" –") if told else ""
+
     @property
     def matters(self) -> bool:
         """Whether its reason is to be read: it is not determined, or more is said of it."""
@@ -103,6 +108,19 @@ def readable(name: str, p: ParameterEstimate) -> Readable:
         name, symbol(name), shown, stderr, interval, unit, p.state, p.why, p.ci95_method or "",
         span, scale,
     )  # fmt: skip
+
+
+def own_name(name: str, model: str) -> str:
+    """Name of a parameter, without the spring where there is only one."""
+    return name if "+" in model else name.removeprefix("s1_")
+
+
+def in_unit(values: Sequence[float], unit: str) -> str:
+    """Write one value, or the ends of an interval, in the unit in which they read well."""
+    if not values:
+        return ""
+    factor, name = readable_unit(max(map(abs, values)), unit)
+    return f"{' to '.join(number(value / factor) for value in values)} {name}".rstrip()
 
 
 def number(value: float | None) -> str:
