@@ -33,7 +33,7 @@ from foamfit.study import joint_fit
 from foamfit.study.joint_estimates import common_covariance, parameters_of
 from foamfit.study.joint_fit import JointFit, Map, fit_jointly
 from foamfit.study.joint_result import Alone, JointData
-from foamfit.study.joint_words import sentences_of, warnings_of
+from foamfit.study.joint_words import with_words
 from foamfit.study.shared import Group
 from foamfit.study.study_file import AUTO, Study, read_study
 from foamfit.study.workers import begin, workers
@@ -413,7 +413,4 @@ def _conclude(
         alone=Alone(alone.alone, alone.n_alone, alone.bic_alone, alone.misfits),
         refused=refused,
     )
-    lost, warnings = warnings_of(result)
-    status = "failed" if lost else "warnings" if warnings else "ok"
-    sentences = tuple(sentences_of(result))
-    return replace(result, status=status, warnings=tuple(warnings), sentences=sentences)
+    return with_words(result)

@@ -300,11 +300,11 @@ def _correlation(
     names = names if isinstance(names, list) else [None]
     known = {*parameters, *NUISANCE}
     try:
-        matrix = np.array(given.item(key).get(of), dtype=float).reshape(len(names), -1)
+        matrix = np.reshape(np.array(given.item(key).get(of), dtype=float), (len(names),) * 2)
         there = all(str(name).removesuffix(":b") in known for name in names)
     except (TypeError, ValueError):
         there = False
-    if not there or matrix.shape != (len(names),) * 2:
+    if not there:
         raise InputError(
             f"{given.where}: {key} must have the names of parameters and a square matrix of as "
             "many rows"
