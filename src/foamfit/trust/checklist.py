@@ -19,7 +19,7 @@ from foamfit.fitting.curves import check_time_shift
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.search import SearchRecord
 from foamfit.results import Check, Intervals, ParameterEstimate
-from foamfit.springs.parameters import BRANCHES, NUISANCE, split_name
+from foamfit.springs.parameters import NUISANCE, split_name
 from foamfit.text import engineering, listed, percent
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import AT_LIMIT, WEAK
@@ -208,7 +208,7 @@ def _vanishes(e: Findings, name: str) -> bool:
 
 def _visited(e: Findings) -> Check:
     problem = e.best.problem
-    wanted = [tuple(dict.fromkeys(BRANCHES.get(k, {}).values())) for k in problem.model.kinds]
+    wanted = [law.needed for law in problem.model.laws]
     if not any(wanted):
         return _check("visited", True, "linear")
     seen = visited(problem, e.best.simulated)
