@@ -116,13 +116,10 @@ class Tried:
         best, objective = self.best, self.best.problem.objective
         self.name = rung_name(self.result.model, self.damping, self.result.relaxation)
         self.varied = sum(item.vary for item in self.result.parameters.values())
-        self.counted, self.sizes, slices = (
-            objective.counted,
-            objective.sizes,
-            parts(objective.sizes),
-        )
+        self.counted, self.sizes = objective.counted, objective.sizes
         self.spans = [objective.span(name) for name in self.counted]  # in the unit of the residual
         self.residual = soften(best.residual[: objective.n_data], objective.loss)
+        slices = parts(self.sizes)
         self.curves = [self.residual[part] for part in slices]
         self.taus = [autocorrelation_time(curve) for curve in self.curves]
         soft = softness(best.residual, objective.loss)

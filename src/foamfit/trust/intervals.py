@@ -20,7 +20,7 @@ from foamfit.results import Intervals
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.profile import PLACED, Tracing, departures
 from foamfit.trust.resample import bootstrap, check_emcee, mcmc, walkers
-from foamfit.trust.residuals.noise_process import variance_of
+from foamfit.trust.residuals.noise_process import parts
 from foamfit.trust.sentences import say
 
 # The default profiles a parameter if the root of the cost departs from a straight line by this
@@ -155,8 +155,10 @@ def _halves(best: BestPoint, point: Array, residual: Array) -> Array:
     difference of their residuals.
     """
     if best.misfits:
-        apart = (residual - best.soft)[:, None]
-        spread = float(variance_of(best.spread.noise, apart, best.problem.objective.sizes)[0])
+        apart, objective = (residual - best.soft)[:, None], best.problem.objective
+        noise = zip(best.spread.noise, parts(objective.sizes), strict=True)
+        spread = float(np.sum(apart[objective.n_data :] ** 2))  # of priors, of unit variance
+        spread += sum(float(process.forms(apart[part])[0]) for process, part in noise)
         near = float(residual @ residual) - best.cost <= 1.96 * 2.0 * math.sqrt(spread)
         return best.halves if near else np.full(best.halves.shape, np.nan)
     left = 1.0 - best.rises(residual) / best.quantiles**2

@@ -106,16 +106,6 @@ class NoiseProcess:
         return np.asarray(out / self.samples)
 
 
-def variance_of(noise: Sequence[NoiseProcess], columns: Array, sizes: tuple[int, ...]) -> Array:
-    """Variance of the noise times each column l of an (n, k) array, (k,).
-
-    The rows are those of all curves, so many samples each, and of priors of unit variance.
-    """
-    pairs = zip(noise, parts(sizes), strict=True)
-    data = np.sum([process.forms(columns[part]) for process, part in pairs], axis=0)
-    return np.asarray(data + np.sum(columns[sum(sizes) :] ** 2, axis=0))
-
-
 def levinson(lags: Array) -> list[tuple[Array, float]]:
     """Autoregressions of order 0, 1, … from autocovariances, with their white variance."""
     fits = [(np.empty(0), float(lags[0]))]
