@@ -7,7 +7,6 @@ samples, τ the autocorrelation time.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
