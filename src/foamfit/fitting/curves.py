@@ -64,13 +64,13 @@ def check_drive(measurement: Measurement, drive: str) -> None:
 
 
 def interior_curves(measurement: Measurement, springs: int) -> dict[str, int]:
-    """Curves of the masses inside a chain of so many springs that were followed, and their node."""
+    """Curves of the masses inside a chain whose motion was measured, and their node."""
     nodes = sorted(node for node in measurement.interior if node < springs)
     return {f"{interior_channel(node)}_time": node for node in nodes}
 
 
 def check_interior(measurement: Measurement, springs: int) -> None:
-    """Refuse the displacement of a mass that is not inside a chain of so many springs (InputError).
+    """Refuse the displacement of a mass that is not inside the chain (InputError).
 
     A single spring has nothing inside; the result's notes say so.
     """
@@ -85,12 +85,12 @@ def check_interior(measurement: Measurement, springs: int) -> None:
 
 
 def default_weights(measurement: Measurement, drive: str, springs: int = 1) -> dict[str, float]:
-    """Weights that count each measured channel once, for a chain of so many springs.
+    """Weights that count each measured channel once.
 
     In the impact drive stress and displacement are compared in time; a displacement that was
-    integrated from the force is no second measurement. In the displacement drive the stress along
-    the measured displacement is the one curve, in the stress drive the displacement. Displacements
-    of masses inside count in all drives: they tell the springs apart.
+    integrated from the force is not a second measurement. In the displacement drive the only curve
+    is the stress along the measured displacement, in the stress drive the displacement.
+    Displacements of masses inside count in all drives: they tell the springs apart.
     """
     weights = dict.fromkeys(CURVES, 0.0)
     weights |= dict.fromkeys(interior_curves(measurement, springs), 1.0)

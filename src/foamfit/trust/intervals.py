@@ -1,7 +1,7 @@
 """The 95 % intervals of a fit: which are made, how, and what is said of them.
 
-The local covariance takes the cost for a parabola. Where branches a and d are about equally stiff
-it is none: it is flat along ε_a, with several shallow minima. There the cost itself is followed.
+The local covariance assumes that the cost is a parabola. Where branches a and d are about equally
+stiff it is not: it is flat along ε_a, with several shallow minima. There the cost itself is used.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ REFITS, ENOUGH_DRAWS, MOST_DRAWS = 9, 40, 100_000
 # Evaluations of a refit, and its slopes.
 EVALUATIONS, SLOPES = 6.0, 0.6
 # A minimum is hardly worse than the best within this factor of the 95 % cut, of standard errors:
-# noise makes so much of a difference in three tests of a thousand.
+# noise makes that much difference in three tests of a thousand.
 HARDLY_WORSE = 1.5
 Announce = Callable[[str], None]
 Minima = Sequence[tuple[Array, Array]]  # points at which descents ended, and their residuals
@@ -259,7 +259,7 @@ def _percentiles(best: BestPoint, drawn: Array, method: str, note: str, fine: bo
 def _seconds(
     best: BestPoint, count: int, *, evaluations: float = EVALUATIONS, slopes: float = SLOPES
 ) -> float:
-    """Expected seconds of so many refits, from three evaluations and one set of slopes."""
+    """Expected run time of refits, s, from three evaluations and one set of slopes."""
     problem, began = best.problem, time.perf_counter()
     for _ in range(3):
         problem.objective.residual(best.values)
