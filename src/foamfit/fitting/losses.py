@@ -78,5 +78,7 @@ class Weighing:
 
     def __call__(self, rows: Array) -> Array:
         """Weigh residuals (n,), or columns of their derivatives (n, k)."""
-        off = (self.less * self.axes) @ (self.axes.T @ (rows.T / self.levels).T)
-        return np.asarray(rows - (off.T * self.levels).T)
+        levels, less = self.levels, self.less
+        if rows.ndim == 2:
+            levels, less = levels[:, None], less[:, None]
+        return np.asarray(rows - levels * (self.axes @ (less * (self.axes.T @ (rows / levels)))))

@@ -17,14 +17,12 @@ from numpy.typing import NDArray
 from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting import levenberg
-from foamfit.fitting.box import Scales, Space, is_logarithmic
+from foamfit.fitting.box import Scales, Space
 from foamfit.fitting.links import RATES, STEEPEST, Links, factor, start_of
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.problem import Problem
-from foamfit.springs.parameters import NUISANCE, split_name
+from foamfit.springs.parameters import NUISANCE
 
-# What a coordinate of the box is relative to, by the short names of the parameters.
-RELATIVE_TO = {"eps_star": ("k0", "kc"), "eps_c": ("eps_a",), "dsigma": ("k0", "eps_a")}
 # Descents end when two steps in a row gain less than this share, or after so many steps.
 ENOUGH, ITERATIONS = 1e-5, 80
 # Least value of which a scattering parameter has the logarithm, and the largest logarithm.
@@ -333,7 +331,7 @@ class _Layout:
             name
             for name in names
             if name not in own
-            and (parents := _parents(name) & set(names))
+            and (parents := _parents(problems[0], name) & set(names))
             and (parents - shared or kinds[name] in RATES)
         ]
         places, count = dict[str, int](), 0
@@ -346,15 +344,15 @@ class _Layout:
             zip(problems, _spaces(problems, absolute), strict=True)
         ):
             at, rates = list[int](), list[Rate]()
-            for j, (place, short, _) in enumerate(space.coordinates):
-                name = problem.names[place]
+            for j, one in enumerate(space.coordinates):
+                name = problem.names[one.place]
                 if name in own:
                     at.append(count)
                     count += 1
                     continue
                 at.append(places[name])
                 if kinds[name] in RATES:
-                    rates.append(Rate(j, kinds[name], links.x(t), is_logarithmic(short)))
+                    rates.append(Rate(j, kinds[name], links.x(t), one.is_logarithmic))
             pulls = tuple(
                 Pull(problem.index[name], places[name], float(pull[t]))
                 for name, pull in links.pulls.items()
@@ -451,7 +449,7 @@ def _logarithm(value: float) -> float:
     return float(np.log(max(abs(value), _TINY)))
 
 
-def _parents(name: str) -> set[str]:
+def _parents(problem: Problem, name: str) -> set[str]:
     """Names of the parameters that the coordinate of this one is relative to."""
-    spring, short = split_name(name)
-    return {f"s{spring + 1}_{parent}" for parent in RELATIVE_TO.get(short, ())}
+    of = () if name in NUISANCE else problem.model.param(name).of
+    return {f"{name.partition('_')[0]}_{parent}" for parent in of}

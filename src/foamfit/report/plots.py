@@ -18,7 +18,7 @@ from foamfit.arrays import Array
 from foamfit.report import figures
 from foamfit.report.figures import BLUE, GREY, INSIDE, TWO, VERMILION
 from foamfit.report.readable import readable_unit
-from foamfit.springs.spring import LinearSpring
+from foamfit.springs.laws import LinearSpring
 from foamfit.terminal import printable
 
 if TYPE_CHECKING:

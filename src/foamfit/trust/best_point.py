@@ -26,10 +26,10 @@ from foamfit.trust.residuals.noise_process import noise_processes, parts
 def m_estimate(residual: Array, sizes: tuple[int, ...], loss: str) -> tuple[Array, Array]:
     """Weights of slopes and pseudo-residuals whose least squares have the covariance of a loss.
 
-    With the mean m of ψ'(r) over each curve (so many samples in `sizes`): √m and ψ(r)/√m. The
-    normal matrix of the slopes so weighted is half the curvature of the cost, and the covariance of
-    their least squares that of an M-estimate (Huber 1981, Robust Statistics, section 7.6). Under
-    the linear loss they are one and the residuals, as those of priors behind the curves always are.
+    With the mean m of ψ'(r) over each curve (of `sizes` samples): √m and ψ(r)/√m. The normal matrix
+    of the slopes so weighted is half the curvature of the cost, and the covariance of their least
+    squares that of an M-estimate (Huber 1981, Robust Statistics, section 7.6). Under the linear
+    loss they are one and the residuals, as for priors, which follow the curves, under any loss.
     """
     psi, slope = influence(residual, loss)
     weights, data = np.ones(residual.size), sum(sizes)
@@ -43,7 +43,7 @@ def m_estimate(residual: Array, sizes: tuple[int, ...], loss: str) -> tuple[Arra
 class BestPoint:
     """A point of the parameters (SI), usually the best one, and what holds locally there.
 
-    `chosen` are the parameters whose uncertainty is asked for; by default those that vary and
+    `chosen` are the parameters whose uncertainty is wanted; by default those that vary and
     whose branch was reached.
     """
 
@@ -79,7 +79,7 @@ class BestPoint:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of the k parameters whose uncertainty is asked for."""
+        """Names of the k parameters whose uncertainty is wanted."""
         if self.chosen is not None:
             return self.chosen
         return tuple(name for name in self.problem.free() if name not in self.unreached)
@@ -181,7 +181,7 @@ class BestPoint:
 
     @cached_property
     def known(self) -> list[str]:
-        """Parameters of which the local interval says anything."""
+        """Parameters that the local interval does not leave undetermined."""
         told = self.halves <= covariance.NOTHING * self.sizes
         return [name for name, known in zip(self.names, told, strict=True) if known]
 

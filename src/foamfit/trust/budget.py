@@ -30,7 +30,7 @@ from foamfit.trust.covariance import AT_LIMIT, SINGULAR
 STEP = 1e-4
 # Change of a parameter over the largest one, both over their scales, that counts as none.
 ROUNDING = 1e-6
-# Nuisance parameters by what they contribute to.
+# Nuisance parameters by the source of uncertainty to which they contribute.
 _CONTACT = (nuisance.CONTACT_TIME, *nuisance.ZEROS)
 _STRIKER = (*nuisance.STRIKER, nuisance.TIME_SHIFT)
 # Quantities of a test: where they stand, and the source of uncertainty that they are.

@@ -19,7 +19,7 @@ from foamfit.fitting.curves import check_time_shift
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.search import SearchRecord
 from foamfit.results import Check, Intervals, ParameterEstimate
-from foamfit.springs.parameters import BRANCHES, NUISANCE, split_name
+from foamfit.springs.parameters import NUISANCE, split_name
 from foamfit.text import engineering, listed, percent
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import AT_LIMIT, WEAK
@@ -208,7 +208,7 @@ def _vanishes(e: Findings, name: str) -> bool:
 
 def _visited(e: Findings) -> Check:
     problem = e.best.problem
-    wanted = [tuple(dict.fromkeys(BRANCHES.get(k, {}).values())) for k in problem.model.kinds]
+    wanted = [law.needed for law in problem.model.laws]
     if not any(wanted):
         return _check("visited", True, "linear")
     seen = visited(problem, e.best.simulated)
@@ -267,10 +267,11 @@ def _of_test(e: Findings) -> Iterator[Check]:
 
 def _of_what_is_left_out(e: Findings) -> Iterator[Check]:
     yield _time_shift(e)
-    known = e.objective.drive == "displacement" and e.best.names
-    found = damping_hint(e.best, e.known) if known else None
-    answer = found is None if known else None
-    yield _check("damping", answer, size=engineering(found or 0.0, "Pa·s"))
+    if e.objective.drive != "displacement" or not e.best.names:
+        yield _check("damping", None)
+        return
+    eta = damping_hint(e.best, e.known) or 0.0
+    yield _check("damping", eta == 0.0, size=engineering(eta, "Pa·s"))
 
 
 def _time_shift(e: Findings) -> Check:
@@ -287,6 +288,6 @@ def _time_shift(e: Findings) -> Check:
         check_time_shift(test, e.objective.drive)
     except InputError:
         return _check("time_shift", None)
-    found = shift_hint(e.best, e.known)
-    told = f"{'late' if (found or 0.0) > 0.0 else 'early'} by {engineering(abs(found or 0.0), 's')}"
-    return _check("time_shift", found is None, late=told)
+    late = shift_hint(e.best, e.known) or 0.0
+    told = f"{'late' if late > 0.0 else 'early'} by {engineering(abs(late), 's')}"
+    return _check("time_shift", late == 0.0, late=told)

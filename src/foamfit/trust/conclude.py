@@ -22,7 +22,6 @@ from foamfit.fitting.losses import LOSSES
 from foamfit.fitting.objective import MODEL_ERROR, Objective
 from foamfit.fitting.search import SearchRecord
 from foamfit.results import Correlation, Curves, Fit, Intervals, ParameterEstimate, Switch
-from foamfit.springs import kernels
 from foamfit.springs.parameters import split_name, unit_of
 from foamfit.text import engineering, listed, percent
 from foamfit.trust import covariance
@@ -323,12 +322,12 @@ def _statistics(best: BestPoint, record: SearchRecord) -> dict[str, float | int 
 def _switches(best: BestPoint) -> tuple[Switch, ...]:
     """Place the switches of the fitted response on its curves."""
     motion, clock = best.simulated.motion, best.problem.objective.time
-    timed = best.problem.measurement.time is not None
+    laws, timed = best.problem.model.laws, best.problem.measurement.time is not None
     return tuple(
         Switch(
             spring=int(spring) + 1,
-            source=kernels.BRANCH_NAMES[int(left)],
-            target=kernels.BRANCH_NAMES[int(entered)],
+            source=laws[int(spring)].named_branch(int(left)),
+            target=laws[int(spring)].named_branch(int(entered)),
             time=float(when) if timed else None,
             displacement=float(np.interp(when, clock, motion.displacement[-1])),
             stress=float(np.interp(when, clock, motion.base_stress)),

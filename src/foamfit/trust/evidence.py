@@ -1,6 +1,6 @@
 """What speaks for a model: AICc and BIC where the noise is reached, else what it predicts.
 
-AICc and BIC go by the effective samples and parameters: neither correlated residuals nor
+AICc and BIC count the effective samples and parameters: neither correlated residuals nor
 combinations of parameters that the curves do not fix are evidence. They take the residuals for
 noise, so they do not hold where every model has an error of its own; then models are compared by
 how well they predict blocks of the test that are held back.
@@ -43,13 +43,13 @@ MARGIN = 6.0
 # Where no model reaches the noise: by what share each further parameter of a richer model must
 # lower the predicted misfit for it to be preferred.
 SHARE = 0.03
-# A model that follows the curves so many times worse than another of as many parameters is not
-# chosen, whatever it predicts.
+# A model whose misfit is this many times that of another with as many parameters is not chosen,
+# whatever it predicts.
 WORSE = 2.0
 # Below this misfit (over the range) residuals are the simulation's own error.
 EXACT = 1e-5
 # Blocks in time: an eighth of a loop takes a whole feature of it away (the turning point, the first
-# stress), and what is then predicted goes by chance; from two dozen on the order of models stays.
+# stress), so that the prediction is a matter of chance; from two dozen on the ranking is stable.
 BLOCKS = 24
 # Levenberg-Marquardt steps of the fit without one block, which ends when two in a row gain less
 # than a share.
@@ -112,17 +112,14 @@ class Tried:
     predicted: float | None = None
 
     def __post_init__(self) -> None:
-        """Compute what the comparison goes by."""
+        """Compute all that the comparison needs."""
         best, objective = self.best, self.best.problem.objective
         self.name = rung_name(self.result.model, self.damping, self.result.relaxation)
         self.varied = sum(item.vary for item in self.result.parameters.values())
-        self.counted, self.sizes, slices = (
-            objective.counted,
-            objective.sizes,
-            parts(objective.sizes),
-        )
+        self.counted, self.sizes = objective.counted, objective.sizes
         self.spans = [objective.span(name) for name in self.counted]  # in the unit of the residual
         self.residual = soften(best.residual[: objective.n_data], objective.loss)
+        slices = parts(self.sizes)
         self.curves = [self.residual[part] for part in slices]
         self.taus = [autocorrelation_time(curve) for curve in self.curves]
         soft = softness(best.residual, objective.loss)
@@ -207,7 +204,7 @@ def criteria(one: Tried, reference: Tried) -> Criteria:
 
 @dataclass(frozen=True)
 class Score:
-    """What the comparison by prediction goes by: parameters, fitted and predicted misfit."""
+    """What a comparison by prediction uses: parameters, fitted and predicted misfit."""
 
     varied: int
     misfit: float

@@ -1,4 +1,4 @@
-"""What a test can tell of its parameters: sensitivities, information, directions.
+"""What a test says about its parameters: sensitivities, information, directions.
 
 Everything here is local: it holds at one point of the parameters, a start value or the best point.
 Sensitivities are in standard deviations of the noise per relative change of a parameter (over its

@@ -1,7 +1,7 @@
 """The 95 % intervals of a fit: which are made, how, and what is said of them.
 
-The local covariance takes the cost for a parabola. Where branches a and d are about equally stiff
-it is none: it is flat along ε_a, with several shallow minima. There the cost itself is followed.
+The local covariance assumes that the cost is a parabola. Where branches a and d are about equally
+stiff it is not: it is flat along ε_a, with several shallow minima. There the cost itself is used.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from foamfit.results import Intervals
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.profile import PLACED, Tracing, departures
 from foamfit.trust.resample import bootstrap, check_emcee, mcmc, walkers
-from foamfit.trust.residuals.noise_process import variance_of
+from foamfit.trust.residuals.noise_process import parts
 from foamfit.trust.sentences import say
 
 # The default profiles a parameter if the root of the cost departs from a straight line by this
@@ -32,7 +32,7 @@ REFITS, ENOUGH_DRAWS, MOST_DRAWS = 9, 40, 100_000
 # Evaluations of a refit, and its slopes.
 EVALUATIONS, SLOPES = 6.0, 0.6
 # A minimum is hardly worse than the best within this factor of the 95 % cut, of standard errors:
-# noise makes so much of a difference in three tests of a thousand.
+# noise makes that much difference in three tests of a thousand.
 HARDLY_WORSE = 1.5
 Announce = Callable[[str], None]
 Minima = Sequence[tuple[Array, Array]]  # points at which descents ended, and their residuals
@@ -155,8 +155,10 @@ def _halves(best: BestPoint, point: Array, residual: Array) -> Array:
     difference of their residuals.
     """
     if best.misfits:
-        apart = (residual - best.soft)[:, None]
-        spread = float(variance_of(best.spread.noise, apart, best.problem.objective.sizes)[0])
+        apart, objective = (residual - best.soft)[:, None], best.problem.objective
+        noise = zip(best.spread.noise, parts(objective.sizes), strict=True)
+        spread = float(np.sum(apart[objective.n_data :] ** 2))  # of priors, of unit variance
+        spread += sum(float(process.forms(apart[part])[0]) for process, part in noise)
         near = float(residual @ residual) - best.cost <= 1.96 * 2.0 * math.sqrt(spread)
         return best.halves if near else np.full(best.halves.shape, np.nan)
     left = 1.0 - best.rises(residual) / best.quantiles**2
@@ -257,7 +259,7 @@ def _percentiles(best: BestPoint, drawn: Array, method: str, note: str, fine: bo
 def _seconds(
     best: BestPoint, count: int, *, evaluations: float = EVALUATIONS, slopes: float = SLOPES
 ) -> float:
-    """Expected seconds of so many refits, from three evaluations and one set of slopes."""
+    """Expected run time of refits, s, from three evaluations and one set of slopes."""
     problem, began = best.problem, time.perf_counter()
     for _ in range(3):
         problem.objective.residual(best.values)

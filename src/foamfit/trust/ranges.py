@@ -1,8 +1,8 @@
 """What the error of a law leaves open: parameters that follow the curves about as well.
 
-Where a law misses part of the curves, its best point depends on what is asked of it: another weight
-of the samples, a window of them, another minimum of the cost. The range of a parameter is the hull
-of its values over such descriptions.
+Where a law misses part of the curves, its best point depends on the weights of the samples, the
+window of time that is fitted and on the minimum of the cost that is found. The range of a
+parameter is the hull of its values over such descriptions.
 """
 
 from __future__ import annotations

@@ -67,7 +67,7 @@ def common_and_spread(values: Array, errors: Array) -> Spread:
     costs = [criterion(0.0), *map(criterion, grid)]
     at, tau2, error = int(np.argmin(costs)), 0.0, None
     if at > 0:
-        ends = np.log([grid[max(at - 2, 0)], grid[min(at, grid.size - 1)]])
+        ends = (math.log(grid[max(at - 2, 0)]), math.log(grid[min(at, grid.size - 1)]))
         best = minimize_scalar(
             lambda u: criterion(math.exp(u)), bounds=ends, method="bounded", options={"xatol": 1e-8}
         )

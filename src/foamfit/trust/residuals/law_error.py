@@ -1,7 +1,7 @@
 """Noise or error of the law: what the residual of each curve is made of.
 
 What a law cannot follow is left in the residual and is the same whenever the test is measured
-again: it is no noise. It shows as slow waves, a peak of the spectrum at low frequencies that falls
+again: it is not noise. It shows as slow waves, a peak of the spectrum at low frequencies that falls
 faster beyond than noise does. Where there is evidence for such a peak, the noise is read off the
 frequencies beyond it; elsewhere the residual is the noise.
 """
@@ -29,9 +29,9 @@ from foamfit.trust.residuals.noise_process import (
 SMALLEST = 2e-3
 # Frequencies (half waves in the record) that stand alone, and the ratio of the bands beyond them.
 ALONE, BAND = 64, 1.06
-# An error of the law has its corner at so many half waves at most. Beyond it the spectrum falls as
-# the frequency to the power of minus twice the steepness (a kink leaves 2, noise of first order
-# has 1); up to it, it rises as twice the rise: a fit takes what is slow.
+# The most half waves in the record at which an error of the law has its corner. Beyond it the
+# spectrum falls as the frequency to the power of minus twice the steepness (a kink leaves 2, noise
+# of first order has 1); up to it, it rises as twice the rise, because a fit takes what is slow.
 LAST_CORNER, STEEPNESS, RISES = 60.0, (1.5, 2.0, 3.0), (0.0, 1.0, 2.0)
 # Corner of noise on top of white noise, as a share of the frequencies: slower noise of that kind
 # cannot be told from an error of the law.

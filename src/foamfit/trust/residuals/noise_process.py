@@ -7,7 +7,6 @@ samples, τ the autocorrelation time.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -21,7 +20,7 @@ MOST_ORDERS, LARGEST, CORRECTIONS = 10, 0.995, 4
 
 
 def parts(sizes: tuple[int, ...]) -> list[slice]:
-    """Slices of the curves in a residual, of which they have so many samples each."""
+    """Slices of the curves in a residual, from their numbers of samples."""
     ends = np.cumsum(sizes)
     return [slice(int(end - size), int(end)) for size, end in zip(sizes, ends, strict=True)]
 
@@ -42,7 +41,7 @@ class NoiseProcess:
         return np.asarray(lags * (self.variance / lags[0]))
 
     def _response(self, size: int) -> Array:
-        """Autocovariance if the driving white noise has unit variance, at so many lags."""
+        """Autocovariance at `size` lags if the driving white noise has unit variance."""
         transfer = np.abs(np.fft.rfft(np.append(1.0, -self.coefficients), size)) ** -2
         return np.asarray(np.fft.irfft(transfer))
 
@@ -112,16 +111,6 @@ class NoiseProcess:
         return np.asarray(out / self.samples)
 
 
-def variance_of(noise: Sequence[NoiseProcess], columns: Array, sizes: tuple[int, ...]) -> Array:
-    """Variance of the noise times each column l of an (n, k) array, (k,).
-
-    The rows are those of all curves, so many samples each, and of priors of unit variance.
-    """
-    pairs = zip(noise, parts(sizes), strict=True)
-    data = np.sum([process.forms(columns[part]) for process, part in pairs], axis=0)
-    return np.asarray(data + np.sum(columns[sum(sizes) :] ** 2, axis=0))
-
-
 def levinson(lags: Array) -> list[tuple[Array, float]]:
     """Autoregressions of order 0, 1, … from autocovariances, with their white variance."""
     fits = [(np.empty(0), float(lags[0]))]
@@ -159,10 +148,10 @@ def noise_processes(
     smaller than the noise was. With the hat matrix H = QQᵀ of the fit, residuals (I-H)e have the
     expected lag sums tr S_k (I-H)Σ(I-H); the autocovariances are corrected by what Σ itself loses.
 
-    `residual` (n,) holds all curves after each other, each in the order of time, so many samples of
-    each as in `sizes`; `jacobian` (n, k) may have any scaling of its columns. Where other data took
-    part in the fit, `taken` (n, k) says what it took of these: orthogonal columns, each as long as
-    the root of the share of the noise along it.
+    `residual` (n,) holds all curves, one after the other, each in the order of time with `sizes`
+    samples; `jacobian` (n, k) may have any scaling of its columns. Where other data took part in
+    the fit, `taken` (n, k) says what it took of these: orthogonal columns, each as long as the root
+    of the share of the noise along it.
     """
     basis = basis_of(jacobian) if taken is None else _shortened(taken)
     curves = parts(sizes)

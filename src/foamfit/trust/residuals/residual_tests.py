@@ -20,8 +20,8 @@ def runs_test(residual: Array) -> float:
 
     Given n₊ positive and n₋ negative residuals in random order, the number of runs has mean
     μ = 2 n₊n₋/n + 1 and variance (μ-1)(μ-2)/(n-1), and is nearly normal (here with the correction
-    for continuity). One-sided: slow waves make few runs; noise that alternates is no structure. The
-    residuals are in the order of time; those that are exactly zero are left out.
+    for continuity). One-sided: slow waves make few runs; noise that alternates is not structure.
+    The residuals are in the order of time; those that are exactly zero are left out.
     """
     signs = residual[residual != 0.0] > 0.0
     n, positive = signs.size, int(np.count_nonzero(signs))
