@@ -178,8 +178,8 @@ class Space:
     high: Array
     # Completes a vector in which some parameters hang on others.
     tied: Callable[[Array], Array] | None
-    # Parameters that are their own coordinates (SI) rather than relative to others: what tests share
-    # would else not be one value. Not every point is admissible then.
+    # Parameters that are their own coordinates (SI) rather than relative to others, so that tests
+    # can share their values. Not every point is admissible then.
     absolute: tuple[str, ...] = ()
 
     @cached_property

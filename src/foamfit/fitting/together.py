@@ -268,9 +268,14 @@ def fit_linked(
         for part, term in zip(parts, terms, strict=True)
     )
     return Together(
-        layout.problems, links, layout.linked, layout.own, values, costs,
+        layout.problems,
+        links,
+        layout.linked,
+        layout.own,
+        values,
+        costs,
         layout.common(best.point, values),
-    )  # fmt: skip
+    )
 
 
 def _varying(problems: Sequence[Problem]) -> tuple[str, ...]:
@@ -360,10 +365,14 @@ class _Layout:
             )
             terms.append(
                 Term(
-                    _finite(problem), problem.objective, space, np.array(at, np.intp),
-                    tuple(rates), pulls,
+                    _finite(problem),
+                    problem.objective,
+                    space,
+                    np.array(at, np.intp),
+                    tuple(rates),
+                    pulls,
                 )
-            )  # fmt: skip
+            )
         box = np.full(count, -_FAR), np.full(count, _FAR)
         for term in terms:
             for side, ends, steepest in zip(

@@ -60,16 +60,23 @@ class FittedCycles:
         """Names of the parameters of the springs that vary in any fit."""
         fits = [one.parameters for one in self.results.values()]
         return [
-            name for name in self.names
+            name
+            for name in self.names
             if name not in NUISANCE and any(name in one and one[name].vary for one in fits)
-        ]  # fmt: skip
+        ]
 
     def rows(self) -> Iterator[list[object]]:
         """Rows of cycles.csv, the header first: SI, one row for each cycle, empty = not there."""
         head = [
-            "cycle", "start_strain", "peak_strain", "peak_stress", ENERGY,
-            *(f"misfit_{name}" for name in CURVES), "status", "error",
-        ]  # fmt: skip
+            "cycle",
+            "start_strain",
+            "peak_strain",
+            "peak_stress",
+            ENERGY,
+            *(f"misfit_{name}" for name in CURVES),
+            "status",
+            "error",
+        ]
         parts = "", "_stderr", "_lo", "_hi", "_state"
         yield [*head, *(f"{name}{part}" for name in self.names for part in parts)]
         for number in sorted({*self.results, *self.refused}):

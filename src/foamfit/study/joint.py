@@ -59,9 +59,13 @@ class JointResult(JointData):
     """Everything that a joint fit found, and how it is written; its fields are `JointData`'s."""
 
     def save(
-        self, folder: str | Path, *, jobs: int | None = None, report: bool = True,
+        self,
+        folder: str | Path,
+        *,
+        jobs: int | None = None,
+        report: bool = True,
         figure_width: str = TWO,
-    ) -> Path:  # fmt: skip
+    ) -> Path:
         """Write joint.json, joint.html, joint.png and a result folder per test; returns the folder.
 
         joint.csv holds what is plotted in joint.png. An older result there is replaced as a whole,
@@ -256,27 +260,25 @@ def _params(study: Study, tests: Sequence[Measurement]) -> list[lmfit.Parameters
 def _links(study: Study, tests: Sequence[_Test]) -> Links:
     """What each parameter is to the tests, and ln(rate/rate0) where a law of rate needs it."""
     rates = [test.rate for test in tests]
-    by_rate = [name for name, kind in study.kinds.items() if kind in RATES]
-    for name in by_rate:
-        where = f'{study.path}: [parameters] {name} = "{study.kinds[name]}"'
+    for name, kind in study.kinds.items():
+        where = f'{study.path}: [parameters] {name} = "{kind}"'
         there = [test for test in tests if name in test.problem.free()]
-        for test in there:
-            if test.rate is None:
-                raise InputError(
-                    f"{where} needs the strain rate of every test, and {test.file} has no time"
-                )
+        if kind == "scatter" and len(there) < 2:
+            raise InputError(
+                f"{where} needs two or more tests in which it varies, and there is "
+                f"{counted(len(there), 'test')}"
+            )
+        if kind not in RATES:
+            continue
+        if untimed := [test.file for test in there if test.rate is None]:
+            raise InputError(
+                f"{where} needs the strain rate of every test, and {untimed[0]} has no time"
+            )
         if not _several([test.rate for test in there]):
             rate = f"{there[0].rate:.3g} 1/s" if there else "none"
             raise InputError(
                 f"{where} needs tests at two or more rates, and all have one ({rate}); make it "
                 '"shared" or "own", or add tests'
-            )
-    for name, kind in study.kinds.items():
-        there = [test for test in tests if name in test.problem.free()]
-        if kind == "scatter" and len(there) < 2:
-            raise InputError(
-                f'{study.path}: [parameters] {name} = "scatter" needs two or more tests in which '
-                f"it varies, and there is {counted(len(there), 'test')}"
             )
     middle = _median_rate(rates)
     if middle is None:
@@ -303,9 +305,13 @@ def _several(rates: Sequence[float | None]) -> bool:
 
 
 def _own_fits(
-    study: Study, options: Options, tests: list[_Test], refused: dict[str, str], each: Map,
+    study: Study,
+    options: Options,
+    tests: list[_Test],
+    refused: dict[str, str],
+    each: Map,
     tell: Progress,
-) -> tuple[list[_Test], Group]:  # fmt: skip
+) -> tuple[list[_Test], Group]:
     """Tests that can be fitted, and what a fit of each alone finds.
 
     A few tests, spread over the rates, are searched as `fit` searches them. The others descend from
@@ -351,9 +357,12 @@ def _own_fits(
 
 
 def _own_fit(
-    measurement: Measurement, model: str, params: lmfit.Parameters, options: Options,
+    measurement: Measurement,
+    model: str,
+    params: lmfit.Parameters,
+    options: Options,
     near: tuple[Array, ...],
-) -> tuple[Array, float] | str:  # fmt: skip
+) -> tuple[Array, float] | str:
     """Fit one test from points nearby, or search; returns its vector and χ² per sample.
 
     Where it cannot be fitted, a sentence that says why.
@@ -392,9 +401,13 @@ def _evidence(
 
 
 def _conclude(
-    study: Study, tests: Sequence[_Test], fit: JointFit, alone: Group,
-    tried: tuple[tuple[joint_fit.Alternative, ...], dict[str, float]], refused: Mapping[str, str],
-) -> JointResult:  # fmt: skip
+    study: Study,
+    tests: Sequence[_Test],
+    fit: JointFit,
+    alone: Group,
+    tried: tuple[tuple[joint_fit.Alternative, ...], dict[str, float]],
+    refused: Mapping[str, str],
+) -> JointResult:
     """Assemble the result."""
     names = tuple(test.name for test in tests)
     rates = tuple(test.rate for test in tests)

@@ -294,9 +294,13 @@ def evidence(
 
 
 def choose_kinds(
-    problems: Sequence[Problem], links: Links, names: Sequence[str], starts: Sequence[Vectors],
-    n_eff: int, kinds: Sequence[str],
-) -> Links:  # fmt: skip
+    problems: Sequence[Problem],
+    links: Links,
+    names: Sequence[str],
+    starts: Sequence[Vectors],
+    n_eff: int,
+    kinds: Sequence[str],
+) -> Links:
     """Links in which each of these parameters has the kind of the least BIC.
 
     All are shared at first; in each round the change of one kind that lowers BIC most is taken. A

@@ -76,11 +76,12 @@ class JointParameter:
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return its part of joint.json."""
-        content = asdict(self)
-        gone = [] if self.kind == "scatter" else [*_SCATTER]
-        gone += [] if self.kind.endswith("rate") else [*_RATE]
-        gone += [] if self.tests is not None else ["tests"]
-        return {key: value for key, value in content.items() if key not in gone}
+        gone = {
+            *(() if self.kind == "scatter" else _SCATTER),
+            *(() if self.kind.endswith("rate") else _RATE),
+            *(() if self.tests is not None else ("tests",)),
+        }
+        return {key: value for key, value in asdict(self).items() if key not in gone}
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,15 +116,18 @@ class TestFit:
         made = conclude(BestPoint(self.problem, self.values), record)
         checklist = tuple(check for check in made.checklist if check.key not in _OF_A_SEARCH)
         own = {
-            name: replace(one, systematic=made.parameters[name].systematic)
-            if name in made.parameters
-            else one
+            name: replace(one, systematic=made.parameters.get(name, one).systematic)
             for name, one in self.parameters.items()
         }
         return replace(
-            made, parameters=own, notes=(self.note, *made.notes), checklist=checklist,
-            status=status_of(checklist), warnings=warnings_of(checklist), budget=None,
-        )  # fmt: skip
+            made,
+            parameters=own,
+            notes=(self.note, *made.notes),
+            checklist=checklist,
+            status=status_of(checklist),
+            warnings=warnings_of(checklist),
+            budget=None,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,19 +196,14 @@ class JointData:
         for name, value in zip(problem.names, (values + problem.origins).tolist(), strict=True):
             if problem.is_exact(name):
                 continue
-            one, vary = self.parameters[name], problem.params[name].vary
-            if not vary:
-                expr = problem.params[name].expr
-                why = "held fixed" if expr is None else f"tied by {expr}"
-                out[name] = ParameterEstimate(
-                    value, None, None, one.unit, False, "fixed", why
-                )  # fmt: skip
+            one, param = self.parameters[name], problem.params[name]
+            if not param.vary:
+                why = "held fixed" if param.expr is None else f"tied by {param.expr}"
+                out[name] = ParameterEstimate(value, None, None, one.unit, False, "fixed", why)
                 continue
             at = one if one.tests is None else one.tests[self.tests[test]]
-            out[name] = ParameterEstimate(
-                value, at.stderr, at.ci95, one.unit, True, at.state or "fixed", at.why or "",
-                None if at.ci95 is None else "local covariance",
-            )  # fmt: skip
+            judged = (at.state or "fixed", at.why or "", at.ci95 and "local covariance")
+            out[name] = ParameterEstimate(value, at.stderr, at.ci95, one.unit, True, *judged)
         return out
 
     def to_json_dict(self) -> dict[str, Any]:
@@ -255,9 +254,8 @@ class JointData:
         """What the result folder of each test is made of."""
         others = counted(len(self.tests) - 1, "other test")
         note = f"Fitted together with {others} ({self.study.name}): intervals are those of all."
-        for t, (problem, values) in enumerate(
-            zip(self.problems, self.fit.found.values, strict=True)
-        ):
+        pairs = zip(self.problems, self.fit.found.values, strict=True)
+        for t, (problem, values) in enumerate(pairs):
             yield TestFit(problem, values, self.estimates(t), note, self.study.seed)
 
     @property

@@ -215,9 +215,15 @@ def _problem(source: Source, measurement: Measurement, drive: str | None) -> Pro
         except InputError:  # it was that of another record
             late = False
     return make_problem(
-        measurement, source.model.name, chosen, None, None, inside,
-        time_shift=late, relaxation=source.model.relaxation,
-    )  # fmt: skip
+        measurement,
+        source.model.name,
+        chosen,
+        None,
+        None,
+        inside,
+        time_shift=late,
+        relaxation=source.model.relaxation,
+    )
 
 
 def _point(population: Population, problem: Problem) -> Array:
@@ -304,9 +310,13 @@ def _draw(
 
 
 def _simulate(
-    population: Population, problem: Problem, point: Array, draws: int, seed: list[int],
+    population: Population,
+    problem: Problem,
+    point: Array,
+    draws: int,
+    seed: list[int],
     parts: set[str],
-) -> _Drawn:  # fmt: skip
+) -> _Drawn:
     """Draw and simulate until there are so many; what is not admissible is drawn again.
 
     What lies beyond the limits of a fit of the test is moved there, as a fit does: to draw it again
@@ -350,9 +360,13 @@ def _by_motion(problem: Problem, point: Array) -> dict[str, Array]:
 
 
 def _curve(
-    problem: Problem, name: str, predicted: Array, drawn: dict[str, _Drawn],
-    source: Source, by_motion: Array | None,
-) -> PredictedCurve:  # fmt: skip
+    problem: Problem,
+    name: str,
+    predicted: Array,
+    drawn: dict[str, _Drawn],
+    source: Source,
+    by_motion: Array | None,
+) -> PredictedCurve:
     """One curve with its band: quantiles of the draws, all other parts added in quadrature."""
     objective = problem.objective
     channel, n = objective.channel(name), predicted.size

@@ -155,7 +155,7 @@ class _Item:
         return self.content.get(key) if isinstance(self.content, Mapping) else None
 
     def item(self, key: str) -> _Item:
-        """Return what stands under a key."""
+        """What stands under a key."""
         return _Item(self.get(key), f"{self.where}: {key}")
 
     def items(self, key: str) -> dict[str, _Item]:
