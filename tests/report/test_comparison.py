@@ -25,10 +25,10 @@ from foamfit.report.comparison import (
     Row,
     compare,
     comparison_text,
+    plot_comparison,
     recognised,
     write_csv,
 )
-from foamfit.report.comparison_plot import plot_comparison
 from foamfit.results import Correlation
 
 NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")

@@ -13,8 +13,7 @@ from conftest import AREA, HEIGHT
 from foamfit.data.measurement import Measurement, Noise, Specimen
 from foamfit.fitting.links import Links
 from foamfit.fitting.problem import make_problem
-from foamfit.report.figures import STYLE, image, laid_out
-from foamfit.report.plotted import plotted, table
+from foamfit.report.figures import STYLE, image, laid_out, plotted, table
 from foamfit.report.studies.joint import joint_page, joint_text, plot_joint
 from foamfit.study.joint_estimates import common_covariance, parameters_of
 from foamfit.study.joint_fit import Alternative, fit_jointly

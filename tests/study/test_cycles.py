@@ -13,7 +13,7 @@ import foamfit as ff
 from conftest import DATA, needs_data, without_pictures
 from cycled import FRESH, ONSETS, SETS, write_record
 from foamfit.cli import main
-from foamfit.report.plotted import plotted
+from foamfit.report.figures import plotted
 from foamfit.report.studies import cycles as cycles_report
 
 

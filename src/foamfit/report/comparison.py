@@ -8,27 +8,36 @@ from __future__ import annotations
 
 import math
 import re
+import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from foamfit.errors import InputError
 from foamfit.files import csv_bytes, write_file
+from foamfit.report import figures
+from foamfit.report.figures import BLUE, GREY, TWO, VERMILION
 from foamfit.report.folder import load_result
 from foamfit.report.readable import readable
 from foamfit.report.render import sentences, words
 from foamfit.results import Fit, ParameterEstimate, law_in_words
+from foamfit.springs.laws import law
+from foamfit.springs.laws.record import ETA, RELAXATION_TIME, STRENGTH, Compared
 from foamfit.springs.model import Model
-from foamfit.springs.parameters import HYSTERETIC, names_of
-from foamfit.springs.published import MM, MPA, PublishedSet
+from foamfit.springs.published import PublishedSet
 from foamfit.springs.published import published as published_sets
 from foamfit.text import signed, significant
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
 Result = Fit | Mapping[str, Any] | str | Path
 
+MARKS = ((BLUE, "o"), (VERMILION, "s"), ("black", "^"), (GREY, "D"))  # of the results
 NOTHING = 3.0  # standard error over value past which a difference means nothing
 WORST_FIRST = ("not determined", "weak", "determined", "fixed")
 ETA_PUBLISHED = (
@@ -39,7 +48,7 @@ VAGUE = "its standard error is many times its value, so the test does not determ
 # What is read of a result, and of each of its parameters.
 _NUMBER = int | float | None
 CONTENT = {"test": str, "model": str, "drive": str, "status": str, "parameters": Mapping}
-ESTIMATE = {"value": _NUMBER, "stderr": _NUMBER}
+ESTIMATE: dict[str, Any] = {"value": _NUMBER, "stderr": _NUMBER}
 ESTIMATE |= {"unit": str, "vary": bool, "state": str, "why": str}
 
 
@@ -128,10 +137,9 @@ def compare(results: Sequence[Result], published: str | None = None) -> Comparis
     where a test names none, all are put beside the first of them. InputError if a result cannot be
     read, the set is unknown, or there is nothing to compare with.
     """
-    names = ", ".join(published_sets)
-    if published is not None and published not in published_sets:
-        raise InputError(f"there is no published set '{published}'; there are {names}")
-    sides = [_side_of(result) for result in results]
+    if published is not None:
+        published_side(published)  # refuses one that is not there
+    sides = [side_of(result) for result in results]
     if not sides:
         raise InputError("nothing to compare; give at least one result folder")
     belongs = [published or (None if _unpublished(s) else recognised(s.test)) for s in sides]
@@ -145,7 +153,7 @@ def compare(results: Sequence[Result], published: str | None = None) -> Comparis
             f"no published set has {kind} springs; give a second result to compare with"
             if kind
             else f"the test '{sides[0].test}' names no published set; choose one by --published "
-            f"({names}), or give a second result"
+            f"({', '.join(published_sets)}), or give a second result"
         )
     return Comparison(tuple(_pair(side, sides[0]) for side in sides[1:]), with_published=False)
 
@@ -182,7 +190,7 @@ class Side:
     relaxation: int = 0  # terms of each hysteretic spring
 
 
-def _side_of(result: Result) -> Side:
+def side_of(result: Result) -> Side:
     """Return the parameters of a fit; InputError if the result is not whole."""
     if isinstance(result, Fit):
         content: Mapping[str, Any] = result.to_json_dict()
@@ -245,93 +253,42 @@ def _correlation(content: Any, where: str) -> dict[tuple[str, str], float]:
 
 
 def published_side(name: str) -> Side:
-    """Return the parameters of a published set."""
+    """Return the parameters of a published set; InputError if there is none of that name."""
+    if name not in published_sets:
+        known = ", ".join(published_sets)
+        raise InputError(f"there is no published set '{name}'; there are {known}")
     item = published_sets[name]
-    kinds = Model.parse(item.model).kinds
     values = {} if item.eta is None else {"site_eta": item.eta}
-    for i, (kind, spring) in enumerate(zip(kinds, item.chain.springs, strict=True), start=1):
-        shorts = (short for short in names_of(kind) if short != "eta")
-        values |= {f"s{i}_{short}": getattr(spring, short) for short in shorts}
+    for i, spring in enumerate(item.chain.springs, start=1):
+        values |= {f"s{i}_{name}": getattr(spring, name) for name in spring.law.own}
         values[f"s{i}_height"] = item.chain.heights[i - 1]
     estimates = {
         name: ParameterEstimate(value, None, None, "", False, "published", "")
         for name, value in values.items()
     }
+    kinds = tuple(spring.law.kind for spring in item.chain.springs)
     return Side(f"published {name}", kinds, estimates, {}, source=item)
 
 
 def _unpublished(side: Side) -> str:
     """Kind of spring of which nothing is published, "" if there is none."""
-    return next((kind for kind in side.kinds if kind == "microscale"), "")
+    laws = map(law, side.kinds)
+    return next((one.kind for one in laws if one.hysteretic and not one.published), "")
 
 
 # ---------------------------------------------------------------- the quantities of the tables
 
 
-class _Quantity(NamedTuple):
-    """A number of the paper's tables as a function of the parameters of one spring."""
-
-    name: str
-    unit: str
-    parts: tuple[str, ...]
-    formula: Callable[..., Any]  # of floats; also of complex numbers, for its derivatives
+def _quantities(kind: str, relaxation: int) -> Iterator[Compared]:
+    """Give the rows of a kind of spring."""
+    yield from law(kind).compared
+    for k in range(1, relaxation + 1) if law(kind).hysteretic else ():
+        for param in (STRENGTH, RELAXATION_TIME):
+            yield Compared(f"{param.symbol[0]}_{k}", param.unit, (f"{param.name}{k}",), _total)
 
 
 def _total(*parts: Any) -> Any:
     return sum(parts)
-
-
-def _ratio(part: Any, k0: Any) -> Any:
-    return part / k0
-
-
-def _in_mpa(value: Any) -> Any:
-    return value / MPA
-
-
-_ETA = _Quantity("η", "Pa·s", ("eta",), _total)
-_K0 = _Quantity("k0", "MPa", ("k0",), _in_mpa)
-_HEIGHT = _Quantity("h", "mm", ("height",), lambda h: h / MM)
-TABLE = (  # of a linear spring, those whose parameters it has
-    _K0,
-    _Quantity(
-        "Δσ/σ_a",
-        "",
-        ("dsigma", "k0", "eps_a"),
-        lambda drop, k0, eps_a: drop * (1.0 - eps_a) / (k0 * eps_a),
-    ),
-    _ETA,
-    _Quantity("ε_a", "", ("eps_a",), _total),
-    _Quantity("ε_c", "", ("eps_c",), _total),
-    _HEIGHT,
-    _Quantity("k_h+/k0", "", ("kh_plus", "k0"), _ratio),
-    _Quantity("k_h−/k0", "", ("kh_minus", "k0"), _ratio),
-    _Quantity("k_c/k0", "", ("kc", "k0"), _ratio),
-)
-OF_MICROSCALE = (  # which the paper's tables do not have
-    _K0,
-    _Quantity("k_c", "MPa", ("kc",), _in_mpa),
-    _ETA,
-    _Quantity("ε_*", "", ("eps_star",), _total),
-    _Quantity("σ₊", "MPa", ("sigma_plus",), _in_mpa),
-    _Quantity("s₊", "", ("spread_plus",), _total),
-    _Quantity("σ₋", "MPa", ("sigma_minus",), _in_mpa),
-    _Quantity("s₋", "", ("spread_minus",), _total),
-    _HEIGHT,
-)
-
-
-def _quantities(kind: str, relaxation: int) -> tuple[_Quantity, ...]:
-    """Return the rows of a kind of spring; a linear spring leaves out what it does not have."""
-    table = OF_MICROSCALE if kind == "microscale" else TABLE
-    if kind not in HYSTERETIC:
-        return table
-    terms = [
-        _Quantity(f"{symbol}_{k}", unit, (f"{short}{k}",), _total)
-        for k in range(1, relaxation + 1)
-        for symbol, unit, short in (("g", "", "g"), ("τ", "s", "tau"))
-    ]
-    return (*table, *terms)
 
 
 class _Value(NamedTuple):
@@ -394,7 +351,7 @@ def _incomparable(side: Side, other: Side) -> str:
 
 
 def _family(kind: str) -> str:
-    return kind if kind in HYSTERETIC else "linear"
+    return kind if law(kind).hysteretic else "linear"
 
 
 def _spring_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
@@ -402,17 +359,17 @@ def _spring_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
     for i, kind in enumerate(side.kinds, start=1):
         alike = i <= len(other.kinds) and _family(other.kinds[i - 1]) == _family(kind)
         for quantity in _quantities(kind, side.relaxation):
-            eta = quantity is _ETA
+            eta = quantity.of == (ETA.name,)
             if eta and not several:
                 continue  # of one spring, it stands with the onsite damper
-            names = [f"s{i}_{part}" for part in quantity.parts]
+            names = [f"s{i}_{part}" for part in quantity.of]
             value = _evaluate(side, names, quantity.formula)
             reference = _evaluate(other, names, quantity.formula) if alike else None
             idle = eta and reference is None
             if value is None or (idle and (value.state, value.value) == ("fixed", 0.0)):
                 continue
             remark = nothing or _remark(value, reference, eta, side, other)
-            yield _row(i if several else 0, quantity.name, quantity.unit, value, reference, remark)
+            yield _row(i if several else 0, quantity.label, quantity.unit, value, reference, remark)
 
 
 def _damping_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
@@ -427,7 +384,7 @@ def _damping_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
         return
     remark = nothing or _remark(value, reference, True, side, other)
     yield _row(0, "η" if one_spring else "site η", "Pa·s", value, reference, remark)
-    soft = [i for i, kind in enumerate(side.kinds, 1) if kind in HYSTERETIC]
+    soft = [i for i, kind in enumerate(side.kinds, 1) if law(kind).hysteretic]
     if item is None or len(soft) != 1 or nothing:
         return
     # ρ H = m/A, so that 2 H √(ρ k_c) = 2 √(m H k_c/A).
@@ -529,3 +486,132 @@ def write_csv(comparison: Comparison, path: str | Path) -> None:
             cells = [getattr(row, name) for name in of_row.values()]
             rows.append([*(getattr(pair, name) for name in of_pair), cells[0] or "", *cells[1:]])
     write_file(path, csv_bytes(rows))
+
+
+# ---------------------------------------------------------------- as a figure
+
+
+def plot_comparison(
+    comparison: Comparison, path: str | Path | None = None, *, width: str = TWO, table: bool = True
+) -> Figure:
+    """Draw how far each parameter is from its reference, in standard errors, and in percent.
+
+    One panel for each reference; shaded are one and three standard errors. What is not compared is
+    left out, what is not determined is named. For `path` and `width` see `plots.plot_fit`; without
+    `table` no CSV of what is plotted is written.
+    """
+    groups: dict[str, list[Pair]] = {}
+    for pair in comparison.pairs:
+        groups.setdefault(pair.reference, []).append(pair)
+    wide = figures.inches(width)
+    columns = figures.abreast(wide, min(len(groups), 2), 2.9)
+    lines = [max(len(_shown(pairs)), 1) * (len(_lanes(pairs)) + 1) for pairs in groups.values()]
+    rows = [max(lines[i : i + columns]) for i in range(0, len(lines), columns)]
+    with figures.drawing(wide, 0.5 + sum(0.6 + 0.12 * n for n in rows)) as figure:
+        ratios = [n + 2 for n in rows]
+        axes = figure.subplots(len(rows), columns, squeeze=False, height_ratios=ratios).ravel()
+        for ax in axes[len(groups) :]:
+            ax.remove()
+        for ax, (reference, pairs) in zip(axes, groups.items(), strict=False):
+            _draw_comparison(ax, pairs)
+            title = textwrap.fill(f"beside {reference}", int(16 * wide / columns))
+            ax.set_title(title, loc="left", fontsize=7.5, pad=4, weight="bold", parse_math=False)
+        for ax in figure.axes[-columns:]:  # the lowest ones
+            ax.set_xlabel("deviation (standard errors)")
+        _name_results(figure, list(groups.values()))
+    return figures.save(figure, path, table=table)
+
+
+def _is_shown(row: Row) -> bool:
+    return row.standard_errors is not None or row.lost
+
+
+def _shown(pairs: list[Pair]) -> list[str]:
+    """Return the parameters of which some result has something to show, in their order."""
+    rows = [row for pair in pairs for row in pair.rows]
+    there = {row.label for row in rows if _is_shown(row)}
+    return [label for label in dict.fromkeys(row.label for row in rows) if label in there]
+
+
+def _lanes(pairs: list[Pair]) -> list[int]:
+    """Return the places of the results that have anything to show: each gets a lane."""
+    return [k for k, pair in enumerate(pairs) if any(map(_is_shown, pair.rows))]
+
+
+def _draw_comparison(ax: Axes, pairs: list[Pair]) -> None:
+    """One line for each parameter of each result; results of a parameter stand together."""
+    labels = _shown(pairs)
+    if not labels:
+        figures.say_nothing_there(ax)
+        return
+    found = [row.standard_errors for pair in pairs for row in pair.rows]
+    reach = max(4.0, 1.1 * max((abs(z) for z in found if z is not None), default=0.0))
+    for half, shade in ((3.0, "0.95"), (1.0, "0.88")):
+        ax.axvspan(-half, half, color=shade, lw=0, zorder=0)
+    ax.axvline(0.0, color=GREY, lw=0.6, zorder=1)
+    lanes = _lanes(pairs)
+    step = len(lanes) + 1
+    for lane, k in enumerate(lanes):
+        color, mark = MARKS[k % len(MARKS)]
+        side = f"{pairs[k].test}, {pairs[k].model}, {pairs[k].drive} drive"
+        for row in pairs[k].rows:
+            if row.label not in labels:
+                continue
+            y, z, name = labels.index(row.label) * step + lane, row.standard_errors, row.label
+            beside: dict[str, Any] = {"va": "center", "fontsize": 6.5, "color": color}
+            if row.lost:
+                beside |= {"ha": "center", "style": "italic", "label": f"_{side}: {name}:"}
+                ax.annotate("not determined", (0.0, y), **beside)
+            elif z is not None:
+                ax.plot([0.0, z], [y, y], color=color, lw=0.9, zorder=2)
+                face = "white" if row.state == "weak" else color
+                style: dict[str, Any] = {"ms": 3.4, "color": color, "mfc": face, "zorder": 3}
+                ax.plot(z, y, mark, label=f"_{side}: {name}", **style)
+                beside |= {"xycoords": ("axes fraction", "data"), "textcoords": "offset points"}
+                ax.annotate(_percent(row), (1.0, y), (2, 0), ha="left", **beside)
+    ax.set_xlim(-reach, reach)
+    ax.set_ylim(step * len(labels) - 0.5, -1.0)
+    ax.set_yticks(
+        [i * step + 0.5 * (step - 2) for i in range(len(labels))],
+        [_math(label) for label in labels],
+    )
+    ax.tick_params(axis="y", length=0)
+    ax.spines["left"].set_visible(False)
+
+
+def _name_results(figure: Figure, groups: list[list[Pair]]) -> None:
+    """Say once what the colours mean: the drives, where these are the same in every panel."""
+    drives = [[f"{pair.drive} drive" for pair in pairs] for pairs in groups]
+    names = max(drives, key=len)
+    if len(groups) == 1 and len(set(names)) < len(names):
+        names = [f"{s.test}: {s.model}, {s.drive} drive" for s in groups[0]]
+    elif len(set(names)) < len(names) or any(d != names[: len(d)] for d in drives):
+        names = [f"result {k + 1}" for k in range(len(names))]
+    drawn = {k for pairs in groups for k in _lanes(pairs)}
+    entries = dict[str, Any]()
+    for k, name in enumerate(names):
+        color, mark = MARKS[k % len(MARKS)]
+        label = name if k in drawn else f"{name}: nothing to compare"
+        (entries[label],) = figure.axes[0].plot([], [], mark, ms=3.4, color=color, label=label)
+    if any(row.state == "weak" for group in groups for pair in group for row in pair.rows):
+        style: dict[str, Any] = {"ms": 3.4, "color": GREY, "mfc": "white"}
+        label = "hollow: weakly determined"
+        (entries[label],) = figure.axes[0].plot([], [], "o", label=label, **style)
+    figures.legend_below(figure, entries)
+
+
+def _math(label: str) -> str:
+    """Write the symbols of a label as formulas: "s2 k_h+/k0" gives "s2 $k_{h+}$/$k_{0}$"."""
+    *spring, name = label.split(" ")
+    parts = re.findall(r"(Δ?\w)_?([^/]*)/?", name.translate(str.maketrans("₊₋−", "+--")))
+    told = "/".join(f"${stem}_{{{index}}}$" if index else f"${stem}$" for stem, index in parts)
+    return " ".join([*spring, told])
+
+
+def _percent(row: Row) -> str:
+    """Return the difference with its standard error, in percent of the reference."""
+    if row.percent is None or not row.reference:
+        return ""
+    spread = 100.0 * row.spread / abs(row.reference)
+    places = 0 if spread >= 10.0 else 1 if spread >= 1.0 else 2
+    return f"{signed(row.percent, places)} ± {spread:.{places}f} %"

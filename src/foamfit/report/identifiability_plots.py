@@ -11,8 +11,7 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.report import figures
-from foamfit.report.figures import BLUE, GREY, INSIDE, TWO, VERMILION
-from foamfit.report.plotted import name_cells
+from foamfit.report.figures import BLUE, GREY, INSIDE, TWO, VERMILION, name_cells
 from foamfit.report.readable import readable_unit
 from foamfit.text import percent
 

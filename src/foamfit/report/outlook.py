@@ -23,18 +23,16 @@ from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.branches import visited
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.search import Tracker, search
-from foamfit.report.comparison import published_side
-from foamfit.report.folder import load_result
+from foamfit.report.comparison import Side, published_side, side_of
 from foamfit.report.readable import readable
 from foamfit.report.render import words
 from foamfit.results import ParameterEstimate, law_in_words, snapping_of
 from foamfit.solve.simulation import Response, simulate
 from foamfit.springs import kernels
 from foamfit.springs.chain import Chain, Impact
+from foamfit.springs.laws import law
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE, split_name, unit_of
-from foamfit.springs.published import published
-from foamfit.springs.spring import BistableSpring
 from foamfit.text import aligned, labelled, wrapped
 from foamfit.trust import covariance
 from foamfit.trust.best_point import BestPoint
@@ -98,7 +96,7 @@ def make_outlook(problem: Problem, values: Array, source: str) -> Outlook:
         closing = {
             f"s{i}": closing_velocity(chain, impact, i)
             for i, kind in enumerate(problem.model.kinds, start=1)
-            if kind == "bistable"
+            if not law(kind).inner_loops and law(kind).hysteretic
         }
         fast = max((v for v in closing.values() if v is not None), default=0.0)
         if fast > impact.velocity:
@@ -150,37 +148,28 @@ def start_values(problem: Problem, seed: int = 0) -> tuple[Array, str]:
     )
 
 
-def published_values(problem: Problem, name: str) -> tuple[Array, str]:
-    """Start values of a published set, its heights scaled to the specimen, without its damping."""
-    if name not in published:
-        known = ", ".join(published)
-        raise InputError(f"there is no published set '{name}'; there are {known}")
-    item, side, values = published[name], published_side(name), problem.vector()
-    if [k == "bistable" for k in problem.model.kinds] != [k == "bistable" for k in side.kinds]:
-        raise InputError(f"{name} is a {item.model}, not a {problem.model.name}; give --model")
-    for full in problem.model.names:
-        short = split_name(full)[1]
-        new = 0.0 if short == "eta" else side.estimates[full].value
-        if short == "height":
-            new = new / item.chain.height * problem.measurement.specimen.height
-        if problem.params[full].vary or short == "eta":
-            values[problem.model.index[full]] = new
-    return problem.space().complete(values), f"published {name}, without its numerical damping"
+def known_values(problem: Problem, side: Side) -> Array:
+    """Start values of the springs of an earlier result or of a published set.
 
-
-def result_values(problem: Problem, folder: Path) -> tuple[Array, str]:
-    """Start values of the springs of an earlier result, from its folder or its fit.json."""
-    content = load_result(folder)
-    given, springs = content.get("parameters", {}), problem.model.names
-    missing = [name for name in springs if name not in given]
-    if missing:
-        raise InputError(
-            f"{folder} has no {missing[0]}; it is a {content.get('model')}, not a "
-            f"{problem.model.name}"
-        )
+    Heights are scaled to the specimen; the damping of a published set is numerical and left out.
+    """
+    model, known = problem.model, dict(side.estimates)
+    if side.source is not None:
+        zero = ParameterEstimate(0.0, None, None, "", False, "published", "")
+        known |= {name: zero for name in model.names if name.endswith("_eta")}
+    families = [[law(kind).hysteretic for kind in kinds] for kinds in (model.kinds, side.kinds)]
+    if families[0] != families[1]:
+        kinds = side.source.model if side.source else "+".join(side.kinds)
+        raise InputError(f"{side.label} is a {kinds}, not a {model.name}; give --model")
+    if missing := [name for name in model.names if name not in known]:
+        raise InputError(f"{side.label} has no {missing[0]}, which {model.name} needs")
+    total = sum(p.value for name, p in known.items() if name.endswith("_height"))
     values = problem.vector()
-    values[: len(springs)] = [float(given[name]["value"]) for name in springs]
-    return problem.space().complete(values), f"the result in {folder}"
+    for name in model.names:
+        scale = problem.measurement.specimen.height / total if name.endswith("_height") else 1.0
+        if side.source is None or problem.params[name].vary or name.endswith("_eta"):
+            values[model.index[name]] = scale * known[name].value
+    return problem.space().complete(values)
 
 
 # ---------------------------------------------------------------- a test that is not made yet
@@ -398,9 +387,10 @@ def outlook_of(
     measurement = read_test(test, specimen) if made else planned_test(test)
     problem = problem_of(measurement)
     if published_set is not None:
-        values, source = published_values(problem, published_set)
+        values = known_values(problem, published_side(published_set))
+        source = f"published {published_set}, without its numerical damping"
     elif result is not None:
-        values, source = result_values(problem, result)
+        values, source = known_values(problem, side_of(result)), f"the result in {result}"
     else:
         values, source = start_values(problem)
     if not made:
@@ -448,17 +438,18 @@ def _loops(outlook: Outlook) -> Iterator[dict[str, Any]]:
     """How far each hysteretic spring goes, and what would close its loop."""
     planned = outlook.planned
     for name, seen in planned.visited.items():
-        if "a" not in seen:
+        own = outlook.problem.model.laws[int(name[1:]) - 1]
+        if not own.hysteretic:
             continue
-        spring = chain_of(outlook.problem, outlook.values).springs[int(name[1:]) - 1]
-        snaps = not isinstance(spring, BistableSpring)
+        closes = not own.inner_loops
         yield {
             "number": name[1:],
             "seen": seen,
-            "snaps": snaps,
+            "closes": closes,
+            "snaps": "snap-through" in own.branches,
             "most": planned.snapped.get(name),
             "closing": outlook.closing.get(name),
-            "needed": None if snaps or planned.velocity else _needed(outlook, int(name[1:])),
+            "needed": _needed(outlook, int(name[1:])) if closes and not planned.velocity else None,
             "lost": [
                 parameter
                 for parameter, item in planned.estimates.items()
@@ -470,14 +461,13 @@ def _loops(outlook: Outlook) -> Iterator[dict[str, Any]]:
 def _needed(outlook: Outlook, spring: int) -> tuple[float, float]:
     """Overall strain, and stress (Pa), at which a spring of a slow chain comes to its C1."""
     chain = chain_of(outlook.problem, outlook.values)
-    soft = chain.springs[spring - 1]
-    assert isinstance(soft, BistableSpring)
-    path = np.linspace(0.0, soft.sigma_hat_c, 400)
+    strain, stress = chain.springs[spring - 1].corners["C1"]
+    path = np.linspace(0.0, stress, 400)
     strains = [
-        soft.eps_hat_c if i == spring - 1 else float(other.strain(path)[-1])
+        strain if i == spring - 1 else float(np.asarray(other.strain(path))[-1])
         for i, other in enumerate(chain.springs)
     ]
-    return float(np.dot(chain.heights, strains)) / chain.height, soft.sigma_hat_c
+    return float(np.dot(chain.heights, strains)) / chain.height, stress
 
 
 def _table(outlook: Outlook) -> list[str]:

@@ -18,7 +18,6 @@ from foamfit.arrays import Array
 from foamfit.report import figures
 from foamfit.report.figures import BLUE, GREY, INSIDE, TWO, VERMILION
 from foamfit.report.readable import readable_unit
-from foamfit.springs.laws import LinearSpring
 from foamfit.terminal import printable
 
 if TYPE_CHECKING:
@@ -33,9 +32,10 @@ POINTS = {"ad": "A1", "da": "A1", "dc": "C1", "ce": "C2", "ec": "C2", "ea": "A2"
 # Where the name of a point stands, in points from it: beside its curve, off the others.
 IN_LOOP = {"A1": (-4, 5), "C1": (-5, 3), "C2": (5, -3), "A2": (4, -7), "σ₊": (-4, 5), "σ₋": (5, -5)}
 IN_TIME = {"A1": (5, -4), "C1": (-5, 3), "C2": (5, 3), "A2": (5, 4), "σ₊": (5, -4), "σ₋": (5, 4)}
-LIGHT = {"a": (-4.0, 3.0), "c": (5.0, -4.0)}  # of branches that are drawn lightly
-IN_WORDS = {"snap-through": (-6.0, 6.0), "held": (-6.0, 4.0), "snap-back": (7.0, -6.0)}
-BESIDE = {"a": (-6, 4), "d": (-6, 4), "c": (7, -3), "e": (4, -7)}  # points from the branch
+# The same of a branch, if not to the upper left; of an elastic one that is drawn lightly, behind
+# the share of its length at which the name stands.
+BESIDE = {"c": (7.0, -3.0), "e": (4.0, -7.0), "snap-back": (7.0, -6.0)}
+LIGHT = {"a": (0.9, (-4.0, 3.0)), "c": (0.5, (5.0, -4.0))}
 MARKERS = 60  # of a measured curve: more of them blot
 PALE = "#A6CEE3"
 STOOD = "#F2DC6B"  # where the gauge stood still
@@ -202,8 +202,11 @@ def _panels(result: Fit) -> list[_Panel]:
         ("displacement_time", "time", "s", "displacement", "m", moving),
         ("stress_strain", "strain", "–", "stress", "Pa", loop),
     )
-    there = [(*axes, [line for line in lines if line]) for *axes, lines in panels]
-    return [_Panel(*panel) for panel in there if panel[-1]]
+    made = (
+        _Panel(key, x, x_unit, y, y_unit, [line for line in lines if line])
+        for key, x, x_unit, y, y_unit, lines in panels
+    )
+    return [panel for panel in made if panel.lines]
 
 
 def _measured(
@@ -385,15 +388,18 @@ def _mark_switches(labels: _Labels, panel: _Panel, result: Fit) -> None:
 
 
 def _switches(panel: _Panel, result: Fit) -> Iterator[tuple[str, str, float, float]]:
-    """Give the points where a bistable spring changes its branch: spring, name and place, SI."""
+    """Give the points at which a spring changes its branch: spring, name and place, SI."""
     for switch in result.switches:
-        name = f"s{switch.spring}"
-        x = switch.displacement / result.measurement.specimen.height
-        x = x if panel.is_loop else switch.time
-        if name not in result.microscale_springs and x is not None:
-            ends = switch.source, switch.target
+        ends = switch.source, switch.target
+        name = POINTS.get("".join(ends))
+        if name is None and result.chain.springs[switch.spring - 1].law.remembers:
+            continue
+        x = switch.time
+        if panel.is_loop:
+            x = switch.displacement / result.measurement.specimen.height
+        if x is not None:
             y = switch.displacement if panel.key == "displacement_time" else switch.stress
-            yield name, POINTS.get("".join(ends), "→".join(ends)), x, y
+            yield f"s{switch.spring}", name or "→".join(ends), x, y
 
 
 def _halves(panel: _Panel, result: Fit) -> Iterator[tuple[str, str, float, float]]:
@@ -406,21 +412,20 @@ def _halves(panel: _Panel, result: Fit) -> Iterator[tuple[str, str, float, float
 
 
 def _draw_law(labels: _Labels, result: Fit) -> None:
-    """Draw branches a and c of the only spring, if it is microscale, and its equilibrium."""
-    if len(result.chain.springs) > 1 or not result.microscale_springs:
+    """Draw the elastic branches of the only spring, if it has any, and its equilibrium."""
+    spring, ax = result.chain.springs[0], labels.ax
+    if len(result.chain.springs) > 1 or not hasattr(spring, "elastic_branches"):
         return
-    spring, ax = result.microscale_springs["s1"], labels.ax
     (left, right), (low, top) = ax.get_xlim(), ax.get_ylim()
     ax.set(xlim=(left, right), ylim=(low, top))  # the branches go on beyond
     stress = np.linspace(0.0, top * labels.fy, 200)
-    on_a = stress / (spring.k0 + stress)
-    on_c = spring.eps_star + stress / (spring.kc + stress)
-    for name, strain, along in (("a", on_a, 0.9), ("c", on_c, 0.5)):
+    for name, strain in spring.elastic_branches(stress).items():
         line = np.column_stack((strain, stress / labels.fy))[strain < right]
         if len(line):  # branch c may lie beyond all that the test reached
             ax.plot(*line.T, color="0.72", lw=0.7, zorder=1.5, label=f"_branch {name}")
+            along, wanted = LIGHT[name]
             at = line[int(along * (len(line) - 1))]
-            labels.write(name, at, LIGHT[name], color=GREY, fontsize=7)
+            labels.write(name, at, wanted, color=GREY, fontsize=7)
     if spring.relaxation and "s1" in result.snapping and result.strain is not None:
         style: Any = {"color": "0.35", "lw": 0.7, "ls": (0, (4, 2)), "zorder": 3.5}
         held = result.snapping["s1"].stress / labels.fy
@@ -431,43 +436,40 @@ def _name_branches(labels: _Labels, panel: _Panel, result: Fit) -> None:
     """Write beside the curve of the only spring on which branch it is."""
     fitted = next((line for line in panel.lines if line.kind == "fitted"), None)
     springs = result.chain.springs
-    if len(springs) > 1 or isinstance(springs[0], LinearSpring) or fitted is None:
+    if len(springs) > 1 or not springs[0].law.hysteretic or fitted is None:
         return
     for branch, start, end in _first_visits(result, fitted):
         x, y = fitted.x[start : end + 1] / labels.fx, fitted.y[start : end + 1] / labels.fy
-        middle = _evenly(x, y, 3)[1]
-        if branch in BESIDE and result.bistable_springs:
-            style: Any = {"ha": "center", "va": "center", "zorder": 6, "color": BLUE}
-            at = x[middle], y[middle]
-            labels.ax.annotate(
-                branch, at, BESIDE[branch], textcoords="offset points", label="_on branch", **style
-            )
-        elif branch in IN_WORDS:
-            inner = np.column_stack((x, y))[_evenly(x, y, 9)]
-            around = sorted(inner, key=lambda at: float(abs(at[0] - x[middle])))
-            wanted = IN_WORDS[branch]
-            at = next((at for at in around if labels.has_room(branch, at, wanted)), around[0])
-            labels.write(branch, at, wanted, stay=True, fontsize=7, color=BLUE, label="_on branch")
+        inner = np.column_stack((x, y))[_evenly(x, y, 9)]
+        middle = x[_evenly(x, y, 3)[1]]
+        around = sorted(inner, key=lambda at: float(abs(at[0] - middle)))
+        wanted = BESIDE.get(branch, (-6.0, 5.0))
+        at = next((at for at in around if labels.has_room(branch, at, wanted)), around[0])
+        size = 7.5 if len(branch) == 1 else 7.0
+        labels.write(branch, at, wanted, stay=True, fontsize=size, color=BLUE, label="_on branch")
 
 
 def _first_visits(result: Fit, fitted: _Line) -> Iterator[tuple[str, int, int]]:
     """Give each branch of the only spring, and the samples of its first stretch on it.
 
-    Micro-springs are held wherever a measured motion shakes: a stretch that goes back by less than
-    a fiftieth of the largest strain is part of the one before it.
+    A spring leaves its branch wherever a measured motion shakes: a stretch of less than a fiftieth
+    of the largest strain is part of the one before it.
     """
     starts = [0, *_switch_samples(result, fitted), fitted.x.size - 1]
-    branches = [switch.source for switch in result.switches[:1]] or ["a"]
+    at_rest = next(iter(result.chain.springs[0].law.branches))
+    branches = [switch.source for switch in result.switches[:1]] or [at_rest]
     branches += [switch.target for switch in result.switches]
     stretches: list[tuple[str, int, int]] = []
     for branch, start, end in zip(branches, starts, starts[1:], strict=False):
-        shakes = branch == "held" and np.ptp(fitted.x[start : end + 1]) < 0.02 * np.ptp(fitted.x)
+        if end <= start:
+            continue
+        shakes = np.ptp(fitted.x[start : end + 1]) < 0.02 * np.ptp(fitted.x)
         if stretches and (shakes or branch == stretches[-1][0]):
             stretches[-1] = (stretches[-1][0], stretches[-1][1], end)
         elif not shakes:
             stretches.append((branch, start, end))
     for i, (branch, start, end) in enumerate(stretches):
-        if end > start and branch not in [one for one, *_ in stretches[:i]]:
+        if branch not in [one for one, *_ in stretches[:i]]:
             yield branch, start, end
 
 

@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from foamfit import text
 from foamfit.results import ParameterEstimate
+from foamfit.springs.parameters import any_param, family, split_name
 
+# Symbols of what is no spring's parameter; those of a spring are in the record of its law.
 SYMBOLS = {
-    "k0": ("k", "0"), "kc": ("k", "c"), "dsigma": ("Δσ", ""), "eps_a": ("ε", "a"),
-    "eps_c": ("ε", "c"), "kh_plus": ("k", "h+"), "kh_minus": ("k", "h−"), "eta": ("η", ""),
-    "height": ("h", ""), "site_eta": ("η", "site"), "time_shift": ("Δt", ""),
-    "eps_star": ("ε", "*"), "sigma_plus": ("σ", "+"), "spread_plus": ("s", "+"),
-    "sigma_minus": ("σ", "−"), "spread_minus": ("s", "−"), "contact_time": ("t", "0"),
-    "displacement_zero": ("w", "0"), "stress_zero": ("σ", "0"), "acceleration_zero": ("a", "0"),
-    "velocity": ("v", "0"), "striker_mass": ("m", ""),
-}  # fmt: skip
+    "site_eta": ("η", "site"),
+    "contact_time": ("t", "0"),
+    "displacement_zero": ("w", "0"),
+    "stress_zero": ("σ", "0"),
+    "acceleration_zero": ("a", "0"),
+    "velocity": ("v", "0"),
+    "striker_mass": ("m", ""),
+    "time_shift": ("Δt", ""),
+}
 # What a nuisance parameter is called where people read it.
 LABELS = {
     "contact_time": "contact time t₀",
@@ -110,6 +112,12 @@ def readable(name: str, p: ParameterEstimate) -> Readable:
     )  # fmt: skip
 
 
+def quantity(value: float, unit: str) -> tuple[str, str]:
+    """Return a number in the unit in which it reads well, and that unit; "–" for none."""
+    factor, name = readable_unit(value, unit)
+    return number(value / factor), name or "–"
+
+
 def own_name(name: str, model: str) -> str:
     """Name of a parameter, without the spring where there is only one."""
     return name if "+" in model else name.removeprefix("s1_")
@@ -132,13 +140,12 @@ def number(value: float | None) -> str:
 
 def symbol(name: str) -> tuple[str, str]:
     """Return the symbol of a parameter and its index: k and "c,2" of s2_kc."""
-    spring, _, base = name.partition("_")
-    term = re.fullmatch(r"(g|tau)(\d+)", base)
-    known = SYMBOLS | ({base: ("τ" if term[1] == "tau" else "g", term[2])} if term else {})
-    if name in known or base not in known:
-        return known.get(name, (name, ""))
-    stem, index = known[base]
-    return stem, ",".join(part for part in (index, spring.removeprefix("s")) if part)
+    spring, short = split_name(name)
+    if name in SYMBOLS or spring < 0:
+        return SYMBOLS.get(name, (name, ""))
+    stem, index = any_param(short).symbol
+    term = short.removeprefix(family(short))  # of relaxation
+    return stem, ",".join(filter(None, (index, term, str(spring + 1))))
 
 
 def _rounded(value: float, stderr: float) -> tuple[str, str, int]:

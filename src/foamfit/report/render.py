@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from typing import TYPE_CHECKING, Any
 
 from foamfit import text
@@ -19,14 +20,15 @@ def environment() -> Environment:
 
     made = Environment(
         loader=PackageLoader("foamfit.report"),
+        extensions=["jinja2.ext.do"],
         autoescape=select_autoescape(("html",)),
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
     filters = (text.percent, text.engineering, text.significant, text.counted, text.listed, number)
-    made.filters |= {one.__name__: one for one in filters}
-    made.filters |= {"paragraphs": _paragraphs, "aligned": _aligned}
+    made.filters.update({one.__name__: one for one in filters})
+    made.filters.update(paragraphs=_paragraphs, aligned=_aligned, exp=math.exp)
     made.filters["spoken"] = lambda name: name.replace("_", "-")
     return made
 

@@ -7,10 +7,9 @@ from dataclasses import dataclass, fields
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from foamfit.report.figures import DPI, TWO, image, inches, laid_out
+from foamfit.report.figures import DPI, TWO, image, inches, laid_out, table
 from foamfit.report.identifiability_plots import plot_budget, plot_insight, plot_profiles
 from foamfit.report.plots import plot_fit, plot_residuals
-from foamfit.report.plotted import table
 from foamfit.results import Fit
 
 if TYPE_CHECKING:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Any
 
 from foamfit.data.measurement import ASKED, interior_channel
 from foamfit.report.readable import readable
@@ -84,7 +83,6 @@ def conclusions(result: Fit) -> tuple[str, ...]:
         if p.ci95 is not None and p.value and math.isfinite(p.ci95[1] - p.ci95[0])
     }
     ends = dict.fromkeys(choose(widths, key=widths.__getitem__) for choose in (min, max) if widths)
-    accepted = result.status != "failed"
     return sentences(
         "conclusions",
         result=result,
@@ -96,8 +94,9 @@ def conclusions(result: Fit) -> tuple[str, ...]:
         weakest=[] if result.insight is None else list(result.insight.weakest()[1]),
         stated=STATED if result.budget is None else [*filter(result.budget.sources.count, STATED)],
         moved=_moved(result),
-        snapping=list(_snapping(result)) if accepted else [],
-        relaxing=list(_relaxing(result)) if accepted else [],
+        accepted=result.status != "failed",
+        several=len(result.chain.springs) > 1,
+        lost=[name for name, p in springs.items() if p.state == "not determined"],
     )
 
 
@@ -128,36 +127,6 @@ def _moved(result: Fit) -> tuple[str, float] | None:
     }
     most = max(shares, key=shares.__getitem__)
     return (most, shares[most]) if shares[most] > 0.0 else None
-
-
-def _of_spring(result: Fit, name: str) -> str:
-    """Return " of spring 2" for s2, nothing where there is only one spring."""
-    return f" of spring {name[1:]}" if len(result.chain.springs) > 1 else ""
-
-
-def _snapping(result: Fit) -> Iterator[dict[str, Any]]:
-    """How many micro-springs of each spring snap in the test, and where."""
-    for name, snapped in result.snapping.items():
-        yield {
-            "whose": _of_spring(result, name),
-            "most": snapped.most,
-            "stress": float(snapped.stress[snapped.turn]),
-            "strain": None if result.strain is None else float(result.strain[snapped.turn]),
-        }
-
-
-def _relaxing(result: Fit) -> Iterator[dict[str, Any]]:
-    """What the relaxation of each spring that has any amounts to."""
-    for i, spring in enumerate(result.chain.springs, start=1):
-        names = [f"s{i}_{n}{k + 1}" for k in range(len(spring.relaxation)) for n in ("g", "tau")]
-        if names:
-            estimates = {name: result.parameters.get(name) for name in names}
-            yield {
-                "whose": _of_spring(result, f"s{i}"),
-                "lost": [n for n, p in estimates.items() if p and p.state == "not determined"],
-                "total": 1.0 + sum(g for g, _ in spring.relaxation),
-                "terms": spring.relaxation,
-            }
 
 
 def _rows(result: Fit) -> list[str]:

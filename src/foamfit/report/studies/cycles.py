@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from foamfit.report import figures
-from foamfit.report.figures import BLUE, TWO, VERMILION, image
+from foamfit.report.figures import BLUE, TWO, VERMILION, image, table
 from foamfit.report.folder import CYCLES_PLOTTED, save_whole, write_json, write_result, write_table
-from foamfit.report.plotted import table
 from foamfit.report.readable import own_name, readable_unit
 from foamfit.report.render import words
 from foamfit.text import percent

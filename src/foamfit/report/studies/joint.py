@@ -13,9 +13,8 @@ import numpy as np
 
 from foamfit.fitting.links import RATES, law_values
 from foamfit.report import figures
-from foamfit.report.figures import BLUE, TWO, VERMILION, image
+from foamfit.report.figures import BLUE, TWO, VERMILION, image, table
 from foamfit.report.folder import save_whole, write_json, write_result
-from foamfit.report.plotted import table
 from foamfit.report.readable import Readable, in_unit, own_name, readable, readable_unit, symbol
 from foamfit.report.render import page, words
 from foamfit.results import ParameterEstimate, law_in_words

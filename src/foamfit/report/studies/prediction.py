@@ -38,7 +38,7 @@ LINES: dict[str, dict[str, Any]] = {
     "predicted": {"color": VERMILION, "linewidth": 0.9},
     "half width: all": {"color": "black", "linestyle": ":", "linewidth": 0.9},
 }
-BAND = {"color": VERMILION, "alpha": 0.18, "linewidth": 0.0}
+BAND: Any = {"color": VERMILION, "alpha": 0.18, "linewidth": 0.0}
 
 
 def save_prediction(
@@ -157,8 +157,7 @@ def _loop(ax: Axes, found: PredictedTest) -> None:
 
 
 def _band(ax: Axes, x: Array, curve: PredictedCurve, factor: float, part: slice) -> None:
-    style: Any = BAND
-    ax.fill_between(x, curve.lo[part] / factor, curve.hi[part] / factor, **style)
+    ax.fill_between(x, curve.lo[part] / factor, curve.hi[part] / factor, **BAND)
 
 
 def _in_time(above: Axes, below: Axes, found: PredictedTest, curve: PredictedCurve) -> None:
