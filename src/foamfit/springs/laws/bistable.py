@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -16,17 +15,14 @@ from foamfit.springs.laws.record import (
     LAST_STRAIN,
     Between,
     Compared,
+    Functions,
     Law,
     Param,
     PointOf,
-    functions_of,
     steeper,
 )
 from foamfit.springs.loop import Loop
 from foamfit.springs.spring import Relaxation, Spring, freeze_numbers, freeze_terms, require
-
-if TYPE_CHECKING:
-    from foamfit.springs.kernels import Row
 
 
 @dataclass(frozen=True)
@@ -140,13 +136,6 @@ class BistableSpring(Spring):
         if self.eps_hat_a is not None and self.sigma_hat_a is not None:
             out["A2"] = (self.eps_hat_a, self.sigma_hat_a)
         return out
-
-    @cached_property
-    def row(self) -> Row:
-        """The spring as the kernels know it."""
-        from foamfit.springs import kernels
-
-        return kernels.bistable_row(*self.seven, self.eta)
 
 
 def _sigma_a(k0: float, eps_a: float) -> float:
@@ -262,6 +251,13 @@ _DROP = Between(  # Δσ from 0 to -σ_a
 _BEYOND_A1 = Between(("eps_a",), lambda eps_a: (eps_a, LAST_STRAIN), lambda eps_a: ((1.0, 0.0),))
 _STIFFNESSES = (math.log(0.3), math.log(300.0))
 
+
+def _functions() -> Functions:
+    from foamfit.springs.laws import followed
+
+    return followed.functions_of("bistable")
+
+
 LAW = Law(
     kind="bistable",
     title="bistable spring",
@@ -300,7 +296,7 @@ LAW = Law(
         ),
     ),
     numbered=BRANCH_NAMES,
-    functions=functions_of("bistable"),
+    functions=_functions,
     branches={"a": "elastic", "d": "snap-buckling", "c": "densified", "e": "snap-back"},
     spring=BistableSpring,
     searched=("k0", "kc", "eps_a", "eps_c", "dsigma", "kh_plus", "kh_minus"),

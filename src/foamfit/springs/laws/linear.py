@@ -4,15 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import TYPE_CHECKING
 
 from foamfit.springs.law import BRANCH_NAMES
-from foamfit.springs.laws.record import Compared, Law, Param, functions_of
+from foamfit.springs.laws.record import Compared, Functions, Law, Param
 from foamfit.springs.spring import Relaxation, Spring, freeze_numbers
-
-if TYPE_CHECKING:
-    from foamfit.springs.kernels import Row
 
 
 @dataclass(frozen=True)
@@ -47,13 +42,6 @@ class LinearSpring(Spring):
         """The record of its law."""
         return UNILATERAL_LAW if self.unilateral else LAW
 
-    @cached_property
-    def row(self) -> Row:
-        """The spring as the kernels know it."""
-        from foamfit.springs import kernels
-
-        return kernels.linear_row(self.k0, self.eta, self.unilateral)
-
     @property
     def relaxation(self) -> Relaxation:
         """Relaxation terms: a linear spring has none."""
@@ -62,6 +50,12 @@ class LinearSpring(Spring):
 
 def _unilateral(k0: float, eta: float = 0.0) -> LinearSpring:
     return LinearSpring(k0, eta, unilateral=True)
+
+
+def _functions(kind: str) -> Functions:
+    from foamfit.springs.laws import followed
+
+    return followed.functions_of(kind)
 
 
 LAW = Law(
@@ -74,7 +68,7 @@ LAW = Law(
         ),
     ),
     numbered=BRANCH_NAMES,
-    functions=functions_of("linear"),
+    functions=lambda: _functions("linear"),
     branches={"line": "linear"},
     hysteretic=False,
     spring=LinearSpring,
@@ -89,6 +83,6 @@ LAW = Law(
 )  # fmt: skip
 UNILATERAL_LAW = replace(
     LAW, kind="unilateral", title="linear spring without tension", spring=_unilateral,
-    functions=functions_of("unilateral"),
+    functions=lambda: _functions("unilateral"),
     branches={"line": "linear", "open": "out of contact"},
 )  # fmt: skip

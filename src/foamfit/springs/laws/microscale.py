@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,9 +16,9 @@ from foamfit.springs.laws.record import (
     LAST_STRAIN,
     Between,
     Compared,
+    Functions,
     Law,
     Param,
-    functions_of,
     steeper,
 )
 from foamfit.springs.loop import Loop
@@ -31,9 +30,6 @@ from foamfit.springs.spring import (
     freeze_terms,
     require,
 )
-
-if TYPE_CHECKING:
-    from foamfit.springs.kernels import Row
 
 
 @dataclass(frozen=True)
@@ -135,13 +131,6 @@ class MicroscaleSpring(Spring):
             ("−", "back", self.sigma_minus, self.spread_minus),
         )
 
-    @cached_property
-    def row(self) -> Row:
-        """The spring as the kernels know it."""
-        from foamfit.springs import microscale_kernels
-
-        return microscale_kernels.microscale_row(*self.values)
-
     def _stress_along(self, strain: Array) -> tuple[Array, NDArray[np.int64]]:
         from foamfit.springs import microscale_kernels
 
@@ -210,6 +199,13 @@ _BEYOND_A = Between(
 _STIFFNESSES = (math.log(0.3), math.log(300.0))
 _STRESSES, _SPREADS = (math.log(0.02), math.log(1.0)), (math.log(0.05), math.log(2.0))
 
+
+def _functions() -> Functions:
+    from foamfit.springs.laws import followed
+
+    return followed.functions_of("microscale")
+
+
 LAW = Law(
     kind="microscale",
     title="microscale spring",
@@ -245,7 +241,7 @@ LAW = Law(
         ),
     ),
     numbered=BRANCH_NAMES,
-    functions=functions_of("microscale"),
+    functions=_functions,
     branches={
         "a": "elastic, none has snapped",
         "snap-through": "micro-springs snap",
