@@ -23,7 +23,7 @@ from foamfit.cli.progress import ProgressLine, progress_line
 from foamfit.one_model import Options
 from foamfit.report import folder
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.prediction import misfit_of
+from foamfit.trust.evidence import misfit_of
 
 pty = pytest.importorskip("pty")
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"

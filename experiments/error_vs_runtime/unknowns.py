@@ -25,7 +25,7 @@ sys.path.insert(0, str(HERE.parent / "recovery"))
 import rig  # noqa: E402
 
 import foamfit as ff  # noqa: E402
-from foamfit.fitting import clock  # noqa: E402
+from foamfit.fitting import curves  # noqa: E402
 from foamfit.fitting.problem import make_params  # noqa: E402
 from foamfit.springs.parameters import NUISANCE  # noqa: E402
 
@@ -42,11 +42,11 @@ RECORDS: dict[str, rig.Impact | rig.Slow] = {
 @contextmanager
 def exact_motion() -> Iterator[None]:
     """Take every motion for exact, as it was sampled."""
-    usual, clock.EXACT = clock.EXACT, 1.0
+    usual, curves.EXACT = curves.EXACT, 1.0
     try:
         yield
     finally:
-        clock.EXACT = usual
+        curves.EXACT = usual
 
 
 def timed(fit: Callable[[], Any]) -> float:

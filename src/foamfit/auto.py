@@ -33,9 +33,8 @@ from foamfit.text import percent
 from foamfit.trust import evidence
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.checklist import input_first
-from foamfit.trust.evidence import MARGIN, SHARE, Tried
+from foamfit.trust.evidence import BLOCKS, MARGIN, SHARE, Tried, predicted_misfit
 from foamfit.trust.intervals import Announce, Choice
-from foamfit.trust.prediction import BLOCKS, predicted_misfit
 from foamfit.trust.residuals.residual_tests import BENT, find_structure, neighbours_test, runs_test
 
 # From the simplest up, in groups: one spring; a linear spring below it or its relaxation; two
