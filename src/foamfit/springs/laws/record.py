@@ -281,12 +281,6 @@ class Law:
     published: bool = False
     numbered: tuple[str, ...] = ()
 
-    def __reduce__(self) -> tuple[Callable[[str], Law], tuple[str]]:
-        """Pickle the law by its name: another process has the record, as `laws.load_texts` does."""
-        from foamfit.springs import laws
-
-        return laws.law, (self.kind,)
-
     @cached_property
     def own(self) -> tuple[str, ...]:
         """Names of its own parameters."""
