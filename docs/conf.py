@@ -32,6 +32,8 @@ numpydoc_show_class_members = False
 
 html_theme = "furo"
 html_title = f"foamfit {release}"
+html_static_path = ["_static"]
+html_css_files = ["formulas.css"]
 
 
 def copy_pages() -> None:
