@@ -63,9 +63,6 @@ LOG_PLUS, SPREAD_PLUS, LOG_MINUS, SPREAD_MINUS, LOG_CROSS = EPS_A, EPS_C, KH_PLU
 # microscale spring (virgin, it is on A): the snapped fraction p is held, p = P₊, p = P₋ > P₊, and
 # p = P₊ = P₋.
 A, D, C, E, LINE, OPEN, HELD, SNAP, BACK, BOTH = range(10)
-BRANCH_NAMES = (
-    "a", "d", "c", "e", "line", "open", "held", "snap-through", "snap-back", "reversible",
-)  # fmt: skip
 
 _derived_points = inner(derived_points)
 _admissible = inner(admissible)

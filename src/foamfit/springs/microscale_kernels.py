@@ -48,11 +48,11 @@ from foamfit.springs.law import (
     least_eps_star,
 )
 
-# The state of a walk: branch, rank, p, 1 - p, strain, stress, the strains and stresses at which the
+# The state of a walk: strain, stress, branch, rank, p, 1 - p, the strains and stresses at which the
 # branch ends, and dε/dσ, d²ε/dσ² where the stress was last sought. Then what stays: strain and
 # stress where snap-through and snap-back meet, where the first micro-spring snaps, and where the
 # last one has snapped back.
-BRANCH, RANK, SNAPPED, REST, EPS, SIGMA, LOW, HIGH, SIGMA_LOW, SIGMA_HIGH = range(10)
+EPS, SIGMA, BRANCH, RANK, SNAPPED, REST, LOW, HIGH, SIGMA_LOW, SIGMA_HIGH = range(10)
 FLEXIBILITY, CURVATURE, MEET, SIGMA_MEET, FIRST, SIGMA_FIRST, LAST, SIGMA_LAST = range(10, 18)
 STATE = 18
 # Derivatives that are carried: by k0 … spread_minus, and by (the logarithm of) the strain itself.
