@@ -328,7 +328,12 @@ class AnyLawPlan(NamedTuple):
     ) -> tuple[Array, Array]:
         """Difference of displacements and base stress over a step of one direction.
 
-        Upwards alone from what is zero.
+        It is one-sided at a limit of what the law admits, and upwards from zero.
+
+        Raises
+        ------
+        SimulationError
+            If neither side can be followed.
         """
         spring, what = way
         count = len(self.laws[spring].names)
@@ -346,9 +351,18 @@ class AnyLawPlan(NamedTuple):
                 moved[spring, place] += by
             return self.follow(moved, higher, drag + by * (what == DRAG), found.parts)
 
-        above, below = beside(step), beside(-step) if value else found
-        step *= 2.0 if value else 1.0
-        return (above.nodes - below.nodes) / step, (above.stress - below.stress) / step
+        try:
+            above, up = beside(step), step
+        except SimulationError:
+            above, up = found, 0.0
+        try:
+            below, down = (beside(-step), step) if value else (found, 0.0)
+        except SimulationError:
+            below, down = found, 0.0
+        width = up + down
+        if width == 0.0:
+            raise SimulationError("the law admits no value beside this one")
+        return (above.nodes - below.nodes) / width, (above.stress - below.stress) / width
 
     def _damping(self, found: Followed) -> float:
         """Damping that would carry the whole stress, Pa·s."""
