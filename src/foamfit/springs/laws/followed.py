@@ -154,12 +154,14 @@ class Loops(NamedTuple):
     to_stress: Compiled
 
 
-def _walker(given: Functions) -> Compiled:
+def _walker(law: Law) -> Compiled:
     """Take one spring to a strain: over all branches on the way; returns its stress."""
-    leaves, switch, settle = given.leaves, given.switch, given.settle
+    _, _, leaves, switch, settle = compiled_functions(law)
+    columns, states = sizes_of(law)
 
     @compiled
-    def walk(row: Array, state: Array, eps: float) -> float:
+    def walk(rows: Array, whole: Array, eps: float) -> float:
+        row, state = rows[:columns], whole[:states]  # arrays may have room for longer ones
         for _ in range(MOST_SWITCHES):
             if not leaves(row, state, eps):
                 settle(row, state, eps)
@@ -170,13 +172,14 @@ def _walker(given: Functions) -> Compiled:
     return walk
 
 
-def _starter(given: Functions) -> Compiled:
-    begin = given.begin
+def _starter(law: Law) -> Compiled:
+    begin = compiled_functions(law).begin
+    columns, states = sizes_of(law)
 
     @compiled
-    def start(row: Array, state: Array, eps: float) -> float:
-        state[:] = 0.0
-        begin(row, state)
+    def start(rows: Array, whole: Array, eps: float) -> float:
+        whole[:] = 0.0
+        begin(rows[:columns], whole[:states])
         return eps
 
     return start
@@ -204,9 +207,8 @@ def _chosen(functions: Sequence[Compiled]) -> Compiled:
 @cache
 def loops_of(laws: tuple[Law, ...]) -> Loops:
     """Loops of springs of these laws, base first."""
-    functions = [compiled_functions(law) for law in laws]
-    walk = _chosen([_walker(one) for one in functions])
-    start = _chosen([_starter(one) for one in functions])
+    walk = _chosen([_walker(law) for law in laws])
+    start = _chosen([_starter(law) for law in laws])
 
     @compiled
     def step(
