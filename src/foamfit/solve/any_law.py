@@ -328,7 +328,7 @@ class AnyLawPlan(NamedTuple):
     ) -> tuple[Array, Array]:
         """Difference of displacements and base stress over a step of one direction.
 
-        It is one-sided at a limit of what the law admits, and upwards from zero.
+        It is one-sided at a limit of what the law admits, and at zero.
 
         Raises
         ------
@@ -343,25 +343,23 @@ class AnyLawPlan(NamedTuple):
         zero = {OWN_ETA: self._damping(found), DRAG: self._damping(found) / self.height}
         step = RELATIVE * abs(value) or ABSOLUTE * zero.get(what, 1.0)
 
-        def beside(by: float) -> Followed:
+        def beside(by: float) -> Followed | None:
             moved, higher = rows.copy(), np.array(heights, dtype=float)
             if what == OWN_HEIGHT:
                 higher[spring] += by
             elif what != DRAG:
                 moved[spring, place] += by
-            return self.follow(moved, higher, drag + by * (what == DRAG), found.parts)
+            try:
+                return self.follow(moved, higher, drag + by * (what == DRAG), found.parts)
+            except SimulationError:
+                return None
 
-        try:
-            above, up = beside(step), step
-        except SimulationError:
-            above, up = found, 0.0
-        try:
-            below, down = (beside(-step), step) if value else (found, 0.0)
-        except SimulationError:
-            below, down = found, 0.0
-        width = up + down
+        above = beside(step)
+        below = beside(-step) if value or above is None else None
+        width = step * ((above is not None) + (below is not None))
         if width == 0.0:
             raise SimulationError("the law admits no value beside this one")
+        above, below = above or found, below or found
         return (above.nodes - below.nodes) / width, (above.stress - below.stress) / width
 
     def _damping(self, found: Followed) -> float:
