@@ -363,8 +363,10 @@ class AnyLawPlan(NamedTuple):
         places = {OWN_ETA: count - 1, OWN_HEIGHT: -1, DRAG: -1}
         place = places.get(what, count + what - OWN_RELAXATION if what > DRAG else what)
         value = {OWN_HEIGHT: heights[spring], DRAG: drag}.get(what, rows[spring, place])
+        own = self.laws[spring].params
+        size = self._peak(found) if what < len(own) and own[what].unit == "Pa" else 1.0
         zero = {OWN_ETA: self._damping(found), DRAG: self._damping(found) / self.height}
-        step = RELATIVE * abs(value) or ABSOLUTE * zero.get(what, 1.0)
+        step = RELATIVE * abs(value) or ABSOLUTE * zero.get(what, size)
 
         def beside(by: float) -> Followed | None:
             moved, higher = rows.copy(), np.array(heights, dtype=float)
@@ -387,8 +389,11 @@ class AnyLawPlan(NamedTuple):
 
     def _damping(self, found: Followed) -> float:
         """Damping that would carry the whole stress, Pa·s."""
-        lasts = float(self.time[-1] - self.time[0]) or 1.0
-        return max(float(np.abs(found.stress).max()), 1.0) * lasts
+        return self._peak(found) * (float(self.time[-1] - self.time[0]) or 1.0)
+
+    def _peak(self, found: Followed) -> float:
+        """Largest stress, Pa."""
+        return max(float(np.abs(found.stress).max()), 1.0)
 
 
 def _miss(one: Array, other: Array) -> float:
