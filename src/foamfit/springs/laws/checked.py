@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -79,8 +80,9 @@ def _overrun(law: Law, values: Array) -> str | None:
     first followed as it was written.
     """
     given = law.functions if isinstance(law.functions, Functions) else law.functions()
-    plain = Functions(*(getattr(one, "py_func", one) for one in given))
-    if any(one.__module__.startswith(f"{__name__.partition('.')[0]}.") for one in plain):
+    written: list[Any] = [getattr(one, "py_func", one) for one in given]
+    plain = Functions(*written)
+    if any(one.__module__.startswith("foamfit.") for one in written):
         return None  # the paper's laws call what Python cannot
     columns, states = followed.sizes_of(law)
     row, state = np.zeros(columns), np.zeros(states)
