@@ -12,7 +12,6 @@ LISTED = (
     "fit_a_new_test.ipynb",
     "fitted_against_published.ipynb",
     "what_changes_by_cycle.ipynb",
-    "a_law_of_your_own.ipynb",
     "turn_the_parameters.ipynb",
 )
 

@@ -128,9 +128,7 @@ def load_file(path: str | Path) -> tuple[Law, ...]:
     try:
         exec(compile(path.read_text(encoding="utf-8"), str(path), "exec"), module.__dict__)
         given = [one for one in vars(module).values() if isinstance(one, Law)]
-        found = {one.kind: one for one in given if one.kind not in _OWN}
-        for one in found.values():
-            register(one)
+        found = {one.kind: register(one) for one in given if one.kind not in _OWN}
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except Exception as error:
