@@ -243,6 +243,15 @@ class Space:
             values[one.place] = min(max(value, self.low[one.place]), self.high[one.place])
         return self.complete(values)
 
+    def admit(self, values: Array) -> Array:
+        """Move what is relative to other parameters between its ends, in place, and complete it."""
+        for one in self.coordinates:
+            if one.param is not None and isinstance(one.param.coordinate, Between):
+                first, last = self._ends(one, values)
+                ends = [first + u * (last - first) for u in one.param.limits]
+                values[one.place] = np.clip(values[one.place], min(ends), max(ends))
+        return self.complete(values)
+
     def complete(self, values: Array) -> Array:
         """Complete a vector by what hangs on others."""
         return values if self.tied is None else self.tied(values)

@@ -19,7 +19,7 @@ from foamfit.fitting.curves import check_time_shift
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.search import SearchRecord
 from foamfit.results import Check, Intervals, ParameterEstimate
-from foamfit.springs.parameters import NUISANCE, split_name
+from foamfit.springs.parameters import NUISANCE, any_param, split_name
 from foamfit.text import engineering, listed, percent
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import AT_LIMIT, WEAK
@@ -36,8 +36,6 @@ STATED, ESTIMATED = 1.1, 1.5
 STRUCTURED = 5.0
 # Most reasons in one warning; more of them are easier to read in the table of parameters.
 REASONS = 3
-# Parameters that may be zero: their interval tells whether there is an effect at all.
-MAY_VANISH = ("dsigma", "kh_plus", "kh_minus", "eta")
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +58,11 @@ class Findings:
     def known(self) -> list[str]:
         """Parameters that have a standard error."""
         return [name for name, item in self.estimates.items() if item.stderr is not None]
+
+
+def may_vanish(name: str) -> bool:
+    """Whether a parameter may be zero: its interval tells whether there is an effect at all."""
+    return name not in NUISANCE and any_param(split_name(name)[1]).has_neutral
 
 
 def status_of(checklist: Iterable[Check]) -> str:
@@ -199,7 +202,7 @@ def _determined(e: Findings) -> Check:
 def _vanishes(e: Findings, name: str) -> bool:
     """Whether a parameter is consistent with zero and its upper bound is small."""
     item = e.estimates[name]
-    if item.state != "weak" or item.ci95 is None or split_name(name)[1] not in MAY_VANISH:
+    if item.state != "weak" or item.ci95 is None or not may_vanish(name):
         return False
     size = float(e.best.problem.sizes((name,), e.best.values)[0])
     ends = (*item.ci95, *(item.range or ()))
@@ -240,7 +243,7 @@ def _of_parameters(e: Findings) -> Iterator[Check]:
         for bound in e.best.limits(name):
             if abs(e.best.values[e.best.index[name]] - bound) > AT_LIMIT * size:
                 continue
-            if bound == 0.0 and split_name(name)[1] in MAY_VANISH:
+            if bound == 0.0 and may_vanish(name):
                 natural.append(f"{name} is zero, which it may be")
             else:
                 stuck.append(f"{name} lies at {bound:g}")
