@@ -62,7 +62,7 @@ class Refit:
         """Vector of all parameters from the scaled ones, moved between these limits (SI)."""
         point = self.best.values.copy()
         point[self.best.places] = np.clip(scaled * self.best.sizes, *box)
-        return self.space.admit(point)
+        return self.space.admit(point, self.best.places[box[0] == box[1]])
 
     def moved(self, at: Array, step: Array) -> Array:
         """Point that is off another by a scaled step, within the limits."""
