@@ -24,10 +24,11 @@ from foamfit.report.comparison import (
     Pair,
     Row,
     compare,
+    comparison_text,
+    plot_comparison,
     recognised,
+    write_csv,
 )
-from foamfit.report.comparison_plot import plot_comparison
-from foamfit.report.comparison_text import comparison_text, write_csv
 from foamfit.results import Correlation
 
 NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
@@ -407,8 +408,8 @@ def test_microscale_fits_stand_beside_each_other() -> None:
     ticks = [
         tick.get_text() for tick in plot_comparison(compare([one, one])).axes[0].get_yticklabels()
     ]
-    assert ticks[-2:] == ["$g_1$", r"$\tau_1$"]
-    assert r"$\sigma_+$" in ticks
+    assert ticks[-2:] == ["$g_{1}$", "$τ_{1}$"]
+    assert "$σ_{+}$" in ticks
 
 
 def test_a_law_that_relaxes_beside_one_that_does_not() -> None:

@@ -13,11 +13,8 @@ from conftest import AREA, HEIGHT
 from foamfit.data.measurement import Measurement, Noise, Specimen
 from foamfit.fitting.links import Links
 from foamfit.fitting.problem import make_problem
-from foamfit.report.figures import STYLE, image, laid_out
-from foamfit.report.plotted import plotted, table
-from foamfit.report.studies.joint_page import joint_page
-from foamfit.report.studies.joint_plot import plot_joint
-from foamfit.report.studies.joint_text import joint_text
+from foamfit.report.figures import STYLE, image, laid_out, plotted, table
+from foamfit.report.studies.joint import joint_page, joint_text, plot_joint
 from foamfit.study.joint_estimates import common_covariance, parameters_of
 from foamfit.study.joint_fit import Alternative, fit_jointly
 from foamfit.study.joint_result import Alone, JointData
@@ -61,7 +58,7 @@ def found(tmp_path_factory) -> JointData:
         "displacement", KINDS, {}, 0, None, None,
     )  # fmt: skip
     return JointData(
-        study=study, seed=0, tests=names, files=(here,) * 3, rates=RATES, rate0=0.1, fit=fit,
+        study=study, tests=names, files=(here,) * 3, rates=RATES, rate0=0.1, fit=fit,
         parameters=parameters_of(fit, names),
         covariance=common_covariance(fit),
         evidence=(

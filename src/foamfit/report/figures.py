@@ -1,23 +1,31 @@
-"""What all figures share: colours, style, one layout for all images of a figure, saving."""
+"""What all figures share: colours, style, one layout for all images, saving, a table of the data.
+
+The table of what is plotted is read off the figure itself, so any other program can draw it again.
+A line, band or mark is a series by its label (one that begins with "_" is left out of legends, and
+is a series all the same); what has no label is decoration. A panel has the name of its label, if it
+has one, or of its title.
+"""
 
 from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.errors import InputError
-from foamfit.files import write_file
-from foamfit.report import plotted
+from foamfit.files import csv_bytes, write_file
+from foamfit.text import wrapped
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -54,6 +62,9 @@ NARROWEST, WIDEST = 2.5, 20.0
 # Points of a drawn line: a longer one is drawn through the first, last and extreme samples of so
 # many stretches, which no print tells from all samples.
 MOST_POINTS, STRETCHES = 3000, 500
+HEAD = ("panel", "series", "x axis", "y axis", "x", "y")
+# Names of the rows and columns of a matrix that is drawn as shaded cells.
+_CELLS = WeakKeyDictionary["Artist", tuple[Sequence[str], Sequence[str]]]()
 
 
 def inches(width: str) -> float:
@@ -77,17 +88,26 @@ def abreast(width: float, panels: int, least: float = 2.1) -> int:
     return max(1, min(panels, int(width / least)))
 
 
+def title_lines(width: float, *parts: str) -> list[str]:
+    """Break the parts of a title into lines for a figure of a width in inches."""
+    return [line for part in parts for line in wrapped(part, 0, int(16 * width))]
+
+
 @contextmanager
-def drawing(width: float, height: float) -> Iterator[Figure]:
+def drawing(width: float, height: float, title: Sequence[str] = ()) -> Iterator[Figure]:
     """Give an empty figure of a size in inches, and the style of all figures to draw it in.
 
-    Long lines are thinned in the end to what can be seen of them.
+    Long lines are thinned in the end to what can be seen of them. `title` has its lines.
     """
     import matplotlib
     from matplotlib.figure import Figure
 
     with matplotlib.rc_context(STYLE):
-        yield (figure := Figure(figsize=(width, height), layout="constrained"))
+        figure = Figure(figsize=(width, height), layout="constrained")
+        if title:  # a name may hold a dollar sign: it is no formula
+            style: Any = {"fontsize": 8, "parse_math": False}
+            figure.suptitle("\n".join(title), x=0.01, ha="left", **style)
+        yield figure
         for line in (line for ax in figure.axes for line in ax.lines):
             x, y = np.asarray(line.get_xdata()), np.asarray(line.get_ydata())
             if x.size > MOST_POINTS:
@@ -118,7 +138,8 @@ def legend_below(figure: Figure, entries: dict[str, Any]) -> int:
         widths = [max(sizes[i : i + lines]) for i in range(0, len(names), lines)]
         if sum(widths) <= room:
             break
-    figure.legend(handles, names, loc="outside lower center", ncols=len(widths))
+    told = [name.replace("$", r"\$") for name in names]
+    figure.legend(handles, told, loc="outside lower center", ncols=len(widths))
     return lines
 
 
@@ -184,10 +205,38 @@ def write_haloed(ax: Axes, name: str, at: Array, offset: tuple[float, float], **
     ax.add_artist(text)
 
 
-def say_nothing_there(ax: Axes) -> None:
+def draw_estimates(
+    ax: Axes, points: Sequence[tuple[float, Any]], factor: float, size: float = 3.5
+) -> tuple[list[float], list[float]]:
+    """Draw values of a parameter, hollow if not determined, and their 95 % intervals.
+
+    `points` are (x, estimate), `factor` is the unit; with a size of 0 there are intervals alone.
+    Returns the values and the ends as drawn.
+    """
+    bars = [(x, *p.ci95) for x, p in points if p.ci95 is not None and np.all(np.isfinite(p.ci95))]
+    ends = np.array(bars, dtype=float).reshape(-1, 3) / (1.0, factor, factor)
+    ax.vlines(*ends.T, color=GREY, linewidth=0.8, zorder=1, label="_95 % interval")
+    for sure, face in ((True, BLUE), (False, "white")) if size else ():
+        chosen = [(x, p.value / factor) for x, p in points if (p.state == "determined") == sure]
+        style: Any = {"color": BLUE, "markerfacecolor": face, "markersize": size}
+        style["label"] = "_determined" if sure else "_not well determined"
+        ax.plot(*np.array(chosen).reshape(-1, 2).T, "o", **style)
+    return [p.value / factor for _, p in points], ends[:, 1:].ravel().tolist()
+
+
+def limit(ax: Axes, values: Sequence[float], ends: Sequence[float]) -> None:
+    """Let wide intervals run out of a panel rather than flatten the values."""
+    low, high = min(values), max(values)
+    room = max(1.5 * (high - low), 0.1 * max(abs(low), abs(high)), 1e-12)
+    bottom, top = max(min([low, *ends]), low - room), min(max([high, *ends]), high + room)
+    edge = 0.08 * max(top - bottom, room)
+    ax.set_ylim(bottom - edge, top + 2.0 * edge)
+
+
+def say_nothing_there(ax: Axes, told: str = "no curve to compare") -> None:
     """Write into an empty panel that there is no curve."""
     ax.set_axis_off()
-    ax.text(0.5, 0.5, "no curve to compare", ha="center", va="center", transform=ax.transAxes)
+    ax.text(0.5, 0.5, told, ha="center", va="center", transform=ax.transAxes)
 
 
 def figure_format(path: str | Path) -> Literal["png", "pdf", "svg"]:
@@ -201,13 +250,117 @@ def figure_format(path: str | Path) -> Literal["png", "pdf", "svg"]:
 def save(figure: Figure, path: str | Path | None, *, table: bool = False) -> Figure:
     """Save a figure, if there is a path, in the format of its suffix; returns the figure.
 
-    With `table` what is plotted in it is written beside it as CSV; see `foamfit.report.plotted`.
+    With `table` what is plotted in it is written beside it as CSV; see `plotted`.
     """
     if path is not None:
         data = Path(path).with_suffix(".csv")
         if table:
-            plotted.check_table(data)
+            check_table(data)
         write_file(path, image(figure, figure_format(path)))
         if table:
-            write_file(data, plotted.table(figure))
+            write_file(data, csv_bytes(plotted(figure)))
     return figure
+
+
+# ---------------------------------------------------------------- the table of what is plotted
+
+
+def name_cells(picture: Artist, rows: Sequence[str], columns: Sequence[str]) -> None:
+    """Say what the rows and columns of a matrix are: they need not stand at its axes."""
+    _CELLS[picture] = tuple(rows), tuple(columns)
+
+
+def plotted(figure: Figure) -> Iterator[tuple[object, ...]]:
+    """Give the rows of the table, the header first, in the units of the axes.
+
+    x is empty for what lies across a panel, y for what stands upright in it. A band is its outline,
+    an interval its two ends, a cell of a matrix has the names of its row (the series) and column.
+    """
+    yield HEAD
+    for ax in figure.axes:
+        axes = _sides(ax)
+        titles = str(ax.get_label()), ax.get_title(loc="left"), ax.get_title()
+        panel = next(filter(None, titles), f"{axes[1]} over {axes[0]}")
+        for series, x, y in _series(ax):
+            yield from ((panel, series, *axes, *place) for place in zip(x, y, strict=True))
+
+
+def table(figure: Figure) -> bytes:
+    """Return the table as the bytes of a CSV file."""
+    return csv_bytes(plotted(figure))
+
+
+def check_table(
+    path: Path, head: str = ",".join(HEAD),
+    words: str = "the plotted data of the figure are to be written, and is no such table; name the "
+    "figure otherwise",
+) -> None:  # fmt: skip
+    """Raise InputError if something else stands where a table that begins so is to be written."""
+    try:
+        with path.open(encoding="utf-8", errors="replace") as file:
+            known = file.readline().startswith(head)
+    except FileNotFoundError:
+        return
+    except OSError:
+        known = False
+    if not known:
+        raise InputError(f"{path} stands where {words}")
+
+
+def _sides(ax: Axes) -> tuple[str, str]:
+    """What the axes of a panel are, from the panel beside it where that is written only there."""
+    found = []
+    for side, shared in (("x", ax.get_shared_x_axes()), ("y", ax.get_shared_y_axes())):
+        labels = [getattr(one, f"get_{side}label")() for one in (ax, *shared.get_siblings(ax))]
+        found.append(next(filter(None, labels), ""))
+    return found[0], found[1] or " ".join(ax.get_title().split())
+
+
+def _series(ax: Axes) -> Iterator[tuple[str, list[str], list[str]]]:
+    """Give the series of a panel, each with its places."""
+    from matplotlib.collections import LineCollection, PolyCollection
+    from matplotlib.text import Annotation
+
+    for line in ax.lines:
+        if name := _name(line):
+            yield name, *_columns(ax, line, np.asarray(line.get_xydata(), dtype=float))
+    for patch in ax.patches:
+        if name := _name(patch):
+            corners = patch.get_patch_transform().transform(patch.get_path().vertices)
+            yield name, *_columns(ax, patch, corners[:-1])
+    for drawn in ax.collections:
+        if (name := _name(drawn)) and isinstance(drawn, LineCollection | PolyCollection):
+            for path in drawn.get_paths():
+                yield name, *_columns(ax, drawn, np.asarray(path.vertices, dtype=float))
+    for text in ax.texts:
+        if isinstance(text, Annotation) and (name := _name(text)):
+            x, y = text.xy
+            yield f"{name} {text.get_text()}", [_cell(x)], [_cell(y)]
+    for picture in ax.images:
+        rows, columns = _CELLS[picture]
+        for row, values in zip(rows, np.asarray(picture.get_array()).tolist(), strict=True):
+            there = [(x, v) for x, v in zip(columns, values, strict=True) if np.isfinite(v)]
+            yield row, [x for x, _ in there], [_cell(v) for _, v in there]
+
+
+def _name(artist: Artist) -> str:
+    """Name of a series; "" of decoration, to which matplotlib gives names like "_child3"."""
+    label = str(artist.get_label() or "")
+    return "" if label.startswith("_child") else label.removeprefix("_")
+
+
+def _columns(ax: Axes, artist: Artist, places: Array) -> tuple[list[str], list[str]]:
+    """The coordinates as text; empty along an axis to which the series runs across."""
+    here = artist.get_transform().contains_branch_seperately(ax.transData)
+    if not all(here):  # a line across has two equal places
+        places = np.unique(places[:, [int(here[1])]], axis=0)[:, [0, 0]]
+    columns = [
+        [_cell(value) for value in column] if own else [""] * len(places)
+        for own, column in zip(here, places.T.tolist(), strict=True)
+    ]
+    return columns[0], columns[1]
+
+
+def _cell(value: float) -> str:
+    """A number as finely as a figure could ever show it; empty where there is none."""
+    return f"{value:.6g}" if np.isfinite(value) else ""

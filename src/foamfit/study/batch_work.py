@@ -222,9 +222,14 @@ def _several(task: Task, path: Path, toml: Path) -> tuple[tuple[Row, ...], Write
     assert isinstance(recipe.cycles, tuple)
     # Not together, which takes longer than all of them: the summary has a row for each.
     found = fit_cycles(
-        path, toml, cycles=recipe.cycles or None, model=recipe.model, params=recipe.params,
-        together=False, **recipe.options,
-    )  # fmt: skip
+        path,
+        toml,
+        cycles=recipe.cycles or None,
+        model=recipe.model,
+        params=recipe.params,
+        together=False,
+        **recipe.options,
+    )
 
     def row(number: int, result: FitResult | None) -> Row:
         name = f"{task.name}/cycle-{number}"

@@ -5,6 +5,7 @@ All that is concluded from a fit reads this: one plain simulation and one with s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -17,9 +18,9 @@ from foamfit.fitting.losses import influence, soften
 from foamfit.fitting.objective import Simulated
 from foamfit.fitting.problem import Problem
 from foamfit.trust import covariance
-from foamfit.trust.covariance import Covariance
+from foamfit.trust.covariance import Block, Covariance, Uncertainty
 from foamfit.trust.residuals.law_error import CurveError, curve_errors
-from foamfit.trust.residuals.noise_process import noise_processes, parts, variance_of
+from foamfit.trust.residuals.noise_process import noise_processes, parts
 
 
 def m_estimate(residual: Array, sizes: tuple[int, ...], loss: str) -> tuple[Array, Array]:
@@ -139,40 +140,34 @@ class BestPoint:
         """Whether the law misses more of some curve than its noise."""
         return any(error.found for error in self.errors)
 
+    def block(self, errors: Sequence[CurveError]) -> Block:
+        """Its part in a covariance, by the errors of its curves; as estimated with the loss."""
+        jacobian, pseudo = self.weighted
+        return Block(
+            jacobian * self.sizes,
+            pseudo,
+            self.problem.objective.sizes,
+            [error.noise for error in errors],
+            np.eye(len(self.names)),
+            self.gradient if any(error.found for error in errors) else None,
+            (np.abs(self.box - self.values[self.places]) / self.sizes).T,
+        )
+
+    def gradient(self, places: NDArray[np.intp], step: Array) -> Array:
+        """Half the gradient of the cost by some of the parameters, all scaled, at a step of them.
+
+        The step ends at their limits.
+        """
+        at, sizes, (low, high) = self.places[places], self.sizes[places], self.box[:, places]
+        values = self.values.copy()
+        values[at] = np.clip(values[at] + step * sizes, low, high)
+        slopes = self.problem.slopes(values, tuple(self.names[i] for i in places)) * sizes
+        return np.asarray(slopes.T @ self.problem.objective.residual(values))
+
     @cached_property
     def spread(self) -> Covariance:
-        """Their local covariance, as estimated with the loss.
-
-        Where the law has an error it goes by the curvature of the cost itself, and what the
-        residual presses to a limit is held.
-        """
-        jacobian, pseudo = self.weighted
-        noise, curves = [error.noise for error in self.errors], self.problem.objective.sizes
-        plain = covariance.covariance(jacobian, pseudo, curves, self.sizes, noise)
-        free = np.arange(len(self.names))
-        if self.misfits:
-            free = np.flatnonzero(~self._held(jacobian, pseudo, plain))
-        if not self.misfits or not free.size:
-            return plain
-        places, sizes, (low, high) = self.places[free], self.sizes[free], self.box[:, free]
-        names = tuple(self.names[i] for i in free)
-
-        def gradient(step: Array) -> Array:
-            values = self.values.copy()
-            values[places] = np.clip(values[places] + step * sizes, low, high)
-            slopes = self.problem.slopes(values, names) * sizes
-            return np.asarray(slopes.T @ self.problem.objective.residual(values))
-
-        bent = covariance.covariance(jacobian[:, free], pseudo, curves, sizes, noise, gradient)
-        return plain.with_some(free, bent)
-
-    def _held(self, jacobian: Array, residual: Array, spread: Covariance) -> NDArray[np.bool_]:
-        """Parameters that the residual presses to a limit by more than its noise could, (k,)."""
-        pull = jacobian.T @ residual
-        sure = variance_of(spread.noise, jacobian, self.problem.objective.sizes)
-        near = np.abs(self.box - self.values[self.places]) <= covariance.AT_LIMIT * self.sizes
-        outward = np.where(near[0], pull, np.where(near[1], -pull, 0.0))
-        return np.asarray(outward > 1.96 * np.sqrt(sure))
+        """Their local covariance, as estimated with the loss."""
+        return Uncertainty((self.block(self.errors),), self.sizes).covariance
 
     @cached_property
     def quantiles(self) -> Array:

@@ -129,9 +129,9 @@ class _Side:
         """
         shift = np.zeros(len(self.refit.best.names))
         shift[self.column] = (value - self.value(near)) / self.refit.best.sizes[self.column]
-        ahead = near.residual + near.jacobian @ shift
+        ahead = near.gradient + near.normal @ shift
         held = np.arange(shift.size) == self.column
-        for step in (shift + damped_step(ahead, near.jacobian, 1e-9, held), shift):
+        for step in (shift + damped_step(ahead, near.normal, 1e-9, held), shift):
             found = self.refit.run(self.refit.moved(near.point, step), (self.column, value))
             if found is not None:
                 return found

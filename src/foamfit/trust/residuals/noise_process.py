@@ -77,20 +77,26 @@ class NoiseProcess:
         root = np.sqrt(np.maximum(self._circulant(n).real, 0.0))
         return np.asarray(np.fft.irfft(root * np.fft.rfft(rng.standard_normal(2 * n)))[:n])
 
-    def forms(self, columns: Array) -> Array:
-        """Variance lᵀΣl of the noise times each column l of an (n, k) array, (k,)."""
-        return np.asarray(np.einsum("ij,ij->j", columns, self.times(columns)))
+    def forms(self, columns: Array, mix: Array | None = None) -> Array:
+        """Variance lᵀΣl of the noise times each column l of an (n, m) product, (m,).
 
-    def doubt(self, columns: Array) -> Array:
-        """Variance of `forms`, as estimated from `samples`, (k,): the delta method.
+        The product is that of `columns` (n, k) and `mix` (k, m), by default the columns themselves.
+        """
+        inner = columns.T @ self.times(columns)
+        if mix is None:
+            return np.diag(inner)
+        return np.asarray(np.einsum("ij,ij->j", mix, inner @ mix))
+
+    def doubt(self, columns: Array, mix: Array) -> Array:
+        """Variance of `forms`, as estimated from `samples`, (m,): the delta method.
 
         Estimates of the white variance w and of φ are independent for large n. That of w has the
         variance 2w²/n of normal noise; those of φ have the covariance w Γ⁻¹/n with Γ that of p
         successive samples (Brockwell & Davis 1991, Time Series: Theory and Methods, theorem 8.1.1).
         """
         if math.isinf(self.samples):
-            return np.zeros(columns.shape[1])
-        here = self.forms(columns)
+            return np.zeros(mix.shape[1])
+        here = self.forms(columns, mix)
         out = 2.0 * here**2
         order = self.coefficients.size
         if order:
@@ -100,7 +106,7 @@ class NoiseProcess:
                 NoiseProcess(phi, white / NoiseProcess(phi, 1.0).white)
                 for phi in self.coefficients + step * np.eye(order)
             ]
-            slopes = np.array([(other.forms(columns) - here) / step for other in moved])
+            slopes = np.array([(other.forms(columns, mix) - here) / step for other in moved])
             gamma = toeplitz(self.autocovariance(order))
             out += white * np.einsum("ik,ik->k", slopes, np.linalg.solve(gamma, slopes))
         return np.asarray(out / self.samples)
