@@ -146,18 +146,13 @@ class Chain:
     @cached_property
     def arrays(self) -> ChainArrays:
         """The chain as the kernels know it."""
-        from foamfit.springs import kernels
-
         room = max(self.relaxation)
         if self.is_registered:
             own = [
                 np.array([*spring.values, *np.ravel(spring.relaxation)]) for spring in self.springs
             ]
         else:
-            own = [
-                kernels.relaxing(spring.row, spring.relaxation, room) if room else spring.row
-                for spring in self.springs
-            ]
+            own = [one.solver_row(room) for one in self.springs]
         return ChainArrays(
             rows=padded(own),
             heights=np.array(self.heights),

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError
-from foamfit.springs import kernels, laws, microscale_kernels
+from foamfit.springs import laws
 from foamfit.springs.chain import Chain, padded
+from foamfit.springs.laws import followed
 from foamfit.springs.laws.record import Law, Param
 from foamfit.springs.parameters import direction, names_of, param_of
 from foamfit.springs.spring import Spring
@@ -80,7 +81,7 @@ class Model:
         """The law of each spring."""
         return tuple(laws.law(kind) for kind in self.kinds)
 
-    @property
+    @cached_property
     def is_registered(self) -> bool:
         """Whether a spring follows a law that is none of the paper's."""
         return any(laws.is_registered(kind) for kind in self.kinds)
@@ -122,30 +123,22 @@ class Model:
         terms = (self.relaxation,) * len(self.kinds)
         return np.array([direction(self.kinds, name, terms) for name in self.names])
 
-    @cached_property
-    def _codes(self) -> NDArray[np.int64]:
-        return np.array([laws.code(kind) for kind in self.kinds])
-
     def rows(self, values: Array) -> Array | None:
         """Springs as the solver knows them, (n_springs, columns); None if one is not admissible."""
-        if self.is_registered:
-            return self._registered_rows(values)
-        rows = np.zeros((len(self.kinds), kernels.N_COLUMNS + 2 * self.relaxation))
-        plain = self.relaxation == 0 and "microscale" not in self.kinds
-        fill = kernels.fill_rows if plain else microscale_kernels.fill_rows
-        return rows if fill(self._codes, values, rows) else None
-
-    def _registered_rows(self, values: Array) -> Array | None:
-        """Own parameters, eta and relaxation terms of each spring, filled up with zeros."""
-        from foamfit.springs.laws import followed
-
         rows = []
         for i, law in enumerate(self.laws):
             own = self.own(i, values)
-            first, terms = self.own_places[i] + own.size, 2 * self.relaxation * law.hysteretic
-            if followed.row_of(law, own) is None or own[-1] < 0.0:
+            last = self.own_places[i] + own.size + 2 * self.relaxation * law.hysteretic
+            terms = values[self.own_places[i] + own.size : last]
+            if not self.is_registered:
+                row = followed.solver_row(law, own, terms, self.relaxation)
+            elif followed.row_of(law, own) is None or not own[-1] >= 0.0:
+                row = None
+            else:
+                row = np.append(own, terms)
+            if row is None:
                 return None
-            rows.append(values[first - own.size : first + terms])
+            rows.append(row)
         return padded(rows)
 
     def heights(self, values: Array, total: float) -> Array:

@@ -6,6 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -121,10 +122,19 @@ class Spring(ABC):
     def law(self) -> Law:
         """The record of its law."""
 
-    @property
-    @abstractmethod
+    @cached_property
     def row(self) -> Row:
-        """The spring as the solver knows it."""
+        """The spring as the kernels of the paper's laws know it, without relaxation."""
+        return self.solver_row(0)
+
+    def solver_row(self, room: int) -> Row:
+        """The same with room for so many relaxation terms; without any, none is written."""
+        from foamfit.springs.laws import followed
+
+        terms = self.relaxation if room else ()
+        row = followed.solver_row(self.law, np.array(self.values), terms, room)
+        assert row is not None  # it was checked when the spring was made
+        return row
 
     @property
     @abstractmethod
@@ -265,11 +275,6 @@ class LawSpring(Spring):
     def law(self) -> Law:
         """The record of its law."""
         return self.record
-
-    @property
-    def row(self) -> Row:
-        """Own parameters and eta."""
-        return np.array(self.numbers)
 
     def _stress_along(self, strain: Array) -> tuple[Array, NDArray[np.int64]]:
         from foamfit.springs.laws import followed

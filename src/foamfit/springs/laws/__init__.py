@@ -20,7 +20,6 @@ from foamfit.springs.laws.record import Law as Law
 from foamfit.springs.laws.record import Param as Param
 
 ENTRY_POINTS = "foamfit.laws"
-# In the order of the kernels' BISTABLE, LINEAR, UNILATERAL, MICROSCALE.
 _LAWS = {law.kind: law for law in (bistable.LAW, linear.LAW, linear.UNILATERAL_LAW, microscale.LAW)}
 _OWN = tuple(_LAWS)  # laws that the kernels know
 _asked_packages: list[bool] = []
@@ -45,11 +44,6 @@ def kinds() -> tuple[str, ...]:
     """Names of all laws that are known, the paper's first."""
     _load_packages()
     return tuple(_LAWS)
-
-
-def code(kind: str) -> int:
-    """Number of a kind of spring, by which compiled loops know it."""
-    return tuple(_LAWS).index(kind)
 
 
 def is_registered(kind: str) -> bool:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -24,9 +23,6 @@ from foamfit.springs.laws.record import (
 )
 from foamfit.springs.loop import Loop
 from foamfit.springs.spring import Relaxation, Spring, freeze_numbers, freeze_terms, require
-
-if TYPE_CHECKING:
-    from foamfit.springs.kernels import Row
 
 
 @dataclass(frozen=True)
@@ -140,13 +136,6 @@ class BistableSpring(Spring):
         if self.eps_hat_a is not None and self.sigma_hat_a is not None:
             out["A2"] = (self.eps_hat_a, self.sigma_hat_a)
         return out
-
-    @cached_property
-    def row(self) -> Row:
-        """The spring as the kernels know it."""
-        from foamfit.springs import kernels
-
-        return kernels.bistable_row(*self.seven, self.eta)
 
 
 def _sigma_a(k0: float, eps_a: float) -> float:

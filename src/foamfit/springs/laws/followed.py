@@ -31,7 +31,7 @@ MOST_SWITCHES = 10_000  # of one spring on the way to one strain
 # ---------------------------------------------------------------- the paper's laws
 
 
-@compiled
+@kernels.compiled
 def _begin(row: Array, state: Array) -> None:
     """Set the state of a spring at rest."""
     if row[kernels.KIND] == MICROSCALE:
@@ -43,7 +43,7 @@ def _begin(row: Array, state: Array) -> None:
     state[micro.LOW], state[micro.HIGH] = kernels.interval(row, branch)
 
 
-@compiled
+@kernels.compiled
 def _leaves(row: Array, state: Array, eps: float) -> bool:
     """Whether a spring leaves its branch before it reaches a strain."""
     if row[kernels.KIND] == MICROSCALE:
@@ -51,7 +51,7 @@ def _leaves(row: Array, state: Array, eps: float) -> bool:
     return eps > state[micro.HIGH] if eps > state[EPS] else eps < state[micro.LOW]
 
 
-@compiled
+@kernels.compiled
 def _settle(row: Array, state: Array, eps: float) -> None:
     """Bring a spring to a strain that lies on its branch."""
     if row[kernels.KIND] == MICROSCALE:
@@ -60,7 +60,7 @@ def _settle(row: Array, state: Array, eps: float) -> None:
         state[EPS], state[SIGMA] = eps, kernels.stress_on(row, int(state[BRANCH]), eps)
 
 
-@compiled
+@kernels.compiled
 def _switch(row: Array, state: Array, up: bool) -> None:
     """Go over to the next branch, at the end of this one or where the strain turns."""
     if row[kernels.KIND] == MICROSCALE:
@@ -74,33 +74,11 @@ def _switch(row: Array, state: Array, up: bool) -> None:
     state[SIGMA] = kernels.stress_on(row, branch, state[EPS])
 
 
-@compiled
-def _fill_bistable(values: Array, row: Array) -> bool:
-    v = values
-    return kernels.fill_bistable(row, v[0], v[1], v[2], v[3], v[4], v[5], v[6], 0.0)
-
-
-@compiled
-def _fill_microscale(values: Array, row: Array) -> bool:
-    v = values
-    return micro.fill_microscale(row, v[0], v[1], v[2], v[3], v[4], v[5], v[6], 0.0)
-
-
-@compiled
-def _fill_linear(values: Array, row: Array) -> bool:
-    return kernels.fill_linear(row, values[0], 0.0, False)
-
-
-@compiled
-def _fill_unilateral(values: Array, row: Array) -> bool:
-    return kernels.fill_linear(row, values[0], 0.0, True)
-
-
 _FILL = {
-    "bistable": _fill_bistable,
-    "microscale": _fill_microscale,
-    "linear": _fill_linear,
-    "unilateral": _fill_unilateral,
+    "bistable": kernels.fill_bistable,
+    "microscale": micro.fill_microscale,
+    "linear": kernels.fill_linear,
+    "unilateral": kernels.fill_unilateral,
 }
 
 
@@ -133,6 +111,24 @@ def row_of(law: Law, values: ArrayLike) -> Array | None:
     return row if compiled_functions(law).fill(own, row) else None
 
 
+def solver_row(law: Law, values: Array, terms: ArrayLike, room: int) -> Array | None:
+    """Row of one of the paper's laws as the solver takes it; None if it is not admissible.
+
+    `values` are own parameters and eta; g and τ of the relaxation `terms` follow the columns, with
+    room for so many.
+    """
+    row, pairs = np.zeros(kernels.N_COLUMNS + 2 * room), np.ravel(terms)
+    own, relaxing = row[: kernels.N_COLUMNS], row[kernels.N_COLUMNS :]
+    fine = compiled_functions(law).fill(values[:-1], own) and values[-1] >= 0.0
+    own[kernels.ETA] = values[-1]
+    relaxing[1::2] = np.inf  # no term
+    relaxing[: pairs.size] = pairs
+    g, tau = pairs[::2], pairs[1::2]
+    if fine and pairs.size:
+        fine = bool(np.all((g >= 0.0) & (g < np.inf) & (tau > 0.0) & (tau < np.inf)))
+    return row if fine else None
+
+
 # Columns of a relaxation term: strength g, time τ (s), and its memory y, see `solve.relaxation`.
 STRENGTH, TIME, MEMORY = range(3)
 
@@ -154,12 +150,14 @@ class Loops(NamedTuple):
     to_stress: Compiled
 
 
-def _walker(given: Functions) -> Compiled:
+def _walker(law: Law) -> Compiled:
     """Take one spring to a strain: over all branches on the way; returns its stress."""
-    leaves, switch, settle = given.leaves, given.switch, given.settle
+    _, _, leaves, switch, settle = compiled_functions(law)
+    columns, states = sizes_of(law)
 
     @compiled
-    def walk(row: Array, state: Array, eps: float) -> float:
+    def walk(rows: Array, whole: Array, eps: float) -> float:
+        row, state = rows[:columns], whole[:states]  # arrays may have room for longer ones
         for _ in range(MOST_SWITCHES):
             if not leaves(row, state, eps):
                 settle(row, state, eps)
@@ -170,13 +168,14 @@ def _walker(given: Functions) -> Compiled:
     return walk
 
 
-def _starter(given: Functions) -> Compiled:
-    begin = given.begin
+def _starter(law: Law) -> Compiled:
+    begin = compiled_functions(law).begin
+    columns, states = sizes_of(law)
 
     @compiled
-    def start(row: Array, state: Array, eps: float) -> float:
-        state[:] = 0.0
-        begin(row, state)
+    def start(rows: Array, whole: Array, eps: float) -> float:
+        whole[:] = 0.0
+        begin(rows[:columns], whole[:states])
         return eps
 
     return start
@@ -204,9 +203,8 @@ def _chosen(functions: Sequence[Compiled]) -> Compiled:
 @cache
 def loops_of(laws: tuple[Law, ...]) -> Loops:
     """Loops of springs of these laws, base first."""
-    functions = [compiled_functions(law) for law in laws]
-    walk = _chosen([_walker(one) for one in functions])
-    start = _chosen([_starter(one) for one in functions])
+    walk = _chosen([_walker(law) for law in laws])
+    start = _chosen([_starter(law) for law in laws])
 
     @compiled
     def step(

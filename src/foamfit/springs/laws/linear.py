@@ -4,15 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import TYPE_CHECKING
 
 from foamfit.springs.law import BRANCH_NAMES
 from foamfit.springs.laws.record import Compared, Law, Param, functions_of
 from foamfit.springs.spring import Relaxation, Spring, freeze_numbers
-
-if TYPE_CHECKING:
-    from foamfit.springs.kernels import Row
 
 
 @dataclass(frozen=True)
@@ -46,13 +41,6 @@ class LinearSpring(Spring):
     def law(self) -> Law:
         """The record of its law."""
         return UNILATERAL_LAW if self.unilateral else LAW
-
-    @cached_property
-    def row(self) -> Row:
-        """The spring as the kernels know it."""
-        from foamfit.springs import kernels
-
-        return kernels.linear_row(self.k0, self.eta, self.unilateral)
 
     @property
     def relaxation(self) -> Relaxation:

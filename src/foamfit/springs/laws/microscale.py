@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,9 +30,6 @@ from foamfit.springs.spring import (
     freeze_terms,
     require,
 )
-
-if TYPE_CHECKING:
-    from foamfit.springs.kernels import Row
 
 
 @dataclass(frozen=True)
@@ -134,13 +130,6 @@ class MicroscaleSpring(Spring):
             ("+", "through", self.sigma_plus, self.spread_plus),
             ("−", "back", self.sigma_minus, self.spread_minus),
         )
-
-    @cached_property
-    def row(self) -> Row:
-        """The spring as the kernels know it."""
-        from foamfit.springs import microscale_kernels
-
-        return microscale_kernels.microscale_row(*self.values)
 
     def _stress_along(self, strain: Array) -> tuple[Array, NDArray[np.int64]]:
         from foamfit.springs import microscale_kernels

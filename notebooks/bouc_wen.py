@@ -12,28 +12,34 @@ EPS, SIGMA, BRANCH, Z = range(4)
 
 
 def fill(values, row):
+    """Copy the parameters; refuse what no spring has."""
     row[:] = values
     return values[0] > 0.0 and values[2] > 0.0
 
 
 def begin(row, state):
+    """Rest: no strain, no stress, z = 0."""
     state[:] = 0.0
 
 
 def leaves(row, state, strain):
+    """Whether the strain turns."""
     return strain != state[EPS] and (strain > state[EPS]) != (state[BRANCH] == 0.0)
 
 
 def switch(row, state, up):
+    """Loading is branch 0, unloading branch 1."""
     state[BRANCH] = 0.0 if up else 1.0
 
 
 @njit
 def slope(z, step, limit, n):
+    """dz/dε."""
     return 1.0 - (abs(z) / limit) ** n if z * step > 0.0 else 1.0
 
 
 def settle(row, state, strain):
+    """Follow z to a strain on the same branch."""
     k, alpha, limit, n = row
     count = int(abs(strain - state[EPS]) / (0.01 * limit)) + 1
     step, z = (strain - state[EPS]) / count, state[Z]
