@@ -7,7 +7,6 @@ samples, τ the autocorrelation time.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -110,16 +109,6 @@ class NoiseProcess:
             gamma = toeplitz(self.autocovariance(order))
             out += white * np.einsum("ik,ik->k", slopes, np.linalg.solve(gamma, slopes))
         return np.asarray(out / self.samples)
-
-
-def variance_of(noise: Sequence[NoiseProcess], columns: Array, sizes: tuple[int, ...]) -> Array:
-    """Variance of the noise times each column l of an (n, k) array, (k,).
-
-    The rows are those of all curves, so many samples each, and of priors of unit variance.
-    """
-    pairs = zip(noise, parts(sizes), strict=True)
-    data = np.sum([process.forms(columns[part]) for process, part in pairs], axis=0)
-    return np.asarray(data + np.sum(columns[sum(sizes) :] ** 2, axis=0))
 
 
 def levinson(lags: Array) -> list[tuple[Array, float]]:
