@@ -117,12 +117,14 @@ def _spring(where: str, given: dict[str, Any]) -> Spring:
     if kind not in laws.kinds():
         raise InputError(f"{where} kind = {kind!r}; it must be one of {', '.join(laws.kinds())}.")
     law = laws.law(kind)
-    terms = ["relaxation"] if law.hysteretic else []
-    check_keys(where, given, ["kind", "height", "mass", *law.names, *terms])
+    more = ["relaxation"] if law.hysteretic else []
+    check_keys(where, given, ["kind", "height", "mass", *law.names, *more])
     values = [
         _number(where, given, name) if name != "eta" or name in given else 0.0 for name in law.names
     ]
-    return _made(where, law.make, values, _relaxation(where, given.get("relaxation", [])))
+    terms = _relaxation(where, given.get("relaxation", []))
+    spring: Spring = _made(where, law.make, values, terms)
+    return spring
 
 
 def _relaxation(where: str, given: Any) -> list[tuple[float, float]]:

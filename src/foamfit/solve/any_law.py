@@ -43,11 +43,25 @@ class Springs(NamedTuple):
     eta: Array  # Pa·s
 
 
+class InSeries(NamedTuple):
+    """Compiled loops of springs in series, see `in_series`."""
+
+    begin: Callable[..., None]
+    stretch: Callable[..., float]
+    elongate: Callable[..., float]
+    note: Callable[..., None]
+
+
 @cache
-def march_of(laws: tuple[Law, ...]) -> Callable[..., tuple[float, bool]]:
-    """Compiled loop through the samples of a scene, for springs of these laws."""
+def in_series(laws: tuple[Law, ...]) -> InSeries:
+    """Loops that take springs of these laws to a common stress or to an elongation."""
     loops = followed.loops_of(laws)
     start, step, to_stress, count = loops.start, loops.step, loops.to_stress, len(laws)
+
+    @compiled
+    def begin(springs: Springs) -> None:
+        for i in range(count):
+            start(i, springs.rows[i], springs.states[i], 0.0)
 
     @compiled
     def stretch(springs: Springs, sigma: float, h: float) -> float:
@@ -115,6 +129,14 @@ def march_of(laws: tuple[Law, ...]) -> Callable[..., tuple[float, bool]]:
             nodes[i, j] = top
             branches[i, j] = int(springs.states[i, BRANCH])
 
+    return InSeries(begin, stretch, elongate, note)
+
+
+@cache
+def driven(laws: tuple[Law, ...]) -> Callable[..., tuple[float, bool]]:
+    """Loop along a prescribed stress or motion, for springs of these laws."""
+    begin, stretch, elongate, note = in_series(laws)
+
     @compiled
     def drive(
         springs: Springs, top: int, t: Array, values: Array, parts: int,
@@ -122,8 +144,7 @@ def march_of(laws: tuple[Law, ...]) -> Callable[..., tuple[float, bool]]:
     ) -> tuple[float, bool]:  # fmt: skip
         """Follow a prescribed stress (Pa) or motion (m), in so many parts from sample to sample."""
         sigma = 0.0
-        for i in range(count):
-            start(i, springs.rows[i], springs.states[i], 0.0)
+        begin(springs)
         for j in range(t.size):
             for k in range(parts if j else 1):
                 part = (k + 1.0) / parts if j else 1.0
@@ -140,6 +161,15 @@ def march_of(laws: tuple[Law, ...]) -> Callable[..., tuple[float, bool]]:
             note(springs, j, nodes, branches)
         return math.nan, True
 
+    return drive
+
+
+@cache
+def struck(laws: tuple[Law, ...]) -> Callable[..., tuple[float, bool]]:
+    """Loop through an impact, for springs of these laws."""
+    begin, _, elongate, note = in_series(laws)
+    count = len(laws)
+
     @compiled
     def strike(
         springs: Springs, mass: float, drag: float, speed: float, t: Array, parts: int,
@@ -147,8 +177,8 @@ def march_of(laws: tuple[Law, ...]) -> Callable[..., tuple[float, bool]]:
     ) -> tuple[float, bool]:  # fmt: skip
         """Follow a striker from contact, at t = 0; returns when contact ends."""
         w, v, now, end, soft = 0.0, speed, 0.0, math.nan, 0.0
+        begin(springs)
         for i in range(count):
-            start(i, springs.rows[i], springs.states[i], 0.0)
             soft += springs.heights[i] / springs.eta[i]
         sigma = speed / soft  # what the dashpots bear at contact; 0 where a spring has none
         for j in range(t.size):
@@ -182,16 +212,7 @@ def march_of(laws: tuple[Law, ...]) -> Callable[..., tuple[float, bool]]:
                 note(springs, j, nodes, branches)
         return end, True
 
-    @compiled
-    def march(
-        springs: Springs, top: int, mass: float, drag: float, speed: float, t: Array,
-        values: Array, parts: int, nodes: Array, stress: Array, branches: NDArray[np.int64],
-    ) -> tuple[float, bool]:  # fmt: skip
-        if speed > 0.0:
-            return strike(springs, mass, drag, speed, t, parts, nodes, stress, branches)
-        return drive(springs, top, t, values, parts, nodes, stress, branches)
-
-    return march
+    return strike
 
 
 class Followed(NamedTuple):
@@ -262,10 +283,12 @@ class AnyLawPlan(NamedTuple):
             springs = springs._replace(eta=np.zeros(1))
         nodes, stress, branches = np.empty(shape), np.empty(shape[1]), np.empty(shape, np.int64)
         springs.terms[:, :, MEMORY] = 0.0
-        end, fine = march_of(self.laws)(
-            springs, self.top, self.mass[-1], drag, self.speed, self.time, self.values, parts,
-            nodes, stress, branches,
-        )  # fmt: skip
+        filled = parts, nodes, stress, branches
+        if self.speed > 0.0:
+            strike = struck(self.laws)
+            end, fine = strike(springs, self.mass[-1], drag, self.speed, self.time, *filled)
+        else:
+            end, fine = driven(self.laws)(springs, self.top, self.time, self.values, *filled)
         if not fine:
             raise SimulationError(
                 "a stress or strain is no longer finite: the drive goes past what the law can bear"

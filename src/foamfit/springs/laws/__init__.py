@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from dataclasses import replace
 from importlib.metadata import entry_points
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from foamfit.springs.laws.microscale import MicroscaleSpring as MicroscaleSpring
 from foamfit.springs.laws.record import Functions as Functions
 from foamfit.springs.laws.record import Law as Law
 from foamfit.springs.laws.record import Param as Param
+from foamfit.springs.spring import LawSpring, Relaxation
 
 ENTRY_POINTS = "foamfit.laws"
 _LAWS = {law.kind: law for law in (bistable.LAW, linear.LAW, linear.UNILATERAL_LAW, microscale.LAW)}
@@ -63,7 +65,7 @@ def register(law: Law) -> Law:
     Returns
     -------
     Law
-        The same record.
+        The record as it is known; `make` makes springs of it.
 
     Raises
     ------
@@ -74,8 +76,14 @@ def register(law: Law) -> Law:
     from foamfit.springs.laws.checked import check
 
     check(law, _OWN)
-    _LAWS[law.kind] = law
-    return law
+    if law.spring is None:
+
+        def make(*values: float, relaxation: Relaxation = ()) -> LawSpring:
+            return LawSpring(known, values, relaxation)
+
+        law = replace(law, spring=make)
+    known = _LAWS[law.kind] = law
+    return known
 
 
 def load_file(path: str | Path) -> tuple[Law, ...]:

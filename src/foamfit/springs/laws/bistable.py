@@ -15,10 +15,10 @@ from foamfit.springs.laws.record import (
     LAST_STRAIN,
     Between,
     Compared,
+    Functions,
     Law,
     Param,
     PointOf,
-    functions_of,
     steeper,
 )
 from foamfit.springs.loop import Loop
@@ -251,6 +251,13 @@ _DROP = Between(  # Δσ from 0 to -σ_a
 _BEYOND_A1 = Between(("eps_a",), lambda eps_a: (eps_a, LAST_STRAIN), lambda eps_a: ((1.0, 0.0),))
 _STIFFNESSES = (math.log(0.3), math.log(300.0))
 
+
+def _functions() -> Functions:
+    from foamfit.springs.laws import followed
+
+    return followed.functions_of("bistable")
+
+
 LAW = Law(
     kind="bistable",
     title="bistable spring",
@@ -289,7 +296,7 @@ LAW = Law(
         ),
     ),
     numbered=BRANCH_NAMES,
-    functions=functions_of("bistable"),
+    functions=_functions,
     branches={"a": "elastic", "d": "snap-buckling", "c": "densified", "e": "snap-back"},
     spring=BistableSpring,
     searched=("k0", "kc", "eps_a", "eps_c", "dsigma", "kh_plus", "kh_minus"),

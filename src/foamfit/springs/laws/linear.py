@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 from foamfit.springs.law import BRANCH_NAMES
-from foamfit.springs.laws.record import Compared, Law, Param, functions_of
+from foamfit.springs.laws.record import Compared, Functions, Law, Param
 from foamfit.springs.spring import Relaxation, Spring, freeze_numbers
 
 
@@ -52,6 +52,12 @@ def _unilateral(k0: float, eta: float = 0.0) -> LinearSpring:
     return LinearSpring(k0, eta, unilateral=True)
 
 
+def _functions(kind: str) -> Functions:
+    from foamfit.springs.laws import followed
+
+    return followed.functions_of(kind)
+
+
 LAW = Law(
     kind="linear",
     title="linear spring",
@@ -62,7 +68,7 @@ LAW = Law(
         ),
     ),
     numbered=BRANCH_NAMES,
-    functions=functions_of("linear"),
+    functions=lambda: _functions("linear"),
     branches={"line": "linear"},
     hysteretic=False,
     spring=LinearSpring,
@@ -77,6 +83,6 @@ LAW = Law(
 )  # fmt: skip
 UNILATERAL_LAW = replace(
     LAW, kind="unilateral", title="linear spring without tension", spring=_unilateral,
-    functions=functions_of("unilateral"),
+    functions=lambda: _functions("unilateral"),
     branches={"line": "linear", "open": "out of contact"},
 )  # fmt: skip

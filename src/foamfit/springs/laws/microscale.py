@@ -16,9 +16,9 @@ from foamfit.springs.laws.record import (
     LAST_STRAIN,
     Between,
     Compared,
+    Functions,
     Law,
     Param,
-    functions_of,
     steeper,
 )
 from foamfit.springs.loop import Loop
@@ -199,6 +199,13 @@ _BEYOND_A = Between(
 _STIFFNESSES = (math.log(0.3), math.log(300.0))
 _STRESSES, _SPREADS = (math.log(0.02), math.log(1.0)), (math.log(0.05), math.log(2.0))
 
+
+def _functions() -> Functions:
+    from foamfit.springs.laws import followed
+
+    return followed.functions_of("microscale")
+
+
 LAW = Law(
     kind="microscale",
     title="microscale spring",
@@ -234,7 +241,7 @@ LAW = Law(
         ),
     ),
     numbered=BRANCH_NAMES,
-    functions=functions_of("microscale"),
+    functions=_functions,
     branches={
         "a": "elastic, none has snapped",
         "snap-through": "micro-springs snap",

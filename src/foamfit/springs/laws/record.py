@@ -11,15 +11,13 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from foamfit.arrays import Array
-
-if TYPE_CHECKING:
-    from foamfit.springs.loop import Loop
-    from foamfit.springs.spring import Spring
+from foamfit.errors import InputError
+from foamfit.springs.loop import Loop
 
 # The state of a spring along its strain begins with strain, stress (Pa) and the number of its
 # branch; what else a law remembers follows.
@@ -176,17 +174,6 @@ class Compared(NamedTuple):
     formula: Callable[..., Any]  # also of complex numbers, for its derivatives
 
 
-def functions_of(kind: str) -> Callable[[], Functions]:
-    """Functions of one of the paper's laws, compiled when they are first asked for."""
-
-    def load() -> Functions:
-        from foamfit.springs.laws import followed
-
-        return followed.functions_of(kind)
-
-    return load
-
-
 # k_c over the largest stress from which a search begins again.
 STEEP = np.geomspace(1.0, 1000.0, 7)
 
@@ -232,7 +219,7 @@ class Law:
     hysteretic : bool
         Whether it has a loop, and may relax.
     spring : callable, optional
-        Makes the spring of own parameters, eta, and relaxation=; by default a `LawSpring`.
+        Makes the spring of own parameters, eta, and relaxation=; `register` gives a `LawSpring`.
     searched : tuple of str, optional
         Order of the coordinates of the search; by default the parameters, those last that are
         relative to others.
@@ -275,7 +262,7 @@ class Law:
     branches: Mapping[str, str] = field(default_factory=lambda: {"line": "the law"})
     title: str = ""
     hysteretic: bool = True
-    spring: Callable[..., Spring] | None = None
+    spring: Callable[..., Any] | None = None
     searched: tuple[str, ...] = ()
     read_off: Callable[[Loop, Array, Any, int], Array] | None = None
     read_in_series: Callable[[Loop, Array, float], Array] | None = None
@@ -322,15 +309,19 @@ class Law:
         shown = {param.branch for param in self.params}
         return tuple(branch for branch in self.branches if branch in shown)
 
-    def make(self, values: Sequence[float], relaxation: Sequence[tuple[float, float]]) -> Spring:
-        """Make the spring of its own parameters and eta; InputError if they are not admissible."""
-        if self.spring is not None:
-            return self.spring(*values, **({"relaxation": relaxation} if self.hysteretic else {}))
-        from foamfit.springs.spring import LawSpring
+    def make(self, values: Sequence[float], relaxation: Sequence[tuple[float, float]]) -> Any:
+        """Make the spring of its own parameters and eta.
 
-        return LawSpring(self, tuple(map(float, values)), relaxation=relaxation)
+        Raises
+        ------
+        InputError
+            If they are not admissible, or the law is not registered yet.
+        """
+        if self.spring is None:
+            raise InputError(f"law '{self.kind}' is not known yet: register it first")
+        return self.spring(*values, **({"relaxation": relaxation} if self.hysteretic else {}))
 
-    def any_spring(self) -> Spring:
+    def any_spring(self) -> Any:
         """Make some spring of the law, whatever its numbers: of it only the law counts."""
         values = {}
         for param in sorted(self.params, key=lambda param: self.search_order.index(param.name)):
