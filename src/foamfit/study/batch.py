@@ -337,8 +337,8 @@ class _Run:
     def _is_cold(self) -> bool:
         """Whether the first fit compiles what the others need too."""
         recipe = self.batch.recipe
-        memory = "microscale" in recipe.model or recipe.options["relaxation"] > 0
-        memory = memory or recipe.model == "auto"
+        memory = recipe.model == "auto" or recipe.options["relaxation"] > 0
+        memory = memory or any(law.remembers for law in Model.parse(recipe.model).laws)
         return memory and not cache.compiled("integrate_with_memory")
 
     def _begin(self, name: str, path: Path) -> None:

@@ -173,73 +173,87 @@ class Block:
 
 
 @dataclass(frozen=True, eq=False)
-class Sandwich:
-    """Covariance H⁻¹ JᵀΣJ H⁻¹ of m unknowns with Σ the noise of the curves of all tests, scaled.
+class Frame:
+    """Directions of m unknowns along which the residuals of all tests together have unit slopes.
 
-    H is JᵀJ, or with `curvatures` (`Block.curvature` of each test) that of half the cost, which a
-    residual that is no noise changes (White 1982, Econometrica 50, 1). `drawn` (d, m) are the
-    slopes of further residuals, of so much variance each (d,); `bend` (m, m) is what the bend of
-    `Block.through` adds to H.
+    `drawn` (d, m) are the slopes of further residuals, of so much variance each (d,).
     """
 
     blocks: tuple[Block, ...]
     drawn: tuple[Array, Array] | None = None
-    bend: Array | None = None
-    curvatures: tuple[Array, ...] | None = None
 
     @cached_property
     def _solved(self) -> tuple[Array, Array]:
-        """Orthonormal columns of all tests (·, s), and the unknowns that lead to them (m, s)."""
         rows = [block.axes[1] @ block.through for block in self.blocks]
         rows += [] if self.drawn is None else [self.drawn[0]]
         left, singular, vt = np.linalg.svd(np.concatenate(rows), full_matrices=False)
         seen = singular > SINGULAR * max(float(singular.max(initial=0.0)), 1e-300)
         return left[:, seen], vt[seen].T / singular[seen]
 
+    @property
+    def root(self) -> Array:
+        """Unknowns that lead to each of the directions, (m, s)."""
+        return self._solved[1]
+
     @cached_property
     def lost(self) -> NDArray[np.bool_]:
         """Unknowns of which the tests say nothing, (m,)."""
-        root = self._solved[1]
-        along = root / np.maximum(np.linalg.norm(root, axis=0), 1e-300)
+        along = self.root / np.maximum(np.linalg.norm(self.root, axis=0), 1e-300)
         return np.asarray(np.sum(along**2, axis=1) < 1.0 - 1e-6)
 
     @cached_property
     def lefts(self) -> list[Array]:
-        """Rows of the orthonormal columns of each test, (r, s); their squares are its shares."""
+        """The directions along the orthonormal columns of each test, (r, s)."""
         ends = np.cumsum([len(block.axes[1]) for block in self.blocks])
         return np.split(self._solved[0], ends)[: len(self.blocks)]
 
     @cached_property
-    def _axes(self) -> Array:
-        """Principal axes of the covariance along the orthonormal columns, one deviation long."""
+    def axes(self) -> Array:
+        """Principal axes of the covariance of the noise, one deviation long, (s, s)."""
         pairs = zip(self.lefts, self.blocks, strict=True)
-        meat = np.sum([left.T @ block.meat @ left for left, block in pairs], axis=0)
-        if self.drawn is not None:
-            meat = meat + (self._pulled.T * self.drawn[1]) @ self._pulled
+        rows = [block.meat @ left for left, block in pairs]
+        rows += [] if self.drawn is None else [self.drawn[1][:, None] * self.pulled]
+        meat = self._solved[0].T @ np.concatenate(rows)
         power, axes = np.linalg.eigh(0.5 * (meat + meat.T))
         least = 1e-12 * power.max(initial=0.0)  # no variance is negative
         return np.asarray(axes * np.sqrt(np.maximum(power, least)))
 
     @property
-    def _pulled(self) -> Array:
-        """Rows of the orthonormal columns of what is drawn, (d, s)."""
+    def pulled(self) -> Array:
+        """The directions along what is drawn, (d, s)."""
         return self._solved[0][sum(map(len, self.lefts)) :]
 
-    def curved(self) -> Sandwich:
-        """The same with the curvature of the cost."""
-        spreads = [left @ self._axes for left in self.lefts]
+    @cached_property
+    def curvatures(self) -> tuple[Array, ...]:
+        """`Block.curvature` of each test."""
+        spreads = [left @ self.axes for left in self.lefts]
         pairs = zip(self.blocks, spreads, strict=True)
-        return replace(self, curvatures=tuple(block.curvature(one @ one.T) for block, one in pairs))
+        return tuple(block.curvature(one @ one.T) for block, one in pairs)
+
+
+@dataclass(frozen=True, eq=False)
+class Sandwich:
+    """Covariance H⁻¹ JᵀΣJ H⁻¹ of m unknowns with Σ the noise of the curves of all tests, scaled.
+
+    H is JᵀJ, or with `curvatures` (of each test, along its `Block.axes`) that of half the cost,
+    which a residual that is no noise changes (White 1982, Econometrica 50, 1). `bend` (m, m) is
+    what the bend of `Block.through` adds to H.
+    """
+
+    frame: Frame
+    bend: Array | None = None
+    curvatures: tuple[Array, ...] | None = None
 
     @cached_property
     def _bread(self) -> Array:
-        """H⁻¹ along the orthonormal columns; where there is no curvature, that of JᵀJ."""
-        root = self._solved[1]
+        """H⁻¹ along the directions; where there is no curvature, that of JᵀJ."""
+        root = self.frame.root
         out = np.eye(root.shape[1])
         if self.curvatures is None:
             return out
-        for left, curved in zip(self.lefts, self.curvatures, strict=True):
-            out += left.T @ (curved - np.eye(len(curved))) @ left
+        pairs = zip(self.frame.lefts, self.curvatures, strict=True)
+        more = [(curved - np.eye(len(curved))) @ left for left, curved in pairs]
+        out += np.concatenate(self.frame.lefts).T @ np.concatenate(more)
         out += 0.0 if self.bend is None else root.T @ self.bend @ root
         values, vectors = np.linalg.eigh(0.5 * (out + out.T))
         return np.asarray((vectors / np.where(values > FLATTEST, values, 1.0)) @ vectors.T)
@@ -247,46 +261,46 @@ class Sandwich:
     @cached_property
     def inverse(self) -> Array:
         """H⁻¹, (m, m); zero where the tests say nothing."""
-        root = self._solved[1]
+        root = self.frame.root
         return root @ self._bread @ root.T
 
     @cached_property
     def matrix(self) -> Array:
         """The covariance, (m, m); NaN where the tests say nothing."""
-        spread = self._solved[1] @ self._bread @ self._axes
+        spread = self.frame.root @ self._bread @ self.frame.axes
         out = spread @ spread.T
-        for t, (left, block) in enumerate(zip(self.lefts, self.blocks, strict=True)):
+        for t, (left, block) in enumerate(zip(self.frame.lefts, self.frame.blocks, strict=True)):
             if block.given is not None and block.given.any():
                 moved = block.axes[1] @ block.given
                 moved = moved if self.curvatures is None else self.curvatures[t] @ moved
-                pull = self._solved[1] @ self._bread @ left.T @ moved
+                pull = self.frame.root @ self._bread @ left.T @ moved
                 out = out + np.outer(pull, pull)
-        out[self.lost, :] = out[:, self.lost] = np.nan
+        out[self.frame.lost, :] = out[:, self.frame.lost] = np.nan
         return out
 
     def covariance(self, scales: Array) -> Covariance:
         """Covariance of the unknowns in SI, by their scales (m,)."""
-        root, m = self._solved[1], scales.size
+        back, m = self._bread @ self.frame.root.T, scales.size
         variance, doubt, most = np.zeros((3, m))
-        there = np.array([(block.through != 0.0).any(axis=0) for block in self.blocks])
+        there = np.array([(block.through != 0.0).any(axis=0) for block in self.frame.blocks])
         own = there & (there.sum(axis=0) == 1)
-        effective = sum(block.effective for block in self.blocks)
-        for left, block, mine in zip(self.lefts, self.blocks, own, strict=True):
-            mix = left @ self._bread @ root.T
+        effective = sum(block.effective for block in self.frame.blocks)
+        for left, block, mine in zip(self.frame.lefts, self.frame.blocks, own, strict=True):
+            mix = left @ back
             variance += np.einsum("ij,ij->j", mix, block.meat @ mix)
             doubt += block.doubt(mix)
             most[mine] = block.effective - np.count_nonzero(mine)
         most[~own.any(axis=0)] = effective - m
-        if self.drawn is not None:
-            mix = self._pulled @ self._bread @ root.T
-            variance += self.drawn[1] @ mix**2
+        if self.frame.drawn is not None:
+            mix = self.frame.pulled @ back
+            variance += self.frame.drawn[1] @ mix**2
         known = 2.0 * variance**2 / np.maximum(doubt, 1e-300)
         return Covariance(
             self.matrix * np.outer(scales, scales),
-            np.diag(self.matrix) / np.where(self.lost, np.nan, np.diag(self.inverse)),
+            np.diag(self.matrix) / np.where(self.frame.lost, np.nan, np.diag(self.inverse)),
             np.minimum(known, np.maximum(most, 1.0)),
             effective,
-            tuple(one for block in self.blocks for one in block.noise),
+            tuple(one for block in self.frame.blocks for one in block.noise),
         )
 
 
@@ -307,7 +321,7 @@ class Uncertainty:
     @cached_property
     def plain(self) -> Sandwich:
         """As if the law had no error."""
-        return Sandwich(self.blocks, self.drawn)
+        return Sandwich(Frame(self.blocks, self.drawn))
 
     @cached_property
     def held(self) -> NDArray[np.bool_]:
@@ -326,12 +340,12 @@ class Uncertainty:
     @cached_property
     def bent(self) -> Sandwich:
         """With the curvature of the cost, what is pressed to a limit held."""
-        free, drawn = ~self.held, self.drawn
-        return Sandwich(
-            tuple(block.without(self.held) for block in self.blocks),
-            None if drawn is None else (drawn[0][:, free], drawn[1]),
-            None if self.bend is None else self.bend[np.ix_(free, free)],
-        ).curved()
+        free, frame = ~self.held, self.plain.frame
+        if self.held.any():
+            drawn = None if self.drawn is None else (self.drawn[0][:, free], self.drawn[1])
+            frame = Frame(tuple(block.without(self.held) for block in self.blocks), drawn)
+        bend = None if self.bend is None else self.bend[np.ix_(free, free)]
+        return Sandwich(frame, bend, frame.curvatures)
 
     @cached_property
     def covariance(self) -> Covariance:

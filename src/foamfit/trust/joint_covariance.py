@@ -16,7 +16,7 @@ from foamfit.arrays import Array
 from foamfit.fitting.links import LOG_RATE, RATES, factor
 from foamfit.fitting.together import Together
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.covariance import Block, Covariance, Uncertainty
+from foamfit.trust.covariance import Block, Covariance, Frame, Uncertainty
 from foamfit.trust.residuals.law_error import CurveError
 
 
@@ -77,15 +77,15 @@ class JointPoint:
     @cached_property
     def uncertainty(self) -> Uncertainty:
         """What the noise leaves uncertain of all unknowns."""
-        found = [self._block(t) for t in range(len(self.bests))]
-        bend = np.sum([bend for _, bend in found], axis=0)
-        return Uncertainty(tuple(block for block, _ in found), self._scales, self._drawn(), bend)
+        bend = np.zeros((self._scales.size,) * 2)
+        blocks = tuple(self._block(t, bend) for t in range(len(self.bests)))
+        return Uncertainty(blocks, self._scales, self._drawn(), bend)
 
-    def _block(self, t: int) -> tuple[Block, Array]:
-        """One test, and what the bend of laws of rate adds to the curvature of its cost."""
+    def _block(self, t: int, bend: Array) -> Block:
+        """One test; what laws of rate add to the curvature of its cost is added to `bend`."""
         best, links, scales = self.bests[t], self.found.links, self._scales
         block = best.block(self.errors[t] if self.errors else ())
-        through, bend = np.zeros((len(best.names), scales.size)), np.zeros((scales.size,) * 2)
+        through = np.zeros((len(best.names), scales.size))
         given, room = np.zeros(len(best.names)), np.array(block.room)
         pull = block.jacobian.T @ block.residual
         for i, name in enumerate(best.names):
@@ -98,9 +98,8 @@ class JointPoint:
                 two = slice(at, at + 2)
                 through[i, two] = np.array([f, v * slope]) * scales[two] / best.sizes[i]
                 bends = np.array([[0.0, slope], [slope, v * second]])
-                bend[two, two] = (
-                    pull[i] / best.sizes[i] * bends * np.outer(scales[two], scales[two])
-                )
+                bends *= np.outer(scales[two], scales[two])
+                bend[two, two] += pull[i] / best.sizes[i] * bends
                 if links.rate_errors is not None:
                     given[i] = b * v * (1.0 if kind == LOG_RATE else f) / best.sizes[i]
                     given[i] *= links.rate_errors[t]
@@ -109,7 +108,7 @@ class JointPoint:
                 through[i, at] = scales[at] / best.sizes[i]
             if kind not in ("own", "shared"):
                 room[i] = np.inf
-        return replace(block, through=through, given=given, room=room), bend
+        return replace(block, through=through, given=given, room=room)
 
     def _drawn(self) -> tuple[Array, Array] | None:
         """Slopes of the residuals of what is drawn to a common value, and their variances."""
@@ -162,7 +161,11 @@ class JointPoint:
     def reach(self, name: str) -> float:
         """How far a shared value is off where the cost has risen by one; 0 where it is unseen."""
         at, plain = self.names.index(name), self.uncertainty.plain
-        return 0.0 if plain.lost[at] else float(np.sqrt(plain.inverse[at, at]) * self._scales[at])
+        return (
+            0.0
+            if plain.frame.lost[at]
+            else float(np.sqrt(plain.inverse[at, at]) * self._scales[at])
+        )
 
     def moved(self, name: str, change: float) -> list[Array]:
         """Values of each test with a shared one moved, and the others after it, were all linear."""
@@ -182,7 +185,7 @@ class JointPoint:
 
         Along a direction that several tests determine it took a share of each one's noise only.
         """
-        left = self.uncertainty.plain.lefts[test]
+        left = self.uncertainty.plain.frame.lefts[test]
         share, axes = np.linalg.eigh(left @ left.T)
         own = self.uncertainty.blocks[test].axes[0]
         return np.asarray((own @ axes) * np.sqrt(np.clip(share, 0.0, 1.0)))
@@ -193,8 +196,10 @@ class JointPoint:
     def _undrawn(self) -> tuple[Array, Array]:
         """Covariance and inverse curvature of the unknowns, whatever draws them, SI, (m, m)."""
         held = self.uncertainty.held if self.errs else np.zeros(self._scales.size, dtype=bool)
-        whole = self.uncertainty.bent if self.errs else self.uncertainty.plain
-        free, alone = np.ix_(~held, ~held), replace(whole, drawn=None)
+        alone = self.uncertainty.bent if self.errs else self.uncertainty.plain
+        if alone.frame.drawn is not None:
+            alone = replace(alone, frame=Frame(alone.frame.blocks))
+        free = np.ix_(~held, ~held)
         matrix, inverse = np.full((2, held.size, held.size), np.nan)
         matrix[free], inverse[free] = alone.matrix, alone.inverse
         scales = np.outer(self._scales, self._scales)
