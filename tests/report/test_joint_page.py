@@ -120,7 +120,7 @@ def test_ranges_are_told_where_there_are_some(found):
     page = joint_page(ranged, b"\x89PNG")
     assert "<th>range</th>" in page
     assert ">520 to 580 kPa<" in page
-    assert "the range is where it would lie (95 %)" in page
+    assert "where the value would lie (95 %)" in page
     assert "520.0 to 580.0 kPa" in joint_text(ranged)
 
 

@@ -25,7 +25,7 @@ from foamfit.report.readable import readable
 from foamfit.report.render import sentences, words
 from foamfit.results import Fit, ParameterEstimate, law_in_words
 from foamfit.springs.laws import law
-from foamfit.springs.laws.record import ETA, RELAXATION_TIME, STRENGTH, Compared
+from foamfit.springs.laws.record import ETA, RELAXATION_TIME, STRENGTH, Compared, Param
 from foamfit.springs.model import Model
 from foamfit.springs.published import PublishedSet
 from foamfit.springs.published import published as published_sets
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 Result = Fit | Mapping[str, Any] | str | Path
 
 MARKS = ((BLUE, "o"), (VERMILION, "s"), ("black", "^"), (GREY, "D"))  # of the results
-NOTHING = 3.0  # standard error over value past which a difference means nothing
+NOTHING = 3.0  # standard error over value beyond which a difference is meaningless
 WORST_FIRST = ("not determined", "weak", "determined", "fixed")
 ETA_PUBLISHED = (
     "the published η is numerical, it sets how the paper's relaxation under a held stress "
@@ -220,7 +220,7 @@ def _broken(where: str, fault: str) -> InputError:
 
 
 def _whole(content: Any, wanted: Mapping[str, Any], where: str) -> Mapping[str, Any]:
-    """Return what a result holds if it holds all that is wanted, each of its kind."""
+    """Return the content of a result; InputError if a key is missing or of the wrong type."""
     given = content if isinstance(content, Mapping) else {}
     for key, kind in wanted.items():
         fine = key in given and isinstance(given[key], kind)
@@ -271,7 +271,7 @@ def published_side(name: str) -> Side:
 
 
 def _unpublished(side: Side) -> str:
-    """Kind of spring of which nothing is published, "" if there is none."""
+    """Return the first kind of spring without published parameters, "" if there is none."""
     laws = map(law, side.kinds)
     return next((one.kind for one in laws if one.hysteretic and not one.published), "")
 
@@ -281,10 +281,17 @@ def _unpublished(side: Side) -> str:
 
 def _quantities(kind: str, relaxation: int) -> Iterator[Compared]:
     """Give the rows of a kind of spring."""
-    yield from law(kind).compared
+    yield from law(kind).compared or map(_as_it_is, law(kind).params)
     for k in range(1, relaxation + 1) if law(kind).hysteretic else ():
         for param in (STRENGTH, RELAXATION_TIME):
             yield Compared(f"{param.symbol[0]}_{k}", param.unit, (f"{param.name}{k}",), _total)
+
+
+def _as_it_is(param: Param) -> Compared:
+    """Row of a parameter of a law that defines no rows of its own."""
+    factor, unit = (1e6, "MPa") if param.unit == "Pa" else (1.0, param.unit)
+    label = "_".join(filter(None, param.symbol)) or param.name
+    return Compared(label, unit, (param.name,), lambda value: value / factor)
 
 
 def _total(*parts: Any) -> Any:
@@ -395,7 +402,7 @@ def _damping_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
         lambda *at: _total(*at[:-1]) / (2.0 * (inertia * at[-1]) ** 0.5),
     )
     if ratio is not None:
-        # ζ is η over a root: it is known as well as η is, unless k_c is not known at all.
+        # ζ is η over a root, so it is known as well as η unless k_c is undetermined.
         if ratio.state != "not determined" or value.state == "fixed":
             ratio = ratio._replace(state=value.state, why=value.why)
         lost = ratio.state == "not determined" != value.state
@@ -527,19 +534,19 @@ def _is_shown(row: Row) -> bool:
 
 
 def _shown(pairs: list[Pair]) -> list[str]:
-    """Return the parameters of which some result has something to show, in their order."""
+    """Return the parameters that at least one result can show, in order."""
     rows = [row for pair in pairs for row in pair.rows]
     there = {row.label for row in rows if _is_shown(row)}
     return [label for label in dict.fromkeys(row.label for row in rows) if label in there]
 
 
 def _lanes(pairs: list[Pair]) -> list[int]:
-    """Return the places of the results that have anything to show: each gets a lane."""
+    """Return the indices of the results that have something to show; each gets a lane."""
     return [k for k, pair in enumerate(pairs) if any(map(_is_shown, pair.rows))]
 
 
 def _draw_comparison(ax: Axes, pairs: list[Pair]) -> None:
-    """One line for each parameter of each result; results of a parameter stand together."""
+    """Draw one line per parameter and result, grouped by parameter."""
     labels = _shown(pairs)
     if not labels:
         figures.say_nothing_there(ax)
@@ -580,7 +587,7 @@ def _draw_comparison(ax: Axes, pairs: list[Pair]) -> None:
 
 
 def _name_results(figure: Figure, groups: list[list[Pair]]) -> None:
-    """Say once what the colours mean: the drives, where these are the same in every panel."""
+    """Explain the colours once: by drive if the drives are the same in every panel."""
     drives = [[f"{pair.drive} drive" for pair in pairs] for pairs in groups]
     names = max(drives, key=len)
     if len(groups) == 1 and len(set(names)) < len(names):

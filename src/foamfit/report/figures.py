@@ -31,10 +31,10 @@ if TYPE_CHECKING:
 
     from foamfit.arrays import Array
 
-GREY, BLUE, VERMILION = "#6b6b6b", "#0072B2", "#D55E00"  # of Okabe and Ito, told apart by all
-INSIDE = ("#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # of masses inside, from the base up
+GREY, BLUE, VERMILION = "#6b6b6b", "#0072B2", "#D55E00"  # by Okabe and Ito
+INSIDE = ("#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # of interior masses, from the base up
 STYLE: Any = {  # matplotlib types its keys one by one
-    "font.family": "DejaVu Sans",  # upright and regular: a PDF takes 0.1 s for every font
+    "font.family": "DejaVu Sans",  # one upright font: each further font costs 0.1 s per PDF
     "font.size": 7.5,
     "axes.labelsize": 8,
     "axes.titlesize": 8,
@@ -59,10 +59,11 @@ DPI = 250  # of a PNG
 TWO = "two"
 COLUMNS = {"one": 3.25, TWO: 7.0}
 NARROWEST, WIDEST = 2.5, 20.0
-# Points of a drawn line: a longer one is drawn through the first, last and extreme samples of so
-# many stretches, which no print tells from all samples.
+# Lines with more points are drawn through the first, last and extreme samples of this many
+# stretches, which looks the same in print.
 MOST_POINTS, STRETCHES = 3000, 500
 HEAD = ("panel", "series", "x axis", "y axis", "x", "y")
+_STANDS = "the data of the figure would be written, and is no such table; name the figure otherwise"
 # Names of the rows and columns of a matrix that is drawn as shaded cells.
 _CELLS = WeakKeyDictionary["Artist", tuple[Sequence[str], Sequence[str]]]()
 
@@ -84,7 +85,7 @@ def inches(width: str) -> float:
 
 
 def abreast(width: float, panels: int, least: float = 2.1) -> int:
-    """Return how many of the panels, each at least so many inches wide, stand side by side."""
+    """Return how many panels of at least `least` inches fit side by side."""
     return max(1, min(panels, int(width / least)))
 
 
@@ -97,7 +98,7 @@ def title_lines(width: float, *parts: str) -> list[str]:
 def drawing(width: float, height: float, title: Sequence[str] = ()) -> Iterator[Figure]:
     """Give an empty figure of a size in inches, and the style of all figures to draw it in.
 
-    Long lines are thinned in the end to what can be seen of them. `title` has its lines.
+    Long lines are thinned at the end without a visible change. `title` is a list of lines.
     """
     import matplotlib
     from matplotlib.figure import Figure
@@ -116,7 +117,7 @@ def drawing(width: float, height: float, title: Sequence[str] = ()) -> Iterator[
 
 
 def _seen(x: Array, y: Array) -> NDArray[np.intp]:
-    """Return the samples of a long line through which it looks as through all of them."""
+    """Return samples of a long line through which it looks the same as through all."""
     ends = np.linspace(0, x.size, STRETCHES + 1).astype(np.intp)
     kept = [ends[:-1], ends[1:] - 1]
     for values in (x, y):
@@ -127,11 +128,11 @@ def _seen(x: Array, y: Array) -> NDArray[np.intp]:
 
 
 def legend_below(figure: Figure, entries: dict[str, Any]) -> int:
-    """Name what is drawn in a legend below all panels; returns in how many lines it stands."""
+    """Draw a legend below all panels; returns its number of lines."""
     if not entries:
         return 0
     handles, names = list(entries.values()), list(entries)
-    # Typographic points: of a letter, and of a handle with what stands about it.
+    # In typographic points: width of a letter, and of a handle with its margins.
     sizes, room = [4.2 * len(name) + 33.0 for name in names], 72.0 * figure.get_figwidth()
     for columns in range(len(names), 0, -1):
         lines = -(-len(names) // columns)
@@ -145,10 +146,10 @@ def legend_below(figure: Figure, entries: dict[str, Any]) -> int:
 
 @contextmanager
 def laid_out(figure: Figure, dpi: int = DPI) -> Iterator[None]:
-    """Keep one layout of a figure for all images that are made of it within.
+    """Keep one layout for all images of a figure that are made in the body.
 
-    Left to itself matplotlib lays a figure out anew for every image, and draws it once more for
-    that, unseen. `dpi` is the resolution at which its texts are measured.
+    By default matplotlib repeats the layout for every image, and draws the figure an extra time to
+    do so. `dpi` is the resolution at which texts are measured.
     """
     import matplotlib
 
@@ -160,7 +161,7 @@ def laid_out(figure: Figure, dpi: int = DPI) -> Iterator[None]:
         figure.dpi = dpi
         engine.execute(figure)
         figure.dpi = own_dpi
-        figure.set_layout_engine(None)  # "none" leaves a dummy, for which all is drawn twice
+        figure.set_layout_engine(None)  # "none" would leave a dummy engine
     try:
         yield
     finally:
@@ -169,7 +170,7 @@ def laid_out(figure: Figure, dpi: int = DPI) -> Iterator[None]:
 
 @contextmanager
 def _unnamed_letters() -> Iterator[None]:
-    """Let a test be named in letters that the font lacks: the figure is good without them."""
+    """Ignore letters in the name of a test that the font lacks."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing")
         yield
@@ -180,7 +181,7 @@ def image(figure: Figure, form: Literal["png", "pdf", "svg"], dpi: int = DPI) ->
     import matplotlib
 
     buffer = io.BytesIO()
-    # Without the date, the same fit gives the same file.
+    # No date, so that the same fit gives the same file.
     metadata = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(form)
     with laid_out(figure, dpi), matplotlib.rc_context(STYLE), _unnamed_letters():
         figure.savefig(buffer, format=form, dpi=dpi, metadata=metadata)
@@ -188,12 +189,12 @@ def image(figure: Figure, form: Literal["png", "pdf", "svg"], dpi: int = DPI) ->
 
 
 def write_haloed(ax: Axes, name: str, at: Array, offset: tuple[float, float], **style: Any) -> None:
-    """Write beside a place, in points from it, on a white rim that parts it from lines."""
+    """Write a text at an offset (points) from a place, with a white rim."""
     from matplotlib.patheffects import Stroke
     from matplotlib.text import Annotation
 
     class Haloed(Annotation):
-        """A text with a rim, for which matplotlib would make outlines of its letters."""
+        """A text with a rim; matplotlib's own rim would turn its letters into outlines."""
 
         def draw(self, renderer: Any) -> None:
             self.set_path_effects([Stroke(linewidth=1.5, foreground="white")])
@@ -266,7 +267,7 @@ def save(figure: Figure, path: str | Path | None, *, table: bool = False) -> Fig
 
 
 def name_cells(picture: Artist, rows: Sequence[str], columns: Sequence[str]) -> None:
-    """Say what the rows and columns of a matrix are: they need not stand at its axes."""
+    """Name the rows and columns of a matrix, which its axes need not show."""
     _CELLS[picture] = tuple(rows), tuple(columns)
 
 
@@ -290,12 +291,8 @@ def table(figure: Figure) -> bytes:
     return csv_bytes(plotted(figure))
 
 
-def check_table(
-    path: Path, head: str = ",".join(HEAD),
-    words: str = "the plotted data of the figure are to be written, and is no such table; name the "
-    "figure otherwise",
-) -> None:  # fmt: skip
-    """Raise InputError if something else stands where a table that begins so is to be written."""
+def check_table(path: Path, head: str = ",".join(HEAD), words: str = _STANDS) -> None:
+    """Raise InputError if the path holds a file that does not begin with this header."""
     try:
         with path.open(encoding="utf-8", errors="replace") as file:
             known = file.readline().startswith(head)
@@ -308,7 +305,7 @@ def check_table(
 
 
 def _sides(ax: Axes) -> tuple[str, str]:
-    """What the axes of a panel are, from the panel beside it where that is written only there."""
+    """Labels of the axes of a panel, taken from a panel that shares them if it has none."""
     found = []
     for side, shared in (("x", ax.get_shared_x_axes()), ("y", ax.get_shared_y_axes())):
         labels = [getattr(one, f"get_{side}label")() for one in (ax, *shared.get_siblings(ax))]
@@ -344,15 +341,15 @@ def _series(ax: Axes) -> Iterator[tuple[str, list[str], list[str]]]:
 
 
 def _name(artist: Artist) -> str:
-    """Name of a series; "" of decoration, to which matplotlib gives names like "_child3"."""
+    """Name of a series; "" for decoration, which matplotlib labels like "_child3"."""
     label = str(artist.get_label() or "")
     return "" if label.startswith("_child") else label.removeprefix("_")
 
 
 def _columns(ax: Axes, artist: Artist, places: Array) -> tuple[list[str], list[str]]:
-    """The coordinates as text; empty along an axis to which the series runs across."""
+    """The coordinates as text; empty along an axis that the series spans."""
     here = artist.get_transform().contains_branch_seperately(ax.transData)
-    if not all(here):  # a line across has two equal places
+    if not all(here):  # both ends of a line across are the same
         places = np.unique(places[:, [int(here[1])]], axis=0)[:, [0, 0]]
     columns = [
         [_cell(value) for value in column] if own else [""] * len(places)
@@ -362,5 +359,5 @@ def _columns(ax: Axes, artist: Artist, places: Array) -> tuple[list[str], list[s
 
 
 def _cell(value: float) -> str:
-    """A number as finely as a figure could ever show it; empty where there is none."""
+    """A number with more digits than a figure can show; empty if it is not finite."""
     return f"{value:.6g}" if np.isfinite(value) else ""

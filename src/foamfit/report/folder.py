@@ -38,7 +38,7 @@ _FILES = RESULT_FILES | CYCLES_FILES | JOINT_FILES | PREDICTION_FILES | {"batch.
 
 
 class _TriedError(Exception):
-    """Ends what only tries whether a folder can be written."""
+    """Ends a trial of whether a folder can be written."""
 
 
 def save_result(
@@ -67,7 +67,7 @@ def save_whole(folder: str | Path, write: Callable[[Path], None], *, swept: bool
     try:
         with replacing(folder.resolve(), swept=swept) as fresh:
             write(fresh)
-            check_target(folder)  # what has been put there in the meantime stays
+            check_target(folder)  # files put there in the meantime are kept
     except OSError as error:
         raise InputError(
             f"the result cannot be written to {folder}: {reason(error)}; choose another folder"
@@ -76,7 +76,7 @@ def save_whole(folder: str | Path, write: Callable[[Path], None], *, swept: bool
 
 
 def try_target(folder: str | Path) -> None:
-    """Raise InputError unless a result can be written to `folder`: it is begun, and undone."""
+    """Raise InputError unless a result can be written to `folder`; the trial is undone."""
 
     def undo(_: Path) -> NoReturn:
         raise _TriedError
@@ -143,7 +143,7 @@ def check_target(folder: str | Path) -> None:
 
 
 def _check_replaceable(folder: Path, place: Path) -> None:
-    """Refuse a folder that is there, at `place`, and must not or cannot be replaced."""
+    """Refuse an existing folder at `place` that must not or cannot be replaced."""
     if place.is_mount():
         raise InputError(f"{folder} is a mount point and cannot be replaced; name a folder in it")
     there = sorted(place.iterdir())
@@ -162,9 +162,9 @@ def _check_replaceable(folder: Path, place: Path) -> None:
 
 
 def is_written(path: Path, tests: Collection[str] = ()) -> bool:
-    """Whether something in a result folder is what a fit writes there.
+    """Whether a path in a result folder is one that foamfit writes.
 
-    `tests` are the names of the folders that a joint fit says to be its own.
+    `tests` are the names of the test folders of a joint fit.
     """
     if path.is_symlink():
         return False

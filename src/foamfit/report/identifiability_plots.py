@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from foamfit.results import Budget, Fit, ParameterEstimate, Profile
     from foamfit.trust.identifiability import Insight
 
-# Of one spring's branches; of several springs' branches, in turn.
+# Shades of the branches of one spring; alternating shades for several springs.
 SHADES = {"a": "#eef3f7", "d": "#fbeedd", "c": "#e6ddd5", "e": "#e3f1ea"}
 SHADES |= {"snap-through": "#fbeedd", "held": "#e6ddd5", "snap-back": "#e3f1ea"}
 OTHERS = ("#f3f3f3", "#e4e4e4")
@@ -123,7 +123,7 @@ def _draw_profile(ax: Axes, profile: Profile, estimate: ParameterEstimate) -> No
 
 
 def _draw_sensitivities(figure: FigureBase, insight: Insight, width: float) -> None:
-    """Set all rows of a curve in one panel: as panels of their own they take seconds to lay out."""
+    """Draw all rows of a curve in one panel; separate panels would take seconds to lay out."""
     from matplotlib.transforms import Affine2D
 
     k, n = len(insight.names), len(insight.curves)
@@ -142,7 +142,7 @@ def _draw_sensitivities(figure: FigureBase, insight: Insight, width: float) -> N
         _shade(ax, x, insight.sections)
         for i, name in enumerate(insight.names):
             ax.axhline(i, color=GREY, lw=0.5)
-            # The row's own numbers, moved to its place.
+            # The numbers of the row, shifted to its place.
             moved = Affine2D().scale(1.0, -0.44 / (reach[name] or 1.0)).translate(0.0, i)
             style: Any = {"color": _color(curve), "lw": 1.0, "transform": moved + ax.transData}
             ax.plot(x, rows[name][j], label=f"_{name}", **style)
@@ -173,9 +173,9 @@ def _shade(ax: Axes, x: Array, cuts: tuple[Section, ...]) -> None:
 
 
 def without_shakes(cuts: tuple[Section, ...], samples: int) -> list[Section]:
-    """Leave out what lasts for less than a hundredth of the test between two of one name.
+    """Drop sections shorter than a hundredth of the test between two of the same name.
 
-    Micro-springs are held wherever a measured motion shakes.
+    A shaking measured motion makes a spring leave its branch for a moment.
     """
     out: list[Section] = []
     for i, cut in enumerate(cuts):
@@ -252,7 +252,7 @@ def _cells(
             shown = {"−.00": "0", ".00": "0", "1.00": "1", "−0": "0", "0": ""}.get(shown, shown)
             color = "white" if abs(value) > 0.6 * limits[1] else "black"
             text = ax.text(j, i, shown, ha="center", va="center", fontsize=5.5, color=color)
-            text.set_in_layout(False)  # inside its cell anyway; to measure each takes long
+            text.set_in_layout(False)  # inside its cell; measuring is slow
     ax.tick_params(length=0, labelsize=6.5)
     ax.spines[:].set_visible(False)
     return picture

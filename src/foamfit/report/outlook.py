@@ -41,20 +41,20 @@ from foamfit.trust.checklist import ESTIMATED
 from foamfit.trust.conclude import state_of
 from foamfit.trust.identifiability import Insight, look
 
-# Descents of the quick search for start values, for each spring.
+# Descents per spring in the quick search for start values.
 QUICK_STARTS = 4
-# Velocities tried for closing a loop, over the planned one; and how well it is found.
+# Range of velocities tried for closing a loop, over the planned one, and relative tolerance.
 SLOWEST, FASTEST, CLOSE = 1e-2, 30.0, 1e-5
-# A test is looked at this much faster than what closes its loop.
+# The faster test exceeds the closing velocity by this factor.
 BEYOND = 1.05
-# Of a planned test: samples, and noise over the range where none is stated.
+# Samples of a planned test, and its noise over the range if none is stated.
 SAMPLES, NOISE = 501, 0.01
-GUESSED = "the best"  # how a source begins that is no knowledge
+GUESSED = "the best"  # beginning of the source of start values that are a guess
 
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """What to expect of an experiment with one velocity of the striker."""
+    """What to expect of an experiment at one velocity of the striker."""
 
     velocity: float | None  # m/s; None in other drives than the impact
     estimates: dict[str, ParameterEstimate]  # what varies, with expected standard errors
@@ -65,13 +65,13 @@ class Expected:
 
 @dataclass(frozen=True, eq=False)
 class Outlook:
-    """What is to be said of an experiment before it is fitted."""
+    """What can be said about an experiment before it is fitted."""
 
     problem: Problem
-    values: Array  # SI; all that is said holds there
+    values: Array  # SI; everything is evaluated there
     source: str  # where these come from
     planned: Expected
-    # Velocity (m/s) from which on the loop of each bistable spring closes, None if none up to 30
+    # Velocity (m/s) from which on the loop of each spring closes, None if none up to 30
     # times the planned one does; empty in other drives than the impact.
     closing: dict[str, float | None]
     faster: Expected | None  # 5 % faster than what closes all loops, where one is left open
@@ -109,7 +109,7 @@ def make_outlook(problem: Problem, values: Array, source: str) -> Outlook:
 def _moved_farthest(
     best: BestPoint, expected: Mapping[str, ParameterEstimate]
 ) -> dict[str, tuple[str, float, float]]:
-    """What 1 % of each quantity without a ± does, most telling first; see `Outlook.exact`."""
+    """Effect of 1 % of each quantity without a ±, largest first; see `Outlook.exact`."""
     found, sizes = {}, dict(zip(best.names, best.sizes.tolist(), strict=True))
     for quantity in taken_for_exact(best.problem.measurement):
         change = response(best, quantity, 0.01)
@@ -176,7 +176,7 @@ def known_values(problem: Problem, side: Side) -> Array:
 
 
 def planned_test(settings_file: Path) -> Measurement:
-    """Make a test without curves of what a TOML plans; `simulated_test` fills them in."""
+    """Make a test from a TOML that plans one; `simulated_test` fills in the curves."""
     settings = read_settings(settings_file, settings_file, channels=())
     striker = settings.striker or Striker()
     for key, value in (("mass", striker.mass), ("velocity", striker.velocity)):
@@ -215,17 +215,15 @@ def simulated_test(like: Measurement, chain: Chain, drive: Impact) -> Measuremen
         like.noise.displacement or NOISE * float(np.ptp(motion)),
     )
     inside = {node: response.displacement[node - 1] for node in like.interior}
-    slowed = -np.gradient(np.gradient(motion, time), time)
-    return replace(
-        like, time=time, stress=stress, displacement=motion, interior=inside, noise=noise,
-        acceleration=None if like.acceleration is None else slowed,
-        striker=Striker(drive.mass, drive.velocity), outliers={}, sampled={}, block=1,
-        contact="file",
-    )  # fmt: skip
+    measured = like.acceleration is not None
+    slowed = -np.gradient(np.gradient(motion, time), time) if measured else None
+    made = replace(like, time=time, stress=stress, displacement=motion, acceleration=slowed)
+    made = replace(made, interior=inside, striker=Striker(drive.mass, drive.velocity), noise=noise)
+    return replace(made, outliers={}, sampled={}, block=1, contact="file")
 
 
 def _runs(chain: Chain, drive: Impact) -> Iterator[Response]:
-    """Give runs of an impact that last longer and longer, up to one that ends its contact."""
+    """Give runs of an impact of growing duration, up to one in which contact ends."""
     end = 4.0 * chain.height / drive.velocity
     for _ in range(20):
         response = simulate(chain, drive, np.linspace(0.0, end, 16))
@@ -281,21 +279,20 @@ def _faster(
 
     Its curves are simulated, and its nuisance parameters those of such a record.
     """
-    test, springs = problem.measurement, problem.model.names
-    given = {problem.objective.channel(name): value for name, value in noise.items()}
-    moved = next((value for name, value in given.items() if name.startswith("displacement")), None)
+    test = problem.measurement
+    known = {problem.objective.channel(name): value for name, value in noise.items()}
+    moved = next((value for name, value in known.items() if name.startswith("displacement")), None)
     estimated = {name: x for name, x in test.noise.estimated.items() if name == "acceleration"}
-    test = replace(test, noise=Noise(given.get("stress"), moved, estimated))
+    test = replace(test, noise=Noise(known.get("stress"), moved, estimated))
     impact = Impact(_impact(test).mass, velocity)
     test = simulated_test(test, chain_of(problem, values), impact)
     params = problem.params.copy()
     for name in problem.objective.nuisance:
         del params[name]
-    faster = make_problem(
-        test, problem.model.name, "impact", params, problem.objective.weights,
-        problem.objective.interior_mass, relaxation=problem.model.relaxation,
-    )  # fmt: skip
-    own = values[: len(springs)]
+    model, objective = problem.model, problem.objective
+    given = (test, model.name, "impact", params, objective.weights, objective.interior_mass)
+    faster = make_problem(*given, relaxation=model.relaxation)
+    own = values[: len(model.names)]
     return faster, np.append(own, faster.vector()[own.size :])
 
 
@@ -328,7 +325,7 @@ def expect(problem: Problem, values: Array, noise: Mapping[str, float]) -> Expec
 
 
 def _snapped(best: BestPoint) -> dict[str, float]:
-    """Largest fraction of micro-springs that snaps, of each microscale spring where it is known."""
+    """Largest fraction of micro-springs that snaps, by spring, where it is known."""
     problem, curves = best.problem, best.simulated.curves
     test, drive = problem.measurement, problem.objective.drive
     moved = curves.get("displacement_time", test.displacement)

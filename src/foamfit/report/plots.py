@@ -36,10 +36,10 @@ IN_TIME = {"A1": (5, -4), "C1": (-5, 3), "C2": (5, 3), "A2": (5, 4), "σ₊": (5
 # the share of its length at which the name stands.
 BESIDE = {"c": (7.0, -3.0), "e": (4.0, -7.0), "snap-back": (7.0, -6.0)}
 LIGHT = {"a": (0.9, (-4.0, 3.0)), "c": (0.5, (5.0, -4.0))}
-MARKERS = 60  # of a measured curve: more of them blot
+MARKERS = 60  # markers on a measured curve; more would blot
 PALE = "#A6CEE3"
 STOOD = "#F2DC6B"  # where the gauge stood still
-# Of masses inside, from the base up: beside their colours, for who sees or prints grey.
+# Dashes and marks of interior masses, from the base up, for readers without colour.
 DASHES: Any = ((0, (5, 1.2)), (0, (2.5, 1.2)), (0, (1, 1)), (0, (5, 1.2, 1, 1.2)))
 MARKS = ("^", "v", "D", "p")
 # Typographic points: height of a panel beside others and above others, what its labels take beside
@@ -106,19 +106,18 @@ def plot_response(
     loop = time <= (np.inf if end is None else end)  # then the striker flies
     # From the base up: light to dark, the top in the colour of what is simulated.
     shades = np.linspace(0.7, 0.35, max(len(nodes) - 1, 1))
-    motion = [
+    last = {"color": VERMILION, "lw": 1.3}
+    moving = [
         _Line(time, node, f"node {i}", {"color": str(shade), "lw": 1.0})
         for i, (node, shade) in enumerate(zip(nodes[:-1], shades, strict=False), start=1)
-    ]
-    last = {"color": VERMILION, "lw": 1.3}
-    pushed = _Line(time, stress, "_base stress", last)
-    looped = _Line(response.strain[loop], stress[loop], "_base stress", last)
+    ] + [_Line(time, nodes[-1], "top", last)]
+    pushed = [_Line(time, stress, "_base stress", last)]
+    looped = [_Line(response.strain[loop], stress[loop], "_base stress", last)]
     panels = [
-        _Panel("stress_time", "time", "s", "base stress", "Pa", [pushed]),
-        _Panel("displacement_time", "time", "s", "displacement", "m",
-               [*motion, _Line(time, nodes[-1], "top", last)]),
-        _Panel("stress_strain", "overall strain", "–", "base stress", "Pa", [looped]),
-    ]  # fmt: skip
+        _Panel("stress_time", "time", "s", "base stress", "Pa", pushed),
+        _Panel("displacement_time", "time", "s", "displacement", "m", moving),
+        _Panel("stress_strain", "overall strain", "–", "base stress", "Pa", looped),
+    ]
     with _panelled(panels, width) as (figure, axes, _):
         if end is not None:
             at = end / panels[0].scale()[0]
@@ -176,16 +175,14 @@ class _Panel:
 
 def _panels(result: Fit) -> list[_Panel]:
     c, height = result.curves, result.measurement.specimen.height
-    # What a drive prescribes, the fitted loop has too, whether or not it is kept twice.
+    # The fitted loop includes the prescribed curve even if only the measured copy is kept.
     pushed = c.measured_stress if result.drive == "stress" and c.stress is None else c.stress
     moved = c.displacement
     if result.drive == "displacement" and moved is None:
         moved = c.measured_displacement
     strain = None if c.measured_displacement is None else c.measured_displacement / height
     motion = result.measurement.motion or "measured"
-    moving = [
-        _measured(c.time, c.measured_displacement, motion), _fitted(c.time, c.displacement)
-    ]  # fmt: skip
+    moving = [_measured(c.time, c.measured_displacement, motion), _fitted(c.time, c.displacement)]
     for node, (measured, fitted) in c.interior.items():
         moving += [_measured(c.time, measured, node=node), _fitted(c.time, fitted, node)]
     loop = [
@@ -417,7 +414,7 @@ def _draw_law(labels: _Labels, result: Fit) -> None:
     if len(result.chain.springs) > 1 or not hasattr(spring, "elastic_branches"):
         return
     (left, right), (low, top) = ax.get_xlim(), ax.get_ylim()
-    ax.set(xlim=(left, right), ylim=(low, top))  # the branches go on beyond
+    ax.set(xlim=(left, right), ylim=(low, top))  # the branches extend beyond the panel
     stress = np.linspace(0.0, top * labels.fy, 200)
     for name, strain in spring.elastic_branches(stress).items():
         line = np.column_stack((strain, stress / labels.fy))[strain < right]
@@ -494,7 +491,7 @@ def _head(figure: Figure, result: Fit) -> None:
     word = origin_word(result)
     more = [word] if word and word not in name.lower() else []
     more += [f"stopped by {result.stopped}"] if result.stopped else []
-    # A dot stays with what is before it.
+    # No line begins with a dot.
     title = "\u00a0· ".join([name, result.law, f"{result.drive} drive", *more])
     title = textwrap.fill(title, int(12 * figure.get_figwidth()))
     # A name may hold a dollar sign: it is no formula.

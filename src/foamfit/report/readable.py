@@ -10,7 +10,7 @@ from foamfit import text
 from foamfit.results import ParameterEstimate
 from foamfit.springs.parameters import any_param, family, split_name
 
-# Symbols of what is no spring's parameter; those of a spring are in the record of its law.
+# Symbols of parameters that belong to no spring; those of springs are in the records of laws.
 SYMBOLS = {
     "site_eta": ("η", "site"),
     "contact_time": ("t", "0"),
@@ -21,7 +21,7 @@ SYMBOLS = {
     "striker_mass": ("m", ""),
     "time_shift": ("Δt", ""),
 }
-# What a nuisance parameter is called where people read it.
+# Names of nuisance parameters in reports.
 LABELS = {
     "contact_time": "contact time t₀",
     "displacement_zero": "zero of the motion w₀",
@@ -68,7 +68,7 @@ class Readable:
 
     @property
     def label(self) -> str:
-        """What it is called: of a parameter of the springs its name."""
+        """Its name in reports; for a parameter of a spring its own name."""
         return LABELS.get(self.name, self.name)
 
     @property
@@ -82,12 +82,12 @@ class Readable:
 
     @property
     def matters(self) -> bool:
-        """Whether its reason is to be read: it is not determined, or more is said of it."""
+        """Whether its reason is worth reading: it is not determined, or there is a remark."""
         return self.state != "fixed" and (self.state != "determined" or ";" in self.why)
 
 
 def readable(name: str, p: ParameterEstimate) -> Readable:
-    """Return a parameter as it is to be read.
+    """Return a parameter in readable form.
 
     It is shown with the digits that its standard error leaves (two of the error), or with four.
     """
@@ -101,15 +101,13 @@ def readable(name: str, p: ParameterEstimate) -> Readable:
         shown, stderr, places = _rounded(value, p.stderr / factor)
         if p.ci95 is not None:
             interval = " to ".join(_fixed(bound / factor, places) for bound in p.ci95)
-    if p.range is not None:  # an error of the law leaves two digits
+    if p.range is not None:  # a range is good to two digits
         ends = (float(f"{bound / factor + 0.0:.2g}") for bound in p.range)
         span = " to ".join(f"{end:g}".replace("-", "−") for end in ends)
     unit = {"": "–", "1": "–", "-": "–", "Pa s": "Pa·s", "Pa*s": "Pa·s"}.get(unit, unit)
     scale = f"{p.systematic / factor:.2g}" if p.systematic > 0.0 else ""
-    return Readable(
-        name, symbol(name), shown, stderr, interval, unit, p.state, p.why, p.ci95_method or "",
-        span, scale,
-    )  # fmt: skip
+    told = (p.state, p.why, p.ci95_method or "", span, scale)
+    return Readable(name, symbol(name), shown, stderr, interval, unit, *told)
 
 
 def quantity(value: float, unit: str) -> tuple[str, str]:

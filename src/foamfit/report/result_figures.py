@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Mapped = Callable[..., Iterable[Any]]  # as the built-in `map`
-COARSE = 160  # dots per inch of what is only on the page, and should not take long
+COARSE = 160  # dots per inch of a figure that is only on the page, to save time
 # In the order in which they are begun: what takes longest first. "shown" is the fit on the page,
 # two columns wide as all others there.
 _NAMES = ("fit", "shown", "sensitivities", "residuals", "profiles", "budget")
@@ -52,7 +52,7 @@ def draw_all(
     again = inches(width) != inches(TWO)
     names = [name for name in _NAMES if again or name != "shown"]
     drawn: dict[str, Any] = {field.name: getattr(result, field.name) for field in fields(Fit)}
-    # No figure shows them, and another process would import lmfit, which takes it longest.
+    # No figure needs them, and unpickling them would import lmfit, the slowest import.
     drawn["params"] = None
     images = mapped(partial(_draw, Fit(**drawn), width), names)  # begins before it is asked for
 

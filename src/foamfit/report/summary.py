@@ -20,7 +20,7 @@ CURVES = {
 ANSWERS = {True: "yes", False: "no", None: "–"}
 LADDER = ["", "model", "with", "misfit %", "pred. %", "gain %", "rank", "AICc", "BIC"]
 LADDER += ["p", "n.d.", "s"]
-# Lines that the terminal has for the warnings and for the rows that are not used.
+# Lines on the terminal for warnings, and for rows that are not used.
 WARNING_LINES, ROW_LINES = 4, 2
 LONGEST = 180  # characters of the reasons for a state; longer ones are left to the report
 
@@ -55,7 +55,7 @@ def summary_text(result: Fit, *, verbose: bool = False) -> str:
 
 
 def misfits(result: Fit) -> dict[str, float | None]:
-    """Return the misfits by what their curves are called, masses inside last."""
+    """Return the misfits by the names of their curves, interior masses last."""
     names = CURVES | {
         f"{interior_channel(i)}_time": f"displacement-time of mass {i}"
         for i in result.curves.interior
@@ -118,7 +118,7 @@ def _unknown(parameters: dict[str, ParameterEstimate]) -> dict[str, dict[str, li
 
 
 def _moved(result: Fit) -> tuple[str, float] | None:
-    """Parameter that the ± of the TOML that are not fitted move farthest, and its share."""
+    """Parameter that the unfitted ± of the TOML move farthest, and by which share of its scale."""
     if (budget := result.budget) is None or not budget.contributions:
         return None
     shares = {
@@ -130,7 +130,7 @@ def _moved(result: Fit) -> tuple[str, float] | None:
 
 
 def _rows(result: Fit) -> list[str]:
-    """Say how many rows are used and, where it is short, why not the others."""
+    """Say how many rows are used and, if there is room, why the others are not."""
     rows = result.measurement.rows
     reasons = ", ".join(f"{item.rows} ({item.why})" for item in rows.dropped)
     unused = f"; not used: {reasons}" if reasons else ""
@@ -141,7 +141,7 @@ def _rows(result: Fit) -> list[str]:
 
 
 def _short_warnings(result: Fit) -> Iterator[str]:
-    """Give all warnings on the input, and as many others, but those of the states, as fit."""
+    """Give all warnings about the input, and as many others as fit, except those on states."""
     said = [w for check in result.checklist if check.key == "determined" for w in check.warnings]
     warnings = [warning for warning in result.warnings if warning not in said]
     asked = [warning for warning in warnings if warning.startswith(ASKED)]

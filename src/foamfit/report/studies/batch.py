@@ -87,12 +87,10 @@ def row_of(test: str, file: str, result: Fit) -> Row:
     if result.status == "failed":
         told = [w for check in fatal for w in (check.warnings or (check.sentence,))]
         error = " ".join(["no acceptable fit was found:", *(told or result.warnings)[:1]])
-    cells = {
-        name: plain(
-            [p.value, p.stderr, *(p.ci95 or (None, None)), p.state, p.unit, *(p.range or ())]
-        )
-        for name, p in result.parameters.items()
-    }
+    cells = {}
+    for name, p in result.parameters.items():
+        ends = (*(p.ci95 or (None, None)), p.state, p.unit, *(p.range or ()))
+        cells[name] = plain([p.value, p.stderr, *ends])
     misfit, runtime = plain(result.misfit), plain(result.runtime_s)
     return Row(test, file, result.status, error, misfit, runtime, cells, _sketch(result))
 
@@ -207,7 +205,7 @@ def _sketch(result: Fit) -> Sketch | None:
 
 
 def _path(x: Array, y: Array) -> str:
-    """Draw a curve in few points, equally far from each other along it, in whole pixels."""
+    """Draw a curve through a few points at equal distances along it, in whole pixels."""
     if x.size < 2:
         return ""
     length = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
@@ -218,23 +216,10 @@ def _path(x: Array, y: Array) -> str:
     return f"M{points[0, 0]} {points[0, 1]}l{' '.join(moved)}" if moved else ""
 
 
-@dataclass(frozen=True)
-class Column:
-    """A parameter in the page's table, in the unit in which it reads well."""
-
-    name: str
-    symbol: tuple[str, str]
-    unit: str
-    factor: float
-    # Paths of SVG over all tests side by side, by the class that draws them.
-    paths: dict[str, str]
-    ends: tuple[str, str]  # of the strip's axis
-
-
 def write_page(rows: Sequence[Row], folder: Path, title: str) -> None:
     """Write summary.html whole: one file that needs nothing else."""
     shown = rows
-    if len(rows) > MOST_ON_PAGE:  # what has no fit must be seen
+    if len(rows) > MOST_ON_PAGE:  # tests without a fit are always shown
         first = {id(row) for row in rows[:MOST_ON_PAGE]}
         shown = [row for row in rows if id(row) in first or not row.has_fit][: 2 * MOST_ON_PAGE]
     columns = list(_columns(shown))
@@ -258,8 +243,11 @@ def write_page(rows: Sequence[Row], folder: Path, title: str) -> None:
     write_file(folder / "summary.html", text.encode("utf-8", "replace"))
 
 
-def _columns(rows: Sequence[Row]) -> Iterator[Column]:
-    """The parameters that any test varied, with their values and intervals side by side."""
+def _columns(rows: Sequence[Row]) -> Iterator[dict[str, Any]]:
+    """The parameters that any test varied, each in the unit in which it reads well.
+
+    `paths` are SVG over all tests side by side, by the class that draws them; `ends` is the axis.
+    """
     for name in names_of(rows):
         every = ((i, row.parameters.get(name)) for i, row in enumerate(rows))
         there = [(i, cell) for i, cell in every if cell is not None and cell[0] is not None]
@@ -286,20 +274,21 @@ def _columns(rows: Sequence[Row]) -> Iterator[Column]:
                     paths[line] += f"M{x:g} {pixel(ends[0]):g}V{pixel(ends[1]):g}"
             unsure = " unsure" if cell[4] in ("weak", "not determined") else ""
             paths[f"dots{unsure}"] += f"M{x:g} {pixel(cell[0]):g}h0"
-        axis = number(high / factor), number(low / factor)
-        yield Column(name, symbol(name), unit, factor, paths, axis)
+        ends = number(high / factor), number(low / factor)
+        column = {"name": name, "symbol": symbol(name), "unit": unit, "factor": factor}
+        yield column | {"paths": paths, "ends": ends}
 
 
-def _cell(row: Row, column: Column) -> tuple[str, str, str, str]:
+def _cell(row: Row, column: Mapping[str, Any]) -> tuple[str, str, str, str]:
     """Value, what to sort by, interval and state of a parameter of a test."""
-    found = row.parameters.get(column.name)
+    found = row.parameters.get(column["name"])
     if found is None or found[0] is None:
         return "", "", "", ""
-    value, _, low, high, state, _, *span = found
 
     def shown(*ends: float) -> str:
-        return " to ".join(f"{end / column.factor:.4g}" for end in ends).replace("-", "−")
+        return " to ".join(f"{end / column['factor']:.4g}" for end in ends).replace("-", "−")
 
+    value, _, low, high, state, _, *span = found
     interval = "" if low is None or high is None else shown(low, high)
     interval += f"; range {shown(*span)}" if span else ""
     return shown(value), f"{value:.6g}", interval, state

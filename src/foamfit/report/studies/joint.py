@@ -38,10 +38,10 @@ LEAST_LOOP, LEAST_PANEL, LEAST_TABLE = 1.05, 1.55, 2.1  # in
 MEASURED = "0.65"  # wide and light below what is fitted, which is darker in grey too
 MOST_LOOPS = 48
 MOST_NAMES = 12  # of tests that stand at an axis
-# Largest over smallest rate from which on the tests stand by rate though nothing follows a law of
-# it: the rates of twins under one programme of the machine differ by some percent.
+# Tests are ordered by rate from this ratio of the largest to the smallest rate on, even if no
+# parameter follows a law of rate; rates of nominally equal tests differ by some percent.
 SEVERAL_RATES = 1.5
-# Points of a drawn curve, and the share of the largest range that intervals may run out of.
+# Points of a drawn curve.
 POINTS = 400
 
 
@@ -174,7 +174,7 @@ def _parameter_rows(found: JointData) -> list[list[str]]:
     for name, one in found.parameters.items():
         if one.kind == "fixed" and one.value == 0.0:
             continue
-        # The median of what is of one record alone says nothing.
+        # The median of a parameter of single records means nothing.
         value = "" if name in NUISANCE else in_unit((one.value,), one.unit)
         ends = [in_unit(end or (), one.unit) for end in (one.ci95, one.range)[: 1 + ranged]]
         rows.append([name, one.kind, value, *ends, one.state or "", between(one)])
@@ -182,7 +182,7 @@ def _parameter_rows(found: JointData) -> list[list[str]]:
 
 
 def between(one: JointParameter) -> str:
-    """What a parameter does from test to test."""
+    """How a parameter varies from test to test."""
     if one.kind == "scatter" and one.scatter is not None and one.scatter_ci95 is not None:
         low, high = one.scatter_ci95
         return f"scatters by {percent(one.scatter)} ({percent(low)} to {percent(high)})"
@@ -285,7 +285,7 @@ def _draw_loops(axes: list[Axes], found: JointData, shown: list[int], most: int)
 
 
 def by_rate(found: JointData) -> bool:
-    """Whether the tests stand by rate: something follows a law of it, or there are several."""
+    """Whether tests are ordered by rate: a parameter follows a law of rate, or rates differ."""
     rates = [rate for rate in found.rates if rate]
     if found.rate0 is None or min(rates) == max(rates):
         return False
@@ -295,7 +295,7 @@ def by_rate(found: JointData) -> bool:
 
 
 def _marks(tests: Sequence[str]) -> list[str]:
-    """What the names of the tests differ in where that is short, else their numbers."""
+    """Short labels of the tests: the part in which their names differ, else numbers."""
     ways = (list(tests), [name[::-1] for name in tests])
     before, after = (len(commonprefix(way).rstrip("0123456789")) for way in ways)  # noqa: RUF071
     marks = [name[before : len(name) - after] for name in tests]
@@ -366,7 +366,7 @@ def _list(ax: Axes, found: JointData, names: list[str], *, stacked: bool) -> Non
     for name in names:
         one = found.parameters[name]
         widths = [ends[1] - ends[0] for ends in (one.ci95, one.range) if ends is not None]
-        half = 0.5 * max(widths, default=0.0)  # what its state goes by
+        half = 0.5 * max(widths, default=0.0)  # which decides its state
         error = f"±{percent(half / abs(one.value))}" if half and one.value else ""
         error += f" {one.state or ''}" if one.state != "determined" else ""
         value = in_unit((one.value,), one.unit)

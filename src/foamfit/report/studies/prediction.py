@@ -32,7 +32,7 @@ COLOURS: dict[str, tuple[str, Any]] = {
     "motion": (VERMILION, (0, (1, 1.2))),
     "law_error": (INSIDE[0], (0, (5, 1.2, 1, 1.2))),
 }
-# How what the lines and the band show is drawn.
+# Styles of the lines and of the band.
 LINES: dict[str, dict[str, Any]] = {
     "measured": {"color": MEASURED, "linewidth": 1.4},
     "predicted": {"color": VERMILION, "linewidth": 0.9},
@@ -183,7 +183,7 @@ def _in_time(above: Axes, below: Axes, found: PredictedTest, curve: PredictedCur
 
 
 def _legend(ax: Axes, found: PredictedTest) -> None:
-    """What the lines are, in a panel of their own."""
+    """Explain the lines in a panel of its own."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
