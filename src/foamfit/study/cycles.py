@@ -169,9 +169,8 @@ def spread(numbers: list[int]) -> tuple[int, ...]:
 def _sentences(found: CycleFits, selection: Selection) -> tuple[str, ...]:
     """What the fit of several cycles says.
 
-    A trend is told where the cycles one by one and together agree on it. A description of the
-    cycles hops where a parameter of theirs goes up and down again, or another way than in the fit
-    of all.
+    There is a trend where the single fits and the fit of all cycles agree on it. Descriptions hop
+    where a parameter goes up and down again, or another way than in the fit of all cycles.
     """
     best, sure, hopping, unsure = selection.best, list[str](), list[str](), list[str]()
     for name in found.varied:

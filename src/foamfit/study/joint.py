@@ -164,7 +164,7 @@ def joint(
                 for name in (*fit.found.shared, *fit.found.own)
                 if fit.found.links.kind(name) in RATES or name in auto
             ]
-            tried = _evidence(fit, asked, alone, kinds)
+            tried = joint_fit.evidence(fit.found, asked, alone.n_eff, kinds, [alone.vectors])
             result = _conclude(study, tests, fit, alone, tried, refused)
             result = replace(result, runtime_s=time.perf_counter() - began)
     tell(1.0, "done")
@@ -391,13 +391,6 @@ def _choices(tests: Sequence[_Test]) -> tuple[str, ...]:
     rates = [test.rate for test in tests]
     rated = None not in rates and _several(rates)
     return tuple(kind for kind in KINDS if kind != "scatter" and (rated or kind not in RATES))
-
-
-def _evidence(
-    fit: JointFit, names: Sequence[str], alone: Group, kinds: tuple[str, ...]
-) -> tuple[tuple[joint_fit.Alternative, ...], dict[str, float]]:
-    """Parameters with a law of rate, or of which evidence chose, as other kinds."""
-    return joint_fit.evidence(fit.found, names, alone.n_eff, kinds, [alone.vectors])
 
 
 def _conclude(
