@@ -23,6 +23,7 @@ from foamfit.fitting.branches import branch_of_samples
 from foamfit.fitting.problem import make_problem
 from foamfit.report.page import render_report
 from foamfit.report.summary import summary_text
+from foamfit.springs import laws
 from foamfit.springs.model import Model
 from foamfit.trust import evidence
 from foamfit.trust.best_point import BestPoint
@@ -139,7 +140,7 @@ def test_a_bent_structure_is_found_where_it_is():
     strain = np.concatenate([np.linspace(0, 1, 200), np.linspace(1, 0, 200)])
     switches = np.array([[50, 1, 0, 1, 0], [150, 1, 1, 2, 0], [250, 1, 2, 3, 0]], dtype=float)
     problem = SimpleNamespace(
-        model=SimpleNamespace(kinds=("linear", "bistable")),
+        model=SimpleNamespace(laws=[laws.law("linear"), laws.law("bistable")]),
         objective=SimpleNamespace(time=np.arange(400.0)),
         measurement=SimpleNamespace(stress=strain),
     )

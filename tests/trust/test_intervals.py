@@ -105,7 +105,7 @@ class Bench:
         return np.ones(len(names))
 
     def space(self) -> Any:
-        return SimpleNamespace(complete=lambda values: values)
+        return SimpleNamespace(complete=lambda values: values, admit=lambda values, held: values)
 
     @property
     def linear(self) -> Bench:

@@ -7,7 +7,7 @@ between ends that depend on other parameters; nuisance parameters move between t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -253,6 +253,19 @@ class Space:
         for u, one in zip(point, self.coordinates, strict=True):
             value = self._value(u, one, values)
             values[one.place] = min(max(value, self.low[one.place]), self.high[one.place])
+        return self.complete(values)
+
+    def admit(self, values: Array, held: Collection[int] = ()) -> Array:
+        """Move what is relative to other parameters between its ends, in place, and complete it.
+
+        What stands at the places `held` stays.
+        """
+        for one in self.coordinates:
+            param = one.param
+            if param is not None and param.of and one.place not in held:
+                first, last = self._ends(one, values)
+                ends = [first + u * (last - first) for u in param.limits]
+                values[one.place] = np.clip(values[one.place], min(ends), max(ends))
         return self.complete(values)
 
     def complete(self, values: Array) -> Array:

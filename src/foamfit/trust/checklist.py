@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import chain, groupby
 
 import numpy as np
 
+from foamfit.arrays import Array
 from foamfit.data.energy import EnergyAudit
 from foamfit.data.measurement import ASKED, INTEGRATED
 from foamfit.data.zeros import CONTRADICTED
@@ -17,13 +18,13 @@ from foamfit.errors import InputError
 from foamfit.fitting.branches import covered, visited
 from foamfit.fitting.curves import check_time_shift
 from foamfit.fitting.objective import Objective
+from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import SearchRecord
 from foamfit.results import Check, Intervals, ParameterEstimate
-from foamfit.springs.parameters import NUISANCE, split_name
+from foamfit.springs.parameters import NUISANCE, any_param, split_name
 from foamfit.text import engineering, listed, percent
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.covariance import AT_LIMIT, WEAK
-from foamfit.trust.left_out import damping_hint, shift_hint
+from foamfit.trust.covariance import AT_LIMIT, WEAK, covariance
 from foamfit.trust.sentences import SENTENCES, say
 
 # Misfit over the standard deviation of a curve above which the curve was not fitted at all, and
@@ -36,8 +37,6 @@ STATED, ESTIMATED = 1.1, 1.5
 STRUCTURED = 5.0
 # Most reasons in one warning; more of them are easier to read in the table of parameters.
 REASONS = 3
-# Parameters that may be zero: their interval tells whether there is an effect at all.
-MAY_VANISH = ("dsigma", "kh_plus", "kh_minus", "eta")
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +59,11 @@ class Findings:
     def known(self) -> list[str]:
         """Parameters that have a standard error."""
         return [name for name, item in self.estimates.items() if item.stderr is not None]
+
+
+def may_vanish(name: str) -> bool:
+    """Whether a parameter may be zero: its interval tells whether there is an effect at all."""
+    return name not in NUISANCE and any_param(split_name(name)[1]).has_neutral
 
 
 def status_of(checklist: Iterable[Check]) -> str:
@@ -199,7 +203,7 @@ def _determined(e: Findings) -> Check:
 def _vanishes(e: Findings, name: str) -> bool:
     """Whether a parameter is consistent with zero and its upper bound is small."""
     item = e.estimates[name]
-    if item.state != "weak" or item.ci95 is None or split_name(name)[1] not in MAY_VANISH:
+    if item.state != "weak" or item.ci95 is None or not may_vanish(name):
         return False
     size = float(e.best.problem.sizes((name,), e.best.values)[0])
     ends = (*item.ci95, *(item.range or ()))
@@ -240,7 +244,7 @@ def _of_parameters(e: Findings) -> Iterator[Check]:
         for bound in e.best.limits(name):
             if abs(e.best.values[e.best.index[name]] - bound) > AT_LIMIT * size:
                 continue
-            if bound == 0.0 and split_name(name)[1] in MAY_VANISH:
+            if bound == 0.0 and may_vanish(name):
                 natural.append(f"{name} is zero, which it may be")
             else:
                 stuck.append(f"{name} lies at {bound:g}")
@@ -270,7 +274,7 @@ def _of_what_is_left_out(e: Findings) -> Iterator[Check]:
     if e.objective.drive != "displacement" or not e.best.names:
         yield _check("damping", None)
         return
-    eta = damping_hint(e.best, e.known) or 0.0
+    eta = _damping_hint(e.best, e.known) or 0.0
     yield _check("damping", eta == 0.0, size=engineering(eta, "Pa·s"))
 
 
@@ -288,6 +292,90 @@ def _time_shift(e: Findings) -> Check:
         check_time_shift(test, e.objective.drive)
     except InputError:
         return _check("time_shift", None)
-    late = shift_hint(e.best, e.known) or 0.0
+    late = _shift_hint(e.best, e.known) or 0.0
     told = f"{'late' if late > 0.0 else 'early'} by {engineering(abs(late), 's')}"
     return _check("time_shift", late == 0.0, late=told)
+
+
+# ---------------------------------------------------------------- what was left out
+
+
+def _shift_hint(best: BestPoint, determined: Sequence[str]) -> float | None:
+    """Time (s) by which the motion channel is late, where the test plainly shows it, else None.
+
+    Read off the residuals by one linear step, accepted above a quarter of a sample; where a large
+    shift has spoilt the fit, off the balance of the striker's motion. The test must have both
+    channels in time; see `fitting.curves.check_time_shift`.
+    """
+    objective, there = best.problem.objective, best.simulated
+    gap = float(np.median(np.diff(objective.time)))
+    early, late = (
+        objective.compare(replace(there, curves=objective.shifted(there, side * gap)), best.values)
+        for side in (-0.5, 0.5)
+    )
+    found = _one_step(best, determined, (late - early) / gap, gap)
+    if found is not None and abs(found) > 0.25 * gap:
+        return found
+    return _shift_of_motion(best.problem)
+
+
+def _damping_hint(best: BestPoint, determined: Sequence[str]) -> float | None:
+    """Damping (Pa·s) that a single spring lacks under a driven motion, where it is plain."""
+    problem, name = best.problem, "s1_eta"
+    held = problem.params[name]
+    alone = problem.objective.drive == "displacement" and len(problem.model.kinds) == 1
+    if not alone or problem.measurement.time is None or held.vary or held.value != 0.0:
+        return None
+    column = problem.linear.slopes(best.values, (name,))[:, 0]
+    size = float(problem.sizes((name,), best.values)[0])
+    eta = _one_step(best, determined, column, size)
+    return eta if eta is not None and eta > 0.0 else None
+
+
+def _one_step(
+    best: BestPoint, determined: Sequence[str], column: Array, size: float
+) -> float | None:
+    """Value of a parameter that was left out, by one linear step of it and all determined ones.
+
+    `column` is the slope of the residual by it, `size` its scale. None unless it is more than four
+    standard errors and the step takes a fifth of χ².
+    """
+    problem, residual = best.problem, best.residual
+    jacobian = np.column_stack([best.jacobian[:, [*map(best.names.index, determined)]], column])
+    sizes = np.append(problem.sizes(tuple(determined), best.values), size)
+    move = sizes * np.linalg.lstsq(jacobian * sizes, -residual, rcond=1e-10)[0]
+    left = residual + jacobian @ move
+    if left @ left >= 0.8 * float(residual @ residual):
+        return None
+    spread = covariance(jacobian, left, problem.objective.sizes, sizes)
+    return float(move[-1]) if abs(move[-1]) > 4.0 * spread.stderr[-1] else None
+
+
+def _shift_of_motion(problem: Problem) -> float | None:
+    """Time (s) by which the motion is late, where the striker's balance of motion plainly shows it.
+
+    m w'' = -F: the force, integrated twice, gives the motion but for its scale and its zero.
+    Accepted where a shift of a sample or more halves what is left, down to the noise, or takes nine
+    tenths.
+    """
+    test, striker = problem.measurement, problem.measurement.striker
+    time, stress, motion = test.time, test.stress, test.displacement
+    if problem.objective.drive != "impact" or time is None or stress is None or motion is None:
+        return None
+    assert striker is not None
+    assert striker.velocity is not None
+    dt = np.diff(time, prepend=min(time[0], 0.0))
+    slowed = np.cumsum(dt * (stress - 0.5 * np.diff(stress, prepend=0.0)))
+    braked = np.cumsum(dt * (slowed - 0.5 * np.diff(slowed, prepend=0.0)))
+    shifts = np.linspace(-0.1, 0.1, 401) * float(time[-1])
+    left = []
+    for late in shifts:
+        when = time - late
+        columns = np.column_stack([np.interp(when, time, braked), np.ones(time.size)])
+        free = motion - striker.velocity * when
+        left.append(float(np.linalg.lstsq(columns, free, rcond=None)[1].sum()))
+    best, none = int(np.argmin(left)), left[shifts.size // 2]
+    floor = 4.0 * problem.objective.noise("displacement_time").sigma ** 2 * time.size
+    plain = 0 < best < shifts.size - 1 and left[best] < (0.5 if left[best] < floor else 0.1) * none
+    gap = float(np.median(np.diff(time)))
+    return float(shifts[best]) if plain and abs(shifts[best]) > gap else None

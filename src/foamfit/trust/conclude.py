@@ -22,12 +22,13 @@ from foamfit.fitting.losses import LOSSES
 from foamfit.fitting.objective import MODEL_ERROR, Objective
 from foamfit.fitting.search import SearchRecord
 from foamfit.results import Correlation, Curves, Fit, Intervals, ParameterEstimate, Switch
-from foamfit.springs.parameters import split_name, unit_of
+from foamfit.springs import laws
+from foamfit.springs.parameters import any_param, split_name, unit_of
 from foamfit.text import engineering, listed, percent
 from foamfit.trust import covariance
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.budget import make_budget
-from foamfit.trust.checklist import MAY_VANISH, Findings, make_checklist, status_of, warnings_of
+from foamfit.trust.checklist import Findings, make_checklist, may_vanish, status_of, warnings_of
 from foamfit.trust.identifiability import Insight, look
 from foamfit.trust.residuals.law_error import CurveError
 from foamfit.trust.sentences import say
@@ -173,9 +174,9 @@ def _notes(best: BestPoint) -> Iterator[str]:
 
 def _inner_loops(best: BestPoint) -> Iterator[str]:
     """Say what a partial unloading leaves in the residuals of a law that has no inner loops."""
-    test, kinds = best.problem.measurement, best.problem.model.kinds
-    curve = best.simulated.curves.get("stress_strain")
-    if "bistable" not in kinds or "microscale" in kinds or curve is None:
+    test, curve = best.problem.measurement, best.simulated.curves.get("stress_strain")
+    own = [law for law in best.problem.model.laws if law.hysteretic]
+    if not own or curve is None or any(law.inner_loops for law in own):
         return
     assert test.displacement is not None  # there is a curve along it
     assert test.stress is not None
@@ -190,7 +191,13 @@ def _inner_loops(best: BestPoint) -> Iterator[str]:
     if spans and (total := float(squares.sum())) > 0.0:
         share = float(squares[inside].sum()) / total
         samples, held = percent(float(inside.mean())), percent(share)
-        yield say("note", "loops", spans=listed(spans), samples=samples, squares=held)
+        with_loops = [law for law in map(laws.law, laws.kinds()) if law.inner_loops]
+        none, others = (
+            listed(dict.fromkeys(f"{law.title}s" for law in some)) for some in (own, with_loops)
+        )
+        none = none[0].upper() + none[1:]
+        facts = {"spans": listed(spans), "samples": samples, "squares": held}
+        yield say("note", "loops", none=none, others=others, **facts)
 
 
 def _estimates(
@@ -270,7 +277,7 @@ def state_of(
     what = "95 % interval"
     if span is not None and span[1] - span[0] > ends[1] - ends[0]:
         ends, what = span, "range"
-    size, short = float(insight.sizes[insight.names.index(name)]), split_name(name)[1]
+    size = float(insight.sizes[insight.names.index(name)])
     unit, half = unit_of(name), 0.5 * (ends[1] - ends[0])
     half = half if math.isfinite(half) else math.nan
     of = scale_in_words(name, value, size)
@@ -279,8 +286,9 @@ def state_of(
         reason = why if math.isfinite(half) else say("why", "independent")
         return state, insight.combination(name, covariance.NOTHING / 1.96) or reason
     at_bound = value in limits and value != 0.0
-    if short in MAY_VANISH and ends[0] <= 0.0 <= ends[1] and not at_bound:
-        side, end = ("lower", ends[0]) if limits[1] == 0.0 else ("upper", ends[1])
+    if may_vanish(name) and ends[0] <= 0.0 <= ends[1] and not at_bound:
+        below = any_param(split_name(name)[1]).admissible == "zero or negative"
+        side, end = ("lower", ends[0]) if below else ("upper", ends[1])
         bound = engineering(end, unit).replace("Pa s", "Pa·s").replace("-", "−")
         key, what = "at_zero" if value == 0.0 else "zero", what.removesuffix(" interval")
         return "weak", say("why", key, side=side, bound=bound, what=what)
@@ -322,12 +330,12 @@ def _statistics(best: BestPoint, record: SearchRecord) -> dict[str, float | int 
 def _switches(best: BestPoint) -> tuple[Switch, ...]:
     """Place the switches of the fitted response on its curves."""
     motion, clock = best.simulated.motion, best.problem.objective.time
-    laws, timed = best.problem.model.laws, best.problem.measurement.time is not None
+    own, timed = best.problem.model.laws, best.problem.measurement.time is not None
     return tuple(
         Switch(
             spring=int(spring) + 1,
-            source=laws[int(spring)].named_branch(int(left)),
-            target=laws[int(spring)].named_branch(int(entered)),
+            source=own[int(spring)].named_branch(int(left)),
+            target=own[int(spring)].named_branch(int(entered)),
             time=float(when) if timed else None,
             displacement=float(np.interp(when, clock, motion.displacement[-1])),
             stress=float(np.interp(when, clock, motion.base_stress)),

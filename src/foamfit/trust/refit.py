@@ -10,11 +10,8 @@ from foamfit.arrays import Array
 from foamfit.fitting.levenberg import Iterate, descend
 from foamfit.fitting.losses import soften, softness
 from foamfit.fitting.search import Tracker
-from foamfit.springs.law import least_eps_star
 from foamfit.trust.best_point import BestPoint
 
-# Largest drop of the stress from A1 to C2 over the stress at A1.
-LAST_DROP = 0.999
 # A refit ends where the expected gain of the cost is below this share of the 95 % cut, or after so
 # many steps. Refits that end earlier depend on where they began, and so on rounding.
 ENOUGH, STEPS = 1e-6, 40
@@ -31,16 +28,9 @@ class Refit:
     shift: Array | float = 0.0
 
     def __post_init__(self) -> None:
-        """Find what ties the parameters."""
-        best, index = self.best, self.best.index
-        self.complete = best.problem.space().complete
-        self.drops, self.stars = (
-            [
-                ([index[f"{own}_{other}"] for other in others], index[f"{own}_{short}"])
-                for own in (name.partition("_")[0] for name in best.names if name.endswith(short))
-            ]
-            for short, others in (("dsigma", ("k0", "eps_a")), ("eps_star", ("k0", "kc")))
-        )
+        """Find the box of the parameters and the gain at which a refit ends."""
+        best = self.best
+        self.space = best.problem.space()
         cuts = best.quantiles**2 * best.spread.inflation  # NaN where the test says nothing
         self.enough = ENOUGH * float(min(cuts[np.isfinite(cuts)], default=1.0))
 
@@ -72,12 +62,7 @@ class Refit:
         """Vector of all parameters from the scaled ones, moved between these limits (SI)."""
         point = self.best.values.copy()
         point[self.best.places] = np.clip(scaled * self.best.sizes, *box)
-        for sigma_a, drop in self.drops:  # no spring's stress at C2 falls below zero
-            k0, eps_a = point[sigma_a]
-            point[drop] = max(point[drop], -LAST_DROP * k0 * eps_a / (1.0 - eps_a))
-        for stiffnesses, star in self.stars:  # branch c never lies before branch a
-            point[star] = max(point[star], least_eps_star(*point[stiffnesses]))
-        return self.complete(point)
+        return self.space.admit(point, self.best.places[box[0] == box[1]])
 
     def moved(self, at: Array, step: Array) -> Array:
         """Point that is off another by a scaled step, within the limits."""

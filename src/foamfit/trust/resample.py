@@ -160,7 +160,7 @@ def mcmc(best: BestPoint, steps: int, seed: int, tracker: Tracker | None = None)
         point = best.values.copy()
         own = point[best.places] = scaled * best.sizes
         inside = np.all((own >= low) & (own <= high))
-        residual = refit.residual(refit.complete(point)) if inside else None
+        residual = refit.residual(refit.space.complete(point)) if inside else None
         return -0.5 * float(weights @ residual**2) if residual is not None else -np.inf
 
     count, k = walkers(best), len(best.names)
