@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.arrays import Array
-from foamfit.data.contact import smooth
 from foamfit.data.measurement import Record
-from foamfit.data.noise import noise_level
+from foamfit.data.noise import noise_level, smooth
 from foamfit.errors import InputError
 from foamfit.text import engineering, percent
 

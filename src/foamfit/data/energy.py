@@ -11,9 +11,8 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.data.contact import line_at
 from foamfit.data.measurement import INTEGRATED, Measurement, Striker
-from foamfit.data.noise import noise_level
+from foamfit.data.noise import line_at, noise_level
 from foamfit.text import engineering, percent
 
 

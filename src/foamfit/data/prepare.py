@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.data.contact import Start, leave_rest, smooth, start_of_impact, start_of_slow_test
+from foamfit.data.contact import Start, leave_rest, start_of_impact, start_of_slow_test
 from foamfit.data.cycles import (
     choose_cycle,
     cut_to_cycle,
@@ -43,7 +43,7 @@ from foamfit.data.measurement import (
     Window,
     interior_channel,
 )
-from foamfit.data.noise import averaged, estimated_noise, noise_before_contact, noise_level
+from foamfit.data.noise import averaged, estimated_noise, noise_before_contact, noise_level, smooth
 from foamfit.data.outliers import (
     bridge_outliers,
     fill_staircase,

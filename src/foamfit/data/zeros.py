@@ -7,17 +7,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.data.contact import (
-    ELSEWHERE,
-    Level,
-    Levels,
-    Start,
-    level_on_line,
-    mean_level,
-    smooth,
-)
+from foamfit.data.contact import ELSEWHERE, Levels, Start
 from foamfit.data.measurement import NoiseLevel, Record, Striker
-from foamfit.data.noise import MIN_REST
+from foamfit.data.noise import MIN_REST, Level, level_on_line, mean_level, smooth
 from foamfit.text import engineering, percent
 
 _LEAST_LEAD, _FEWEST = 8, 3  # rows kept before contact; rows that show a zero
@@ -138,7 +130,9 @@ def take_zeros(
                     f"{name} stands."
                 )
         else:
-            zero, source = _zero_of_motion(name, first, start, n, noise)
+            zero, source = start.zero, start.zero_from
+            if impact or name != "displacement":
+                zero, source = _zero_of_motion(name, first, start, n, noise)
             if name == "displacement" and start.gauge == "rest" and n >= _FEWEST:
                 done.errors[name] = zero.error
             size = engineering(zero.value, "m")
@@ -188,8 +182,6 @@ def _zero_of_motion(
     time, values, first = record.instants, record.channel(name), start.first
     assert values is not None  # asked for by its name
     top = name == "displacement"
-    if top and start.zero is not None:
-        return start.zero, start.zero_from
     rows = n if n >= _FEWEST else max(0, first - 2)
     if rows >= _FEWEST and (not top or start.gauge == "rest"):
         zero = mean_level(values[:rows], noise)
