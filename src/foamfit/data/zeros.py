@@ -9,7 +9,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.data.contact import ELSEWHERE, Levels, Start
 from foamfit.data.measurement import NoiseLevel, Record, Striker
-from foamfit.data.noise import MIN_REST, Level, level_on_line, mean_level, smooth
+from foamfit.data.noise import MIN_REST, NOTHING, Level, level_on_line, mean_level, smooth
 from foamfit.text import engineering, percent
 
 _LEAST_LEAD, _FEWEST = 8, 3  # rows kept before contact; rows that show a zero
@@ -111,7 +111,7 @@ def take_zeros(
     for name, values in first.curves("acceleration").items():
         if name in record.derived:
             continue
-        noise, zero = levels[name], Level(0.0, 0.0, 0)
+        noise, zero = levels[name], NOTHING
         if name in ("stress", "acceleration"):
             tail = tail_level(values, noise) if impact and n < _FEW else None
             if tail is not None and tail.samples > n:
@@ -130,9 +130,7 @@ def take_zeros(
                     f"{name} stands."
                 )
         else:
-            zero, source = start.zero, start.zero_from
-            if impact or name != "displacement":
-                zero, source = _zero_of_motion(name, first, start, n, noise)
+            zero, source = _zero_of_motion(name, first, start, n, noise, impact=impact)
             if name == "displacement" and start.gauge == "rest" and n >= _FEWEST:
                 done.errors[name] = zero.error
             size = engineering(zero.value, "m")
@@ -173,11 +171,12 @@ def _zero_at_rest(name: str, values: Array, n: int, noise: NoiseLevel, notes: li
 
 
 def _zero_of_motion(
-    name: str, record: Record, start: Start, n: int, noise: NoiseLevel
+    name: str, record: Record, start: Start, n: int, noise: NoiseLevel, *, impact: bool
 ) -> tuple[Level, str]:
     """Value of a motion at contact: the mean of its rest, or else that of a line there.
 
-    Where nothing was recorded before contact, the file's zero stands unless it lies elsewhere.
+    Where nothing was recorded before contact, the file's zero stands unless it lies elsewhere; a
+    slow test whose record starts under load has its own zero, too.
     """
     time, values, first = record.instants, record.channel(name), start.first
     assert values is not None  # asked for by its name
@@ -191,8 +190,11 @@ def _zero_of_motion(
     near = slice(max(0, first - reach) if flies else first, first + reach)
     zero = level_on_line(time[near], values[near], start.time, noise)[0]
     source = zero.source(noise, "line through") + (" around it" if flies else " from there on")
-    least = max(ELSEWHERE * zero.error, (0.1 if top else 2e-3) * float(np.ptp(values)))
-    return (zero if flies or abs(zero.value) > least else Level(0.0, 0.0, 0)), source
+    size, stress = float(np.ptp(values)), record.stress
+    loaded = not impact and stress[:3].mean() > 0.05 * stress.max() and 0.0 < zero.value < size
+    least = max(ELSEWHERE * zero.error, ((0.1 if impact else 0.02) if top else 2e-3) * size)
+    own = not flies and (loaded or abs(zero.value) <= least)
+    return NOTHING if own else zero, source
 
 
 def mark_flight(record: Record, start: Start, span: Span) -> Record:
