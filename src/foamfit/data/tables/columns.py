@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from foamfit.data.csv_table import Table, read_numbers
-from foamfit.data.headers import CHANNELS, WEAK, WEIGHTS, Header, channel_of, example, in_si
 from foamfit.data.measurement import Striker, interior_channel, interior_node
+from foamfit.data.tables.csv_table import Table, read_numbers
+from foamfit.data.tables.headers import CHANNELS, WEAK, WEIGHTS, channel_of, example, in_si
 from foamfit.data.toml_file import Column, Settings
 from foamfit.data.units import is_unit
 from foamfit.errors import InputError
@@ -26,7 +26,11 @@ def assign_columns(table: Table, given: dict[str, Column], toml: Path | None) ->
     """Which column each channel is in: as [columns] of the TOML says, else as the headers do."""
     found: dict[str, int] = {}
     strained = "strain" in given or any(h.rank("strain") is not None for h in table.headers)
-    for channel in _channels(table, given):
+    # The usual channels, then the masses inside that are named, those of the TOML first.
+    numbers = {int(w) for h in table.headers for w in h.words if w.isdecimal()}
+    inside = {c for c in (*map(interior_channel, numbers), *given) if interior_node(c)}
+    inside_first = sorted(inside, key=lambda c: (c not in given, interior_node(c) or 0))
+    for channel in [*CHANNELS, *inside_first]:
         if channel in given:
             found[channel] = _place(table, channel, given[channel].column, toml)
             continue
@@ -53,21 +57,21 @@ def assign_columns(table: Table, given: dict[str, Column], toml: Path | None) ->
         if named in given and twin not in given:
             found.pop(twin, None)
     # A true stress needs the cross-section that no file has.
-    stress = found.get("stress")
-    if "stress" not in given and "force" in found and stress is not None:
-        true = table.headers[stress].measure("stress")
-        found = {c: k for c, k in found.items() if c != "stress" or not true}
+    true = "stress" in found and table.headers[found["stress"]].measure("stress")
+    if true and "stress" not in given and "force" in found:
+        del found["stress"]
     return found
 
 
 def _place(table: Table, channel: str, column: str | int, toml: Path | None) -> int:
     """Place of a column that the TOML gives by its header or its number."""
-    count = len(table.headers)
+    where, count = f"{toml}: [columns] {channel}: column", len(table.headers)
     if isinstance(column, int):
-        if column > count:
-            wrong = f"column {column} is not in {table.path.name}, which has {count} columns"
-            raise InputError(f"{toml}: [columns] {channel}: {wrong}.")
-        return column - 1
+        if column <= count:
+            return column - 1
+        raise InputError(
+            f"{where} {column} is not in {table.path.name}, which has {count} columns."
+        )
     places = [k for k, h in enumerate(table.headers) if h.is_named(column)]
     if len(places) == 1:
         return places[0]
@@ -75,7 +79,7 @@ def _place(table: Table, channel: str, column: str | int, toml: Path | None) -> 
     if places:
         numbers = " or ".join(str(k + 1) for k in places)
         more = f"twice in {table.path.name}; give its number, column = {numbers}"
-    raise InputError(f"{toml}: [columns] {channel}: column {column!r} is {more}.")
+    raise InputError(f"{where} {column!r} is {more}.")
 
 
 def quoted(table: Table, k: int) -> str:
@@ -83,13 +87,6 @@ def quoted(table: Table, k: int) -> str:
     text = table.headers[k].text
     alone = table.header_row and [h.text for h in table.headers].count(text) == 1
     return json.dumps(text, ensure_ascii=False) if alone else str(k + 1)
-
-
-def _channels(table: Table, given: dict[str, Column]) -> list[str]:
-    """List the channels to look for: the usual ones, then the masses inside that are named."""
-    numbers = {int(w) for h in table.headers for w in h.words if w.isdecimal()}
-    inside = {c for c in (*map(interior_channel, numbers), *given) if interior_node(c)}
-    return [*CHANNELS, *sorted(inside, key=lambda c: (c not in given, interior_node(c) or 0))]
 
 
 def _clear_time(table: Table, columns: list[int]) -> list[int]:
@@ -105,7 +102,7 @@ def _clear_time(table: Table, columns: list[int]) -> list[int]:
 
 def si_factor(table: Table, channel: str, k: int, given: Column | None) -> float:
     """Return what the numbers of column `k` are multiplied by to be SI."""
-    header = table.headers[k]
+    header, given = table.headers[k], given or _NONE
     if channel == "cycle":  # counted; pint takes "Cycles" in a header for a unit of angle
         return 1.0
     right, where = example(channel), f"{table.path}: column {table.name(k)}"
@@ -114,7 +111,6 @@ def si_factor(table: Table, channel: str, k: int, given: Column | None) -> float
             f"{where} is a {header.measure(channel)} stress, which needs the cross-section of each "
             "instant; give the force or the nominal (engineering) stress."
         )
-    given = given or _NONE
     unit = given.unit if given.unit is not None else header.unit
     over = header.text.partition("/")[2].strip()  # Weg/mm, which only the TOML calls displacement
     if unit is None and over and in_si(channel, over, given.scale_unit) is not None:
@@ -132,13 +128,19 @@ def si_factor(table: Table, channel: str, k: int, given: Column | None) -> float
     unit = unit or ""
     if not is_unit(unit, any_case=True):
         raise InputError(f"{where} has an unknown unit {unit!r}; write it like '{right}'.")
-    if given.unit is not None:
-        _check_unit(channel, header, given.unit, where)
-    one = in_si(channel, unit, given.scale_unit)
-    if is_sensitivity(channel, unit, given):
-        one = in_si(channel, unit, f"1/({given.scale_unit})")
-        assert one is not None
-        one /= given.scale**2
+    own = header.unit
+    if given.unit is not None and own is not None and is_unit(own, any_case=True):
+        stated, there = in_si(channel, given.unit), in_si(channel, own)
+        # The last word of a name may only look like a unit.
+        bracketed = there is not None or header.text.endswith((")", "]", "}"))
+        other = stated is None and given.unit.casefold() != own.casefold()
+        if bracketed and (stated != there or other):
+            raise InputError(
+                f"{where} has the unit {own!r} in its header, but [columns] {channel} says "
+                f"{given.unit!r}; leave unit out, or, if the header is wrong, correct it by scale."
+            )
+    one, inverse = in_si(channel, unit, given.scale_unit), _inverse(channel, unit, given)
+    one = inverse / given.scale**2 if inverse is not None else one
     if one is None:
         raise InputError(
             f"{where} cannot be read as {channel}: its unit {unit!r} is of another kind; "
@@ -147,35 +149,18 @@ def si_factor(table: Table, channel: str, k: int, given: Column | None) -> float
     return given.scale * one * (-1.0 if given.counts_down else 1.0)
 
 
-def is_sensitivity(channel: str, unit: str, given: Column) -> bool:
-    """Whether a scale is that of a sensor, "4 mV/N", by which its reading is divided."""
-    return (
-        in_si(channel, unit, given.scale_unit) is None
-        and bool(given.scale_unit)
-        and (in_si(channel, unit, f"1/({given.scale_unit})") is not None)
-    )
-
-
-def _check_unit(channel: str, header: Header, given: str, where: str) -> None:
-    """Refuse a unit in [columns] that contradicts the one in the header."""
-    own = header.unit
-    if own is None or not is_unit(own, any_case=True):
-        return
-    stated, there = in_si(channel, given), in_si(channel, own)
-    if there is None and not header.text.endswith((")", "]", "}")):
-        return  # the last word of a name only looks like a unit
-    if stated != there or (stated is None and given.casefold() != own.casefold()):
-        raise InputError(
-            f"{where} has the unit {own!r} in its header, but [columns] {channel} says {given!r}; "
-            "leave unit out, or, if the header is wrong, correct it by scale."
-        )
+def _inverse(channel: str, unit: str, given: Column) -> float | None:
+    """SI value of a unit over that of a scale which is a sensor's sensitivity, as "4 mV/N"."""
+    if not given.scale_unit or in_si(channel, unit, given.scale_unit) is not None:
+        return None
+    return in_si(channel, unit, f"1/({given.scale_unit})")
 
 
 def needed_columns(table: Table, columns: dict[str, int], settings: Settings) -> dict[str, int]:
     """Choose the channels worth reading; refuse a file that lacks one that nothing can replace."""
-    has, striker = set(columns), settings.striker or Striker()
-    forced = bool(has & {"stress", "force"})
-    braked = bool(has & {"acceleration", "velocity"} or (has & set(_MOTIONS) and striker.velocity))
+    has, striker, motion = set(columns), settings.striker or Striker(), settings.motion
+    forced, moved = bool(has & {"stress", "force"}), bool(has & set(_MOTIONS))
+    braked = bool(has & {"acceleration", "velocity"} or (moved and striker.velocity))
     if not forced and not ("time" in has and braked and striker.mass):
         entries = entries_of(table, has, "force", "displacement", "time")
         raise InputError(
@@ -184,11 +169,20 @@ def needed_columns(table: Table, columns: dict[str, int], settings: Settings) ->
             "with a time and the [striker] mass an acceleration or a velocity will do, and with "
             "its velocity a displacement."
         )
-    helping = {"velocity"} if has & {"acceleration", *_MOTIONS} else set[str]()
+    own = [c for c in columns if c in _MOTIONS or interior_node(c)]
+    if motion is not None and own:
+        raise InputError(
+            f"{table.path}: column {table.headers[columns[own[0]]].text!r} is a {own[0]}, but "
+            f"[motion] file = {motion.file.name!r} has the motion; leave one of them out."
+        )
+    if motion is not None and "time" not in columns:
+        raise InputError(
+            f"{table.path}: no column is a time (there are {table.listed}); with [motion] it needs "
+            "one like 'time (ms)'."
+        )
+    helping = {"velocity"} if moved or "acceleration" in has else set[str]()
     helping = {"velocity", "acceleration"} if forced else helping
-    if settings.motion is not None:
-        _check_motion(table, columns, settings.motion.file)
-    if has & set(_MOTIONS) or settings.motion is not None:
+    if moved or motion is not None:
         return {c: k for c, k in columns.items() if c not in helping}
     for channel in has & helping - set(settings.columns):
         try:  # these only help, so one whose unit does not say what it is can be left
@@ -206,16 +200,30 @@ def needed_columns(table: Table, columns: dict[str, int], settings: Settings) ->
     return {c: k for c, k in columns.items() if c in has}
 
 
+def motion_columns(table: Table, columns: dict[str, int]) -> dict[str, int]:
+    """Choose time and displacements of a file of [motion]; refuse one that lacks them."""
+    needed = {c: k for c, k in columns.items() if c in ("time", *_MOTIONS) or interior_node(c)}
+    for wanted, names in (("time", ["time"]), ("displacement", _MOTIONS)):
+        if not needed.keys() & set(names):
+            raise InputError(
+                f"{table.path}: no column is a {' or a '.join(names)} (there are {table.listed}); "
+                f"name one like '{example(wanted)}', or write {wanted} = "
+                f'{{ column = "…", unit = "{CHANNELS[wanted].unit}" }} in [columns].'
+            )
+    return needed
+
+
 def entries_of(table: Table, has: set[str], *channels: str) -> str:
     """Entries of [columns] for channels that the file seems to lack, by units of its headers."""
     entries = []
+    unnamed = [
+        k
+        for k, header in enumerate(table.headers)
+        if header.unit and all(header.rank(channel) is None for channel in CHANNELS)
+    ]
     for channel in channels:
-        fits = (
-            k for k, header in enumerate(table.headers)
-            if header.unit and in_si(channel, header.unit) is not None
-            and all(header.rank(other) is None for other in CHANNELS)
-        )  # fmt: skip
-        k = next(fits, None)
+        units = ((k, table.headers[k].unit or "") for k in unnamed)
+        k = next((k for k, unit in units if in_si(channel, unit) is not None), None)
         column = '"…"' if k is None else quoted(table, k)
         unit = f', unit = "{channel_of(channel).unit}"' if k is None else ""
         entries += [f"{channel} = {{ column = {column}{unit} }}"] if channel not in has else []
@@ -227,11 +235,8 @@ def left_out(table: Table, needed: dict[str, int]) -> dict[str, int]:
     found: dict[str, int] = {}
     for channel in (c for c in needed if c in {"time", *TWINS}):
         twin = TWINS.get(channel, channel)
-        ranks = {
-            k: rank
-            for k, header in enumerate(table.headers)
-            if k not in needed.values() and (rank := header.rank(twin)) is not None
-        }
+        headers = ((k, h.rank(twin)) for k, h in enumerate(table.headers))
+        ranks = {k: r for k, r in headers if r is not None and k not in needed.values()}
         if ranks and (twin not in needed or channel == "time"):
             found[twin] = min(ranks, key=lambda k: ranks[k])
     return found
@@ -247,48 +252,19 @@ def scale_spreads(columns: dict[str, int], given: dict[str, Column]) -> dict[str
     return {name: spread for name, spread in spreads.items() if spread}
 
 
-def _check_motion(table: Table, columns: dict[str, int], file: Path) -> None:
-    """Refuse a test with [motion] that has a displacement of its own, or no time."""
-    own = [c for c in columns if c in _MOTIONS or interior_node(c)]
-    if own:
-        raise InputError(
-            f"{table.path}: column {table.headers[columns[own[0]]].text!r} is a {own[0]}, but "
-            f"[motion] file = {file.name!r} has the motion; leave one of them out."
-        )
-    if "time" not in columns:
-        raise InputError(
-            f"{table.path}: no column is a time (there are {table.listed}); with [motion] it needs "
-            "one like 'time (ms)'."
-        )
-
-
-def motion_columns(table: Table, columns: dict[str, int]) -> dict[str, int]:
-    """Choose time and displacements of a file of [motion]; refuse one that lacks them."""
-    needed = {c: k for c, k in columns.items() if c in ("time", *_MOTIONS) or interior_node(c)}
-    for wanted, names in (("time", ["time"]), ("displacement", _MOTIONS)):
-        if not needed.keys() & set(names):
-            raise InputError(
-                f"{table.path}: no column is a {' or a '.join(names)} (there are {table.listed}); "
-                f"name one like '{example(wanted)}', or write {wanted} = "
-                f'{{ column = "…", unit = "{CHANNELS[wanted].unit}" }} in [columns].'
-            )
-    return needed
-
-
 def read_note(table: Table, needed: dict[str, int], columns: dict[str, Column]) -> str:
     """Say what is read from which column, and which columns are not used."""
     parts = []
     for channel, k in needed.items():
         given, header = columns.get(channel, _NONE), table.headers[k]
-        by = f"{given.scale:.6g} {given.scale_unit}".strip()
-        own = (given.unit or header.unit or "").casefold()
-        part = f"{channel} from {table.name(k)}" + (f" in {given.unit}" if given.unit else "")
+        by, unit = f"{given.scale:.6g} {given.scale_unit}".strip(), given.unit or header.unit or ""
         by += f" ± {percent(given.spread)}" if given.spread else ""
-        inverse = is_sensitivity(channel, given.unit or header.unit or "", given)
-        part += f" {'over the sensitivity' if inverse else 'times'} {by}" if by != "1" else ""
+        over = _inverse(channel, unit, given) is not None
+        part = f"{channel} from {table.name(k)}" + (f" in {given.unit}" if given.unit else "")
+        part += f" {'over the sensitivity' if over else 'times'} {by}" if by != "1" else ""
         part += ", counting down" if given.counts_down else ""
-        if channel == "force" and own in WEIGHTS:
-            part += f" ({WEIGHTS[own]}: the weight of that mass)"
+        if channel == "force" and unit.casefold() in WEIGHTS:
+            part += f" ({WEIGHTS[unit.casefold()]}: the weight of that mass)"
         parts.append(part)
     used = needed.values()
     rest = [repr(h.text) for k, h in enumerate(table.headers) if h.text and k not in used]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from foamfit.data.columns import assign_columns, entries_of, quoted, si_factor
-from foamfit.data.csv_table import Text, find_table
-from foamfit.data.headers import CHANNELS, channel_of
+from foamfit.data.tables.columns import assign_columns, entries_of, quoted, si_factor
+from foamfit.data.tables.csv_table import Text, find_table
+from foamfit.data.tables.headers import CHANNELS, channel_of
 from foamfit.data.toml_file import LONGEST, toml_beside
 from foamfit.errors import InputError
 from foamfit.terminal import printable
