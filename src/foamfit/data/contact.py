@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.data.measurement import NoiseLevel, Record, Striker
-from foamfit.data.noise import MIN_REST, level_on_line, line_at
+from foamfit.data.measurement import NoiseLevel, Record
+from foamfit.data.noise import MIN_REST, level_on_line
 
 # A signal rests where its slope is less than this share of the slope that follows: the branches of
 # a foam differ less on loading (6 times in the published sets), so that a soft start is no rest.
@@ -17,6 +17,7 @@ from foamfit.data.noise import MIN_REST, level_on_line, line_at
 STILL, _STILL_IMPACT, STILL_MOTION = 0.15, 0.3, 0.5
 # A machine that travels farther than this share without a stress has not yet reached the specimen.
 _APPROACH = 0.02
+_BRAKED = 0.02  # share of the peak of a derived stress at which contact starts
 # Shares of the peak up to which a rise is taken for straight: the least that is so many standard
 # deviations of the noise, or else the largest.
 _SHARES, _CLEAR, _LARGEST = (0.025, 0.05, 0.1, 0.2), 8.0, 0.5
@@ -29,8 +30,8 @@ Levels = dict[str, NoiseLevel]
 class Start:
     """Where contact starts: at a `time` of the file, s, at or before its sample `first`.
 
-    `error` is the standard error of that time. `by` is the channel that shows it: "stress",
-    "motion", or "file" where nothing was recorded from before contact; `how` says it in words. With
+    `error` is the standard error of that time; `how` says in words what shows it, `by` which
+    channel: "stress", "motion", or "file" where nothing was recorded from before contact. With
     `free` nothing pressed on the specimen before. `gauge` says what the motion was before contact:
     "rest", "flight" (at the velocity that it goes on with), "other", or "" where it is not shown.
     """
@@ -51,23 +52,22 @@ class Kink(NamedTuple):
     error: float
 
 
-def _kink(time: Array, values: Array, noise: NoiseLevel, power: int) -> Kink | None:
-    """Time from which a signal rises as (t − t0)^power above what was before.
+def _kink(time: Array, values: Array, noise: NoiseLevel) -> Kink | None:
+    """Time from which a signal rises as a straight line above the level before.
 
-    That was a level for the power 1, else a line. Least squares on a grid of times, then on a finer
-    one. None if a rise from the first sample does about as well.
+    Least squares on a grid of times, then on a finer one. None if a rise from the first sample does
+    about as well.
     """
     block = 1 + len(time) // 500  # their means show it as well
     rows = len(time) // block
     if rows < 6:
         return None
     t, y = (x[-rows * block :].reshape(rows, block).mean(axis=1) for x in (time, values))
-    rest = np.linalg.qr(np.vander(t - t.mean(), 1 if power == 1 else 2))[0]
-    y = y - rest @ (rest.T @ y)
+    y = y - y.mean()
 
     def misfit(starts: Array) -> Array:
-        ramps = np.maximum(0.0, (t - starts[:, None]) / (t[-1] - t[0])) ** power
-        ramps -= (ramps @ rest) @ rest.T
+        ramps = np.maximum(0.0, (t - starts[:, None]) / (t[-1] - t[0]))
+        ramps -= ramps.mean(axis=1, keepdims=True)
         size = np.maximum(np.sum(ramps**2, axis=1), 1e-300)
         return np.asarray(y @ y - np.maximum(ramps @ y, 0.0) ** 2 / size)
 
@@ -100,13 +100,13 @@ def _reached(values: Array, share: float) -> tuple[int, int]:
     return high, 1 + int(np.argmin(level[high::-1] > share / 3.0))
 
 
-def _onset(time: Array, values: Array, noise: NoiseLevel, power: int = 1) -> Kink | None:
+def _onset(time: Array, values: Array, noise: NoiseLevel) -> Kink | None:
     """Where a signal starts to rise, by the least part of its rise that stands out of its noise."""
     clear, size = _CLEAR * noise.sigma, float(np.ptp(values[: int(np.argmax(values)) + 1]))
     for share in [s for s in _SHARES if s * size >= clear] or [_LARGEST] * bool(size >= clear):
         high, lasts = _reached(values, share)
         part = slice(max(0, high - 4 * max(lasts, 3) - 8), high + 1)
-        if found := _kink(time[part], values[part], noise, power):
+        if found := _kink(time[part], values[part], noise):
             return found
     return None
 
@@ -137,23 +137,6 @@ def leave_rest(
     return None
 
 
-def _leave_flight(time: Array, w: Array, noise: NoiseLevel) -> Kink | None:
-    """Where a striker's motion, up to its peak, leaves the straight line that it shows before.
-
-    With a stress that rises steadily the distance from the line grows as the cube of time.
-    """
-    found = _kink(time, -w, noise, 3)
-    n = int(np.searchsorted(time, found.time)) if found else 0
-    if found is None or n < 8:
-        return None
-    t = time - found.time
-    (bend, *_), variance = np.polyfit(t[:n], w[:n], 2, cov="unscaled")
-    error = noise.sigma * float(np.sqrt(noise.time * variance[0, 0]))
-    off = np.polyval(np.polyfit(t[:n], w[:n], 1), t) - w
-    straight = abs(bend) + _ERRORS * error < 0.5 * off[-1] / t[-1] ** 2
-    return (_onset(time, off, noise, 3) or found) if straight else None
-
-
 def _at_kink(channel: str, time: Array, at: Kink, by: str, what: str = "rest") -> Start:
     how = f"where the {channel} leaves its {what}"
     return Start(how, at.time, int(np.searchsorted(time, at.time)), at.error, by, True)
@@ -162,7 +145,7 @@ def _at_kink(channel: str, time: Array, at: Kink, by: str, what: str = "rest") -
 def _first_motion(time: Array, w: Array, noise: NoiseLevel) -> tuple[float, bool]:
     """First value of a motion, by a line through its early rise, and whether its zero is elsewhere.
 
-    So few samples as five before the peak show no zero.
+    Fewer than five samples before the peak show no zero.
     """
     top = int(np.argmax(w))
     early = slice(0, max(5, top // 12))
@@ -171,17 +154,18 @@ def _first_motion(time: Array, w: Array, noise: NoiseLevel) -> tuple[float, bool
     return first.value, top >= 5 and abs(first.value) > least
 
 
-def start_of_impact(record: Record, levels: Levels, striker: Striker) -> Start:
+def start_of_impact(record: Record, levels: Levels) -> Start:
     """Estimate where an impact starts: where the stress or the motion leaves its rest.
 
-    A motion that is followed in flight alone leaves its straight line. If none does, the first part
+    A motion that is followed in flight alone is braked from there. If none does, the first part
     of the rise is extrapolated back to zero, by a few samples at most; a file whose first sample is
     a step or so after its time zero has that right.
     """
     time, stress, w = record.instants, record.stress, record.displacement
-    drift, at = 0.01, None
+    drift, at, elsewhere = 0.01, None, False
     if w is not None:  # where the motion starts at its zero, no stress that rises is at rest
-        drift = np.inf if _first_motion(time, w, levels["displacement"])[1] else 0.002
+        elsewhere = _first_motion(time, w, levels["displacement"])[1]
+        drift = np.inf if elsewhere else 0.002
     if "stress" not in record.derived:
         least = drift * float(np.ptp(stress))
         at = leave_rest(time, stress, levels["stress"], _STILL_IMPACT, least)
@@ -194,43 +178,32 @@ def start_of_impact(record: Record, levels: Levels, striker: Striker) -> Start:
         alike = abs(at.time - start.time) < 0.1 * (time[up][-1] - start.time)
         if not start.free or (at.error < start.error and alike):
             start = _at_kink("displacement", time, at, "motion")
-    elif "stress" in record.derived and (at := _leave_flight(time[up], w[up], noise)):
-        start = _at_kink("displacement", time, at, "motion", "line")
-    return replace(start, gauge=_gauge(record, start, noise, striker)) if start.free else start
+    elif "stress" in record.derived and elsewhere:  # it brakes a motion followed in flight
+        below = np.flatnonzero(stress[: int(np.argmax(stress))] < _BRAKED * stress.max())
+        last = int(below[-1]) if below.size else 0
+        at = Kink(float(time[last]), _BRAKED * float(np.ptp(time)))
+        start = _at_kink("displacement", time, at, "motion", "line") if last else start
+    return start
 
 
-def _first_time(time: Array) -> float:
-    """Time zero of a file that starts in contact: its own if that is two steps before at most."""
-    return 0.0 if 0 <= time[0] <= 2 * (time[1] - time[0]) else float(time[0])
-
-
-def _first_sample(record: Record, levels: Levels) -> Start:
-    """Start of a record that begins in contact or at it."""
-    time, stress = record.instants, record.stress
-    first, step, top = _first_time(time), float(time[1] - time[0]), int(np.argmax(stress))
-    early = slice(0, max(5, _reached(stress, 0.2)[0]))
-    level, slope = level_on_line(time[early], stress[early], time[0], levels["stress"])
-    back = level.value / slope.value if slope.value > 0 else 0.0
-    most = max(8 * step, 0.15 * float(time[top] - time[0]))
-    if first == time[0] != 0 and level.value > _ERRORS * level.error and back < most:
-        return Start("before the first sample, where the rise leads back to zero", first - back, 0)
+def _at_first(time: Array) -> Start:
+    """Start of a file that starts in contact: its time zero if that is two steps before at most."""
+    first = 0.0 if 0 <= time[0] <= 2 * (time[1] - time[0]) else float(time[0])
     return Start("at the first sample", first, 0)
 
 
-def _gauge(record: Record, start: Start, noise: NoiseLevel, striker: Striker) -> str:
-    """Say what the motion was before contact: "rest", "flight", or "other"."""
-    time, w, before = record.instants, record.displacement, start.first - 2
-    assert w is not None
-    if before < 3:
-        return "other" if start.first else ""
-    top = int(np.argmax(w))
-    early = slice(start.first, start.first + max(5, (top - start.first) // 6))
-    speed = striker.velocity or line_at(time[early], w[early], start.time)[1]
-    slope = level_on_line(time[:before], w[:before], start.time, noise)[1]
-    for gauge, expected in (("flight", speed), ("rest", 0.0)):
-        if abs(slope.value - expected) <= slope.error + 0.05 * speed:
-            return gauge if slope.error < 0.2 * speed else "other"
-    return "other"
+def _first_sample(record: Record, levels: Levels) -> Start:
+    """Start of an impact whose record begins in contact or at it."""
+    time, stress, start = record.instants, record.stress, _at_first(record.instants)
+    early = slice(0, max(5, _reached(stress, 0.2)[0]))
+    level, slope = level_on_line(time[early], stress[early], time[0], levels["stress"])
+    back = level.value / slope.value if slope.value > 0 else 0.0
+    most = max(8 * (time[1] - time[0]), 0.15 * (time[np.argmax(stress)] - time[0]))
+    near = start.time == time[0] != 0 and back < most
+    if not near or level.value <= _ERRORS * level.error:
+        return start
+    how = "before the first sample, where the rise leads back to zero"
+    return Start(how, start.time - back, 0)
 
 
 def start_of_slow_test(record: Record, levels: Levels) -> Start:
@@ -244,9 +217,8 @@ def start_of_slow_test(record: Record, levels: Levels) -> Start:
         first, elsewhere = _first_motion(time, w, levels["displacement"])
     at = leave_rest(time, stress, levels["stress"], drift=np.inf if elsewhere else 0.01 * peak)
     start = _at_kink("stress", time, at, "stress") if at else None
-    at_first = Start("at the first sample", _first_time(time), 0)
     if w is None:
-        return start or at_first
+        return start or _at_first(time)
     top, onset = int(np.argmax(w)), start.first if start else 0
     if start and float(w[onset]) - first > _APPROACH * float(w[top] - w[onset]):
         return replace(start, gauge="flight")
@@ -256,4 +228,4 @@ def start_of_slow_test(record: Record, levels: Levels) -> Start:
     if elsewhere and first < 0.0 < w[top] and stress[crossing] < 0.2 * peak:
         how = "where the displacement passes zero"
         return Start(how, float(time[crossing]), crossing, by="motion", gauge="other")
-    return at_first
+    return _at_first(time)

@@ -98,7 +98,8 @@ def condition(
     curves = first.curves("acceleration")
     levels = {c: held[c] if c in held else estimated_noise(v) for c, v in curves.items()}
     if impact:
-        start = start_of_impact(first, levels, known)
+        start = start_of_impact(first, levels)
+        start = replace(start, gauge=zeros.gauge_before(first, start, levels, known))
         span = zeros.Span.of_impact(first, start, levels)
         notes += zeros.flight_notes(first, start, span, levels, known, spread)
     else:

@@ -9,7 +9,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.data.contact import ELSEWHERE, Levels, Start
 from foamfit.data.measurement import NoiseLevel, Record, Striker
-from foamfit.data.noise import MIN_REST, NOTHING, Level, level_on_line, mean_level, smooth
+from foamfit.data.noise import MIN_REST, NOTHING, Level, level_on_line, line_at, mean_level, smooth
 from foamfit.text import engineering, percent
 
 _LEAST_LEAD, _FEWEST = 8, 3  # rows kept before contact; rows that show a zero
@@ -195,6 +195,23 @@ def _zero_of_motion(
     least = max(ELSEWHERE * zero.error, ((0.1 if impact else 0.02) if top else 2e-3) * size)
     own = not flies and (loaded or abs(zero.value) <= least)
     return NOTHING if own else zero, source
+
+
+def gauge_before(record: Record, start: Start, levels: Levels, striker: Striker) -> str:
+    """Say what the motion of an impact was before contact; see `Start.gauge`."""
+    time, w, before = record.instants, record.displacement, start.first - 2
+    if w is None or not start.free or start.first == 0:
+        return ""
+    if before < 3:
+        return "other"
+    top = int(np.argmax(w))
+    early = slice(start.first, start.first + max(5, (top - start.first) // 6))
+    speed = striker.velocity or line_at(time[early], w[early], start.time)[1]
+    slope = level_on_line(time[:before], w[:before], start.time, levels["displacement"])[1]
+    for gauge, expected in (("flight", speed), ("rest", 0.0)):
+        if abs(slope.value - expected) <= slope.error + 0.05 * speed:
+            return gauge if slope.error < 0.2 * speed else "other"
+    return "other"
 
 
 def mark_flight(record: Record, start: Start, span: Span) -> Record:
