@@ -81,8 +81,8 @@ def _kink(time: Array, values: Array, noise: NoiseLevel) -> Kink | None:
     variance = max(best / rows, 0.25 * white) * max(noise.time / block, 1.0)
     if off[0] <= best + 9 * variance + 1e-9 * float(y @ y):
         return None
-    alike = np.count_nonzero(off <= best + variance)
-    error = 0.5 * max(alike - 1, 0.5) * float(coarse[1] - coarse[0])
+    alike = int(np.count_nonzero(off <= best + variance))
+    error = 0.5 * max(float(alike) - 1.0, 0.5) * float(coarse[1] - coarse[0])
     return Kink(float(fine[int(np.argmin(near))]), error)
 
 

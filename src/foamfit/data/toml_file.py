@@ -255,8 +255,9 @@ def motion_file(toml: Path) -> Path | None:
 def _file(toml: Path, table: Any) -> Path | None:
     """Path of the file that a table [motion] names, which is relative to its TOML."""
     name = table.get("file") if isinstance(table, dict) else None
-    plain = isinstance(name, str) and name.strip() and "\0" not in name
-    return toml.parent / name if plain else None
+    if not isinstance(name, str) or not name.strip() or "\0" in name:
+        return None
+    return toml.parent / name
 
 
 def _motion(path: Path, table: Any, spreads: dict[str, float]) -> Motion:
