@@ -70,10 +70,10 @@ def find_cycles(record: Record) -> list[Cycle]:
     return found
 
 
-def choose_cycle(cycles: list[Cycle], number: int | None) -> Cycle:
+def choose_cycle(cycles: list[Cycle], number: int | None) -> Cycle | None:
     """Return the cycle with this number, the first one without; InputError if it is not there."""
-    if number is None:
-        return cycles[0]
+    if number is None or not cycles:
+        return cycles[0] if cycles else None
     there = [cycle.number for cycle in cycles]
     if there.count(number) == 1:
         return cycles[there.index(number)]

@@ -125,18 +125,15 @@ def estimated_noise(values: Array, what: str = "samples") -> NoiseLevel:
 
 
 def noise_before_contact(
-    rest: dict[str, Array], curves: dict[str, Array], block: int
+    whole: dict[str, Array], n: int, curves: dict[str, Array], block: int
 ) -> dict[str, NoiseLevel]:
-    """Noise of channels from their samples before contact, about their line, if they are twenty.
+    """Noise of channels from their `n` samples before contact, about their line, if so many.
 
     The `curves` during contact are means of `block` samples; where the noise that they show
     contradicts, it is the answer.
     """
-    found = dict[str, NoiseLevel]()
-    for name, values in rest.items():
-        n, x = len(values), np.arange(len(values), dtype=np.float64)
-        if n < MIN_REST:
-            continue
+    found, x = dict[str, NoiseLevel](), np.arange(n, dtype=np.float64)
+    for name, values in ((c, v[:n]) for c, v in whole.items() if n >= MIN_REST):
         off = values - np.polyval(np.polyfit(x, values, 1), x)
         sigma, phi = float(np.sqrt(off @ off / (n - 2))), lag_one(off)
         time = correlation_time(phi) if 2 / np.sqrt(n) < phi < 1 else 1.0

@@ -93,10 +93,10 @@ def condition(
     still = [] if impact else spoilt.find_standstills(record)
     record = spoilt.bridge_standstills(done(spoilt.fill_staircase(record)), still)
     cycles = [] if impact else find_cycles(record)
-    chosen = choose_cycle(cycles, window.cycle) if cycles else None
+    chosen = choose_cycle(cycles, window.cycle)
     first = cut_to_cycle(record, cycles, cycles[0])[0] if cycles else record
     curves = first.curves("acceleration")
-    levels = {c: held[c] if c in held else estimated_noise(v) for c, v in curves.items()}
+    levels = {c: estimated_noise(v) for c, v in curves.items()} | held
     if impact:
         start = start_of_impact(first, levels)
         start = replace(start, gauge=zeros.gauge_before(first, start, levels, known))
@@ -118,14 +118,11 @@ def condition(
     record, motion = integrate_motion(record, specimen, known)
     if impact:
         record = done(start_within_height(record, specimen, known, motion, found.origins))
-    if motion != MEASURED:
-        notes.append(f"The file has no displacement: the motion is {motion}.")
     notes += checks(record, specimen, known, motion)
     whole, record = record, done(thin(record))
     block = -(-len(whole) // len(record))
     resting = max(0, start.first - 2) if start.free else 0
-    before = {name: values[:resting] for name, values in curves.items()}
-    noise = noise_before_contact(before, record.curves("acceleration"), block)
+    noise = noise_before_contact(curves, resting, record.curves("acceleration"), block)
     noise |= {c: noise_of_blocks(lv, block, whole.sampled.get(c)) for c, lv in held.items()}
     outliers = spoilt.outliers_of_blocks(whole, block)
     for name, n in spikes.items():
@@ -342,7 +339,8 @@ def checks(record: Record, specimen: Specimen, striker: Striker, motion: str) ->
     """Refuse strains beyond one; say what is not plausible."""
     displacement, height = record.displacement, specimen.height
     assert displacement is not None  # measured or integrated by now
-    notes = inner_reversals(displacement)
+    notes = [] if motion == MEASURED else [f"The file has no displacement: the motion is {motion}."]
+    notes += inner_reversals(displacement)
     if len(record) < MIN_ROWS:
         raise InputError(f"only {len(record)} samples are in contact; at least {MIN_ROWS} needed.")
     strain = float(displacement.max()) / height
@@ -357,7 +355,15 @@ def checks(record: Record, specimen: Specimen, striker: Striker, motion: str) ->
             raise InputError(f"{name} reaches {reached}; check its unit.")
         if most > 1.05 * displacement.max():
             notes.append(f"Check: {name} goes farther than the top; check its unit and its node.")
-    notes += _stress_notes(record.stress)
+    stress = record.stress
+    peak, width, first = float(stress.max()), max(1, len(stress) // 100), stress[:3].mean()
+    if first > 0.05 * peak:
+        load = percent(first / peak)
+        notes.append(f"Check: the record starts under load, at {load} of the peak stress.")
+    lowest = float(smooth(stress, width)[np.argmax(stress) :].min())
+    if lowest < -max(0.002 * peak, 4 * noise_level(stress) / np.sqrt(width)):
+        after = f"{engineering(lowest, 'Pa')} after the peak (adhesion, drift or vibration)"
+        notes.append(f"The stress goes down to {after}; it is kept.")
     if striker.velocity and record.time is not None and motion != INTEGRATED:
         early = displacement <= 0.15 * displacement.max()
         early[int(np.argmax(displacement)) :] = False
@@ -389,19 +395,6 @@ def _unusual(record: Record, specimen: Specimen, strain: float) -> list[str]:
                 f"Check: the {name} is {shown}, but tests of specimens have {least} to {most}; "
                 "check the units (mm or Mm, mN or MN)."
             )
-    return notes
-
-
-def _stress_notes(stress: Array) -> list[str]:
-    """Say where a stress does not start or end at zero."""
-    peak, width, notes = float(stress.max()), max(1, len(stress) // 100), []
-    first, lowest = stress[:3].mean(), float(smooth(stress, width)[np.argmax(stress) :].min())
-    if first > 0.05 * peak:
-        load = f"at {percent(first / peak)} of the peak stress"
-        notes.append(f"Check: the record starts under load, {load}.")
-    if lowest < -max(0.002 * peak, 4 * noise_level(stress) / np.sqrt(width)):
-        after = f"{engineering(lowest, 'Pa')} after the peak (adhesion, drift or vibration)"
-        notes.append(f"The stress goes down to {after}; it is kept.")
     return notes
 
 

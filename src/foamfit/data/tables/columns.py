@@ -26,11 +26,7 @@ def assign_columns(table: Table, given: dict[str, Column], toml: Path | None) ->
     """Which column each channel is in: as [columns] of the TOML says, else as the headers do."""
     found: dict[str, int] = {}
     strained = "strain" in given or any(h.rank("strain") is not None for h in table.headers)
-    # The usual channels, then the masses inside that are named, those of the TOML first.
-    numbers = {int(w) for h in table.headers for w in h.words if w.isdecimal()}
-    inside = {c for c in (*map(interior_channel, numbers), *given) if interior_node(c)}
-    inside_first = sorted(inside, key=lambda c: (c not in given, interior_node(c) or 0))
-    for channel in [*CHANNELS, *inside_first]:
+    for channel in _channels(table, given):
         if channel in given:
             found[channel] = _place(table, channel, given[channel].column, toml)
             continue
@@ -61,6 +57,13 @@ def assign_columns(table: Table, given: dict[str, Column], toml: Path | None) ->
     if true and "stress" not in given and "force" in found:
         del found["stress"]
     return found
+
+
+def _channels(table: Table, given: dict[str, Column]) -> list[str]:
+    """List the channels to look for: the usual ones, then the masses inside that are named."""
+    numbers = {int(w) for h in table.headers for w in h.words if w.isdecimal()}
+    inside = {c for c in (*map(interior_channel, numbers), *given) if interior_node(c)}
+    return [*CHANNELS, *sorted(inside, key=lambda c: (c not in given, interior_node(c) or 0))]
 
 
 def _place(table: Table, channel: str, column: str | int, toml: Path | None) -> int:
@@ -169,17 +172,8 @@ def needed_columns(table: Table, columns: dict[str, int], settings: Settings) ->
             "with a time and the [striker] mass an acceleration or a velocity will do, and with "
             "its velocity a displacement."
         )
-    own = [c for c in columns if c in _MOTIONS or interior_node(c)]
-    if motion is not None and own:
-        raise InputError(
-            f"{table.path}: column {table.headers[columns[own[0]]].text!r} is a {own[0]}, but "
-            f"[motion] file = {motion.file.name!r} has the motion; leave one of them out."
-        )
-    if motion is not None and "time" not in columns:
-        raise InputError(
-            f"{table.path}: no column is a time (there are {table.listed}); with [motion] it needs "
-            "one like 'time (ms)'."
-        )
+    if motion is not None:
+        _check_motion(table, columns, motion.file.name)
     helping = {"velocity"} if moved or "acceleration" in has else set[str]()
     helping = {"velocity", "acceleration"} if forced else helping
     if moved or motion is not None:
@@ -198,6 +192,21 @@ def needed_columns(table: Table, columns: dict[str, int], settings: Settings) ->
             f"in [columns], or give {timed}the [striker] mass and velocity to integrate the motion."
         )
     return {c: k for c, k in columns.items() if c in has}
+
+
+def _check_motion(table: Table, columns: dict[str, int], name: str) -> None:
+    """Refuse a test with [motion] that has a displacement of its own, or no time."""
+    own = [c for c in columns if c in _MOTIONS or interior_node(c)]
+    if own:
+        raise InputError(
+            f"{table.path}: column {table.headers[columns[own[0]]].text!r} is a {own[0]}, but "
+            f"[motion] file = {name!r} has the motion; leave one of them out."
+        )
+    if "time" not in columns:
+        raise InputError(
+            f"{table.path}: no column is a time (there are {table.listed}); with [motion] it needs "
+            "one like 'time (ms)'."
+        )
 
 
 def motion_columns(table: Table, columns: dict[str, int]) -> dict[str, int]:

@@ -43,22 +43,19 @@ def draft(text: Text) -> tuple[str, list[str]]:
     What was understood is filled in; each question is a line behind "# " with an example.
     """
     columns, name = _columns(text), printable(toml_beside(text.path).stem[:LONGEST])
-    parts = [
-        (
-            f"# {printable(text.path.name)}: what foamfit needs to know of this test.",
-            '# A line behind "# " is a question: give your value and take the "# " away.',
-            f"name = {json.dumps(name, ensure_ascii=False)}",
-        ),
-        _open(_NEEDED), _open(_IMPACT), ("[columns]", *columns), _open(_HELPS),
-    ]  # fmt: skip
-    needed = [line.removeprefix("# ") for line in columns if "  # needed" in line]
-    asked = [*_NEEDED, *(["[columns]", *needed] if needed else []), *_IMPACT]
+    head = (
+        f"# {printable(text.path.name)}: what foamfit needs to know of this test.",
+        '# A line behind "# " is a question: give your value and take the "# " away.',
+        f"name = {json.dumps(name, ensure_ascii=False)}",
+    )
+    needed, impact, helps = (
+        (section[0], *(f"# {line}" for line in section[1:]))
+        for section in (_NEEDED, _IMPACT, _HELPS)
+    )
+    parts = [head, needed, impact, ("[columns]", *columns), helps]
+    missing = [line.removeprefix("# ") for line in columns if "  # needed" in line]
+    asked = [*_NEEDED, *(["[columns]", *missing] if missing else []), *_IMPACT]
     return "\n\n".join(map("\n".join, parts)) + "\n", asked
-
-
-def _open(section: tuple[str, ...]) -> tuple[str, ...]:
-    """The lines of a section as questions."""
-    return section[0], *(f"# {line}" for line in section[1:])
 
 
 def without_toml(toml: Path, text: Text) -> InputError:
