@@ -20,8 +20,8 @@ def init(test: Path) -> None:
 
     Example: foamfit init TEST.csv
     """
-    from foamfit.data.csv_table import read_text
-    from foamfit.data.draft import draft
+    from foamfit.data.tables.csv_table import read_text
+    from foamfit.data.tables.draft import draft
     from foamfit.data.toml_file import toml_beside
     from foamfit.files import reason
 

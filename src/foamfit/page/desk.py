@@ -20,7 +20,7 @@ import tomli_w
 
 from foamfit.cli.fitting import cycles_of
 from foamfit.data.csv_file import read_test
-from foamfit.data.csv_table import find_table, read_text
+from foamfit.data.tables.csv_table import find_table, read_text
 from foamfit.data.describe import describe
 from foamfit.data.energy import audit
 from foamfit.data.measurement import Measurement
