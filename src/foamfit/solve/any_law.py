@@ -12,13 +12,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
+from foamfit.solve.motion import Motion, Slopes, list_switches
 from foamfit.solve.scene import FREE, MOTION, STRESS
 from foamfit.springs import laws as known
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact
@@ -326,25 +327,23 @@ class AnyLawPlan(NamedTuple):
         drag: float | None = None,
         everything: bool = True,
         directions: NDArray[np.int64] | None = None,
-    ) -> Any:
+    ) -> Motion:
         """Run the scene; see `solve.plan.Plan.run`. Derivatives are differences."""
-        from foamfit.solve import plan
-
         drag = self.drag if drag is None else drag
         found = self.resolve(rows, heights, drag, rtol)
         slopes = None
         if directions is not None and len(directions):
             sides = [self._slope(rows, heights, drag, found, way) for way in directions]
-            slopes = plan.Slopes(
+            slopes = Slopes(
                 np.array([nodes for nodes, _ in sides]), np.array([stress for _, stress in sides])
             )
         strain = np.diff(found.nodes, axis=0, prepend=0.0) / np.array(heights)[:, None]
-        switches = plan.list_switches(self.time, strain, found.branches)
+        switches = list_switches(self.time, strain, found.branches)
         nodes = found.nodes if everything else found.nodes[-1:]
         if slopes is not None and not everything:
             slopes = slopes._replace(displacement=slopes.displacement[:, -1:])
         steps = found.parts * self.time.size
-        return plan.Motion(nodes, found.stress, found.contact_end, switches, steps, METHOD, slopes)
+        return Motion(nodes, found.stress, found.contact_end, switches, steps, METHOD, slopes)
 
     def _slope(
         self, rows: Array, heights: Array, drag: float, found: Followed, way: Sequence[int]

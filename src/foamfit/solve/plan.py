@@ -16,6 +16,9 @@ from foamfit.solve import scene as scenes
 from foamfit.solve.any_law import AnyLawPlan, plan_of
 from foamfit.solve.explicit import taylor
 from foamfit.solve.implicit import steps
+from foamfit.solve.motion import CLOSED_FORM as CLOSED_FORM
+from foamfit.solve.motion import NO_SWITCHES, Slopes, list_switches
+from foamfit.solve.motion import Motion as Motion
 from foamfit.springs import equilibrium, kernels
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.springs.law import BISTABLE, LINEAR
@@ -25,7 +28,7 @@ from foamfit.springs.spring import as_samples
 
 Directions = NDArray[np.int64]
 
-CLOSED_FORM, FIRST_ORDER, SECOND_ORDER = "closed form", "first order", "second order"
+FIRST_ORDER, SECOND_ORDER = "first order", "second order"
 TAYLOR, RADAU, AGGREGATE = "Taylor series", "Radau IIA", "aggregate"
 MAX_STEPS = 2_000_000
 # Explicit steps are given up where something relaxes, or vibrates, so many times (in radians) while
@@ -70,36 +73,11 @@ _TOO_FAST = (
 RADIANS, FEW_EXPLICIT = 3.0, 20_000
 
 NO_DIRECTIONS: Directions = np.empty((0, 2), np.int64)
-NO_SWITCHES = np.empty((0, 5))
 _NOTHING = np.zeros(1)
 # Tops under which springs start from rest, and what they start from.
 _RESTING, _AT_REST = (scenes.FREE, scenes.VISCOUS), np.zeros((1, 0))
 # Outcomes of explicit steps after which implicit ones are tried.
 _STIFF = (scenes.TOO_MANY_STEPS, scenes.STEP_UNDERFLOW)
-
-
-class Slopes(NamedTuple):
-    """Derivatives of displacement (p, nodes, n_t) and base stress (p, n_t) in p directions.
-
-    Of those marked in `one_sided` (p,), there are two.
-    """
-
-    displacement: Array
-    base_stress: Array
-    one_sided: Array = _NOTHING[:0]
-
-
-class Motion(NamedTuple):
-    """The bare outcome of a run; see `Response`. `slopes` is None where none were asked for."""
-
-    displacement: Array
-    base_stress: Array
-    contact_end: float
-    switches: Array
-    steps: int
-    method: str = CLOSED_FORM
-    slopes: Slopes | None = None
-    unresolved: float = 0.0  # vibrations that were damped out, relative to the ranges
 
 
 class Plan(NamedTuple):
@@ -420,15 +398,6 @@ def _motion(
 def _new_history(count: int, n: int) -> tuple[Array, NDArray[np.int64]]:
     """Empty arrays for the strains and branches of springs along a history."""
     return np.empty((count, n)), np.empty((count, n), np.int64)
-
-
-def list_switches(time: Array, strain: Array, branches: NDArray[np.int64]) -> Array:
-    """List the changes of branch between samples, at the later sample."""
-    samples, springs = np.nonzero((branches[:, 1:] != branches[:, :-1]).T)
-    out, later = np.empty((samples.size, 5)), samples + 1
-    out[:, 0], out[:, 1], out[:, 4] = time[later], springs, strain[springs, later]
-    out[:, 2], out[:, 3] = branches[springs, samples], branches[springs, later]
-    return out
 
 
 def _time(t: ArrayLike) -> Array:

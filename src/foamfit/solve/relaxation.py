@@ -17,6 +17,7 @@ bends and no derivative is wanted, the cubic is that through values and slopes a
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,17 +29,14 @@ from foamfit.springs.kernels import (
     Array,
     Branches,
     Row,
-    above,
-    below,
     branch_shape,
     compiled,
-    first_branch,
+    inlined,
     inner,
-    interval,
     slope_on,
-    stress_on,
 )
 from foamfit.springs.law import MICROSCALE
+from foamfit.springs.laws import followed
 from foamfit.springs.microscale_kernels import (
     BRANCH,
     CARRIED,
@@ -77,49 +75,33 @@ STEP, DECAY, WEIGHT, BY_X, OF_FOURTH, OF_FIFTH, OF_SIXTH = 0, 1, 2, 6, 10, 11, 1
 OF_BUMP, LASTING, TABLE = 13, 14, 15
 
 
-@inner
-def _begin(row: Row, state: Array) -> None:
-    """Set the state of a spring at rest."""
-    micro.begin(row, state)
-    if row[KIND] != MICROSCALE:
-        state[BRANCH] = first_branch(row)
-        state[LOW], state[HIGH] = interval(row, first_branch(row))
+class Kept(NamedTuple):
+    """What terms remember: y (terms,), and its derivatives (terms, CARRIED), by τ (terms or 0,)."""
+
+    y: Array
+    by: Array
+    by_tau: Array
 
 
-@inner
-def _leaves(row: Row, state: Array, eps: float) -> bool:
-    """Whether a spring leaves its branch before it reaches a strain."""
-    if row[KIND] == MICROSCALE:
-        return micro.leaves(state, eps)
-    return eps > state[HIGH] if eps > state[EPS] else eps < state[LOW]
+_, _begin, _leaves, _switch_law, _settle_law = followed.functions_of("microscale")
 
 
 @inner
 def _settle(row: Row, state: Array, eps: float) -> None:
-    """Bring a spring to a strain that lies on its branch."""
-    if row[KIND] == MICROSCALE:
-        micro.settle(row, state, eps)
-        if state[BRANCH] <= HELD:  # on the others the slope comes with the stress
-            micro.fill_slopes(row, state)
-    else:
-        state[EPS], state[SIGMA] = eps, stress_on(row, int(state[BRANCH]), eps)
+    """Bring a spring to a strain that lies on its branch, and find its slope there."""
+    _settle_law(row, state, eps)
+    if row[KIND] == MICROSCALE and state[BRANCH] <= HELD:  # on others it comes with the stress
+        micro.fill_slopes(row, state)
 
 
 @inner
 def _switch(row: Row, state: Array, up: bool) -> None:
     """Go over to the next branch, at the end of this one or where the strain turns."""
+    _switch_law(row, state, up)
     if row[KIND] == MICROSCALE:
-        micro.switch(row, state, up)
         sigma = state[SIGMA]
         _settle(row, state, state[EPS])  # the slope that it starts with
         state[SIGMA] = sigma
-        return
-    branch = int(state[BRANCH])
-    state[EPS] = state[HIGH] if up else state[LOW]
-    branch = above(branch) if up else below(branch)
-    state[BRANCH] = branch
-    state[LOW], state[HIGH] = interval(row, branch)
-    state[SIGMA] = stress_on(row, branch, state[EPS])
 
 
 @inner
@@ -182,6 +164,22 @@ def _tabulate(h: float, tau: float, moments: Array, table: Array) -> None:
     table[OF_BUMP] = max(moments[2] - 2.0 * moments[3] + moments[4], 0.0) / moments[0]
 
 
+@inlined
+def _begin_table(row: Row, lasts: float, table: Array) -> None:
+    """Note the share of each term that shows while the motion lasts, s."""
+    for k in range(table.shape[0]):
+        share = min(1.0, lasts / row[N_COLUMNS + 2 * k + 1])
+        table[k, LASTING] = row[N_COLUMNS + 2 * k] * share
+
+
+@inlined
+def _tabulate_all(row: Row, h: float, moments: Array, table: Array) -> None:
+    """Bring the tables of all terms to steps of the length h."""
+    for k in range(table.shape[0]):
+        if not abs(h - table[k, STEP]) <= 1e-13 * h:
+            _tabulate(h, row[N_COLUMNS + 2 * k + 1], moments, table[k])
+
+
 @inner
 def _truncation(nodes: Array, table: Array, begins: float, ends_with: float) -> float:
     """Estimate what the cubic through four nodes does to the stress of all terms in the end.
@@ -239,6 +237,104 @@ def _fill_by_slopes(
     return 0.5 * max(abs(first), abs(last))
 
 
+@inlined
+def _try_slopes(
+    row: Row, state: Array, nodes: Array, table: Array, end: float, bar: float, largest: float
+) -> bool:
+    """Take a step to a strain by the slopes at its ends; false, and not taken, if it is too long.
+
+    `bar` is the wanted error over the `largest` stress.
+    """
+    origin, flexibility, curvature = state[EPS], state[FLEXIBILITY], state[CURVATURE]
+    _settle(row, state, end)
+    bump = _fill_by_slopes(nodes, state, origin, flexibility, curvature)
+    if MARGIN * bump * _of_bump(table) <= bar * max(largest, abs(state[SIGMA])):
+        return True
+    state[EPS], state[SIGMA] = origin, nodes[0]
+    state[FLEXIBILITY], state[CURVATURE] = flexibility, curvature
+    return False
+
+
+@inlined
+def _try_nodes(
+    row: Row, state: Array, nodes: Array, table: Array, goal: float, rough: bool
+) -> tuple[float, bool]:
+    """Take a step to a strain by the four nodes.
+
+    Returns its error, which is not asked for of a `rough` one, and whether the slopes are known.
+    """
+    origin, flexibility, begins, ends_with = state[EPS], state[FLEXIBILITY], 0.0, 0.0
+    for i in range(1, 4):
+        _settle(row, state, goal if i == 3 else origin + NODES[i] * (goal - origin))
+        nodes[i] = state[SIGMA]
+    if rough or not abs(nodes[3]) < math.inf:
+        return 0.0, False
+    if flexibility > 0.0 and state[FLEXIBILITY] > 0.0:
+        begins = (goal - origin) / flexibility
+        ends_with = (goal - origin) / state[FLEXIBILITY]
+    return MARGIN * _truncation(nodes, table, begins, ends_with), begins * ends_with != 0.0
+
+
+@inlined
+def _derive(
+    row: Row, state: Array, nodes: Array, d_rank: Array, d_nodes: Array, first: float, last: float
+) -> None:
+    """Fill the derivatives of the stress at the nodes of a step between two strains."""
+    for c in range(CARRIED):
+        d_nodes[0, c] = d_nodes[3, c]
+    here = state[SIGMA], state[EPS]
+    for i in range(1, 4):
+        state[EPS], state[SIGMA] = first + NODES[i] * (last - first), nodes[i]
+        _tangents(row, state, d_rank, d_nodes[i])
+    state[SIGMA], state[EPS] = here
+
+
+@inlined
+def _derive_end(row: Row, state: Array, d_rank: Array, d_nodes: Array, wanted: bool) -> None:
+    """Fill the derivatives of the stress where the spring is now, if they are wanted."""
+    if wanted:
+        _tangents(row, state, d_rank, d_nodes[3])
+
+
+@inlined
+def _relax(row: Row, h: float, table: Array, nodes: Array, d_nodes: Array, kept: Kept) -> None:
+    """Let all terms relax over a step."""
+    for k in range(table.shape[0]):
+        tau = row[N_COLUMNS + 2 * k + 1]
+        x, decay, total, change = h / tau, table[k, DECAY], 0.0, 0.0
+        for i in range(4):
+            total += table[k, WEIGHT + i] * nodes[i]
+            change += table[k, BY_X + i] * nodes[i]
+        if kept.by_tau.size > 0:
+            by_x = -decay * kept.y[k] - total - x * change
+            kept.by_tau[k] = decay * kept.by_tau[k] - by_x * x / tau
+            for c in range(CARRIED):
+                total_c = 0.0
+                for i in range(4):
+                    total_c += table[k, WEIGHT + i] * d_nodes[i, c]
+                kept.by[k, c] = decay * kept.by[k, c] - x * total_c
+        kept.y[k] = decay * kept.y[k] - x * total
+
+
+@inlined
+def _sum_up(
+    row: Row, sigma: float, d_sigma: Array, kept: Kept, by: Array, by_g: Array, by_tau: Array
+) -> float:
+    """Fill the derivatives of the stress at a sample; returns the stress with all terms."""
+    total = sigma
+    for c in range(by.size):
+        by[c] = d_sigma[c]
+    for k in range(by_g.size):
+        g = row[N_COLUMNS + 2 * k]
+        by_g[k] = sigma + kept.y[k]
+        total += g * by_g[k]
+        for c in range(by.size):
+            by[c] += g * (d_sigma[c] + kept.by[k, c])
+    for k in range(by_tau.size):
+        by_tau[k] = row[N_COLUMNS + 2 * k] * kept.by_tau[k]
+    return total
+
+
 @inner
 def _of_bump(table: Array) -> float:
     """Return what r²(1 - r)² in each step does to the stress of all terms in the end."""
@@ -272,22 +368,16 @@ def relaxed_along(
         stress (8 or 0, n) by k0 … kh_minus or spread_minus, and by the logarithm of the strain; by
         the g of every term (terms, n), and by its τ (terms or 0, n).
     """
-    n, terms, size = eps.size, (row.size - N_COLUMNS) // 2, CARRIED if derive else 0
-    sigma, branches = np.empty(n), np.empty(n, np.int64)
-    by, by_g, by_tau = (
-        np.empty((size, n)),
-        np.empty((terms, n)),
-        np.empty((terms if derive else 0, n)),
-    )
+    n, terms, wanted = eps.size, (row.size - N_COLUMNS) // 2, int(derive)
+    sigma, branches, by = np.empty(n), np.empty(n, np.int64), np.empty((wanted * CARRIED, n))
+    by_g, by_tau = np.empty((terms, n)), np.empty((wanted * terms, n))
     state, nodes = np.empty(STATE), np.empty(4)
     table, moments = np.zeros((terms, TABLE)), np.empty(5)
-    y, y_tau, d_y = np.zeros(terms), np.zeros(terms), np.zeros((terms, CARRIED))
+    kept = Kept(np.zeros(terms), np.zeros((terms, CARRIED)), np.zeros(by_tau.shape[0]))
     d_rank, d_nodes = np.zeros(CARRIED), np.zeros((4, CARRIED))
     _begin(row, state)
     largest, entered, plain = 0.0, True, 0
-    for k in range(terms):
-        share = min(1.0, (t[n - 1] - t[0]) / row[N_COLUMNS + 2 * k + 1])
-        table[k, LASTING] = row[N_COLUMNS + 2 * k] * share
+    _begin_table(row, t[n - 1] - t[0], table)
     for j in range(n):
         before, start, done = state[EPS], j == 0, 0.0
         while True:
@@ -296,16 +386,15 @@ def relaxed_along(
                 _switch(row, state, up)
                 entered, plain = True, 0
                 continue
-            end = (state[HIGH] if up else state[LOW]) if leaving else eps[j]
-            until = 1.0
+            end, until = eps[j], 1.0
             if leaving:
+                end = state[HIGH] if up else state[LOW]
                 until = min(max((end - before) / (eps[j] - before), done), 1.0)
             if start:  # from rest to the first sample in no time
                 _settle(row, state, end)
                 done, entered = until, True
-            if derive and entered:
-                _tangents(row, state, d_rank, d_nodes[3])
-                entered = False
+            _derive_end(row, state, d_rank, d_nodes, derive and entered)
+            entered = False
             pace = until - done
             at, first = done, state[EPS]
             while done < until:
@@ -314,64 +403,27 @@ def relaxed_along(
                 nodes[0], origin = state[SIGMA], state[EPS]
                 flexibility, curvature = state[FLEXIBILITY], state[CURVATURE]
                 h = pace * (t[j] - t[j - 1])
-                for k in range(terms):
-                    if not abs(h - table[k, STEP]) <= 1e-13 * h:
-                        _tabulate(h, row[N_COLUMNS + 2 * k + 1], moments, table[k])
-                short = False
-                if plain > 0 and last and pace == 1.0 and not derive:
-                    _settle(row, state, end)
-                    plain -= 1
-                    bump = _fill_by_slopes(nodes, state, origin, flexibility, curvature)
-                    error = MARGIN * bump * _of_bump(table)
-                    short = error <= rtol * max(largest, abs(state[SIGMA]))
-                    if not short:
-                        state[EPS], state[SIGMA] = origin, nodes[0]
-                        state[FLEXIBILITY], state[CURVATURE] = flexibility, curvature
-                for i in range(1, 1 if short else 4):
-                    way = (done + pace * NODES[i] - at) / (until - at)
-                    _settle(row, state, end if last and i == 3 else first + way * (end - first))
-                    nodes[i] = state[SIGMA]
+                _tabulate_all(row, h, moments, table)
+                goal = end if last else first + (done + pace - at) / (until - at) * (end - first)
+                tried = plain > 0 and last and pace == 1.0 and not derive
+                short = tried and _try_slopes(row, state, nodes, table, end, rtol, largest)
+                plain, error, sloped = plain - tried, 0.0, False
+                if not short:
+                    rough = pace <= LEAST_PACE
+                    error, sloped = _try_nodes(row, state, nodes, table, goal, rough)
                 if not abs(nodes[3]) < math.inf:
                     break
                 largest = max(largest, abs(nodes[3]))
-                error, begins, ends_with = 0.0, 0.0, 0.0
-                if pace > LEAST_PACE and not short:
-                    if flexibility > 0.0 and state[FLEXIBILITY] > 0.0:
-                        begins = (state[EPS] - origin) / flexibility
-                        ends_with = (state[EPS] - origin) / state[FLEXIBILITY]
-                    error = _truncation(nodes, table, begins, ends_with)
-                if MARGIN * error > rtol * largest:
+                if error > rtol * largest:
                     state[EPS], state[SIGMA] = origin, nodes[0]
                     state[FLEXIBILITY], state[CURVATURE] = flexibility, curvature
                     pace *= 0.5
                     continue
                 if not short:
-                    fine = MARGIN * error <= PLAIN * rtol * largest and begins != 0.0
-                    plain = CHECKED if fine and ends_with != 0.0 else 0
+                    plain = CHECKED if sloped and error <= PLAIN * rtol * largest else 0
                 if derive:
-                    d_nodes[0] = d_nodes[3]
-                    here = state[SIGMA], state[EPS]
-                    for i in range(1, 4):
-                        way = (done + pace * NODES[i] - at) / (until - at)
-                        state[EPS] = first + way * (end - first)
-                        state[SIGMA] = nodes[i]
-                        _tangents(row, state, d_rank, d_nodes[i])
-                    state[SIGMA], state[EPS] = here
-                for k in range(terms):
-                    tau = row[N_COLUMNS + 2 * k + 1]
-                    x, decay, total, change = h / tau, table[k, DECAY], 0.0, 0.0
-                    for i in range(4):
-                        total += table[k, WEIGHT + i] * nodes[i]
-                        change += table[k, BY_X + i] * nodes[i]
-                    if derive:
-                        by_x = -decay * y[k] - total - x * change
-                        y_tau[k] = decay * y_tau[k] - by_x * x / tau
-                        for c in range(CARRIED):
-                            total_c = 0.0
-                            for i in range(4):
-                                total_c += table[k, WEIGHT + i] * d_nodes[i, c]
-                            d_y[k, c] = decay * d_y[k, c] - x * total_c
-                    y[k] = decay * y[k] - x * total
+                    _derive(row, state, nodes, d_rank, d_nodes, origin, goal)
+                _relax(row, h, table, nodes, d_nodes, kept)
                 done = until if last else done + pace
                 pace *= 2.0
             if not abs(state[SIGMA]) < math.inf:
@@ -383,25 +435,13 @@ def relaxed_along(
                 continue
             if state[EPS] != end:  # so near the end of a branch that no time is left
                 _settle(row, state, end)
-                if derive:
-                    _tangents(row, state, d_rank, d_nodes[3])
+                _derive_end(row, state, d_rank, d_nodes, derive)
             break
         if start:
-            for k in range(terms):
-                y[k] = -state[SIGMA]
-                for c in range(size):
-                    d_y[k, c] = -d_nodes[3, c]
-        total = state[SIGMA]
-        for k in range(terms):
-            by_g[k, j] = state[SIGMA] + y[k]
-            total += row[N_COLUMNS + 2 * k] * by_g[k, j]
-            if derive:
-                by_tau[k, j] = row[N_COLUMNS + 2 * k] * y_tau[k]
-        for c in range(size):
-            by[c, j] = d_nodes[3, c]
-            for k in range(terms):
-                by[c, j] += row[N_COLUMNS + 2 * k] * (d_nodes[3, c] + d_y[k, c])
-        sigma[j], branches[j] = total, int(state[BRANCH])
+            kept.y[:] = -state[SIGMA]
+            kept.by[:] = -d_nodes[3]
+        sigma[j] = _sum_up(row, state[SIGMA], d_nodes[3], kept, by[:, j], by_g[:, j], by_tau[:, j])
+        branches[j] = int(state[BRANCH])
     return sigma, branches, by, by_g, by_tau
 
 

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
 from foamfit.solve.any_law import AnyLawPlan
+from foamfit.solve.motion import Slopes
 from foamfit.solve.plan import (
     AGGREGATE,
     CLOSED_FORM,
@@ -23,7 +24,6 @@ from foamfit.solve.plan import (
     Directions,
     Motion,
     Plan,
-    Slopes,
     plan,
 )
 from foamfit.solve.scene import MOTION

@@ -323,7 +323,7 @@ class _Run:
             if self.switches < len(self.log):
                 self.log[self.switches] = self.now, i, left, entered, eps
             self.switches += 1
-            step.enter(i, entered)
+            step.enter(int(i), entered)
         return opened
 
     # ---------------------------------------------------------------- what is recorded
