@@ -20,10 +20,10 @@ import tomli_w
 
 from foamfit.cli.fitting import cycles_of
 from foamfit.data.csv_file import read_test
-from foamfit.data.tables.csv_table import find_table, read_text
 from foamfit.data.describe import describe
 from foamfit.data.energy import audit
 from foamfit.data.measurement import Measurement
+from foamfit.data.tables.csv_table import find_table, read_text
 from foamfit.data.toml_file import toml_beside
 from foamfit.errors import InputError
 from foamfit.page.worker import Job, Worker, end_all, parsed
