@@ -30,7 +30,7 @@ from foamfit.springs.chain import Drive
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 sys.path.append(str(Path(__file__).parents[1] / "stability"))
-import independent_memory
+import independent
 
 import reference
 
@@ -207,7 +207,7 @@ def _restarted(chain: ff.Chain, drive: ff.Impact, t: Array) -> tuple[Array, Arra
 
 
 def _by_brute_force(chain: ff.Chain, drive: Drive, t: Array) -> tuple[Array, Array]:
-    truth = independent_memory.follow(chain, drive, t)
+    truth = independent.follow(chain, drive, t)
     assert not truth.why
     return truth.displacement[-1], truth.base_stress
 
@@ -229,8 +229,8 @@ def reference_of(
 
     The function gives the displacement of the top (m) and the base stress (Pa), (n,) each.
     """
-    if independent_memory.has_memory(chain):
-        return "brute force at 1e-13 (experiments/stability/independent_memory.py)", _by_brute_force
+    if independent.has_memory(chain):
+        return "brute force at 1e-13 (experiments/stability/independent.py)", _by_brute_force
     if not isinstance(drive, ff.Impact):
         return "root finding on the law (tests/reference.py)", _by_reference
     damped = chain.site_damping > 0.0 or any(spring.eta > 0.0 for spring in chain.springs)

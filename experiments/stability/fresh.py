@@ -52,7 +52,6 @@ from numpy.typing import NDArray
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
 
-import independent_memory  # noqa: E402
 from energy import rebound_of  # noqa: E402
 from independent import LOOSE, Truth, follow, judge, over_range  # noqa: E402
 from scenes import Point, designed, scene_of  # noqa: E402
@@ -533,10 +532,9 @@ def follower(scene: Scene, spec: Spec) -> Callable[[Any, Any, Array, float, int]
         import roots  # the only one that needs mpmath
 
         return roots.follow
-    by = independent_memory.follow if independent_memory.has_memory(scene[0]) else follow
     if isinstance(scene[1], ff.Impact):
-        return by
-    return lambda chain, drive, time, *bounds: by(chain, drive, time - time[0], *bounds)
+        return follow
+    return lambda chain, drive, time, *bounds: follow(chain, drive, time - time[0], *bounds)
 
 
 # ------------------------------------------------------------------------------- the derivatives
