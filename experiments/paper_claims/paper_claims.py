@@ -1,8 +1,8 @@
 """Is it so, what the paper says? The claims of its section 4 that can be tested without its data.
 
-Question. Does a foam's own mass oscillate and a small damper end it (1)? Is the literal reading, the
-striker's mass under its own measured stress, a model (2)? Do the damping ratios follow from the
-tables (3)? Do striker and loop agree in energy (4)? Are the branches made by micro-springs (5)?
+Question. Does a foam's own mass oscillate, and does a small damper end it (1)? Is the literal
+reading, the striker's mass under its own measured stress, a model (2)? Do the damping ratios follow
+from the tables (3)? Do striker and loop agree in energy (4)? Do micro-springs make the branches (5)?
 
 Method. No measured curve of the paper is available: all is simulated from the published parameters
 (Thevamaran, Fraternali & Daraio 2014, Tables 1-3). A stress drive is the base stress of a simulated
@@ -381,7 +381,8 @@ def draw_oscillation(drive: Drive, needed: float, path: Path) -> None:
     with studies.sheet(path, 7.0, 4.9) as figure:
         axes = figure.subplots(2, 2).ravel()
         panels = (
-            ("(a) stress", "spring stress (MPa)", lambda r: r.base_stress / 1e6, drive.stress / 1e6),
+            ("(a) stress", "spring stress (MPa)", lambda r: r.base_stress / 1e6,
+             drive.stress / 1e6),
             ("(b) displacement", "displacement (mm)", lambda r: 1e3 * r.displacement[-1],
              1e3 * drive.displacement),
             ("(c) stress minus that of equilibrium", "difference (MPa)",
@@ -472,7 +473,7 @@ def draw_ratios(readings: dict[str, dict[str, float]], path: Path) -> None:
 
 
 def in_mathtext(label: str) -> str:
-    """Set the symbols of a label as matplotlib does: k_h+ as $k_{h+}$, ε_* as $\\varepsilon_{*}$."""
+    """Set the symbols of a label as matplotlib does: k_h+ as $k_{h+}$."""
     label = label.replace("−", "-").replace("k₀", "$k_{0}$").replace("- ", "− ")
     label = re.sub(r"([kε])_(h[+-]|[ac*])", r"$\1_{\2}$", label)
     return label.replace("ε", r"\varepsilon")
@@ -504,7 +505,8 @@ def draw_energy(path: Path) -> None:
             ax.margins(y=0.12)
         ax, factors = axes[2], np.linspace(0.9, 1.25, 141)
         for name, colour, style in (
-            (MODEL_1, SKY, "-"), (MODEL_2, BLUE, "--"), (MODEL_3, ORANGE, "-"), (FOAM_2, GREEN, "-"),
+            (MODEL_1, SKY, "-"), (MODEL_2, BLUE, "--"), (MODEL_3, ORANGE, "-"),
+            (FOAM_2, GREEN, "-"),
         ):  # fmt: skip
             chain, velocity = impact_scene(name), ff.published[name].striker_velocity
             lost = [lost_share(chain, velocity * f) for f in factors]
