@@ -2,7 +2,7 @@
 
 Question. Does a foam's own mass oscillate, and does a small damper end it (1)? Is the literal
 reading, the striker's mass under its own measured stress, a model (2)? Do the damping ratios follow
-from the tables (3)? Do striker and loop agree in energy (4)? Do micro-springs make the branches (5)?
+from the tables (3)? Do striker and loop agree in energy (4)? Do micro-springs make branches (5)?
 
 Method. No measured curve of the paper is available: all is simulated from the published parameters
 (Thevamaran, Fraternali & Daraio 2014, Tables 1-3). A stress drive is the base stress of a simulated
