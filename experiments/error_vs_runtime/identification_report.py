@@ -233,8 +233,8 @@ def findings(ends: pd.DataFrame) -> str:
         first = np.mean(profile(ends, coordinates)[OWN] == 1.0)
         out.append(
             f"In *{coordinates}*, `{OWN}` solves {own.sum()} of {len(own)} problem-seeds and is "
-            f"the fastest in {first:.0%}; of lmfit's methods `{best}` solves most, {counts[best]} of "
-            f"{len(own)}."
+            f"the fastest in {first:.0%}; of lmfit's methods `{best}` solves most, {counts[best]} "
+            f"of {len(own)}."
         )
     return " ".join(out)
 
