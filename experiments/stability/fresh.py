@@ -674,7 +674,7 @@ def judged(
         answer = ff.simulate(*scene, rtol=rtol)
     except ff.SimulationError as refusal:
         found["seconds"] = time.perf_counter() - began
-        found["reason"] = next((k for k, part in REASONS.items() if part in str(refusal)), "other")
+        found["reason"] = reason_of(refusal)
         found["outcome"] = "refused"
         return found
     except Exception as wrong:  # a run of hundreds of scenes tells of it and goes on
@@ -718,6 +718,16 @@ def energy_error(scene: Scene, answer: ff.Response, bounced: tuple[float, float,
     return float(worst)
 
 
+def reason_of(refusal: ff.SimulationError) -> str:
+    """Return in a word why a scene was refused."""
+    return next((key for key, part in REASONS.items() if part in str(refusal)), "other")
+
+
+def reasons(refused: pd.DataFrame) -> str:
+    """Count the reasons of refused scenes."""
+    return ", ".join(f"{k} {n}" for k, n in refused.reason.value_counts().items())
+
+
 def summary(lines: pd.DataFrame) -> pd.DataFrame:
     """Count per family and rtol."""
     rows = []
@@ -731,7 +741,7 @@ def summary(lines: pd.DataFrame) -> pd.DataFrame:
                 "chaotic": len(steady) - len(known), "beyond the judge": len(group) - len(steady),
                 "answers": int((known.outcome != "refused").sum()),
                 "refused": len(refused),
-                "reasons": ", ".join(f"{k} {n}" for k, n in refused.reason.value_counts().items()),
+                "reasons": reasons(refused),
                 "over 1 rtol": int((known.error > POOR).sum()),
                 "over 3 rtol": int((known.error > BAD).sum()),
                 "largest": known.error.max(),
