@@ -13,8 +13,7 @@ from foamfit.data.measurement import ASKED, Measurement, Specimen, Striker
 from foamfit.report.result_figures import Images
 from foamfit.results import SOURCES, Budget, Curves, ParameterEstimate, Switch
 from foamfit.springs.chain import Chain
-from foamfit.springs.parameters import MICROSCALE_NAMES
-from foamfit.springs.spring import BistableSpring, LinearSpring, MicroscaleSpring
+from foamfit.springs.laws import BistableSpring, LinearSpring, MicroscaleSpring
 from foamfit.trust.checklist import input_first
 
 HEIGHT, AREA = 1.19e-3, 1.9635e-5
@@ -206,7 +205,7 @@ def microscale_result(**changed: Any) -> FitResult:
         at(3, "a", "snap-through"), at(50, "snap-through", "held"), at(51, "held", "snap-through"),
         at(200, "snap-through", "held"), at(back, "held", "snap-back"),
     )  # fmt: skip
-    values = {name: getattr(MICRO, name) for name in MICROSCALE_NAMES}
+    values = dict(zip(MICRO.law.names, MICRO.values, strict=True))
     values |= {"g1": 0.5, "tau1": 0.25}
     made = {f"s1_{name}": estimate(f"s1_{name}", value) for name, value in values.items()}
     made["s1_eta"] = result().parameters["s1_eta"]

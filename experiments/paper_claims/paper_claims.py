@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy.signal import find_peaks
 
 import foamfit as ff
-from foamfit.springs.kernels import BRANCH_NAMES
+from foamfit.springs.law import BRANCH_NAMES
 from foamfit.springs.published import PublishedSet
 
 HERE = Path(__file__).parent

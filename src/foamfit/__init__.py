@@ -9,9 +9,13 @@ import importlib
 from typing import Any
 
 _HOME = {
-    "BistableSpring": "springs.spring",
-    "LinearSpring": "springs.spring",
-    "MicroscaleSpring": "springs.spring",
+    "BistableSpring": "springs.laws",
+    "LinearSpring": "springs.laws",
+    "MicroscaleSpring": "springs.laws",
+    "Law": "springs.laws",
+    "Functions": "springs.laws",
+    "Param": "springs.laws",
+    "register": "springs.laws",
     "Chain": "springs.chain",
     "Impact": "springs.chain",
     "StressDrive": "springs.chain",

@@ -20,14 +20,13 @@ import numpy as np
 from foamfit import one_model
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError
-from foamfit.fitting.box import is_share
 from foamfit.fitting.curves import choose_drive
 from foamfit.fitting.problem import make_params
 from foamfit.fitting.search import SearchStoppedError, what_stopped
 from foamfit.one_model import Found, Options, Progress
 from foamfit.results import Fit, Ladder, Rung, rung_name
 from foamfit.springs.model import Model
-from foamfit.springs.parameters import NUISANCE, split_name
+from foamfit.springs.parameters import NUISANCE, family, split_name
 from foamfit.text import counted, percent
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.checklist import input_first
@@ -116,7 +115,7 @@ def _carry(params: lmfit.Parameters, model: Model, below: Fit | None) -> None:
             continue
         if source in values:
             params[name].value = values[source]
-        elif spring in sources and is_share(short):
+        elif spring in sources and family(short) == "g":
             params[name].value = 0.0
         elif spring not in sources and model.kinds[spring] == "linear":
             params[name].value = params[name].min if short == "height" else 0.1 * params[name].max

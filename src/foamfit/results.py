@@ -14,8 +14,7 @@ from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.data.rate import loading_rate
 from foamfit.springs.chain import Chain
-from foamfit.springs.microscale import follow_fractions
-from foamfit.springs.spring import BistableSpring, MicroscaleSpring
+from foamfit.springs.laws import BistableSpring, MicroscaleSpring
 from foamfit.text import counted
 
 if TYPE_CHECKING:
@@ -331,8 +330,7 @@ def snapping_of(chain: Chain, strain: Array | None, stress: Array | None) -> dic
         if len(springs) == 1:
             own = None if strain is None else np.asarray(spring.stress(strain))
         if own is not None and np.all(np.isfinite(own)):
-            fraction = follow_fractions(own, spring.snapped_below, spring.left_below)
-            out[f"s{i}"] = Snapping(fraction, own)
+            out[f"s{i}"] = Snapping(spring.fraction_along(own), own)
     return out
 
 

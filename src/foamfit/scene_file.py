@@ -17,24 +17,15 @@ from foamfit.data.units import parse_quantity
 from foamfit.errors import InputError
 from foamfit.files import write_file
 from foamfit.solve.simulation import Response
+from foamfit.springs import laws
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
-from foamfit.springs.parameters import HYSTERETIC, KINDS, names_of
+from foamfit.springs.parameters import any_param
 from foamfit.springs.published import published
-from foamfit.springs.spring import BistableSpring, LinearSpring, MicroscaleSpring, Spring
+from foamfit.springs.spring import Spring
 
 Made = TypeVar("Made")
 
-_EXAMPLES = {  # key: SI unit and an example
-    "eps_a": ("", "0.14"),
-    "eps_c": ("", "0.31"),
-    "eps_star": ("", "0.08"),
-    "spread_plus": ("", "0.4"),
-    "spread_minus": ("", "0.8"),
-    "g": ("", "0.5"),
-    "tau": ("s", "0.2 s"),
-    "eta": ("Pa*s", "100 Pa*s"),
-    "dsigma": ("Pa", "-0.18 MPa"),
-    "height": ("m", "1 mm"),
+_EXAMPLES = {  # key: SI unit and an example, of what is no parameter of a spring
     "mass": ("kg", "7 g"),
     "velocity": ("m/s", "1.75 m/s"),
     "diameter": ("m", "5 mm"),
@@ -70,7 +61,7 @@ def _table(path: Path, document: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def _number(where: str, table: dict[str, Any], key: str) -> float:
-    unit, example = _EXAMPLES.get(key, ("Pa", "1 MPa"))
+    unit, example = _EXAMPLES.get(key) or _example(key)
     if key not in table:
         right = example if unit == "" else f'"{example}"'
         raise InputError(f"{where} {key} is missing; give it like {key} = {right}.")
@@ -78,6 +69,12 @@ def _number(where: str, table: dict[str, Any], key: str) -> float:
     if unit == "" and isinstance(value, int | float) and not isinstance(value, bool):
         return float(value)
     return parse_quantity(value, unit, f"{where} {key}", example)
+
+
+def _example(key: str) -> tuple[str, str]:
+    """Unit and example of a parameter of springs."""
+    param = any_param(key)
+    return param.unit.replace(" ", "*"), param.example or f"1 {param.unit}".strip()
 
 
 def _chain(where: str, table: dict[str, Any]) -> Chain:
@@ -117,20 +114,17 @@ def _made(where: str, make: Callable[..., Made], *given: Any, **named: Any) -> M
 
 def _spring(where: str, given: dict[str, Any]) -> Spring:
     kind = given.get("kind")
-    if kind not in KINDS:
-        raise InputError(f"{where} kind = {kind!r}; it must be one of {', '.join(KINDS)}.")
-    names = names_of(kind)
-    terms = ["relaxation"] if kind in HYSTERETIC else []
-    check_keys(where, given, ["kind", "height", "mass", *names, *terms])
-    values: dict[str, Any] = {
-        name: _number(where, given, name) for name in names if name != "eta" or name in given
-    }
-    if kind not in HYSTERETIC:
-        return _made(where, LinearSpring, **values, unilateral=kind == "unilateral")
-    values["relaxation"] = _relaxation(where, given.get("relaxation", []))
-    if kind == "bistable":
-        return _made(where, BistableSpring, **values)
-    return _made(where, MicroscaleSpring, **values)
+    if kind not in laws.kinds():
+        raise InputError(f"{where} kind = {kind!r}; it must be one of {', '.join(laws.kinds())}.")
+    law = laws.law(kind)
+    more = ["relaxation"] if law.hysteretic else []
+    check_keys(where, given, ["kind", "height", "mass", *law.names, *more])
+    values = [
+        _number(where, given, name) if name != "eta" or name in given else 0.0 for name in law.names
+    ]
+    terms = _relaxation(where, given.get("relaxation", []))
+    spring: Spring = _made(where, law.make, values, terms)
+    return spring
 
 
 def _relaxation(where: str, given: Any) -> list[tuple[float, float]]:

@@ -52,7 +52,7 @@ def test_a_fit_calls_what_was_compiled_and_nothing_else() -> None:
     ff.fit(ff.read_test(RECONSTRUCTION), starts=2)
     assert taylor.integrate.signatures == [precompile._calls()[taylor.integrate]]
     for function in (
-        kernels.fill_rows, kernels.stress_along, kernels.fault, kernels.total,
+        kernels.fill_bistable, kernels.stress_along, kernels.fault, kernels.total,
         sensitivities.equilibrium_tangents, vibration.fastest_rates,
     ):  # fmt: skip
         assert len(function.signatures) == 1, function.py_func.__name__
@@ -66,8 +66,8 @@ def test_a_fit_of_springs_with_memory_calls_what_was_compiled_and_nothing_else()
     ff.fit(timed, model="microscale", relaxation=1, starts=1, intervals="local")
     ff.fit(timed, model="microscale", starts=1, intervals="local")
     for function in (
-        relaxation.relaxed_along, microscale_kernels.fill_rows, microscale_kernels.stress_along,
-        microscale_kernels.stress_tangents_along,
+        relaxation.relaxed_along, microscale_kernels.fill_microscale,
+        microscale_kernels.stress_along, microscale_kernels.stress_tangents_along,
     ):  # fmt: skip
         assert len(function.signatures) == 1, function.py_func.__name__
 

@@ -8,7 +8,6 @@ import pytest
 import foamfit as ff
 from foamfit.fitting.problem import make_problem
 from foamfit.springs.chain import Drive
-from foamfit.springs.parameters import BISTABLE_NAMES, LINEAR_NAMES
 from foamfit.springs.spring import Spring
 
 AREA = 1.9635e-5
@@ -84,7 +83,7 @@ def names_of(scene: ff.Chain) -> list[str]:
     """Parameters of a chain, but for dashpots that are not there."""
     names = ["site_eta"] if scene.site_damping > 0.0 else []
     for i, spring in enumerate(scene.springs, start=1):
-        own = BISTABLE_NAMES if isinstance(spring, ff.BistableSpring) else LINEAR_NAMES
+        own = spring.law.names
         names += [f"s{i}_{short}" for short in own if short != "eta" or spring.eta > 0.0]
         names.append(f"s{i}_height")
     return names

@@ -8,11 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.optimize import brentq
-from scipy.stats import norm, weibull_min
+from scipy.stats import norm
 
 import foamfit as ff
 from foamfit.springs import microscale_kernels
-from foamfit.springs.microscale import follow_fractions, follow_strain, fractions_of
 from foamfit.springs.sensitivities import equilibrium_tangents
 
 SHOE = ff.MicroscaleSpring(5.5e5, 2.5e5, 0.08, 1.3e5, 0.4, 5.5e4, 0.77)
@@ -188,54 +187,14 @@ def test_the_held_rank_at_the_end_of_its_stresses_is_held() -> None:
     assert branches.tolist() == [7, 8, 6]
 
 
-# ------------------------------------------------------------------------ any other laws
-
-
-def test_log_normal_laws_are_those_of_the_spring() -> None:
+def test_the_fraction_that_has_snapped_follows_its_two_laws() -> None:
     stress = walk(TURNS, 20) * 4e5
-
-    def law(median: float, spread: float) -> object:
-        return lambda s: norm.cdf(np.log(np.maximum(s, 1e-300) / median) / spread)
-
-    plus, minus = law(1.3e5, 0.4), law(5.5e4, 0.77)
-    got = follow_strain(stress, 5.5e5, 2.5e5, 0.08, plus, minus)  # type: ignore[arg-type]
-    np.testing.assert_allclose(got, SHOE.strain(stress), rtol=0, atol=1e-14)
-
-
-def test_weibull_laws_make_inner_loops() -> None:
-    plus, minus = weibull_min(3.0, scale=2e5).cdf, weibull_min(1.2, scale=8e4).cdf
-    got = follow_fractions([0, 2e5, 1e5, 2e5, 1e5, 3e4, 0], plus, minus)
-    turned, low = plus(2e5), minus(3e4)
-    assert minus(1e5) > turned
-    np.testing.assert_allclose(got, [0, turned, turned, turned, turned, low, 0], rtol=1e-15)
-
-
-@pytest.mark.parametrize("law", [lambda s: -s, lambda s: 1 - s / 1e6, lambda s: s * np.nan])
-def test_what_is_no_law_of_snapping_is_refused(law: object) -> None:
-    with pytest.raises(ff.InputError, match=r"^minus is no law of snapping: at .* Pa"):
-        follow_fractions([0.0, 1e5], lambda s: s / 1e6, law)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    "spring",
-    [
-        ff.BistableSpring(5e5, 1e6, -3e4, 0.12, 0.35, 2e5, 1.2e5),
-        ff.BistableSpring(5.5e6, 82.5e6, -0.2e6, 0.14, 0.31, 5e6, 2.2e6),
-        ff.BistableSpring(5.5e6, 82.5e6, -0.2e6, 0.14, 0.31, 0.0, 2.2e6),
-    ],
-)
-def test_full_loops_of_the_bistable_law_come_of_its_micro_springs(
-    spring: ff.BistableSpring,
-) -> None:
-    top = 1.3 * spring.sigma_hat_c
-    low = spring.sigma_hat_a
-    assert low is not None
-    stress = walk((0.0, top, min(1.2 * low, 0.0), top, 0.0), 301)
-    got = follow_strain(stress, spring.k0, spring.kc, spring.eps_star, *fractions_of(spring))
-    np.testing.assert_allclose(got, spring.strain(stress), rtol=0, atol=1e-10)
-
-
-@pytest.mark.parametrize("name", list(ff.published))
-def test_no_published_spring_has_micro_springs(name: str) -> None:
-    with pytest.raises(ff.InputError, match=r"^kh_plus = .* is too stiff a branch"):
-        fractions_of(ff.published[name].bistable)
+    plus, minus = (
+        norm.cdf(np.log(np.maximum(stress, 1e-300) / median) / spread)
+        for median, spread in ((1.3e5, 0.4), (5.5e4, 0.77))
+    )
+    expected, snapped = [], 0.0
+    for least, most in zip(plus, minus, strict=True):
+        snapped = min(max(snapped, least), max(least, most))
+        expected.append(snapped)
+    np.testing.assert_allclose(SHOE.fraction_along(stress), expected, rtol=0, atol=1e-14)

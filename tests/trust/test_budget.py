@@ -17,7 +17,6 @@ from foamfit.data.measurement import Measurement, Noise, Specimen
 from foamfit.fitting.problem import make_problem
 from foamfit.report.summary import conclusions
 from foamfit.results import SOURCES
-from foamfit.springs.parameters import MICROSCALE_NAMES
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.budget import responses
 
@@ -246,7 +245,7 @@ def test_heights_of_a_chain(tmp_path):
         test, "linear+microscale", "displacement", None, None, interior_mass=False
     )
     values = problem.vector()
-    values[:2], values[2:10] = [2e6, 0.0], [getattr(MICRO, short) for short in MICROSCALE_NAMES]
+    values[:2], values[2:10] = [2e6, 0.0], MICRO.values
     found = responses(best := BestPoint(problem, values))
     assert found["height_1"][best.index["s1_height"]] == pytest.approx(4e-5)
     assert found["height_1"][best.index["s2_height"]] == 0.0

@@ -16,12 +16,14 @@ import foamfit as ff
 from conftest import EXPERIMENTS, needs_data
 from foamfit.api import FitResult
 from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
+from foamfit.fitting.box import Scales
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.search import Tracker
-from foamfit.fitting.starts import Loop, Scales, read_spring
 from foamfit.one_model import Options, identify, judge
 from foamfit.report.folder import load_result
 from foamfit.report.readable import readable
+from foamfit.springs.laws.bistable import read_off
+from foamfit.springs.loop import Loop
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import NOTHING, RULE, WEAK, covariance, half_width
 from foamfit.trust.intervals import Choice
@@ -344,7 +346,7 @@ def test_a_loop_has_two_branches_c():
     strain = np.concatenate([np.linspace(0, 0.5, 200), np.linspace(0.5, 0, 200)[1:]])
     loop, scales = Loop(strain, spring.stress(strain)), Scales(2e5, 0.5, 1.0, 0.01)
     marks = np.array([0.2, 0.9, 0.4, 0.5, 0.0])
-    stiff, soft = (read_spring(loop, marks, scales, soft=value) for value in (False, True))
+    stiff, soft = (read_off(loop, marks, scales, way) for way in (0, 1))
     others = np.arange(8) != 1
     assert soft[others] == pytest.approx(stiff[others])
     assert soft[1] < stiff[1]

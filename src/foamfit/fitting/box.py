@@ -1,8 +1,7 @@
 """The coordinates of the search: a box in which every point is an admissible chain.
 
-Logarithms of the stiffnesses, of ε_a, of snap stresses, spreads and relaxation times; the drop
-Δσ/σ_a; the places of ε_c between ε_a and one and of ε_* between its least and one; slopes, damping
-and shares of relaxation over the scales of the test; nuisance parameters between their limits.
+Each parameter moves as the record of its law says: in its logarithm, over a scale of the test, or
+between ends that depend on other parameters; nuisance parameters move between their limits.
 """
 
 from __future__ import annotations
@@ -11,44 +10,24 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.fitting import nuisance
-from foamfit.springs.law import least_eps_star
+from foamfit.springs.laws.record import Between, Param
 from foamfit.springs.model import Model
-from foamfit.springs.parameters import NUISANCE, split_name
+from foamfit.springs.parameters import NUISANCE, any_param, family, split_name
 
-LAST_STRAIN = 0.999
-# Parameters whose coordinate is a logarithm, besides the relaxation times.
-LOGARITHMIC = (
-    "k0", "kc", "eps_a", "sigma_plus", "sigma_minus", "spread_plus", "spread_minus"
-)  # fmt: skip
-
-
-def is_share(short: str) -> bool:
-    """Whether a parameter is the share g of a relaxation term."""
-    return family(short) == "g"
-
-
-def is_time(short: str) -> bool:
-    """Whether a parameter is the time τ of a relaxation term."""
-    return family(short) == "tau"
+# Coordinates of nuisance parameters: from one limit to the other.
+NUISANCE_BOX = (-1.0, 1.0)
 
 
 def is_logarithmic(short: str) -> bool:
     """Whether the coordinate of a parameter is its logarithm."""
-    return short in LOGARITHMIC or is_time(short)
-
-
-def family(short: str) -> str:
-    """Name of a parameter without the number of its relaxation term: "g1" is "g"."""
-    for name in ("g", "tau"):
-        if short.startswith(name) and short.removeprefix(name).isdigit():
-            return name
-    return short
+    return short not in NUISANCE and any_param(short).is_logarithmic
 
 
 @dataclass(frozen=True)
@@ -101,61 +80,88 @@ class Scales:
             "acceleration_zero": 0.01 * acceleration,
         }
 
-    def of_parameter(self, name: str, values: dict[str, float]) -> float:
-        """Scale of a parameter, in its unit: a change by so much is a relative change of 1."""
-        spring, short = split_name(name)
-        if short == "eta":
-            return max(abs(values[name]), 0.1 * self.eta)
-        if spring < 0 and short in NUISANCE:
+    def unit(self, scale: str) -> float:
+        """A scale of a parameter by its name, see `springs.laws.record.Param`."""
+        return {
+            "one": 1.0, "strain": self.strain, "stress": self.stress, "slope": self.slope,
+            "damping": self.eta, "duration": self.duration, "height": self.height,
+        }[scale]  # fmt: skip
+
+    def of_parameter(self, model: Model, name: str, values: dict[str, float]) -> float:
+        """Scale of a parameter, in its unit: the unit of its relative change."""
+        short = split_name(name)[1]
+        if name in NUISANCE:
             return abs(values[name]) if name in nuisance.STRIKER else self._hundredth[short]
-        if short in ("kh_plus", "kh_minus"):
-            return max(abs(values[name]), 0.1 * self.slope)
-        if short == "dsigma":
-            eps_a = values[f"s{spring + 1}_eps_a"]
-            return values[f"s{spring + 1}_k0"] * eps_a / (1.0 - eps_a)
-        if short == "eps_star" or is_share(short):
-            return max(abs(values[name]), 0.1)
-        return abs(values[name]) or 1.0
+        param = model.param(name)
+        if not param.least_size:
+            return abs(values[name]) or 1.0
+        unit = self.unit(param.scale)
+        if isinstance(param.coordinate, Between) and param.scale != "one":
+            first, last = param.coordinate.ends(*others(name, param, values))
+            unit = abs(last - first)
+        return max(abs(values[name]), param.least_size * unit)
+
+
+def others(name: str, param: Param, values: dict[str, float]) -> list[float]:
+    """Values of the parameters of the same spring that a parameter is relative to."""
+    prefix = name.partition("_")[0]
+    return [values[f"{prefix}_{short}"] for short in param.of]
+
+
+SCALES_IN_WORDS = {
+    "one": "1",
+    "stress": "the largest stress",
+    "slope": "the largest stress over strain",
+    "damping": "the damping that would carry the whole stress",
+    "duration": "the time under load",
+}
+NUISANCE_IN_WORDS = {
+    "time_shift": "a hundredth of the time under load",
+    "contact_time": "a hundredth of the time under load",
+    "stress_zero": "a hundredth of the largest stress",
+    "displacement_zero": "a hundredth of the largest displacement",
+    "acceleration_zero": "a hundredth of the height over the squared time under load",
+}
 
 
 def scale_in_words(name: str, value: float, scale: float) -> str:
     """Say what the scale of a parameter is."""
     if math.isclose(scale, abs(value), rel_tol=1e-9):
         return "its value"
-    return {
-        "eta": "a tenth of the damping that would carry the whole stress",
-        "time_shift": "a hundredth of the time under load",
-        "contact_time": "a hundredth of the time under load",
-        "stress_zero": "a hundredth of the largest stress",
-        "displacement_zero": "a hundredth of the largest displacement",
-        "acceleration_zero": "a hundredth of the height over the squared time under load",
-        "kh_plus": "a tenth of the largest stress over strain",
-        "kh_minus": "a tenth of the largest stress over strain",
-        "dsigma": "σ_a",
-        "eps_star": "0.1",
-    }.get(split_name(name)[1], "0.1" if is_share(split_name(name)[1]) else "its value")
+    if name in NUISANCE:
+        return NUISANCE_IN_WORDS.get(name, "its value")
+    param = any_param(split_name(name)[1])
+    if not param.least_size:
+        return "its value"
+    if param.least_size == 1.0:
+        return "its largest admissible size"
+    share = "a tenth" if param.least_size == 0.1 else f"{param.least_size:g}"
+    if param.scale == "one":
+        return f"{param.least_size:g}"
+    return f"{share} of {SCALES_IN_WORDS[param.scale]}"
 
 
-# Coordinates of the box: lowest and highest. Stiffnesses and stresses are over the largest stress,
-# slopes over stress/strain, relaxation times over the time under load, all of the test.
-BOX = {
-    "k0": (np.log(1e-3), np.log(1e4)),
-    "kc": (np.log(1e-2), np.log(1e5)),
-    "eps_a": (np.log(1e-3), np.log(0.95)),
-    "eps_c": (0.002, 1.0),
-    "eps_star": (0.0, 1.0),
-    "dsigma": (0.0, 0.999),
-    "kh_plus": (0.0, 50.0),
-    "kh_minus": (0.0, 50.0),
-    "sigma_plus": (np.log(1e-3), np.log(30.0)),
-    "sigma_minus": (np.log(1e-4), np.log(30.0)),
-    "spread_plus": (np.log(1e-3), np.log(5.0)),
-    "spread_minus": (np.log(1e-3), np.log(5.0)),
-    "g": (0.0, 10.0),
-    "tau": (np.log(1e-4), np.log(30.0)),
-    "eta": (0.0, 10.0),
-    "height": (0.02, 0.98),
-} | dict.fromkeys(NUISANCE, (-1.0, 1.0))
+# Coordinates that every spring has, in their order behind those of its law.
+COMMON_ORDER = ("g", "tau", "eta", "height")
+
+
+class Coordinate(NamedTuple):
+    """One coordinate: the place of its parameter in the vector, and how they depend on each other.
+
+    `param` is the record, None of a nuisance parameter; `unit` is its scale, SI; `of` has the
+    places of the parameters that it is relative to.
+    """
+
+    place: int
+    short: str
+    param: Param | None
+    unit: float
+    of: tuple[int, ...]
+
+    @property
+    def is_logarithmic(self) -> bool:
+        """Whether it is the logarithm of the parameter."""
+        return self.param is not None and self.param.is_logarithmic
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,51 +180,57 @@ class Space:
     tied: Callable[[Array], Array] | None
 
     @cached_property
-    def coordinates(self) -> list[tuple[int, str, int]]:
-        """Place, short name, place of the spring's first parameter; what others need is first."""
-        out, shorts = [], list(BOX)
-        for name in sorted(self.free, key=lambda name: shorts.index(family(split_name(name)[1]))):
-            spring, short = split_name(name)
-            first = self.model.index[f"s{spring + 1}_k0"] if spring >= 0 else -1
-            out.append((self.names.index(name), short, first))
+    def coordinates(self) -> list[Coordinate]:
+        """The parameters that vary, each after those that it is relative to."""
+        out, index = [], {name: i for i, name in enumerate(self.names)}
+        for name in sorted(self.free, key=self._rank):
+            if name in NUISANCE:
+                out.append(Coordinate(index[name], name, None, 0.0, ()))
+                continue
+            param, prefix = self.model.param(name), name.partition("_")[0]
+            of = tuple(index[f"{prefix}_{short}"] for short in param.of)
+            unit = self.scales.unit(param.scale)
+            out.append(Coordinate(index[name], split_name(name)[1], param, unit, of))
         return out
+
+    def _rank(self, name: str) -> int:
+        """Order of the coordinates: own parameters of the springs as their laws say, the others."""
+        spring, short = split_name(name)
+        own = self.model.laws[spring].search_order if spring >= 0 else ()
+        if short in own:
+            return own.index(short)
+        rest = (*COMMON_ORDER, *NUISANCE)
+        return 1000 + rest.index(family(short))
 
     @cached_property
     def box(self) -> tuple[Array, Array]:
         """Lowest and highest coordinates, (n_free,) each."""
-        pairs = np.array([BOX[family(short)] for _, short, _ in self.coordinates]).reshape(-1, 2)
-        return pairs[:, 0], pairs[:, 1]
-
-    def _unit(self, short: str) -> float:
-        """What a parameter is measured in, SI."""
-        scales = self.scales
-        units = {"height": scales.height, "eta": scales.eta, "tau": scales.duration}
-        units |= dict.fromkeys(("k0", "kc", "sigma_plus", "sigma_minus"), scales.stress)
-        units |= dict.fromkeys(("kh_plus", "kh_minus"), scales.slope)
-        return units.get(family(short), 1.0)
+        pairs = [NUISANCE_BOX if c.param is None else c.param.limits for c in self.coordinates]
+        low, high = np.array(pairs).reshape(-1, 2).T
+        return low, high
 
     def _middle(self, i: int) -> tuple[float, float]:
         """Middle between the limits of a nuisance parameter, and half of their distance."""
         return 0.5 * (self.low[i] + self.high[i]), 0.5 * (self.high[i] - self.low[i])
 
+    def _ends(self, one: Coordinate, values: Array) -> tuple[float, float]:
+        """Values of a parameter at the coordinates 0 and 1, unless its logarithm is one."""
+        if one.param is None:
+            middle, half = self._middle(one.place)
+            return middle, middle + half
+        if isinstance(one.param.coordinate, Between):
+            return one.param.coordinate.ends(*(float(values[place]) for place in one.of))
+        return 0.0, one.unit
+
     def encode(self, values: Array) -> Array:
         """Coordinates of a vector of parameters, moved into the box."""
         out = np.empty(len(self.coordinates))
-        for j, (i, short, first) in enumerate(self.coordinates):
-            if is_logarithmic(short):
-                out[j] = np.log(max(values[i], 1e-300) / self._unit(short))
-            elif short == "eps_c":
-                out[j] = (values[i] - values[first + 3]) / (LAST_STRAIN - values[first + 3])
-            elif short == "eps_star":
-                least = least_eps_star(values[first], values[first + 1])
-                out[j] = (values[i] - least) / (LAST_STRAIN - least)
-            elif short == "dsigma":
-                out[j] = -values[i] / _stress_at_a1(values, first)
-            elif short in NUISANCE:
-                middle, half = self._middle(i)
-                out[j] = (values[i] - middle) / half
+        for j, one in enumerate(self.coordinates):
+            if one.is_logarithmic:
+                out[j] = np.log(max(values[one.place], 1e-300) / one.unit)
             else:
-                out[j] = values[i] / self._unit(short)
+                first, last = self._ends(one, values)
+                out[j] = (values[one.place] - first) / (last - first)
         low, high = self.box
         margin = 1e-9 * (high - low)
         return np.clip(out, low + margin, high - margin)
@@ -226,27 +238,21 @@ class Space:
     def decode(self, point: Array) -> Array:
         """Vector of parameters (SI) at a point of the box."""
         values = self.values.copy()
-        for u, (i, short, first) in zip(point, self.coordinates, strict=True):
-            value = self._value(u, i, short, first, values)
-            values[i] = min(max(value, self.low[i]), self.high[i])
+        for u, one in zip(point, self.coordinates, strict=True):
+            value = self._value(u, one, values)
+            values[one.place] = min(max(value, self.low[one.place]), self.high[one.place])
         return self.complete(values)
 
     def complete(self, values: Array) -> Array:
         """Complete a vector by what hangs on others."""
         return values if self.tied is None else self.tied(values)
 
-    def _value(self, u: float, i: int, short: str, first: int, values: Array) -> float:
+    def _value(self, u: float, one: Coordinate, values: Array) -> float:
         """Parameter of a coordinate, whatever its limits; what it needs of `values` is there."""
-        if is_logarithmic(short):
-            return float(np.exp(u)) * self._unit(short)
-        if short in ("eps_c", "eps_star"):
-            least = least_eps_star(values[first], values[first + 1])
-            least = least if short == "eps_star" else float(values[first + 3])
-            return least + u * (LAST_STRAIN - least)
-        if short in NUISANCE:
-            middle, half = self._middle(i)
-            return middle + u * half
-        return -u * _stress_at_a1(values, first) if short == "dsigma" else u * self._unit(short)
+        if one.is_logarithmic:
+            return float(np.exp(u)) * one.unit
+        first, last = self._ends(one, values)
+        return first + u * (last - first)
 
     def slopes(self, point: Array, values: Array) -> Array:
         """Derivative of the parameters by the coordinates at a point, (n_values, n_free).
@@ -254,31 +260,19 @@ class Space:
         `values` is the decoded point.
         """
         moves = np.zeros((values.size, point.size))
-        for j, (i, short, first) in enumerate(self.coordinates):
-            if is_logarithmic(short):
-                moves[i, j] = values[i]
-            elif short == "eps_star":
-                k0, kc = float(values[first]), float(values[first + 1])
-                least = least_eps_star(k0, kc)
-                if least > 0.0:  # its derivative by the logarithm of kc/k0
-                    rise = 0.25 * (1.0 - least * least)
-                    moves[i] = (1.0 - point[j]) * rise * (moves[first + 1] / kc - moves[first] / k0)
-                moves[i, j] = LAST_STRAIN - least
-            elif short == "eps_c":
-                moves[i] = (1.0 - point[j]) * moves[first + 3]
-                moves[i, j] = LAST_STRAIN - values[first + 3]
-            elif short == "dsigma":
-                eps_a = values[first + 3]
-                rise = eps_a / (1.0 - eps_a) * moves[first]
-                rise += values[first] / (1.0 - eps_a) ** 2 * moves[first + 3]
-                moves[i] = -point[j] * rise
-                moves[i, j] = -_stress_at_a1(values, first)
-            elif short in NUISANCE:
-                moves[i, j] = self._middle(i)[1]
+        for j, one in enumerate(self.coordinates):
+            if one.param is not None and isinstance(one.param.coordinate, Between):
+                by = one.param.coordinate.slopes(*(float(values[place]) for place in one.of))
+                for place, (first, last) in zip(one.of, by, strict=True):
+                    moves[one.place] += (first + point[j] * (last - first)) * moves[place]
+            if one.is_logarithmic:
+                moves[one.place, j] = values[one.place]
             else:
-                moves[i, j] = self._unit(short)
-            if not self.low[i] <= self._value(point[j], i, short, first, values) <= self.high[i]:
-                moves[i] = 0.0
+                first, last = self._ends(one, values)
+                moves[one.place, j] = last - first
+            value = self._value(point[j], one, values)
+            if not self.low[one.place] <= value <= self.high[one.place]:
+                moves[one.place] = 0.0
         return self.follow(values, moves, np.full(point.size, 1e-5))
 
     def follow(self, values: Array, moves: Array, steps: Array) -> Array:
@@ -294,8 +288,3 @@ class Space:
             out[:, j] = (ahead - self.tied(values - step * moves[:, j])) / (2.0 * step)
         # what does not hang on others keeps its move to the last digit
         return np.where(moves != 0.0, moves, out)
-
-
-def _stress_at_a1(values: Array, first: int) -> float:
-    """σ_a = k0 ε_a/(1-ε_a) of the spring whose parameters start at `first`, Pa."""
-    return float(values[first] * values[first + 3] / (1.0 - values[first + 3]))

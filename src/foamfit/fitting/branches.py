@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from foamfit.springs import kernels
-from foamfit.springs.parameters import BRANCHES, HYSTERETIC, split_name
+from foamfit.springs.parameters import split_name
 
 if TYPE_CHECKING:
     from foamfit.fitting.objective import Simulated
@@ -20,10 +19,10 @@ FLIGHT = "free flight"
 
 def visited(problem: Problem, simulated: Simulated) -> dict[str, tuple[str, ...]]:
     """Branches that each spring went through, in the order of the first visit."""
-    kinds = problem.model.kinds
-    seen = {i: ["a" if kind in HYSTERETIC else "line"] for i, kind in enumerate(kinds)}
+    laws = problem.model.laws
+    seen = {i: [next(iter(law.branches))] for i, law in enumerate(laws)}
     for _, spring, _, entered, _ in simulated.motion.switches:
-        name = kernels.BRANCH_NAMES[int(entered)]
+        name = laws[int(spring)].named_branch(int(entered))
         if name not in seen[int(spring)]:
             seen[int(spring)].append(name)
     return {f"s{i + 1}": tuple(names) for i, names in seen.items()}
@@ -42,8 +41,8 @@ def unreached(problem: Problem, simulated: Simulated) -> dict[str, str]:
     seen = visited(problem, simulated)
     out = {}
     for name in problem.model.names:
-        spring, short = split_name(name)
-        branch = BRANCHES.get(problem.model.kinds[spring], {}).get(short) if spring >= 0 else None
+        spring = split_name(name)[0]
+        branch = problem.model.param(name).branch if spring >= 0 else ""
         if branch and branch not in covered(seen[f"s{spring + 1}"]):
             out[name] = branch
     return out
@@ -51,12 +50,12 @@ def unreached(problem: Problem, simulated: Simulated) -> dict[str, str]:
 
 def _states(problem: Problem, simulated: Simulated) -> list[tuple[int, dict[int, str]]]:
     """Samples from which on the hysteretic springs (0 at the base) are on these branches."""
-    kinds = problem.model.kinds
-    state = {i: "a" for i, kind in enumerate(kinds) if kind in HYSTERETIC}
+    laws = problem.model.laws
+    state = {i: next(iter(law.branches)) for i, law in enumerate(laws) if law.hysteretic}
     out = [(0, dict(state))]
     for when, spring, _, entered, _ in simulated.motion.switches:
         if int(spring) in state:
-            state[int(spring)] = kernels.BRANCH_NAMES[int(entered)]
+            state[int(spring)] = laws[int(spring)].named_branch(int(entered))
             out.append((int(np.searchsorted(problem.objective.time, when)), dict(state)))
     return out
 

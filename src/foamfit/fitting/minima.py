@@ -24,9 +24,8 @@ EXCHANGES, EXCHANGED = 8, 16
 # Ends of the search whose cost is above the best by less than so many variances of the noise are
 # settled anew, at most so many; points of the box closer than the last are one minimum.
 NEAR, MINIMA, SAME = 40.0, 24, 0.02
-# Strains at which branches begin, which are scanned. Steps of a scan: share of the box, the most to
+# Steps of a scan: share of the box, the most to
 # each side, and the rise of the cost, in variances of what is left of the curves, at which it ends.
-PLACES = ("eps_a", "eps_star")
 STEP, STEPS, TOO_HIGH = 0.06, 12, 150.0
 
 
@@ -40,10 +39,11 @@ def scan_places(tracker: Tracker, space: Space) -> bool:
         return False
     best, cost, met = tracker.best_values, tracker.best_cost, [space.encode(tracker.best_values)]
     left = max(cost, tracker.objective.floor) / tracker.objective.n_data
-    for column, (place, short, _) in enumerate(space.coordinates):
-        if short not in PLACES:
+    scanned = {law.scanned for law in space.model.laws}
+    for column, one in enumerate(space.coordinates):
+        if one.short not in scanned:
             continue
-        held = {space.names[place], *NUISANCE}
+        held = {space.names[one.place], *NUISANCE}
         free = tuple(name for name in space.free if name not in held)
         for step in (STEP, -STEP):
             at, values = space.encode(best)[column], best

@@ -34,12 +34,10 @@ from foamfit.fitting.curves import (
 )
 from foamfit.fitting.losses import LOSSES, soften, softness
 from foamfit.fitting.weighing import Weighing
-from foamfit.solve.plan import Motion, Plan
+from foamfit.solve.plan import AnyPlan, Motion
 from foamfit.solve.plan import plan as make_plan
-from foamfit.springs import kernels
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.springs.model import Model
-from foamfit.springs.spring import LinearSpring, MicroscaleSpring, Spring
 
 # What a residual is, in units of the curve's scale, where a simulation failed.
 PENALTY = 10.0
@@ -49,8 +47,6 @@ OF_DRIVE = ("those of the drive",)  # nuisance parameters, where none are named
 # measured foam closer than 1 % of its range: noise far below that must not let one channel outweigh
 # the other by what is an error of the model in both.
 MODEL_ERROR = 0.005
-# A spring of a kind, whatever its numbers, where that is more than a linear one to the solver.
-_ANY_SPRING: dict[str, Spring] = {"microscale": MicroscaleSpring(1.0, 1.0, 0.0, 1.0, 1.0, 1.0, 1.0)}
 MAX_STEPS = 20_000  # a trial that needs more is too stiff to be worth waiting for
 # Standard deviation of normal residuals over the median of their sizes.
 NORMAL = 1.4826
@@ -166,7 +162,7 @@ class Objective:
         return np.interp(self._clock, self.time, values)
 
     @cached_property
-    def _along(self) -> dict[bool, Plan]:
+    def _along(self) -> dict[bool, AnyPlan]:
         """Scenes of the springs along the measured motion; none where there is no motion."""
         if self.measurement.displacement is None:
             return {}
@@ -258,14 +254,14 @@ class Objective:
             return StressDrive(driving_stress(self._stress, self.model))
         return DisplacementDrive(self._moved)
 
-    def _scene(self, loading: Drive, *, damped: bool) -> Plan:
+    def _scene(self, loading: Drive, *, damped: bool) -> AnyPlan:
         """Make a scene ready; only which springs have a dashpot matters here, not their values.
 
         Interior masses move in an impact only; along a given motion the springs are in equilibrium.
         """
         specimen = self.measurement.specimen
         count = len(self.model.kinds)
-        springs = [_ANY_SPRING.get(kind, LinearSpring(1.0)) for kind in self.model.kinds]
+        springs = [law.any_spring() for law in self.model.laws]
         heights = [specimen.height / count] * count
         masses = [0.0] * count
         if self.interior_mass and count > 1 and isinstance(loading, Impact):
@@ -403,14 +399,16 @@ class Objective:
         if rows is None or not (np.all(heights > 0.0) and values[-1] >= 0.0):
             raise SimulationError("the parameters are not admissible")
         # A dashpot at zero is left out, unless a derivative by it is wanted.
-        damped = bool(rows[:, kernels.ETA].any()) or bool(self._dashpots[places].any())
+        damped = bool(values[: self._dashpots.size][self._dashpots].any()) or bool(
+            self._dashpots[places].any()
+        )
         drag = float(values[-1]) / height
         everywhere = everything or self._inside
         wanted = self.model.directions[places]
         at = dict(zip(self.nuisance, nuisance.tolist(), strict=True))
         plan = self._placed(self._plans[damped], at)
 
-        def run(plan: Plan, everything: bool) -> Motion:
+        def run(plan: AnyPlan, everything: bool) -> Motion:
             return plan.run(
                 rows, heights, self.rtol, drag=drag, everything=everything, directions=wanted
             )
@@ -474,7 +472,7 @@ class Objective:
         """Whether the measured motion drives the springs."""
         return self.drive == "displacement"
 
-    def _placed(self, plan: Plan, at: dict[str, float]) -> Plan:
+    def _placed(self, plan: AnyPlan, at: dict[str, float]) -> AnyPlan:
         """Plan of an impact with its contact, and its striker, where the nuisance has them."""
         if self._driven and at.get("displacement_zero", 0.0) != 0.0:
             moved = plan.values - at["displacement_zero"]
@@ -486,7 +484,7 @@ class Objective:
         time = self._clock - at[nuisances.CONTACT_TIME]
         return plan._replace(time=time, speed=at[nuisances.VELOCITY], mass=mass)
 
-    def _followed(self, plan: Plan, at: dict[str, float]) -> Plan:
+    def _followed(self, plan: AnyPlan, at: dict[str, float]) -> AnyPlan:
         """Plan of the measured motion of an impact: its zero taken off, none before contact."""
         if self.drive != "impact":
             return plan

@@ -7,7 +7,8 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.fitting.box import Space
 from foamfit.fitting.objective import Objective
-from foamfit.springs.parameters import HYSTERETIC, relaxation_names, split_name
+from foamfit.springs.laws.record import Law
+from foamfit.springs.parameters import relaxation_names, split_name
 
 
 def in_order(space: Space, objective: Objective, values: Array) -> Array:
@@ -17,8 +18,9 @@ def in_order(space: Space, objective: Objective, values: Array) -> Array:
     across a mass inside whose displacement is counted; the foam of the paper buckles first at its
     base.
     """
-    for kind in HYSTERETIC:
-        values = _of_kind(space, objective, values, kind)
+    for law in dict.fromkeys(space.model.laws):
+        if law.hysteretic:
+            values = _of_law(space, objective, values, law)
     return _terms_by_time(space, values)
 
 
@@ -35,24 +37,19 @@ def _terms_by_time(space: Space, values: Array) -> Array:
     return out
 
 
-def _of_kind(space: Space, objective: Objective, values: Array, kind: str) -> Array:
-    """Order the springs of one kind; see `in_order`."""
+def _of_law(space: Space, objective: Objective, values: Array, law: Law) -> Array:
+    """Order the springs of one law; see `in_order`."""
     model = space.model
-    own = [i for i, other in enumerate(model.kinds) if other == kind]
+    own = [i for i, other in enumerate(model.laws) if other is law]
     held = [split_name(name) for name in model.names if name not in space.free]
     if any(spring in own and short not in ("eta", "height") for spring, short in held):
         return values
     nodes = [n for name, n in objective.interior.items() if name in objective.counted]
 
-    def onset(spring: int) -> float:
-        """σ_a, or the median snap-through stress, Pa."""
-        if kind == "microscale":
-            return float(values[model.index[f"s{spring + 1}_sigma_plus"]])
-        k0, eps_a = (values[model.index[f"s{spring + 1}_{short}"]] for short in ("k0", "eps_a"))
-        return float(k0 * eps_a / (1.0 - eps_a))
-
     def order(spring: int) -> tuple[int, float]:
-        return sum(node <= spring for node in nodes), onset(spring)
+        parameters = model.own(spring, values)
+        onset = float(parameters[0] if law.onset is None else law.onset(parameters))
+        return sum(node <= spring for node in nodes), onset
 
     ranked = sorted(own, key=order)
     if ranked == own:

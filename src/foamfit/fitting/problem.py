@@ -15,11 +15,12 @@ from foamfit.data.measurement import Measurement
 from foamfit.data.units import LARGEST
 from foamfit.errors import InputError
 from foamfit.fitting import nuisance
-from foamfit.fitting.box import LAST_STRAIN, Scales, Space, family, is_share
+from foamfit.fitting.box import Scales, Space, others
 from foamfit.fitting.curves import check_interior, choose_drive, default_weights
 from foamfit.fitting.objective import Objective
+from foamfit.springs.laws.record import ADMISSIBLE, Between, Param
 from foamfit.springs.model import Model
-from foamfit.springs.parameters import NUISANCE, split_name
+from foamfit.springs.parameters import NUISANCE, any_param, split_name
 
 
 def make_params(
@@ -58,44 +59,36 @@ def make_params(
     model = Model.parse(model, relaxation) if isinstance(model, str) else model
     drive = choose_drive(measurement) if drive is None else drive
     scales = Scales.of(measurement)
-    stress, slope = scales.stress, scales.slope
     if model.relaxation and measurement.time is None:
         raise InputError(
             f"{measurement.name}: relaxation needs a time column; give one, or leave relaxation out"
         )
-    guess = {
-        "k0": (3.0 * slope, 1e-3 * stress, 1e4 * stress),
-        "kc": (20.0 * slope, 1e-2 * stress, 1e5 * stress),
-        "dsigma": (-0.1 * stress, -10.0 * stress, 0.0),
-        "eps_a": (0.15 * scales.strain, 1e-3, 0.95),
-        "eps_c": (0.8 * scales.strain, 2e-3, 0.999),
-        "kh_plus": (slope, 0.0, 100.0 * slope),
-        "kh_minus": (0.3 * slope, 0.0, 100.0 * slope),
-        "eps_star": (0.8, 0.0, LAST_STRAIN),
-        "sigma_plus": (0.5 * stress, 1e-3 * stress, 30.0 * stress),
-        "spread_plus": (0.4, 1e-3, 5.0),
-        "sigma_minus": (0.2 * stress, 1e-4 * stress, 30.0 * stress),
-        "spread_minus": (0.7, 1e-3, 5.0),
-        "g": (0.2, 0.0, 10.0),
-        "tau": (0.05 * scales.duration, 1e-4 * scales.duration, 30.0 * scales.duration),
-        "eta": (0.0, 0.0, 10.0 * scales.eta),
-    }
     params = lmfit.Parameters()
     count = len(model.kinds)
     for name in model.names:
         spring, short = split_name(name)
         if short == "height":
             continue
-        value, low, high = guess[family(short)]
+        param = model.param(name)
+        value = param.start[0] * scales.unit(param.start[1])
+        low, high = (bound * scales.unit(param.scale) for bound in param.bounds)
         vary = short != "eta" or (drive == "impact" and (spring >= 0) == (count == 1))
         params.add(name, value=value, min=low, max=high, vary=vary)
     _add_heights(params, measurement, model)
     late = nuisance.is_late(measurement, time_shift=time_shift)
     _add_nuisance(params, measurement, scales, drive, time_shift=late)
-    for own in (name.removesuffix("dsigma") for name in model.names if name.endswith("_dsigma")):
-        eps_a = params[own + "eps_a"].value
-        params[own + "dsigma"].value = -0.2 * params[own + "k0"].value * eps_a / (1.0 - eps_a)
+    for name in params:
+        if name in model.index and name != "site_eta":
+            _start_between(params, name, model.param(name))
     return params
+
+
+def _start_between(params: lmfit.Parameters, name: str, param: Param) -> None:
+    """Start a parameter whose ends depend on others at a fifth of the way, if one end is zero."""
+    if isinstance(param.coordinate, Between):
+        first, last = param.coordinate.ends(*others(name, param, params.valuesdict()))
+        if first == 0.0:
+            params[name].value = 0.2 * last
 
 
 def fix_and_vary(
@@ -299,7 +292,7 @@ class Problem:
     def sizes(self, names: tuple[str, ...], values: Array) -> Array:
         """Scales of some parameters at a point."""
         at = dict(zip(self.names, map(float, values), strict=True))
-        return np.array([self.scales.of_parameter(name, at) for name in names])
+        return np.array([self.scales.of_parameter(self.model, name, at) for name in names])
 
     def slopes(self, values: Array, names: tuple[str, ...]) -> Array:
         """Derivative of the residual by some parameters at a point, (n_data, n_names), per SI unit.
@@ -320,20 +313,12 @@ def _check_held(params: lmfit.Parameters) -> None:
     for name, parameter in params.items():
         if parameter.vary or parameter.expr is not None:
             continue
-        value, short = parameter.value, split_name(name)[1]
-        wanted, fine = {
-            "eps_a": ("between 0 and 1", 0.0 < value < 1.0),
-            "eps_c": ("between 0 and 1", 0.0 < value < 1.0),
-            "eps_star": ("at least 0 and less than 1", 0.0 <= value < 1.0),
-            "dsigma": ("zero or negative", value <= 0.0),
-            "kh_plus": ("zero or positive", value >= 0.0),
-            "kh_minus": ("zero or positive", value >= 0.0),
-            "eta": ("zero or positive", value >= 0.0),
-        }.get(short, ("positive", value > 0.0))
-        if name in NUISANCE and name not in nuisance.STRIKER:
-            wanted, fine = "finite", bool(np.isfinite(value))
-        if is_share(short):
-            wanted, fine = "zero or positive", value >= 0.0
+        value = parameter.value
+        if name in NUISANCE:
+            wanted = "positive" if name in nuisance.STRIKER else "finite"
+        else:
+            wanted = any_param(split_name(name)[1]).admissible
+        fine = ADMISSIBLE[wanted](value)
         if abs(value) > LARGEST:
             wanted, fine = f"less than {LARGEST:g} (SI)", False
         if not fine:

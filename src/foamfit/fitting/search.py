@@ -14,12 +14,12 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.fitting import levenberg
-from foamfit.fitting.box import Space, is_logarithmic
+from foamfit.fitting.box import Space
 from foamfit.fitting.nuisance import TIME_SHIFT
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.starts import CURVE_STARTS, box_starts, curve_starts, smooth_loop
 from foamfit.springs.model import Model
-from foamfit.springs.parameters import HYSTERETIC, NUISANCE
+from foamfit.springs.parameters import NUISANCE
 
 Progress = Callable[[float, str], None]
 
@@ -35,7 +35,6 @@ NOISY = 0.005  # noise of a motion, over its range, that is much
 AROUND = 200  # points about the best one among which another search begins
 # Share of the box that counts as its edge, and where inside a descent begins again.
 EDGE, INSIDE = 0.02, (0.35, 0.5, 0.65)
-STEEP = np.geomspace(1.0, 1000.0, 7)  # k_c over the largest stress at which it begins again
 # Minima of the loop whose cost on the drive's curves is within this factor of the best go on.
 PROMISING = 100.0
 # Factors by which the stiffness that an interior mass vibrates on is changed, and their inverses.
@@ -145,11 +144,12 @@ def rank(tracker: Tracker, space: Space, points: list[Array]) -> list[tuple[floa
 
 
 def spread_out(space: Space, points: list[Array], count: int) -> list[Array]:
-    """Choose `count` of the ranked points: the best, then the best of each range of ε_a.
+    """Choose `count` of the ranked points: the best, then the best of each range of `Law.strata`.
 
-    Where branch d is about as stiff as branch a, the minima of the cost differ by where A1 lies.
+    Where branch d is about as stiff as branch a, the minima of the cost differ by ε_a.
     """
-    marks = [j for j, (_, short, _) in enumerate(space.coordinates) if short == "eps_a"]
+    wanted = {law.strata for law in space.model.laws}
+    marks = [j for j, one in enumerate(space.coordinates) if one.short in wanted]
     if not marks:
         return points[:count]
     places = np.array([point[marks[0]] for point in points])
@@ -218,7 +218,7 @@ def search(
 
 def has_several(model: Model) -> bool:
     """Whether more than one spring of a chain is hysteretic."""
-    return sum(kind in HYSTERETIC for kind in model.kinds) > 1
+    return sum(law.hysteretic for law in model.laws) > 1
 
 
 def _around_best(tracker: Tracker, space: Space, rng: np.random.Generator) -> list[Array]:
@@ -246,13 +246,13 @@ def _off_edges(tracker: Tracker, space: Space) -> list[float]:
     edges = (best - low < EDGE * span) | (high - best < EDGE * span)
     edges |= len(space.model.kinds) > 1 and tracker.best_cost > tracker.objective.floor
     starts = []
-    for at in np.flatnonzero(edges & [is_logarithmic(short) for _, short, _ in space.coordinates]):
+    for at in np.flatnonzero(edges & [one.is_logarithmic for one in space.coordinates]):
         for share in INSIDE:
             start = best.copy()
             start[at] = low[at] + share * span[at]
             starts.append(start)
     if tracker.best_cost > tracker.objective.floor:
-        starts += _other_kc(space, space.decode(best))
+        starts += _neighbours(space, space.decode(best))
     for start in starts:
         cost, end = descend(tracker, space, start, 60)
         tracker.ends.append(space.decode(end))
@@ -260,24 +260,16 @@ def _off_edges(tracker: Tracker, space: Space) -> list[float]:
     return costs
 
 
-def _other_kc(space: Space, values: Array) -> Iterator[Array]:
-    """Points with another k_c whose branch c passes through the same strain at the largest stress.
-
-    A steep branch c shows in few samples: where k_c alone changes it misses them altogether.
-    """
-    top, index = space.scales.stress, space.model.index
-    for spring, kind in enumerate(space.model.kinds, start=1):
-        name, place = f"s{spring}_kc", {"bistable": "eps_c", "microscale": "eps_star"}.get(kind)
-        if place is None or name not in space.free or f"s{spring}_{place}" not in space.free:
-            continue
-        k0, kc, dsigma, eps_a = values[index[f"s{spring}_k0"] :][:4]
-        low = k0 * eps_a / (1.0 - eps_a) + dsigma if kind == "bistable" else 0.0
-        for other in top * STEEP:
-            moved = values.copy()
-            moved[index[name]] = other
-            rises = [top / (k + top) - low / (k + low) for k in (kc, other)]
-            moved[index[f"s{spring}_{place}"]] += rises[0] - rises[1]
-            yield space.encode(moved)
+def _neighbours(space: Space, values: Array) -> Iterator[Array]:
+    """Points whose springs have nearly the same loop, as their laws say."""
+    for spring, law in enumerate(space.model.laws):
+        own = space.model.own(spring, values)[:-1]
+        for near in law.neighbours(own, space.scales.stress):
+            changed = [f"s{spring + 1}_{law.own[at]}" for at in np.flatnonzero(near != own)]
+            if all(name in space.free for name in changed):
+                moved = values.copy()
+                space.model.own(spring, moved)[:-1] = near
+                yield space.encode(moved)
 
 
 def _settled(tracker: Tracker, ends: list[tuple[float, int]], attempt: int, least: int) -> bool:
@@ -362,9 +354,9 @@ def _scan_vibration(tracker: Tracker, space: Space, start: Array) -> list[tuple[
     massless = Tracker(objective, tracker.deadline)
     _, start = descend(massless, space, start, 40)
     out: list[tuple[float, Array]] = []
-    for spring, kind in enumerate(space.model.kinds, start=1):
+    for spring, law in enumerate(space.model.laws, start=1):
         name = f"s{spring}_k0"
-        if kind in HYSTERETIC or name not in space.free:
+        if law.hysteretic or name not in space.free:
             continue
         at = space.model.index[name]
         for factors in (STIFFER, 1.0 / STIFFER):

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
-from foamfit.fitting.box import LAST_STRAIN, Scales, Space, is_logarithmic
+from foamfit.fitting.box import Scales, Space, is_logarithmic
 from foamfit.fitting.links import (
     RATES,
     STEEPEST,
@@ -31,10 +31,8 @@ from foamfit.fitting.links import (
     start_of,
 )
 from foamfit.fitting.problem import Problem
-from foamfit.springs.parameters import NUISANCE, split_name
+from foamfit.springs.parameters import NUISANCE, any_param, split_name
 
-# What a coordinate of the box is relative to, by the short names of the parameters.
-RELATIVE_TO = {"eps_star": ("k0", "kc"), "eps_c": ("eps_a",), "dsigma": ("k0", "eps_a")}
 # Descents end when two steps in a row gain less than this share, or after so many steps.
 ENOUGH, ITERATIONS = 1e-5, 80
 _LEAST_MOVE, _MOST_DAMPING = 1e-9, 1e8
@@ -225,7 +223,7 @@ class _Test:
     @cached_property
     def _order(self) -> NDArray[np.intp]:
         """Where each coordinate of the box stands among the local ones."""
-        named = [self.problem.names[place] for place, _, _ in self.space.coordinates]
+        named = [self.problem.names[one.place] for one in self.space.coordinates]
         return np.array([self.names.index(name) for name in named], dtype=np.intp)
 
     @cached_property
@@ -249,8 +247,9 @@ class _Test:
         low[self._order], high[self._order] = self.space.box
         for at, place in zip(self._plain, self._places, strict=True):
             low[at], high[at] = self.space.low[place], self.space.high[place]
-            if split_name(self.problem.names[place])[1] != "dsigma":
-                high[at] = min(high[at], LAST_STRAIN)
+            param = self.problem.model.param(self.problem.names[place])
+            if param.scale == "one":
+                high[at] = min(high[at], param.bounds[1])
         return low, high
 
     def encode(self, values: Array) -> Array:
@@ -462,7 +461,8 @@ def _logarithm(problem: Problem, values: Array, name: str) -> float:
 def _parents(name: str) -> set[str]:
     """Names of the parameters that the coordinate of this one is relative to."""
     spring, short = split_name(name)
-    return {f"s{spring + 1}_{parent}" for parent in RELATIVE_TO.get(short, ())}
+    of = () if name in NUISANCE else any_param(short).of
+    return {f"s{spring + 1}_{parent}" for parent in of}
 
 
 # ------------------------------------------------------------------------------- the descent

@@ -19,8 +19,8 @@ from foamfit.fitting.starts import curve_starts, smooth_loop
 from foamfit.one_model import Keywords, Options
 from foamfit.report.readable import readable_unit
 from foamfit.results import law_in_words
+from foamfit.springs.laws import BistableSpring
 from foamfit.springs.parameters import NUISANCE, split_name, unit_of
-from foamfit.springs.spring import BistableSpring
 
 MOST_SAMPLES = 1500  # of a curve that is drawn again at every move
 WIDE = 4.0  # times its value that a slider reaches

@@ -15,7 +15,7 @@ from typing import Any
 from foamfit.errors import InputError
 from foamfit.report.sides import Result, Side, published_side, side_of
 from foamfit.results import law_in_words
-from foamfit.springs.parameters import HYSTERETIC
+from foamfit.springs import laws
 from foamfit.springs.published import MM, MPA
 from foamfit.springs.published import published as published_sets
 
@@ -209,7 +209,7 @@ OF_MICROSCALE = (  # which the paper's tables do not have
 def _quantities(kind: str, relaxation: int) -> tuple[_Quantity, ...]:
     """Return the rows of a kind of spring; a linear spring leaves out what it does not have."""
     table = OF_MICROSCALE if kind == "microscale" else TABLE
-    if kind not in HYSTERETIC:
+    if not laws.law(kind).hysteretic:
         return table
     terms = [
         _Quantity(f"{symbol}_{k}", unit, (f"{short}{k}",), _total)
@@ -321,7 +321,7 @@ def _incomparable(side: Side, other: Side) -> str:
 
 
 def _family(kind: str) -> str:
-    return kind if kind in HYSTERETIC else "linear"
+    return kind if laws.law(kind).hysteretic else "linear"
 
 
 def _spring_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:

@@ -9,9 +9,8 @@ import numpy as np
 from foamfit.report.outlook import GUESSED, Outlook, chain_of, worth
 from foamfit.report.readable import readable
 from foamfit.results import law_in_words
-from foamfit.springs.law import MICROSCALE
-from foamfit.springs.parameters import KINDS, NUISANCE
-from foamfit.springs.spring import BistableSpring
+from foamfit.springs.laws import BistableSpring
+from foamfit.springs.parameters import NUISANCE
 from foamfit.text import aligned, engineering, labelled, percent, significant, wrapped
 from foamfit.trust.checklist import ESTIMATED
 from foamfit.trust.identifiability import Insight
@@ -79,7 +78,7 @@ def _closing_sentences(outlook: Outlook) -> Iterator[str]:
     for name, seen in planned.visited.items():
         if "a" not in seen:
             continue
-        if KINDS.index(outlook.problem.model.kinds[int(name[1:]) - 1]) == MICROSCALE:
+        if not outlook.problem.model.laws[int(name[1:]) - 1].points:
             yield _snapping_sentence(at, name, seen, planned.snapped.get(name))
             continue
         if planned.velocity is None:

@@ -15,8 +15,7 @@ from foamfit.report.readable import number, readable, readable_unit
 from foamfit.report.result_figures import Images, draw_all
 from foamfit.report.summary import ANSWERS, LADDER, conclusions, ladder_cells, misfits
 from foamfit.results import Fit
-from foamfit.springs.parameters import KINDS
-from foamfit.springs.spring import BistableSpring, MicroscaleSpring
+from foamfit.springs.laws import BistableSpring, MicroscaleSpring
 from foamfit.text import engineering, percent
 from foamfit.trust.covariance import RULE
 
@@ -28,16 +27,6 @@ DRIVES = {
     "enters the simulation.",
     "stress": "The measured stress acts on the chain, which is in equilibrium at every sample.",
     "displacement": "The measured displacement of the top is prescribed.",
-}
-# By kind of spring: its branches, and the points or marks that the figure has of it.
-BRANCHES = {
-    "bistable": {"a": "elastic", "d": "snap-buckling", "c": "densified", "e": "snap-back"},
-    "microscale": {
-        "a": "elastic, none has snapped",
-        "snap-through": "micro-springs snap",
-        "held": "as many stay snapped",
-        "snap-back": "micro-springs snap back",
-    },
 }
 MARKS = {
     "bistable": "A1 and C1 are where the spring starts to snap and has snapped on loading; C2 and "
@@ -212,7 +201,7 @@ def _visited(result: Fit) -> dict[str, list[tuple[str, str, bool]]]:
     return {
         f"s{i}": [
             (branch, meaning, branch in covered(result.visited.get(f"s{i}", ())))
-            for branch, meaning in BRANCHES.get(KINDS[spring.kind], {}).items()
+            for branch, meaning in (spring.law.branches if spring.law.hysteretic else {}).items()
         ]
         for i, spring in enumerate(result.chain.springs, start=1)
     }

@@ -29,7 +29,7 @@ from foamfit.report.figures import (
     write_haloed,
 )
 from foamfit.report.readable import readable_unit
-from foamfit.springs.spring import LinearSpring
+from foamfit.springs.laws import LinearSpring
 from foamfit.terminal import printable
 
 if TYPE_CHECKING:

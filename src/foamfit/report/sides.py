@@ -12,10 +12,8 @@ from foamfit.errors import InputError
 from foamfit.report.folder import load_result
 from foamfit.results import Fit, ParameterEstimate, law_in_words
 from foamfit.springs.model import Model
-from foamfit.springs.parameters import BISTABLE_NAMES, LINEAR_NAMES
 from foamfit.springs.published import PublishedSet
 from foamfit.springs.published import published as published_sets
-from foamfit.springs.spring import LinearSpring
 
 Result = Fit | Mapping[str, Any] | str | Path
 
@@ -114,14 +112,9 @@ def published_side(name: str) -> Side:
     values = {} if item.eta is None else {"site_eta": item.eta}
     kinds = []
     for i, spring in enumerate(item.chain.springs, start=1):
-        names: tuple[str, ...] = BISTABLE_NAMES
-        kind = "bistable"
-        if isinstance(spring, LinearSpring):
-            names, kind = LINEAR_NAMES, "unilateral" if spring.unilateral else "linear"
-        kinds.append(kind)
-        for short in names:
-            if short != "eta":
-                values[f"s{i}_{short}"] = getattr(spring, short)
+        kinds.append(spring.law.kind)
+        for short in spring.law.own:
+            values[f"s{i}_{short}"] = getattr(spring, short)
         values[f"s{i}_height"] = item.chain.heights[i - 1]
     estimates = {
         name: ParameterEstimate(value, None, None, "", False, "published", "")

@@ -13,11 +13,12 @@ from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
 from foamfit.solve import cache, many, relaxation
 from foamfit.solve import scene as scenes
+from foamfit.solve.any_law import AnyLawPlan, plan_of
 from foamfit.solve.explicit import taylor
 from foamfit.solve.implicit import steps, vibration
 from foamfit.springs import equilibrium, kernels
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
-from foamfit.springs.law import BISTABLE, LINEAR, MICROSCALE
+from foamfit.springs.law import BISTABLE, LINEAR
 from foamfit.springs.parameters import OWN_ETA, OWN_HEIGHT
 from foamfit.springs.sensitivities import equilibrium_tangents
 from foamfit.springs.spring import as_samples
@@ -316,7 +317,7 @@ class Plan(NamedTuple):
         nodes = heights[:, None] * strain
         for i in range(1, len(nodes)):  # np.cumsum takes six times as long
             nodes[i] += nodes[i - 1]
-        switches = _switches(self.time, strain, branches)
+        switches = list_switches(self.time, strain, branches)
         return Motion(nodes, stress, math.nan, switches, 0, CLOSED_FORM, slopes)
 
     def _stretched(self, rows: Array, heights: Array) -> tuple[Array, Array, NDArray[np.int64]]:
@@ -384,6 +385,9 @@ class Plan(NamedTuple):
         return bool(vibrates > MOST_VIBRATION or relaxes > MOST_RELAXATION)
 
 
+AnyPlan = Plan | AnyLawPlan
+
+
 def _on_one_plateau(rows: Array, branches: NDArray[np.int64], directions: Directions) -> Array:
     """Mark the directions of springs that were on flat branches together: either may go first."""
     flat = (branches == kernels.D) & (rows[:, kernels.KH_PLUS] == 0.0)[:, None]
@@ -418,7 +422,7 @@ def _new_history(count: int, n: int) -> tuple[Array, NDArray[np.int64]]:
     return np.empty((count, n)), np.empty((count, n), np.int64)
 
 
-def _switches(time: Array, strain: Array, branches: NDArray[np.int64]) -> Array:
+def list_switches(time: Array, strain: Array, branches: NDArray[np.int64]) -> Array:
     """List the changes of branch between samples, at the later sample."""
     samples, springs = np.nonzero((branches[:, 1:] != branches[:, :-1]).T)
     out, later = np.empty((samples.size, 5)), samples + 1
@@ -438,6 +442,18 @@ def _time(t: ArrayLike) -> Array:
     return time
 
 
+def _check_samples(drive: Drive, time: Array) -> None:
+    """Refuse a drive that has not one value per sample."""
+    if isinstance(drive, Impact):
+        return
+    name = "stress" if isinstance(drive, StressDrive) else "displacement"
+    values = drive.stress if isinstance(drive, StressDrive) else drive.displacement
+    if values.size != time.size:
+        raise InputError(
+            f"{name} has {values.size} samples and t has {time.size}: give one value per sample"
+        )
+
+
 def plan(
     chain: Chain,
     drive: Drive,
@@ -446,7 +462,7 @@ def plan(
     dashpots: bool = False,
     relaxing: bool = False,
     max_steps: int = MAX_STEPS,
-) -> Plan:
+) -> AnyPlan:
     """Find what a scene needs: the nodes that have a state, and the least solver.
 
     Parameters
@@ -471,6 +487,9 @@ def plan(
         If t does not increase or has not one value per sample of the drive.
     """
     time = _time(t)
+    _check_samples(drive, time)
+    if chain.is_registered:
+        return plan_of(chain, drive, time)
     above = chain.masses[-1]
     speed, values = 0.0, _NOTHING
     top = scenes.FREE
@@ -478,12 +497,7 @@ def plan(
         above += drive.mass
         speed = drive.velocity
     else:
-        name = "stress" if isinstance(drive, StressDrive) else "displacement"
         values = np.array(drive.stress if isinstance(drive, StressDrive) else drive.displacement)
-        if values.size != time.size:
-            raise InputError(
-                f"{name} has {values.size} samples and t has {time.size}: give one value per sample"
-            )
         if isinstance(drive, DisplacementDrive):
             above = 0.0
             top = scenes.MOTION
@@ -495,7 +509,7 @@ def plan(
         ends = np.append(inside + 1, ends)
         masses = np.append(chain.arrays.masses[inside] / chain.area, masses)
     relaxing |= any(g > 0.0 for spring in chain.springs for g, _ in spring.relaxation)
-    memory = relaxing or any(spring.kind == MICROSCALE for spring in chain.springs)
+    memory = relaxing or any(spring.law.remembers for spring in chain.springs)
     alone = top == scenes.MOTION and len(chain.springs) == 1
     damped = dashpots or chain.arrays.damped or top == scenes.VISCOUS
     if len(ends) > 1 or above > 0.0:

@@ -22,9 +22,9 @@ from foamfit.solve.cache import PACKAGE
 
 def _run(drive: str, count: int = 1, eta: float = 0.0) -> None:
     """Simulate a few samples of a small chain, and a derivative, by explicit steps."""
-    from foamfit.solve.plan import plan
+    from foamfit.solve.plan import Plan, plan
     from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
-    from foamfit.springs.spring import BistableSpring
+    from foamfit.springs.laws import BistableSpring
 
     spring = BistableSpring(5e6, 8e7, -2e5, 0.14, 0.31, 1.4e7, 2.5e6, eta)
     chain, shape = Chain([spring] * count, [1e-3] * count, 2e-5), np.array([0.0, 1.0, 0.5, 0.0])
@@ -34,6 +34,7 @@ def _run(drive: str, count: int = 1, eta: float = 0.0) -> None:
         "displacement": DisplacementDrive(1e-4 * shape),
     }
     scene = plan(chain, drives[drive], np.linspace(0.0, 1e-3, 4))
+    assert isinstance(scene, Plan)
     directions = np.zeros((1, 2), np.int64)
     scene._replace(implicit=False).run(*chain.arrays[:2], 1e-2, directions=directions)
 

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
+from foamfit.solve.any_law import AnyLawPlan
 from foamfit.solve.plan import (
     AGGREGATE,
     CLOSED_FORM,
@@ -29,7 +30,7 @@ from foamfit.solve.scene import MOTION
 from foamfit.springs import kernels
 from foamfit.springs.chain import Chain, Drive, check_scene
 from foamfit.springs.law import BISTABLE, MICROSCALE
-from foamfit.springs.parameters import DRAG, KINDS, OWN_HEIGHT, OWN_RELAXATION, direction
+from foamfit.springs.parameters import DRAG, OWN_HEIGHT, OWN_RELAXATION, direction
 from foamfit.springs.spring import as_number
 
 _UNRESOLVED = (
@@ -303,8 +304,7 @@ def simulate(
         raise InputError(f"rtol = {rtol:g} is not admissible: it must be between 1e-14 and 0.1")
     directions = NO_DIRECTIONS
     if sensitivities:
-        kinds = tuple(KINDS[spring.kind] for spring in chain.springs)
-        wanted = [direction(kinds, name, chain.relaxation) for name in sensitivities]
+        wanted = [direction(chain.kinds, name, chain.relaxation) for name in sensitivities]
         longer = any(what == OWN_HEIGHT for _, what in wanted)
         if longer and chain.site_damping > 0.0:  # the onsite damper acts over the whole height
             wanted.append((-1, DRAG))
@@ -316,7 +316,11 @@ def simulate(
         dashpots=any(name.endswith("_eta") for name in sensitivities),
         relaxing=any(what >= OWN_RELAXATION for _, what in directions),
     )
-    motion = _verified(scene, chain.arrays.rows, chain.arrays.heights, rtol, directions)
+    rows, heights = chain.arrays.rows, chain.arrays.heights
+    if isinstance(scene, AnyLawPlan):
+        motion = scene.run(rows, heights, rtol, directions=directions)
+    else:
+        motion = _verified(scene, rows, heights, rtol, directions)
     if scene.top == MOTION and len(chain.springs) > 1:
         miss = _difference(scene.values, motion.displacement[-1])
         if not miss <= max(rtol, ROUNDING):

@@ -13,14 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError
-from foamfit.springs.spring import (
-    BistableSpring,
-    LinearSpring,
-    MicroscaleSpring,
-    Spring,
-    as_number,
-    as_samples,
-)
+from foamfit.springs import laws
+from foamfit.springs.spring import Spring, as_number, as_samples
 
 
 def _finite(value: object, name: str, least: float, strict: bool) -> float:
@@ -41,6 +35,14 @@ def _listed(values: Any, name: str, wanted: str) -> tuple[Any, ...]:
     raise InputError(
         f"{name} = {values!r} is not admissible: it must be a sequence of {wanted}, base first"
     )
+
+
+def padded(rows: Sequence[Array]) -> Array:
+    """Rows of several lengths as one array, filled up with zeros."""
+    out = np.zeros((len(rows), max(row.size for row in rows)))
+    for line, row in zip(out, rows, strict=True):
+        line[: row.size] = row
+    return out
 
 
 class ChainArrays(NamedTuple):
@@ -65,8 +67,8 @@ class Chain:
 
     Parameters
     ----------
-    springs : sequence of BistableSpring, MicroscaleSpring or LinearSpring
-        Base first.
+    springs : sequence of springs
+        Base first: BistableSpring, MicroscaleSpring, LinearSpring, or of a registered law.
     heights : sequence of float
         Height h_i of each spring, m.
     area : float
@@ -97,15 +99,15 @@ class Chain:
         site_damping: float = 0.0,
     ) -> None:
         """Check and freeze the chain."""
-        springs = _listed(springs, "springs", "BistableSpring, MicroscaleSpring or LinearSpring")
+        springs = _listed(springs, "springs", "springs")
         n = len(springs)
         if n == 0:
             raise InputError("springs is empty: a chain needs at least one spring")
         for i, spring in enumerate(springs, start=1):
-            if not isinstance(spring, BistableSpring | MicroscaleSpring | LinearSpring):
+            if not isinstance(spring, Spring):
+                known = "a BistableSpring, a MicroscaleSpring or a LinearSpring"
                 raise InputError(
-                    f"springs: spring {i} is a {type(spring).__name__}; "
-                    "it must be a BistableSpring, a MicroscaleSpring or a LinearSpring"
+                    f"springs: spring {i} is a {type(spring).__name__}; it must be {known}"
                 )
         heights = _listed(heights, "heights", "numbers")
         masses = _listed([0.0] * n if masses is None else masses, "masses", "numbers")
@@ -126,6 +128,16 @@ class Chain:
         """Overall height H = Σ h_i, m."""
         return math.fsum(self.heights)
 
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The law of each spring."""
+        return tuple(spring.law.kind for spring in self.springs)
+
+    @property
+    def is_registered(self) -> bool:
+        """Whether a spring follows a law that is none of the paper's."""
+        return any(laws.is_registered(kind) for kind in self.kinds)
+
     @cached_property
     def relaxation(self) -> tuple[int, ...]:
         """Number of relaxation terms of each spring."""
@@ -134,16 +146,15 @@ class Chain:
     @cached_property
     def arrays(self) -> ChainArrays:
         """The chain as the kernels know it."""
-        from foamfit.springs import kernels
-
         room = max(self.relaxation)
+        if self.is_registered:
+            own = [
+                np.array([*spring.values, *np.ravel(spring.relaxation)]) for spring in self.springs
+            ]
+        else:
+            own = [one.solver_row(room) for one in self.springs]
         return ChainArrays(
-            rows=np.array(
-                [
-                    kernels.relaxing(spring.row, spring.relaxation, room) if room else spring.row
-                    for spring in self.springs
-                ]
-            ),
+            rows=padded(own),
             heights=np.array(self.heights),
             masses=np.array(self.masses),
             top=np.array([len(self.springs)]),

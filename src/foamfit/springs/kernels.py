@@ -8,7 +8,6 @@ spring is on is its whole memory: a and d belong to the paper's flag a, c and e 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -63,35 +62,24 @@ LOG_PLUS, SPREAD_PLUS, LOG_MINUS, SPREAD_MINUS, LOG_CROSS = EPS_A, EPS_C, KH_PLU
 # microscale spring (virgin, it is on A): the snapped fraction p is held, p = P₊, p = P₋ > P₊, and
 # p = P₊ = P₋.
 A, D, C, E, LINE, OPEN, HELD, SNAP, BACK, BOTH = range(10)
-BRANCH_NAMES = (
-    "a", "d", "c", "e", "line", "open", "held", "snap-through", "snap-back", "reversible",
-)  # fmt: skip
 
 _derived_points = inner(derived_points)
 _admissible = inner(admissible)
 
 
 @compiled
-def fill_bistable(
-    row: Row,
-    k0: float,
-    kc: float,
-    dsigma: float,
-    eps_a: float,
-    eps_c: float,
-    kh_plus: float,
-    kh_minus: float,
-    eta: float,
-) -> bool:
-    """Write a bistable spring into `row`; false, and nothing written, if it is not admissible."""
-    if not (_admissible(k0, kc, dsigma, eps_a, eps_c, kh_plus, kh_minus) and eta >= 0.0):
+def fill_bistable(values: Array, row: Row) -> bool:
+    """Write k0 … kh_minus and what follows from them; false if they are not admissible."""
+    k0, kc, dsigma, eps_a = values[0], values[1], values[2], values[3]
+    eps_c, kh_plus, kh_minus = values[4], values[5], values[6]
+    if not _admissible(k0, kc, dsigma, eps_a, eps_c, kh_plus, kh_minus):
         return False
     sigma_a, sigma_c, eps_star, hat_a, hat_c = _derived_points(
         k0, kc, dsigma, eps_a, eps_c, kh_plus, kh_minus
     )
     row[KIND] = BISTABLE
     row[K0], row[KC], row[EPS_A], row[EPS_C] = k0, kc, eps_a, eps_c
-    row[KH_PLUS], row[KH_MINUS], row[ETA] = kh_plus, kh_minus, eta
+    row[KH_PLUS], row[KH_MINUS] = kh_plus, kh_minus
     row[SIGMA_A], row[SIGMA_C], row[EPS_STAR] = sigma_a, sigma_c, eps_star
     row[EPS_HAT_A], row[EPS_HAT_C] = hat_a, hat_c
     row[SIGMA_HAT_A] = -math.inf if hat_a == -math.inf else k0 * hat_a / (1.0 - hat_a)
@@ -100,55 +88,17 @@ def fill_bistable(
 
 
 @compiled
-def fill_linear(row: Row, k0: float, eta: float, unilateral: bool) -> bool:
-    """Write a linear spring into `row`; false, and nothing written, if it is not admissible."""
-    if not (0.0 < k0 < math.inf and eta >= 0.0):
-        return False
-    row[KIND] = UNILATERAL if unilateral else LINEAR
-    row[K0], row[ETA] = k0, eta
-    return True
+def fill_linear(values: Array, row: Row) -> bool:
+    """Write k0; false if it is not admissible."""
+    row[KIND], row[K0] = LINEAR, values[0]
+    return 0.0 < values[0] < math.inf
 
 
 @compiled
-def fill_rows(kinds: Branches, values: Array, rows: Array) -> bool:
-    """Write the springs of a flat vector of parameters into `rows`; false if one is not admissible.
-
-    A bistable spring takes eight values (k0 … kh_minus, eta), a linear one two (k0, eta). Where
-    there are microscale springs or relaxation, see `microscale_kernels`.
-    """
-    at = 0
-    for i in range(kinds.size):
-        if kinds[i] == BISTABLE:
-            p = values[at : at + 8]
-            fine = fill_bistable(rows[i], p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7])
-            at += 8
-        else:
-            fine = fill_linear(rows[i], values[at], values[at + 1], kinds[i] == UNILATERAL)
-            at += 2
-        if not fine:
-            return False
-    return True
-
-
-def bistable_row(*parameters: float) -> Row:
-    """Make the row of an admissible bistable spring from k0 … kh_minus, eta (SI)."""
-    row = np.zeros(N_COLUMNS)
-    fill_bistable(row, *parameters)
-    return row
-
-
-def relaxing(row: Row, terms: Sequence[tuple[float, float]], room: int) -> Row:
-    """Append relaxation terms (g, τ) to a row, with room for so many."""
-    out = np.tile([0.0, math.inf], room)
-    out[: 2 * len(terms)] = np.array(terms).ravel()
-    return np.concatenate([row, out])
-
-
-def linear_row(k0: float, eta: float, unilateral: bool) -> Row:
-    """Make the row of an admissible linear spring (SI)."""
-    row = np.zeros(N_COLUMNS)
-    fill_linear(row, k0, eta, unilateral)
-    return row
+def fill_unilateral(values: Array, row: Row) -> bool:
+    """Write k0; false if it is not admissible."""
+    row[KIND], row[K0] = UNILATERAL, values[0]
+    return 0.0 < values[0] < math.inf
 
 
 # ---------------------------------------------------------------- the law of one spring

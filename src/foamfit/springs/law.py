@@ -9,6 +9,12 @@ import math
 
 # The kinds of spring that the kernels tell apart.
 BISTABLE, LINEAR, UNILATERAL, MICROSCALE = 0, 1, 2, 3
+# Branches by their numbers: of the bistable spring, of a linear one, and of a unilateral one out of
+# contact; of the microscale spring, of which the snapped fraction p is held, p = P₊, p = P₋ > P₊,
+# and p = P₊ = P₋.
+BRANCH_NAMES = (
+    "a", "d", "c", "e", "line", "open", "held", "snap-through", "snap-back", "reversible",
+)  # fmt: skip
 # Below this rank (in standard normal scores) a microscale spring counts as virgin: so few, a share
 # of 5e-17, have snapped.
 LEAST_RANK = -8.3

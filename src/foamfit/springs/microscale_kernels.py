@@ -18,7 +18,6 @@ from foamfit.springs.kernels import (
     BACK,
     BOTH,
     EPS_STAR,
-    ETA,
     HELD,
     K0,
     KC,
@@ -26,7 +25,6 @@ from foamfit.springs.kernels import (
     LOG_CROSS,
     LOG_MINUS,
     LOG_PLUS,
-    N_COLUMNS,
     SNAP,
     SPREAD_MINUS,
     SPREAD_PLUS,
@@ -35,24 +33,20 @@ from foamfit.springs.kernels import (
     Branches,
     Row,
     compiled,
-    fill_bistable,
-    fill_linear,
     inner,
 )
 from foamfit.springs.law import (
-    BISTABLE,
     LEAST_RANK,
     MICROSCALE,
-    UNILATERAL,
     crossing,
     least_eps_star,
 )
 
-# The state of a walk: branch, rank, p, 1 - p, strain, stress, the strains and stresses at which the
+# The state of a walk: strain, stress, branch, rank, p, 1 - p, the strains and stresses at which the
 # branch ends, and dε/dσ, d²ε/dσ² where the stress was last sought. Then what stays: strain and
 # stress where snap-through and snap-back meet, where the first micro-spring snaps, and where the
 # last one has snapped back.
-BRANCH, RANK, SNAPPED, REST, EPS, SIGMA, LOW, HIGH, SIGMA_LOW, SIGMA_HIGH = range(10)
+EPS, SIGMA, BRANCH, RANK, SNAPPED, REST, LOW, HIGH, SIGMA_LOW, SIGMA_HIGH = range(10)
 FLEXIBILITY, CURVATURE, MEET, SIGMA_MEET, FIRST, SIGMA_FIRST, LAST, SIGMA_LAST = range(10, 18)
 STATE = 18
 # Derivatives that are carried: by k0 … spread_minus, and by (the logarithm of) the strain itself.
@@ -69,76 +63,20 @@ _crossing = inner(crossing)
 
 
 @compiled
-def fill_microscale(
-    row: Row,
-    k0: float,
-    kc: float,
-    eps_star: float,
-    sigma_plus: float,
-    spread_plus: float,
-    sigma_minus: float,
-    spread_minus: float,
-    eta: float,
-) -> bool:
-    """Write a microscale spring into `row`; false, and nothing written, if not admissible."""
-    stiff = 0.0 < k0 < math.inf and 0.0 < kc < math.inf
-    plus = 0.0 < sigma_plus < math.inf and 0.0 < spread_plus < math.inf
-    minus = 0.0 < sigma_minus < math.inf and 0.0 < spread_minus < math.inf
-    if not (stiff and plus and minus and eta >= 0.0):
-        return False
+def fill_microscale(values: Array, row: Row) -> bool:
+    """Write k0 … spread_minus and what follows from them; false if they are not admissible."""
+    k0, kc, eps_star = values[0], values[1], values[2]
+    spread_plus, spread_minus = values[4], values[6]
+    for own in range(7):
+        if own != 2 and not 0.0 < values[own] < math.inf:
+            return False
     if not _least_eps_star(k0, kc) <= eps_star < math.inf:
         return False
-    row[KIND] = MICROSCALE
-    row[K0], row[KC], row[EPS_STAR], row[ETA] = k0, kc, eps_star, eta
-    row[LOG_PLUS], row[SPREAD_PLUS] = math.log(sigma_plus), spread_plus
-    row[LOG_MINUS], row[SPREAD_MINUS] = math.log(sigma_minus), spread_minus
+    row[KIND], row[K0], row[KC], row[EPS_STAR] = MICROSCALE, k0, kc, eps_star
+    row[LOG_PLUS], row[SPREAD_PLUS] = math.log(values[3]), spread_plus
+    row[LOG_MINUS], row[SPREAD_MINUS] = math.log(values[5]), spread_minus
     row[LOG_CROSS] = _crossing(row[LOG_PLUS], spread_plus, row[LOG_MINUS], spread_minus)
     return True
-
-
-@inner
-def _fill_relaxation(row: Row, terms: Array) -> bool:
-    """Write g and τ of relaxation terms, and none after them; false if one is not admissible."""
-    for k in range(N_COLUMNS, row.size, 2):
-        row[k], row[k + 1] = 0.0, math.inf
-    for k in range(0, terms.size, 2):
-        if not (0.0 <= terms[k] < math.inf and 0.0 < terms[k + 1] < math.inf):
-            return False
-        row[N_COLUMNS + k], row[N_COLUMNS + k + 1] = terms[k], terms[k + 1]
-    return True
-
-
-@compiled
-def fill_rows(kinds: Branches, values: Array, rows: Array) -> bool:
-    """Write the springs of a flat vector of parameters into `rows`; false if one is not admissible.
-
-    A bistable or microscale spring takes its own eight values, then g and τ of every relaxation
-    term that rows have room for; a linear one takes two (k0, eta).
-    """
-    at, more = 0, rows.shape[1] - N_COLUMNS
-    for i in range(kinds.size):
-        if kinds[i] == BISTABLE or kinds[i] == MICROSCALE:
-            p = values[at : at + 8]
-            if kinds[i] == BISTABLE:
-                fine = fill_bistable(rows[i], p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7])
-            else:
-                fine = fill_microscale(rows[i], p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7])
-            fine = _fill_relaxation(rows[i], values[at + 8 : at + 8 + more]) and fine
-            at += 8 + more
-        else:
-            _fill_relaxation(rows[i], values[:0])
-            fine = fill_linear(rows[i], values[at], values[at + 1], kinds[i] == UNILATERAL)
-            at += 2
-        if not fine:
-            return False
-    return True
-
-
-def microscale_row(*parameters: float) -> Row:
-    """Make the row of an admissible microscale spring from k0 … spread_minus, eta (SI)."""
-    row = np.zeros(N_COLUMNS)
-    fill_microscale(row, *parameters)
-    return row
 
 
 # ---------------------------------------------------------------- the law

@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError
-from foamfit.springs import kernels, microscale_kernels
-from foamfit.springs.chain import Chain
-from foamfit.springs.parameters import HYSTERETIC, KINDS, direction, names_of
-from foamfit.springs.spring import BistableSpring, LinearSpring, MicroscaleSpring, Spring
+from foamfit.springs import laws
+from foamfit.springs.chain import Chain, padded
+from foamfit.springs.laws import followed
+from foamfit.springs.laws.record import Law, Param
+from foamfit.springs.parameters import direction, names_of, param_of
+from foamfit.springs.spring import Spring
 
 # Relaxation terms of a spring, and springs of a chain: no test tells so many apart.
 MOST_TERMS, MOST_SPRINGS = 10, 20
@@ -31,9 +33,10 @@ class Model:
     Parameters
     ----------
     kinds : tuple of str
-        "bistable", "microscale", "linear" or "unilateral" (linear without tension) for each spring.
+        The law of each spring: "bistable", "microscale", "linear", "unilateral" (linear without
+        tension), or one that is registered.
     relaxation : int
-        Number of relaxation terms of every hysteretic (bistable or microscale) spring.
+        Number of relaxation terms of every hysteretic spring.
     """
 
     kinds: tuple[str, ...]
@@ -59,11 +62,12 @@ class Model:
             raise InputError(
                 f"a model of {len(kinds)} springs; it must have {MOST_SPRINGS} at most"
             )
+        known = laws.kinds()
         for kind in kinds:
-            if kind not in KINDS:
+            if kind not in known:
                 raise InputError(
                     f"model '{name}': '{kind}' is not a spring; "
-                    f"join {', '.join(KINDS)} by '+', from the base up"
+                    f"join {', '.join(known)} by '+', from the base up"
                 )
         return cls(kinds, relaxation)
 
@@ -71,6 +75,30 @@ class Model:
     def name(self) -> str:
         """The model's name, springs from the base up."""
         return "+".join(self.kinds)
+
+    @cached_property
+    def laws(self) -> tuple[Law, ...]:
+        """The law of each spring."""
+        return tuple(laws.law(kind) for kind in self.kinds)
+
+    @cached_property
+    def is_registered(self) -> bool:
+        """Whether a spring follows a law that is none of the paper's."""
+        return any(laws.is_registered(kind) for kind in self.kinds)
+
+    def param(self, name: str) -> Param:
+        """Record of a parameter of the model."""
+        return param_of(self.kinds, name)
+
+    @cached_property
+    def own_places(self) -> tuple[int, ...]:
+        """Place of the first own parameter of each spring in the flat vector."""
+        return tuple(self.index[f"s{i}_{law.names[0]}"] for i, law in enumerate(self.laws, 1))
+
+    def own(self, spring: int, values: Array) -> Array:
+        """Own parameters and eta of a spring (0 at the base) in a flat vector, a view."""
+        first = self.own_places[spring]
+        return values[first : first + len(self.laws[spring].names)]
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -95,16 +123,23 @@ class Model:
         terms = (self.relaxation,) * len(self.kinds)
         return np.array([direction(self.kinds, name, terms) for name in self.names])
 
-    @cached_property
-    def _codes(self) -> NDArray[np.int64]:
-        return np.array([KINDS.index(kind) for kind in self.kinds])
-
     def rows(self, values: Array) -> Array | None:
-        """Springs as the kernels know them, (n_springs, columns); None if one is not admissible."""
-        rows = np.zeros((len(self.kinds), kernels.N_COLUMNS + 2 * self.relaxation))
-        plain = self.relaxation == 0 and "microscale" not in self.kinds
-        fill = kernels.fill_rows if plain else microscale_kernels.fill_rows
-        return rows if fill(self._codes, values, rows) else None
+        """Springs as the solver knows them, (n_springs, columns); None if one is not admissible."""
+        rows = []
+        for i, law in enumerate(self.laws):
+            own = self.own(i, values)
+            last = self.own_places[i] + own.size + 2 * self.relaxation * law.hysteretic
+            terms = values[self.own_places[i] + own.size : last]
+            if not self.is_registered:
+                row = followed.solver_row(law, own, terms, self.relaxation)
+            elif followed.row_of(law, own) is None or not own[-1] >= 0.0:
+                row = None
+            else:
+                row = np.append(own, terms)
+            if row is None:
+                return None
+            rows.append(row)
+        return padded(rows)
 
     def heights(self, values: Array, total: float) -> Array:
         """Heights of the springs (m) in a specimen of height `total`."""
@@ -119,21 +154,12 @@ class Model:
         ValueError
             If one is not admissible; the message names the parameter.
         """
-        springs: list[Spring] = []
-        at = 0
-        for kind in self.kinds:
-            if kind in HYSTERETIC:
-                make = BistableSpring if kind == "bistable" else MicroscaleSpring
-                own, more = map(float, values[at : at + 8]), values[at + 8 :]
-                terms = [
-                    (float(more[2 * k]), float(more[2 * k + 1])) for k in range(self.relaxation)
-                ]
-                springs.append(make(*own, relaxation=terms))
-                at += 8 + 2 * self.relaxation
-            else:
-                k0, eta = map(float, values[at : at + 2])
-                springs.append(LinearSpring(k0, eta, kind == "unilateral"))
-                at += 2
+        springs = []
+        for i, law in enumerate(self.laws):
+            own = self.own(i, values)
+            first = self.own_places[i] + own.size
+            pairs = values[first : first + 2 * self.relaxation * law.hysteretic].reshape(-1, 2)
+            springs.append(law.make(own.tolist(), [(float(g), float(tau)) for g, tau in pairs]))
         return tuple(springs)
 
     def chain(self, values: Array, height: float, area: float) -> Chain:

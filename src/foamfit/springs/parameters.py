@@ -1,8 +1,8 @@
-"""Parameters by their names: units, the branches that show them, and directions of derivatives.
+"""Parameters by their names, their units, and directions of derivatives.
 
 A direction is what a derivative is taken by: a spring (0 at the base) and one of its own parameters
-in the order of BISTABLE_NAMES or MICROSCALE_NAMES, or its height, or a number of a relaxation term;
-or no spring (-1) and the onsite damping of the top.
+in the order of its law, or its height, or a number of a relaxation term; or no spring (-1) and the
+onsite damping of the top.
 """
 
 from __future__ import annotations
@@ -10,31 +10,14 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from foamfit.errors import InputError
+from foamfit.springs import laws
+from foamfit.springs.laws.record import COMMON, ETA, Param
 
-# Parameters of the kinds of spring, in their order; a linear spring takes what it has of them.
-BISTABLE_NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus", "eta")
-MICROSCALE_NAMES = (
-    "k0", "kc", "eps_star", "sigma_plus", "spread_plus", "sigma_minus", "spread_minus", "eta",
-)  # fmt: skip
-LINEAR_NAMES = ("k0", "eta")
-# Kinds of spring in the name of a model, in the order of the kernels' BISTABLE, LINEAR, UNILATERAL,
-# MICROSCALE; those that may relax.
-KINDS = ("bistable", "linear", "unilateral", "microscale")
-HYSTERETIC = ("bistable", "microscale")
-# What a direction changes, besides the seven parameters of a spring's law (0 … 6). From
-# OWN_RELAXATION on: the strength g_k of term k = 1, 2, … is OWN_RELAXATION + 2 (k-1), its time τ_k
-# the number after it.
-OWN_ETA, OWN_HEIGHT, DRAG, OWN_RELAXATION = 7, 8, 9, 10
+# What a direction changes, besides the parameters of a spring's law (0, 1, …). From OWN_RELAXATION
+# on: the strength g_k of term k = 1, 2, … is OWN_RELAXATION + 2 (k-1), its time τ_k the number
+# after it.
+OWN_ETA, OWN_HEIGHT, DRAG, OWN_RELAXATION = 20, 21, 22, 23
 
-UNITS = {
-    name: "" if name.startswith(("eps", "spread")) else "Pa"
-    for name in BISTABLE_NAMES + MICROSCALE_NAMES
-} | {
-    "eta": "Pa s",
-    "height": "m",
-    "g": "",
-    "tau": "s",
-}
 # What a record does not say exactly of an impact, and its unit: unknowns beside the springs.
 NUISANCE = {
     "contact_time": "s",
@@ -45,28 +28,6 @@ NUISANCE = {
     "striker_mass": "kg",
     "time_shift": "s",
 }
-# By kind of spring, the branches of which a test must have reached one for the parameter to leave a
-# trace in it.
-BRANCHES = {
-    "bistable": {
-        "k0": "a",
-        "eps_a": "d",
-        "kh_plus": "d",
-        "kc": "c",
-        "eps_c": "e",
-        "dsigma": "e",
-        "kh_minus": "e",
-    },
-    "microscale": {
-        "k0": "a",
-        "sigma_plus": "snap-through",
-        "spread_plus": "snap-through",
-        "kc": "snap-through",
-        "eps_star": "snap-through",
-        "sigma_minus": "snap-back",
-        "spread_minus": "snap-back",
-    },
-}
 
 
 def relaxation_names(terms: int) -> tuple[str, ...]:
@@ -76,10 +37,8 @@ def relaxation_names(terms: int) -> tuple[str, ...]:
 
 def names_of(kind: str, relaxation: int = 0) -> tuple[str, ...]:
     """Names of the own parameters of a kind of spring that has so many relaxation terms, if any."""
-    if kind not in HYSTERETIC:
-        return LINEAR_NAMES
-    law = BISTABLE_NAMES if kind == "bistable" else MICROSCALE_NAMES
-    return law + relaxation_names(relaxation)
+    law = laws.law(kind)
+    return law.names + (relaxation_names(relaxation) if law.hysteretic else ())
 
 
 def springs_first(names: Iterable[str]) -> list[str]:
@@ -96,12 +55,32 @@ def split_name(name: str) -> tuple[int, str]:
     return -1, name.removeprefix("site_")
 
 
+def family(short: str) -> str:
+    """Name of a parameter without the number of its relaxation term: "g1" is "g"."""
+    for name in ("g", "tau"):
+        if short.startswith(name) and short.removeprefix(name).isdigit():
+            return name
+    return short
+
+
+def param_of(kinds: tuple[str, ...], name: str) -> Param:
+    """Record of a parameter ("s1_k0", "s2_height", "site_eta") of springs of these kinds."""
+    spring, short = split_name(name)
+    common = COMMON.get(family(short))
+    return common or laws.law(kinds[spring]).by_name[short]
+
+
+def any_param(short: str) -> Param:
+    """Record of a parameter by its short name alone, of the first law that has it."""
+    if (common := COMMON.get(family(short))) is not None:
+        return common
+    records = (laws.law(kind).by_name for kind in laws.kinds())
+    return next(by_name[short] for by_name in records if short in by_name)
+
+
 def unit_of(name: str) -> str:
     """Unit of a parameter, SI; "" for a pure number."""
-    if name in NUISANCE:
-        return NUISANCE[name]
-    short = split_name(name)[1]
-    return UNITS[short if short in UNITS else short.rstrip("0123456789")]
+    return NUISANCE[name] if name in NUISANCE else any_param(split_name(name)[1]).unit
 
 
 def direction(
@@ -122,13 +101,14 @@ def direction(
     known = [f"s{i}" for i in range(1, len(kinds) + 1)]
     if prefix in known:
         spring = known.index(prefix)
+        law, terms = laws.law(kinds[spring]), relaxation[spring] if relaxation else 0
         if short == "height":
             return spring, OWN_HEIGHT
-        kind, terms = kinds[spring], relaxation[spring] if relaxation else 0
-        if short in names_of(kind):
-            law = MICROSCALE_NAMES if kind == "microscale" else BISTABLE_NAMES
-            return spring, law.index(short)
-        if short in names_of(kind, terms):
+        if short == ETA.name:
+            return spring, OWN_ETA
+        if short in law.own:
+            return spring, law.own.index(short)
+        if short in names_of(law.kind, terms):
             return spring, OWN_RELAXATION + relaxation_names(terms).index(short)
     raise InputError(
         f"sensitivities: '{name}' is not a parameter of this chain; give names like s1_k0, "

@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 
 from foamfit.springs.chain import Chain
-from foamfit.springs.parameters import KINDS
-from foamfit.springs.spring import BistableSpring, LinearSpring, Spring
+from foamfit.springs.laws import BistableSpring, LinearSpring
+from foamfit.springs.spring import Spring
 from foamfit.text import aligned, wrapped
 
 MPA, MM, MG = 1e6, 1e-3, 1e-6
@@ -173,7 +173,7 @@ def _published_row(item: PublishedSet, spring: Spring, height: float) -> list[st
     if not isinstance(spring, BistableSpring):
         return [
             item.name,
-            KINDS[spring.kind],
+            spring.law.kind,
             f"{spring.k0 / MPA:g}",
             "",
             "",

@@ -1,11 +1,11 @@
-"""One mesoscopic spring: the bistable law (eqs. 1-5), the microscale law and the linear spring."""
+"""What springs of every law have in common: following a history, and refusing wrong numbers."""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -14,22 +14,22 @@ from numpy.typing import ArrayLike, NDArray
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
-from foamfit.springs.law import (
-    BISTABLE,
-    LINEAR,
-    MICROSCALE,
-    UNILATERAL,
-    derived_points,
-    least_eps_star,
-)
 
 if TYPE_CHECKING:
     from foamfit.springs.kernels import Row
+    from foamfit.springs.laws.record import Law
 
 Relaxation = Sequence[tuple[float, float]]  # frozen to a tuple of tuples
 
 
-def _require(holds: bool, name: str, value: float, wanted: str) -> None:
+def require(holds: bool, name: str, value: float, wanted: str) -> None:
+    """Refuse a value by the name of its parameter.
+
+    Raises
+    ------
+    InputError
+        If the condition does not hold.
+    """
     if not holds:
         raise InputError(f"{name} = {value:g} is not admissible: it must be {wanted}")
 
@@ -66,21 +66,21 @@ def as_samples(values: ArrayLike, name: str) -> Array:
     raise InputError(f"{name} must be an array of numbers")
 
 
-def _freeze_numbers(spring: object, *names: str) -> None:
-    """Make the parameters of a spring finite floats, slopes and dashpots of the right sign."""
-    for name in names:
+def freeze_numbers(spring: Any, law: Law) -> None:
+    """Make the parameters of a spring finite floats that the law's record admits."""
+    from foamfit.springs.laws.record import ADMISSIBLE
+
+    for name in law.names:
         value = as_number(getattr(spring, name), name)
-        _require(math.isfinite(value), name, value, "finite")
+        require(math.isfinite(value), name, value, "finite")
         object.__setattr__(spring, name, value)
-    for name in names:
-        value = getattr(spring, name)
-        if name in ("k0", "kc"):
-            _require(value > 0, name, value, "positive")
-        elif name in ("kh_plus", "kh_minus", "eta"):
-            _require(value >= 0, name, value, "zero or positive")
+    for name, param in law.by_name.items():
+        if not param.of:  # the law itself refuses what its other parameters rule out
+            value, wanted = getattr(spring, name), param.admissible
+            require(ADMISSIBLE[wanted](value), name, value, wanted)
 
 
-def _freeze_terms(spring: object, given: Any) -> None:
+def freeze_terms(spring: object, given: Any) -> None:
     """Make the relaxation terms of a spring pairs of finite floats of the right sign."""
     wanted = "relaxation must be a sequence of pairs (g, tau in s)"
     try:
@@ -92,15 +92,10 @@ def _freeze_terms(spring: object, given: Any) -> None:
     terms = []
     for k, (g, tau) in enumerate(pairs, start=1):
         g, tau = as_number(g, f"g{k}"), as_number(tau, f"tau{k}")
-        _require(0 <= g < math.inf, f"g{k}", g, "finite and zero or positive")
-        _require(0 < tau < math.inf, f"tau{k}", tau, "finite and positive")
+        require(0 <= g < math.inf, f"g{k}", g, "finite and zero or positive")
+        require(0 < tau < math.inf, f"tau{k}", tau, "finite and positive")
         terms.append((g, tau))
     object.__setattr__(spring, "relaxation", tuple(terms))
-
-
-def _numbers_of(spring: Any) -> tuple[str, ...]:
-    """Names of the fields of a spring that are numbers."""
-    return tuple(item.name for item in fields(spring) if item.name != "relaxation")
 
 
 def _as_history(values: ArrayLike, name: str) -> Array:
@@ -112,33 +107,55 @@ def _as_history(values: ArrayLike, name: str) -> Array:
     return np.atleast_1d(history)
 
 
-def _ranks_below(stress: ArrayLike, middle: float, spread: float) -> Array:
-    """Fraction of ranks whose snap stress lies below these stresses; none in tension."""
-    from scipy.special import ndtr
-
-    with np.errstate(divide="ignore"):
-        scores = (np.log(np.maximum(stress, 0.0)) - math.log(middle)) / spread
-    return np.asarray(ndtr(scores), dtype=float)
-
-
 def _first(mask: NDArray[np.bool_]) -> int:
     return int(np.argmax(np.atleast_1d(mask)))
 
 
-class _Law(ABC):
-    """What a spring does along a history, without its dashpot."""
+class Spring(ABC):
+    """A spring of any law: what it does along a history, without its dashpot."""
+
+    k0: float
+    eta: float
 
     @property
     @abstractmethod
+    def law(self) -> Law:
+        """The record of its law."""
+
+    @cached_property
     def row(self) -> Row:
-        """The spring as the kernels know it."""
+        """The spring as the kernels of the paper's laws know it, without relaxation."""
+        return self.solver_row(0)
+
+    def solver_row(self, room: int) -> Row:
+        """The same with room for so many relaxation terms; without any, none is written."""
+        from foamfit.springs.laws import followed
+
+        terms = self.relaxation if room else ()
+        row = followed.solver_row(self.law, np.array(self.values), terms, room)
+        assert row is not None  # it was checked when the spring was made
+        return row
+
+    @property
+    @abstractmethod
+    def relaxation(self) -> Relaxation:
+        """Relaxation terms (g, τ in s)."""
+
+    @property
+    def values(self) -> tuple[float, ...]:
+        """Own parameters in the order of the law, then eta, SI."""
+        return tuple(getattr(self, name) for name in self.law.names)
+
+    @property
+    def corners(self) -> dict[str, tuple[float, float]]:
+        """Named points of the loop, strain and stress (Pa); a law may have none."""
+        return {}
 
     def stress(self, strain: ArrayLike) -> Array:
         """Stress (Pa) along a strain history, shape (n,), from rest.
 
-        One flag is carried along the history (eqs. 2 and 3), or the fraction that has snapped; the
-        first sample starts with flag a and nothing snapped.
-        A single strain gives a single stress.
+        What the spring remembers is carried along the history (eqs. 2 and 3). A single strain gives
+        a single stress.
 
         Raises
         ------
@@ -172,19 +189,18 @@ class _Law(ABC):
         return self._slope_along(self._along(strain)[0]).reshape(np.shape(strain))
 
     def branches(self, strain: ArrayLike) -> NDArray[np.str_]:
-        """Name the branch of each sample of a strain history, shape (n,).
+        """Name of the branch of each sample of a strain history, shape (n,).
 
         A bistable spring is on "a", "d", "c" or "e"; a microscale spring on "a" while none of it
         has snapped, then on "held" (what has snapped stays so), "snap-through", "snap-back" or
         "reversible" (both at one stress); a linear spring on "line" or, out of contact, "open".
         """
-        from foamfit.springs import kernels
-
-        names = np.array(kernels.BRANCH_NAMES)[self._along(strain)[2]]
+        numbers = self._along(strain)[2]
+        names = np.array([self.law.named_branch(int(number)) for number in numbers])
         return names.reshape(np.shape(strain))
 
     def _stress_along(self, strain: Array) -> tuple[Array, NDArray[np.int64]]:
-        """Stresses and branches of a strain history."""
+        """Stresses and numbers of the branches of a strain history."""
         from foamfit.springs import kernels
 
         return kernels.stress_along(self.row, strain)
@@ -217,31 +233,18 @@ class _Law(ABC):
         return history, stress, branches
 
 
-@dataclass(frozen=True)
-class BistableSpring(_Law):
-    """The hysteretic bistable spring of eqs. 2-5 with a dashpot in parallel.
+@dataclass(frozen=True, init=False)
+class LawSpring(Spring):
+    """A spring of a law that was made known by `foamfit.register`.
 
     Parameters
     ----------
-    k0 : float
-        k_0, first slope of branch a, at zero stress, Pa.
-    kc : float
-        k_c, first slope of the densified branch c, at zero stress, Pa.
-    dsigma : float
-        Δσ = σ̄_c - σ_a, Pa; not positive.
-    eps_a : float
-        ε_a, strain at A1, where snapping starts.
-    eps_c : float
-        ε_c, strain at C2, where snap-back starts.
-    kh_plus : float
-        k_h+, slope of the snap-buckling branch d, A1→C1, Pa.
-    kh_minus : float
-        k_h-, slope of the snap-back branch e, C2→A2, Pa.
-    eta : float
-        η, dashpot in parallel, Pa·s.
+    law : Law
+        Its record.
+    values : sequence of float
+        Its own parameters in the order of the law, then eta, SI; they are attributes too.
     relaxation : sequence of pairs of float
-        Relaxation terms (g, τ in s) in parallel; left out = none. What follows the law along a
-        history (`stress`, `strain`) is the equilibrium, without them.
+        Relaxation terms (g, τ in s) in parallel; left out = none.
 
     Raises
     ------
@@ -249,226 +252,46 @@ class BistableSpring(_Law):
         If a parameter is not admissible; the message names it.
     """
 
-    k0: float
-    kc: float
-    dsigma: float
-    eps_a: float
-    eps_c: float
-    kh_plus: float
-    kh_minus: float
-    eta: float = 0.0
-    relaxation: Relaxation = field(default=(), kw_only=True)
+    record: Law
+    numbers: tuple[float, ...]
+    relaxation: Relaxation = ()
 
-    def __post_init__(self) -> None:
-        """Refuse what is not admissible, by name."""
-        _freeze_numbers(self, *_numbers_of(self))
-        _freeze_terms(self, self.relaxation)
-        _require(0 < self.eps_a < 1, "eps_a", self.eps_a, "between 0 and 1")
-        past = f"greater than eps_a = {self.eps_a:g}"
-        _require(self.eps_c > self.eps_a, "eps_c", self.eps_c, past)
-        least = -self.k0 * self.eps_a / (1 - self.eps_a)
-        allowed = f"greater than -sigma_a = {least:g} and at most 0"
-        _require(least < self.dsigma <= 0, "dsigma", self.dsigma, allowed)
+    def __init__(self, law: Law, values: Sequence[float], relaxation: Relaxation = ()) -> None:
+        """Check and freeze the spring."""
+        from foamfit.springs.laws import followed
+
+        put = object.__setattr__
+        put(self, "record", law)
+        for name, value in zip(law.names, values, strict=True):
+            put(self, name, value)
+        freeze_numbers(self, law)
+        freeze_terms(self, relaxation)
+        put(self, "numbers", tuple(getattr(self, name) for name in law.names))
+        if followed.row_of(law, self.numbers) is None:
+            given = ", ".join(f"{n} = {v:g}" for n, v in zip(law.names, self.numbers, strict=True))
+            raise InputError(f"{given} is not admissible: the law '{law.kind}' refuses it")
 
     @property
-    def seven(self) -> tuple[float, float, float, float, float, float, float]:
-        """The seven parameters of the law in their order, SI."""
-        first = (self.k0, self.kc, self.dsigma, self.eps_a)
-        return *first, self.eps_c, self.kh_plus, self.kh_minus
-
-    @property
-    def sigma_a(self) -> float:
-        """σ_a, stress at A1, Pa."""
-        return derived_points(*self.seven)[0]
-
-    @property
-    def sigma_c(self) -> float:
-        """σ̄_c, stress at C2, Pa."""
-        return derived_points(*self.seven)[1]
-
-    @property
-    def eps_star(self) -> float:
-        """ε_*, strain at which branch c starts from zero stress (eq. 2)."""
-        return derived_points(*self.seven)[2]
-
-    @property
-    def eps_hat_a(self) -> float | None:
-        """ε̂_a, strain at A2 (eq. 4); None where branch e never meets branch a."""
-        eps_hat_a = derived_points(*self.seven)[3]
-        return eps_hat_a if math.isfinite(eps_hat_a) else None
-
-    @property
-    def eps_hat_c(self) -> float:
-        """ε̂_c, strain at C1 (eq. 5)."""
-        return derived_points(*self.seven)[4]
-
-    @property
-    def sigma_hat_a(self) -> float | None:
-        """Stress at A2, Pa; None where branch e never meets branch a."""
-        eps_hat_a = self.eps_hat_a
-        return None if eps_hat_a is None else self.k0 * eps_hat_a / (1 - eps_hat_a)
-
-    @property
-    def sigma_hat_c(self) -> float:
-        """Stress at C1, Pa."""
-        return self.sigma_a + self.kh_plus * (self.eps_hat_c - self.eps_a)
-
-    @property
-    def kind(self) -> int:
-        """The kind of spring that the kernels know."""
-        return BISTABLE
-
-    @cached_property
-    def row(self) -> Row:
-        """The spring as the kernels know it."""
-        from foamfit.springs import kernels
-
-        return kernels.bistable_row(*self.seven, self.eta)
-
-
-@dataclass(frozen=True)
-class MicroscaleSpring(_Law):
-    """Micro-springs in series whose snap stresses are spread log-normally, with a dashpot.
-
-    Its state is the fraction p of them that has snapped. With P₊ and P₋ the fractions whose
-    snap-through and snap-back stress lies below σ (P₋ no less than P₊, both 0 in tension),
-
-        p ← min(max(p, P₊(σ)), P₋(σ))          along the history of σ, from p = 0,
-        ε = (1-p) σ/(k0+σ) + p (eps_star + σ/(kc+σ)).
-
-    Parameters
-    ----------
-    k0 : float
-        First slope of branch a, at zero stress, Pa.
-    kc : float
-        First slope of the densified branch c, at zero stress, Pa.
-    eps_star : float
-        Strain at which branch c starts from zero stress.
-    sigma_plus : float
-        Snap-through stress of the middle rank, Pa.
-    spread_plus : float
-        Standard deviation of the logarithm of the snap-through stress.
-    sigma_minus : float
-        Snap-back stress of the middle rank, Pa.
-    spread_minus : float
-        Standard deviation of the logarithm of the snap-back stress.
-    eta : float
-        η, dashpot in parallel, Pa·s.
-    relaxation : sequence of pairs of float
-        Relaxation terms (g, τ in s) in parallel; left out = none. What follows the law along a
-        history (`stress`, `strain`) is the equilibrium, without them.
-
-    Raises
-    ------
-    ValueError
-        If a parameter is not admissible; the message names it.
-    """
-
-    k0: float
-    kc: float
-    eps_star: float
-    sigma_plus: float
-    spread_plus: float
-    sigma_minus: float
-    spread_minus: float
-    eta: float = 0.0
-    relaxation: Relaxation = field(default=(), kw_only=True)
-
-    def __post_init__(self) -> None:
-        """Refuse what is not admissible, by name."""
-        _freeze_numbers(self, *_numbers_of(self))
-        _freeze_terms(self, self.relaxation)
-        for name in ("sigma_plus", "spread_plus", "sigma_minus", "spread_minus"):
-            _require(getattr(self, name) > 0, name, getattr(self, name), "positive")
-        least = least_eps_star(self.k0, self.kc)
-        wanted = f"at least {least:.9g}, so that branch c lies beyond branch a at every stress"
-        _require(self.eps_star >= least, "eps_star", self.eps_star, wanted)
-
-    @property
-    def kind(self) -> int:
-        """The kind of spring that the kernels know."""
-        return MICROSCALE
-
-    @property
-    def snap_strain(self) -> float:
-        """Strain by which a micro-spring of the middle rank jumps where it snaps through."""
-        sigma = self.sigma_plus
-        return self.eps_star + sigma / (self.kc + sigma) - sigma / (self.k0 + sigma)
-
-    def snapped_below(self, stress: ArrayLike) -> Array:
-        """P₊: the fraction that has snapped on first loading to these stresses."""
-        return _ranks_below(stress, self.sigma_plus, self.spread_plus)
-
-    def left_below(self, stress: ArrayLike) -> Array:
-        """P₋: the fraction that is left on unloading to these stresses, P₊ at least."""
-        left = _ranks_below(stress, self.sigma_minus, self.spread_minus)
-        return np.maximum(left, self.snapped_below(stress))
-
-    @cached_property
-    def row(self) -> Row:
-        """The spring as the kernels know it."""
-        from foamfit.springs import microscale_kernels
-
-        return microscale_kernels.microscale_row(
-            *(getattr(self, name) for name in _numbers_of(self))
-        )
+    def law(self) -> Law:
+        """The record of its law."""
+        return self.record
 
     def _stress_along(self, strain: Array) -> tuple[Array, NDArray[np.int64]]:
-        from foamfit.springs import microscale_kernels
+        from foamfit.springs.laws import followed
 
-        stress, _, branches = microscale_kernels.stress_along(self.row, strain)
-        return stress, branches
+        return followed.stress_along(self.record, self.numbers, strain)
+
+    def _strain_along(self, stress: Array) -> Array:
+        from foamfit.springs.laws import followed
+
+        return followed.strain_along(self.record, self.numbers, stress)
 
     def _slope_along(self, strain: Array) -> Array:
-        from foamfit.springs import microscale_kernels
+        step = 1e-6 * max(float(np.max(np.abs(strain))), 1e-9)
+        ends = [self._next_stress(strain, side) for side in (-step, step)]
+        return np.asarray((ends[1] - ends[0]) / (2.0 * step))
 
-        path = microscale_kernels.stress_along(self.row, strain)
-        return microscale_kernels.stress_tangents_along(self.row, strain, *path)[1]
-
-
-@dataclass(frozen=True)
-class LinearSpring(_Law):
-    """The linear spring S1 of the two-spring models, σ = k0 ε, with a dashpot in parallel.
-
-    Parameters
-    ----------
-    k0 : float
-        Slope, Pa.
-    eta : float
-        η, dashpot in parallel, Pa·s.
-    unilateral : bool
-        If true the spring carries no tension.
-
-    Raises
-    ------
-    ValueError
-        If a parameter is not admissible; the message names it.
-    """
-
-    k0: float
-    eta: float = 0.0
-    unilateral: bool = False
-
-    def __post_init__(self) -> None:
-        """Refuse what is not admissible, by name."""
-        _freeze_numbers(self, "k0", "eta")
-
-    @property
-    def kind(self) -> int:
-        """The kind of spring that the kernels know."""
-        return UNILATERAL if self.unilateral else LINEAR
-
-    @cached_property
-    def row(self) -> Row:
-        """The spring as the kernels know it."""
-        from foamfit.springs import kernels
-
-        return kernels.linear_row(self.k0, self.eta, self.unilateral)
-
-    @property
-    def relaxation(self) -> Relaxation:
-        """Relaxation terms: a linear spring has none."""
-        return ()
-
-
-Spring = BistableSpring | MicroscaleSpring | LinearSpring
+    def _next_stress(self, strain: Array, step: float) -> Array:
+        """Stress after each sample of a history and a small step of the strain beyond it."""
+        paths = (np.append(strain[: j + 1], strain[j] + step) for j in range(strain.size))
+        return np.array([self._stress_along(path)[0][-1] for path in paths])

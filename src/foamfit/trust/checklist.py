@@ -19,7 +19,7 @@ from foamfit.fitting.curves import check_time_shift
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.search import SearchRecord
 from foamfit.results import Check, Intervals, ParameterEstimate
-from foamfit.springs.parameters import BRANCHES, NUISANCE, split_name
+from foamfit.springs.parameters import NUISANCE, split_name
 from foamfit.text import engineering, listed, percent
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import AT_LIMIT, WEAK
@@ -267,8 +267,7 @@ def _by_reason(of: list[tuple[str, str]]) -> str:
 
 
 def _visited(e: Findings) -> _Answer:
-    kinds = e.best.problem.model.kinds
-    wanted = [tuple(dict.fromkeys(BRANCHES.get(kind, {}).values())) for kind in kinds]
+    wanted = [law.needed for law in e.best.problem.model.laws]
     absent = {
         spring: [branch for branch in branches if branch not in covered(seen)]
         for branches, (spring, seen) in zip(

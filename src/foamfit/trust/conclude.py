@@ -24,7 +24,6 @@ from foamfit.fitting.objective import MODEL_ERROR, Objective, Simulated
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import SearchRecord
 from foamfit.results import Correlation, Curves, Fit, Intervals, ParameterEstimate, Switch
-from foamfit.springs import kernels
 from foamfit.springs.parameters import split_name, unit_of
 from foamfit.text import engineering, listed, percent
 from foamfit.trust import covariance
@@ -358,11 +357,12 @@ def _statistics(best: BestPoint, record: SearchRecord) -> dict[str, float | int 
 def _switches(problem: Problem, simulated: Simulated) -> tuple[Switch, ...]:
     """Place the switches of the fitted response on its curves."""
     motion, clock = simulated.motion, problem.objective.time
+    laws = problem.model.laws
     return tuple(
         Switch(
             spring=int(spring) + 1,
-            source=kernels.BRANCH_NAMES[int(left)],
-            target=kernels.BRANCH_NAMES[int(entered)],
+            source=laws[int(spring)].named_branch(int(left)),
+            target=laws[int(spring)].named_branch(int(entered)),
             time=None if problem.measurement.time is None else float(when),
             displacement=float(np.interp(when, clock, motion.displacement[-1])),
             stress=float(np.interp(when, clock, motion.base_stress)),

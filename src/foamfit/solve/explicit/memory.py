@@ -59,6 +59,7 @@ from foamfit.springs.microscale_kernels import (
     FLEXIBILITY,
     HIGH,
     LOW,
+    OF_STRAIN,
     RANK,
     REST,
     SIGMA,
@@ -173,7 +174,7 @@ def enter_mixture(memory: Memory, i: int) -> tuple[float, float]:
     branch, low, high = int(state[BRANCH]), state[LOW], state[HIGH]
     now[PLACE] = row[LOG_MINUS] if branch == BACK else row[LOG_PLUS]
     now[SCALE] = row[SPREAD_MINUS] if branch == BACK else row[SPREAD_PLUS]
-    for own in range(3, OWN_ETA):
+    for own in range(3, OF_STRAIN):
         for n in range(memory.partials.shape[2]):
             memory.partials[own, i, n] = 0.0
     if branch == HELD:

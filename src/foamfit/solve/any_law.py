@@ -1,0 +1,418 @@
+"""Scenes with a spring of a registered law: steps in time that need nothing but the law itself.
+
+Between samples a drive is linear, and each step takes every spring to a new strain by the functions
+of its law (`springs.laws.followed`). Springs in series carry one stress, which is sought at each
+step. A striker of areal mass M follows M dv/dt = -(Σ + η_site v/H) by the velocity Verlet method.
+Every part is of second order in the step: where time counts, steps are halved until two runs agree.
+"""
+
+# mypy: disallow-untyped-decorators=False, warn-return-any=False
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from foamfit.arrays import Array
+from foamfit.errors import InputError, SimulationError
+from foamfit.solve.scene import FREE, MOTION, STRESS
+from foamfit.springs import laws as known
+from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact
+from foamfit.springs.laws import followed
+from foamfit.springs.laws.followed import MEMORY, STRENGTH, TIME, compiled
+from foamfit.springs.laws.record import BRANCH, EPS, Law
+from foamfit.springs.parameters import DRAG, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
+
+METHOD = "steps of any law"
+FIRST_STEPS, MOST_STEPS = 400, 4_000_000
+# Steps of differences over the value, and of what may be zero.
+RELATIVE, ABSOLUTE = 1e-5, 1e-6
+
+
+class Springs(NamedTuple):
+    """Springs in series: rows, states (springs, columns), terms (springs, n, 3), and the rest."""
+
+    rows: Array
+    states: Array
+    terms: Array
+    heights: Array  # m
+    eta: Array  # Pa·s
+
+
+class InSeries(NamedTuple):
+    """Compiled loops of springs in series, see `in_series`."""
+
+    begin: Callable[..., None]
+    stretch: Callable[..., float]
+    elongate: Callable[..., float]
+    note: Callable[..., None]
+
+
+@cache
+def in_series(laws: tuple[Law, ...]) -> InSeries:
+    """Loops that take springs of these laws to a common stress or to an elongation."""
+    loops = followed.loops_of(laws)
+    start, step, to_stress, count = loops.start, loops.step, loops.to_stress, len(laws)
+
+    @compiled
+    def begin(springs: Springs) -> None:
+        for i in range(count):
+            start(i, springs.rows[i], springs.states[i], 0.0)
+
+    @compiled
+    def stretch(springs: Springs, sigma: float, h: float) -> float:
+        """Take all springs to a stress; returns the elongation, m."""
+        out = 0.0
+        for i in range(count):
+            eps = to_stress(
+                i, springs.rows[i], springs.states[i], springs.terms[i], springs.eta[i], sigma, h
+            )
+            out += springs.heights[i] * eps
+        return out
+
+    @compiled
+    def tried(springs: Springs, sigma: float, h: float) -> float:
+        """Elongation under a stress; the springs stay where they are."""
+        trial = Springs(
+            springs.rows, springs.states.copy(), springs.terms.copy(), springs.heights, springs.eta
+        )
+        return stretch(trial, sigma, h)
+
+    @compiled
+    def elongate(springs: Springs, sigma: float, moved: float, h: float) -> float:
+        """Take springs to an elongation, m; returns their stress, sought about `sigma`."""
+        if count == 1:
+            eps = moved / springs.heights[0]
+            return step(
+                0, springs.rows[0], springs.states[0], springs.terms[0], springs.eta[0], eps, h
+            )
+        low = high = sigma
+        least = most = tried(springs, sigma, h)
+        pace = 1e-3 * max(abs(sigma), 1.0)
+        for _ in range(200):
+            if least <= moved <= most:
+                break
+            if moved > most:
+                low, least, high = high, most, high + pace
+                most = tried(springs, high, h)
+            else:
+                high, most, low = low, least, low - pace
+                least = tried(springs, low, h)
+            pace *= 2.0
+        if not least <= moved <= most:
+            return math.nan
+        middle = high
+        for turn in range(200):
+            middle = 0.5 * (low + high)
+            if turn % 3 and most > least:
+                middle = low + (high - low) * (moved - least) / (most - least)
+            now = tried(springs, middle, h)
+            if now < moved:
+                low, least = middle, now
+            else:
+                high, most = middle, now
+            if now == moved or high - low <= 1e-15 * max(abs(low), abs(high)):
+                break
+        stretch(springs, middle, h)
+        return middle
+
+    @compiled
+    def note(springs: Springs, j: int, nodes: Array, branches: NDArray[np.int64]) -> None:
+        """Write displacements and branches of a sample."""
+        top = 0.0
+        for i in range(count):
+            top += springs.heights[i] * springs.states[i, EPS]
+            nodes[i, j] = top
+            branches[i, j] = int(springs.states[i, BRANCH])
+
+    return InSeries(begin, stretch, elongate, note)
+
+
+@cache
+def driven(laws: tuple[Law, ...]) -> Callable[..., tuple[float, bool]]:
+    """Loop along a prescribed stress or motion, for springs of these laws."""
+    begin, stretch, elongate, note = in_series(laws)
+
+    @compiled
+    def drive(
+        springs: Springs, top: int, t: Array, values: Array, parts: int,
+        nodes: Array, stress: Array, branches: NDArray[np.int64],
+    ) -> tuple[float, bool]:  # fmt: skip
+        """Follow a prescribed stress (Pa) or motion (m), in so many parts from sample to sample."""
+        sigma = 0.0
+        begin(springs)
+        for j in range(t.size):
+            for k in range(parts if j else 1):
+                part = (k + 1.0) / parts if j else 1.0
+                before = values[j - 1] if j else 0.0
+                value = before + part * (values[j] - before)
+                h = (t[j] - t[j - 1]) / parts if j else 0.0
+                if top == STRESS:
+                    sigma = value if math.isfinite(stretch(springs, value, h)) else math.nan
+                else:
+                    sigma = elongate(springs, sigma, value, h)
+            if not math.isfinite(sigma):
+                return math.nan, False
+            stress[j] = sigma
+            note(springs, j, nodes, branches)
+        return math.nan, True
+
+    return drive
+
+
+@cache
+def struck(laws: tuple[Law, ...]) -> Callable[..., tuple[float, bool]]:
+    """Loop through an impact, for springs of these laws."""
+    begin, _, elongate, note = in_series(laws)
+    count = len(laws)
+
+    @compiled
+    def strike(
+        springs: Springs, mass: float, drag: float, speed: float, t: Array, parts: int,
+        nodes: Array, stress: Array, branches: NDArray[np.int64],
+    ) -> tuple[float, bool]:  # fmt: skip
+        """Follow a striker from contact, at t = 0; returns when contact ends."""
+        w, v, now, end, soft = 0.0, speed, 0.0, math.nan, 0.0
+        begin(springs)
+        for i in range(count):
+            soft += springs.heights[i] / springs.eta[i]
+        sigma = speed / soft  # what the dashpots bear at contact; 0 where a spring has none
+        for j in range(t.size):
+            if t[j] <= 0.0:
+                nodes[:, j], stress[j], branches[:, j] = 0.0, sigma if t[j] == 0.0 else 0.0, 0
+                nodes[count - 1, j] = speed * t[j]
+                continue
+            h = (t[j] - now) / parts
+            for _ in range(parts if end != end else 0):
+                half = v - 0.5 * h * (sigma + drag * v) / mass
+                after = elongate(springs, sigma, w + h * half, h)
+                if not math.isfinite(after):
+                    return math.nan, False
+                if after <= 0.0 and half < 0.0:
+                    share = sigma / (sigma - after) if sigma > after else 0.0
+                    end = now + share * h
+                    w, v = w + share * h * half, half
+                    break
+                w += h * half
+                v = (half - 0.5 * h * after / mass) / (1.0 + 0.5 * h * drag / mass)
+                sigma = after
+                now += h
+            if end == end:
+                stress[j] = 0.0
+                note(springs, j, nodes, branches)
+                shift = w + v * (t[j] - end) - nodes[count - 1, j]
+                for i in range(count):
+                    nodes[i, j] += shift
+            else:
+                now, stress[j] = t[j], sigma
+                note(springs, j, nodes, branches)
+        return end, True
+
+    return strike
+
+
+class Followed(NamedTuple):
+    """One run: displacements (springs, n_t), base stress and branches; the end of contact."""
+
+    nodes: Array
+    stress: Array
+    branches: NDArray[np.int64]
+    contact_end: float
+    parts: int
+
+
+class AnyLawPlan(NamedTuple):
+    """A scene made ready for springs of any laws; it runs as a `solve.plan.Plan` does.
+
+    `laws` are those of the springs; `top`, `values`, `time` and `speed` are those of a `Plan`,
+    `mass` (1,) is the areal mass of the striker, kg/m², `drag` is η_site/H, Pa·s/m.
+    """
+
+    laws: tuple[Law, ...]
+    height: float
+    top: int
+    values: Array
+    time: Array
+    speed: float
+    mass: Array
+    drag: float
+
+    @property
+    def solver(self) -> str:
+        """The least solver that the scene needs, as `Response.solver` says it."""
+        return "second order" if self.speed > 0.0 else "first order"
+
+    def springs(self, rows: Array, heights: Array) -> Springs:
+        """Springs of rows that hold own parameters, eta and relaxation terms, filled with zeros."""
+        sizes = [followed.sizes_of(law) for law in self.laws]
+        counts = [len(law.names) for law in self.laws]
+        room = max((rows.shape[1] - min(counts)) // 2, 0)
+        own = np.zeros((len(rows), max(columns for columns, _ in sizes)))
+        terms = np.zeros((len(rows), room, 3))
+        terms[:, :, TIME] = math.inf
+        for i, (law, count) in enumerate(zip(self.laws, counts, strict=True)):
+            row = followed.row_of(law, rows[i, : count - 1])
+            if row is None:
+                raise SimulationError(f"the parameters of spring {i + 1} are not admissible")
+            own[i, : row.size] = row
+            given = rows[i, count:]
+            for k in range(given.size // 2 if law.hysteretic else 0):
+                if given[2 * k] > 0.0:
+                    terms[i, k, :2] = given[2 * k : 2 * k + 2]
+        used = terms[:, terms[:, :, STRENGTH].any(axis=0)] if room else terms
+        eta = np.array([rows[i, count - 1] for i, count in enumerate(counts)])
+        states = np.zeros((len(rows), max(states for _, states in sizes)))
+        return Springs(own, states, np.ascontiguousarray(used), np.array(heights), eta)
+
+    def follow(self, rows: Array, heights: Array, drag: float, parts: int) -> Followed:
+        """Run once, with so many steps from sample to sample.
+
+        Raises
+        ------
+        SimulationError
+            If a stress or strain is no longer finite.
+        """
+        springs, shape = self.springs(rows, heights), (len(rows), self.time.size)
+        rate, eta = None, springs.eta
+        if self.top == MOTION and len(rows) == 1 and eta[0] > 0.0:  # the rate is that of the motion
+            rate = np.gradient(self.values / heights[0], self.time)
+            springs = springs._replace(eta=np.zeros(1))
+        nodes, stress, branches = np.empty(shape), np.empty(shape[1]), np.empty(shape, np.int64)
+        springs.terms[:, :, MEMORY] = 0.0
+        filled = parts, nodes, stress, branches
+        if self.speed > 0.0:
+            strike = struck(self.laws)
+            end, fine = strike(springs, self.mass[-1], drag, self.speed, self.time, *filled)
+        else:
+            end, fine = driven(self.laws)(springs, self.top, self.time, self.values, *filled)
+        if not fine:
+            raise SimulationError(
+                "a stress or strain is no longer finite: the drive goes past what the law can bear"
+            )
+        if rate is not None:
+            stress += eta[0] * rate
+        return Followed(nodes, stress, branches, end, parts)
+
+    def resolve(self, rows: Array, heights: Array, drag: float, rtol: float) -> Followed:
+        """Run with steps so short that base stress and displacement are within `rtol`."""
+        count, springs = self.time.size, self.springs(rows, heights)
+        alone = self.top == MOTION and len(rows) == 1
+        timed = bool(springs.terms.size) or (springs.eta.any() and not alone)
+        if self.speed == 0.0 and not timed:
+            return self.follow(rows, heights, drag, 1)
+        parts = max(FIRST_STEPS // count, 1)
+        run = self.follow(rows, heights, drag, parts)
+        while 2 * parts * count <= MOST_STEPS:
+            parts *= 2
+            finer = self.follow(rows, heights, drag, parts)
+            miss = max(_miss(run.nodes, finer.nodes), _miss(run.stress, finer.stress))
+            run = finer
+            if miss <= 2.0 * rtol:
+                return run
+        raise SimulationError(
+            f"{MOST_STEPS} steps leave an error above rtol = {rtol:g}: ask for a larger rtol"
+        )
+
+    def run(
+        self,
+        rows: Array,
+        heights: Array,
+        rtol: float = 1e-6,
+        *,
+        drag: float | None = None,
+        everything: bool = True,
+        directions: NDArray[np.int64] | None = None,
+    ) -> Any:
+        """Run the scene; see `solve.plan.Plan.run`. Derivatives are differences."""
+        from foamfit.solve import plan
+
+        drag = self.drag if drag is None else drag
+        found = self.resolve(rows, heights, drag, rtol)
+        slopes = None
+        if directions is not None and len(directions):
+            sides = [self._slope(rows, heights, drag, found, way) for way in directions]
+            slopes = plan.Slopes(
+                np.array([nodes for nodes, _ in sides]), np.array([stress for _, stress in sides])
+            )
+        strain = np.diff(found.nodes, axis=0, prepend=0.0) / np.array(heights)[:, None]
+        switches = plan.list_switches(self.time, strain, found.branches)
+        nodes = found.nodes if everything else found.nodes[-1:]
+        if slopes is not None and not everything:
+            slopes = slopes._replace(displacement=slopes.displacement[:, -1:])
+        steps = found.parts * self.time.size
+        return plan.Motion(nodes, found.stress, found.contact_end, switches, steps, METHOD, slopes)
+
+    def _slope(
+        self, rows: Array, heights: Array, drag: float, found: Followed, way: Sequence[int]
+    ) -> tuple[Array, Array]:
+        """Difference of displacements and base stress over a step of one direction.
+
+        Upwards alone from what is zero.
+        """
+        spring, what = way
+        count = len(self.laws[spring].names)
+        places = {OWN_ETA: count - 1, OWN_HEIGHT: -1, DRAG: -1}
+        place = places.get(what, count + what - OWN_RELAXATION if what > DRAG else what)
+        value = {OWN_HEIGHT: heights[spring], DRAG: drag}.get(what, rows[spring, place])
+        zero = {OWN_ETA: self._damping(found), DRAG: self._damping(found) / self.height}
+        step = RELATIVE * abs(value) or ABSOLUTE * zero.get(what, 1.0)
+
+        def beside(by: float) -> Followed:
+            moved, higher = rows.copy(), np.array(heights, dtype=float)
+            if what == OWN_HEIGHT:
+                higher[spring] += by
+            elif what != DRAG:
+                moved[spring, place] += by
+            return self.follow(moved, higher, drag + by * (what == DRAG), found.parts)
+
+        above, below = beside(step), beside(-step) if value else found
+        step *= 2.0 if value else 1.0
+        return (above.nodes - below.nodes) / step, (above.stress - below.stress) / step
+
+    def _damping(self, found: Followed) -> float:
+        """Damping that would carry the whole stress, Pa·s."""
+        lasts = float(self.time[-1] - self.time[0]) or 1.0
+        return max(float(np.abs(found.stress).max()), 1.0) * lasts
+
+
+def _miss(one: Array, other: Array) -> float:
+    """Largest difference of two runs over the range of the second, rest included."""
+    span = max(float(other.max()), 0.0) - min(float(other.min()), 0.0)
+    return float(np.abs(one - other).max()) / span if span > 0.0 else 0.0
+
+
+def plan_of(chain: Chain, drive: Drive, time: Array) -> AnyLawPlan:
+    """Make a scene ready.
+
+    Raises
+    ------
+    InputError
+        If it has masses between the springs, or a damper under a prescribed stress, which only
+        chains of the paper's laws have.
+    """
+    if chain.arrays.heavy:
+        raise InputError(
+            "masses between springs go with the paper's laws only: leave them out beside a "
+            "registered law"
+        )
+    top, values, speed, above = FREE, np.zeros(1), 0.0, chain.masses[-1]
+    if isinstance(drive, Impact):
+        speed, above = drive.velocity, above + drive.mass
+    elif isinstance(drive, DisplacementDrive):
+        top, values = MOTION, np.array(drive.displacement)
+    else:
+        top, values = STRESS, np.array(drive.stress)
+        if above > 0.0 or chain.site_damping > 0.0:
+            raise InputError(
+                "a prescribed stress on a mass or an onsite damper goes with the paper's laws "
+                "only: leave them out beside a registered law"
+            )
+    laws = tuple(known.law(kind) for kind in chain.kinds)
+    return AnyLawPlan(
+        laws, chain.height, top, values, time, speed, np.array([above / chain.area]),
+        chain.site_damping / chain.height,
+    )  # fmt: skip

@@ -1,0 +1,148 @@
+"""The laws of springs: the paper's, and those that are registered.
+
+`law(kind)` is the record of a kind of spring; everything outside `springs` goes by it.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from dataclasses import replace
+from importlib.metadata import entry_points
+from pathlib import Path
+
+from foamfit.errors import InputError
+from foamfit.springs.laws import bistable, linear, microscale
+from foamfit.springs.laws.bistable import BistableSpring as BistableSpring
+from foamfit.springs.laws.linear import LinearSpring as LinearSpring
+from foamfit.springs.laws.microscale import MicroscaleSpring as MicroscaleSpring
+from foamfit.springs.laws.record import Functions as Functions
+from foamfit.springs.laws.record import Law as Law
+from foamfit.springs.laws.record import Param as Param
+from foamfit.springs.spring import LawSpring, Relaxation
+
+ENTRY_POINTS = "foamfit.laws"
+_LAWS = {law.kind: law for law in (bistable.LAW, linear.LAW, linear.UNILATERAL_LAW, microscale.LAW)}
+_OWN = tuple(_LAWS)  # laws that the kernels know
+_asked_packages: list[bool] = []
+
+
+def law(kind: str) -> Law:
+    """Record of a kind of spring.
+
+    Raises
+    ------
+    InputError
+        If no law has that name.
+    """
+    if kind not in _LAWS:
+        _load_packages()
+    if kind not in _LAWS:
+        raise InputError(f"'{kind}' is not a spring; it must be one of {', '.join(kinds())}")
+    return _LAWS[kind]
+
+
+def kinds() -> tuple[str, ...]:
+    """Names of all laws that are known, the paper's first."""
+    _load_packages()
+    return tuple(_LAWS)
+
+
+def is_registered(kind: str) -> bool:
+    """Whether a law is none of the paper's, so that it is followed by the loops for any law."""
+    return kind not in _OWN
+
+
+def register(law: Law) -> Law:
+    """Make a law known: its kind becomes a word of a model's name.
+
+    Parameters
+    ----------
+    law
+        The record. One that is registered already under this name is replaced; the paper's laws are
+        not.
+
+    Returns
+    -------
+    Law
+        The record as it is known; `make` makes springs of it.
+
+    Raises
+    ------
+    InputError
+        If something in it is wrong: a name, a missing function, a stress that is not finite, a
+        branch on which the stress falls.
+    """
+    from foamfit.springs.laws.checked import check
+
+    check(law, _OWN)
+    if law.spring is None:
+
+        def make(*values: float, relaxation: Relaxation = ()) -> LawSpring:
+            return LawSpring(known, values, relaxation)
+
+        law = replace(law, spring=make)
+    known = _LAWS[law.kind] = law
+    return known
+
+
+def load_file(path: str | Path) -> tuple[Law, ...]:
+    """Run a Python file and register the laws that it defines.
+
+    Parameters
+    ----------
+    path
+        A file with one or more `Law` records at its top level. It is code of the user's own: only
+        the command line names one.
+
+    Returns
+    -------
+    tuple of Law
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or run, or has no law, or one that is wrong; the message names
+        the file.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give a Python file that defines a Law")
+    before = dict(_LAWS)
+    name = f"foamfit_law_{path.stem}"
+    spec = importlib.util.spec_from_loader(name, loader=None, origin=str(path))
+    assert spec is not None
+    module = importlib.util.module_from_spec(spec)
+    module.__file__ = str(path)
+    sys.modules[name] = module
+    try:
+        exec(compile(path.read_text(encoding="utf-8"), str(path), "exec"), module.__dict__)
+        given = [one for one in vars(module).values() if isinstance(one, Law)]
+        found = {one.kind: one for one in given if one.kind not in _OWN}
+        for one in found.values():
+            register(one)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except Exception as error:
+        what = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise InputError(f"{path}: the file cannot be run ({what})") from None
+    if not found:
+        raise InputError(f"{path}: the file defines no law; make a foamfit.Law at its top level")
+    _LAWS.update({kind: one for kind, one in before.items() if kind not in found})
+    return tuple(found.values())
+
+
+def _load_packages() -> None:
+    """Register the laws that installed packages name, once."""
+    if _asked_packages:
+        return
+    _asked_packages.append(True)
+    for entry in entry_points(group=ENTRY_POINTS):
+        try:
+            found = entry.load()
+        except Exception as error:
+            raise InputError(
+                f"law '{entry.name}' of {entry.value} cannot be loaded: {error}"
+            ) from None
+        for one in found if isinstance(found, tuple | list) else (found,):
+            register(one)

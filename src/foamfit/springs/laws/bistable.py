@@ -1,0 +1,338 @@
+"""The hysteretic bistable spring of the paper (eqs. 1-5)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from foamfit.arrays import Array
+from foamfit.springs.law import BRANCH_NAMES, derived_points
+from foamfit.springs.laws.record import (
+    LAST_STRAIN,
+    Between,
+    Compared,
+    Functions,
+    Law,
+    Param,
+    PointOf,
+    steeper,
+)
+from foamfit.springs.loop import Loop
+from foamfit.springs.spring import Relaxation, Spring, freeze_numbers, freeze_terms, require
+
+
+@dataclass(frozen=True)
+class BistableSpring(Spring):
+    """The hysteretic bistable spring of eqs. 2-5 with a dashpot in parallel.
+
+    Parameters
+    ----------
+    k0 : float
+        k_0, first slope of branch a, at zero stress, Pa.
+    kc : float
+        k_c, first slope of the densified branch c, at zero stress, Pa.
+    dsigma : float
+        Δσ = σ̄_c - σ_a, Pa; not positive.
+    eps_a : float
+        ε_a, strain at A1, where snapping starts.
+    eps_c : float
+        ε_c, strain at C2, where snap-back starts.
+    kh_plus : float
+        k_h+, slope of the snap-buckling branch d, A1→C1, Pa.
+    kh_minus : float
+        k_h-, slope of the snap-back branch e, C2→A2, Pa.
+    eta : float
+        η, dashpot in parallel, Pa·s.
+    relaxation : sequence of pairs of float
+        Relaxation terms (g, τ in s) in parallel; left out = none. `stress` and `strain` follow the
+        equilibrium, without them.
+
+    Raises
+    ------
+    ValueError
+        If a parameter is not admissible; the message names it.
+    """
+
+    k0: float
+    kc: float
+    dsigma: float
+    eps_a: float
+    eps_c: float
+    kh_plus: float
+    kh_minus: float
+    eta: float = 0.0
+    relaxation: Relaxation = field(default=(), kw_only=True)
+
+    def __post_init__(self) -> None:
+        """Refuse what is not admissible, by name."""
+        freeze_numbers(self, LAW)
+        freeze_terms(self, self.relaxation)
+        past = f"greater than eps_a = {self.eps_a:g}"
+        require(self.eps_c > self.eps_a, "eps_c", self.eps_c, past)
+        least = -_sigma_a(self.k0, self.eps_a)
+        allowed = f"greater than -sigma_a = {least:g} and at most 0"
+        require(least < self.dsigma <= 0, "dsigma", self.dsigma, allowed)
+
+    @property
+    def law(self) -> Law:
+        """The record of its law."""
+        return LAW
+
+    @property
+    def seven(self) -> tuple[float, float, float, float, float, float, float]:
+        """The seven parameters of the law in their order, SI."""
+        first = (self.k0, self.kc, self.dsigma, self.eps_a)
+        return *first, self.eps_c, self.kh_plus, self.kh_minus
+
+    @property
+    def sigma_a(self) -> float:
+        """σ_a, stress at A1, Pa."""
+        return derived_points(*self.seven)[0]
+
+    @property
+    def sigma_c(self) -> float:
+        """σ̄_c, stress at C2, Pa."""
+        return derived_points(*self.seven)[1]
+
+    @property
+    def eps_star(self) -> float:
+        """ε_*, strain at which branch c starts from zero stress (eq. 2)."""
+        return derived_points(*self.seven)[2]
+
+    @property
+    def eps_hat_a(self) -> float | None:
+        """ε̂_a, strain at A2 (eq. 4); None where branch e never meets branch a."""
+        eps_hat_a = derived_points(*self.seven)[3]
+        return eps_hat_a if math.isfinite(eps_hat_a) else None
+
+    @property
+    def eps_hat_c(self) -> float:
+        """ε̂_c, strain at C1 (eq. 5)."""
+        return derived_points(*self.seven)[4]
+
+    @property
+    def sigma_hat_a(self) -> float | None:
+        """Stress at A2, Pa; None where branch e never meets branch a."""
+        eps_hat_a = self.eps_hat_a
+        return None if eps_hat_a is None else self.k0 * eps_hat_a / (1 - eps_hat_a)
+
+    @property
+    def sigma_hat_c(self) -> float:
+        """Stress at C1, Pa."""
+        return self.sigma_a + self.kh_plus * (self.eps_hat_c - self.eps_a)
+
+    @property
+    def corners(self) -> dict[str, tuple[float, float]]:
+        """Strain and stress (Pa) at A1, C1, C2 and, where it exists, A2."""
+        out = {
+            "A1": (self.eps_a, self.sigma_a),
+            "C1": (self.eps_hat_c, self.sigma_hat_c),
+            "C2": (self.eps_c, self.sigma_c),
+        }
+        if self.eps_hat_a is not None and self.sigma_hat_a is not None:
+            out["A2"] = (self.eps_hat_a, self.sigma_hat_a)
+        return out
+
+
+def _sigma_a(k0: float, eps_a: float) -> float:
+    """σ_a = k0 ε_a/(1-ε_a), Pa."""
+    return k0 * eps_a / (1.0 - eps_a)
+
+
+# ---------------------------------------------------------------- reading a loop
+
+
+def read_off(loop: Loop, marks: Array, scales: Any, way: int) -> Array:
+    """Read a spring off a loop, given where on it A1, C1 and C2 are taken to lie.
+
+    `marks` (5,) in [0, 1] are the places of A1, C1 and C2 between their neighbours, and shares of
+    the stress at C2 and of the damping. Returned are k0 … kh_minus, eta (SI): initial slope from
+    A1, k_h+ from A1 to C1, k_c through C1 and C2 (of two such branches the stiff one, or on the
+    second `way` the one close to its pole), k_h- from C2 towards rest.
+    """
+    last = float(np.max(loop.strain))
+    eps_a = min((0.02 + 0.85 * marks[0]) * last, 0.9)
+    sigma_a = max(loop.at(eps_a, loading=True), 0.005 * scales.stress)
+    hat_c = eps_a + (0.15 + 1.1 * marks[1]) * max(last - eps_a, 1e-3)  # perhaps never reached
+    seen = min(hat_c, max(last, eps_a + 1e-3))
+    kh_plus = max((loop.at(seen, loading=True) - sigma_a) / (seen - eps_a), 0.0)
+    sigma_hat_c = sigma_a + kh_plus * (hat_c - eps_a)
+    eps_c = eps_a + (0.2 + 0.8 * marks[2]) * (hat_c - eps_a)
+    sigma_c = loop.at(eps_c, loading=False) * (0.5 + marks[3])
+    sigma_c = min(max(sigma_c, 0.02 * sigma_a), 0.98 * sigma_a)
+    kc = _stiffness_between(hat_c - eps_c, sigma_c, sigma_hat_c)
+    if way == 1:
+        kc = sigma_c * sigma_hat_c / kc  # the product of the two
+    k0, eta = sigma_a * (1.0 - eps_a) / eps_a, 0.1 * scales.eta * marks[4] ** 2
+    return np.array([k0, kc, sigma_c - sigma_a, eps_a, eps_c, kh_plus, sigma_c / eps_c, eta])
+
+
+def read_in_series(loop: Loop, marks: Array, share: float) -> Array:
+    """Read one of several springs off the kinks of their common loop.
+
+    While a spring that has but a `share` of the height snaps, the others keep their branches, so
+    the chain bends at the stresses of A1, C1, C2 and A2. `marks` (5,) in [0, 1] choose these among
+    the kinks of the loop, and k_c. Returned are k0 … kh_minus, and a dashpot of zero (SI).
+    """
+
+    def pick(kinks: Array, mark: float) -> tuple[float, float]:
+        strain, stress = kinks[min(int(mark * len(kinks)), len(kinks) - 1)]
+        return float(strain), max(float(stress), 1e-3 * top)
+
+    def soft(stress: float, stiffness: float) -> float:
+        return stress / (stiffness + stress)
+
+    top = float(np.max(loop.stress))
+    at_a1, at_c1, at_c2, at_a2 = loop.kinks
+    (from_x, sigma_a), (to_x, sigma_hat_c) = pick(at_a1, marks[0]), pick(at_c1, marks[1])
+    (_, sigma_c), (_, sigma_e) = pick(at_c2, marks[2]), pick(at_a2, marks[3])
+    early = 0.05 * float(np.max(loop.strain))
+    k0 = max(loop.at(early, loading=True) / early, sigma_a)
+    kc = k0 * 10.0 ** (0.3 + 1.7 * marks[4])
+    sigma_c, sigma_e = min(sigma_c, 0.98 * sigma_a), min(sigma_e, 0.9 * sigma_c, 0.9 * sigma_a)
+    sigma_hat_c = max(sigma_hat_c, 1.001 * sigma_a)
+    moved = abs(to_x - from_x) - (1.0 - share) * (soft(sigma_hat_c, k0) - soft(sigma_a, k0))
+    eps_a = soft(sigma_a, k0)
+    hat_c = eps_a + max(moved, 0.02) / share
+    eps_c = max(hat_c - soft(sigma_hat_c, kc) + soft(sigma_c, kc), eps_a + 0.01)
+    kh_plus = (sigma_hat_c - sigma_a) / (hat_c - eps_a)
+    kh_minus = (sigma_c - sigma_e) / max(eps_c - soft(sigma_e, k0), 0.01)
+    return np.array([k0, kc, sigma_c - sigma_a, eps_a, eps_c, kh_plus, kh_minus, 0.0])
+
+
+def _stiffness_between(rise: float, low: float, high: float) -> float:
+    """k_c of a branch c that rises by a strain `rise` from stress `low` to `high` (Pa).
+
+    It is the larger root k of rise (k+low)(k+high) = k (high-low). Where that equation has no root,
+    k = √(low high) comes closest to it.
+    """
+    gain = max(high - low, 1e-9 * high)
+    rise = max(rise, 1e-6)
+    b = gain - rise * (low + high)
+    discriminant = b * b - 4.0 * rise * rise * low * high
+    if b <= 0.0 or discriminant < 0.0:
+        return float(np.sqrt(low * high))
+    return float((b + np.sqrt(discriminant)) / (2.0 * rise))
+
+
+def _neighbours(values: Array, top: float) -> Iterator[Array]:
+    k0, _, dsigma, eps_a = values[:4]
+    return steeper(values, 1, 4, top, _sigma_a(k0, eps_a) + dsigma)
+
+
+def _to_stresses(values: Array, height: float) -> Array:
+    """k0, kc, k_h+, k_h- over the height (Pa/m), σ_a, σ̄_c, elongation from branch a to C2 (m)."""
+    k0, kc, dsigma, eps_a, eps_c, kh_plus, kh_minus = values
+    sigma_a = _sigma_a(k0, eps_a)
+    sigma_c = sigma_a + dsigma
+    gap = eps_c - sigma_c / (k0 + sigma_c)
+    stiff = np.array([k0, kc, kh_plus, kh_minus]) / height
+    return np.append(stiff, [sigma_a, sigma_c, gap * height])
+
+
+def _from_stresses(mixed: Array, height: float) -> Array:
+    k0, kc, kh_plus, kh_minus = mixed[:4] * height
+    sigma_a, sigma_c, gap = mixed[4:]
+    eps_a, eps_c = sigma_a / (k0 + sigma_a), gap / height + sigma_c / (k0 + sigma_c)
+    return np.array([k0, kc, min(sigma_c - sigma_a, 0.0), eps_a, eps_c, kh_plus, kh_minus])
+
+
+# ---------------------------------------------------------------- the record
+
+_DROP = Between(  # Δσ from 0 to -σ_a
+    ("k0", "eps_a"),
+    lambda k0, eps_a: (0.0, -_sigma_a(k0, eps_a)),
+    lambda k0, eps_a: ((0.0, -eps_a / (1.0 - eps_a)), (0.0, -k0 / (1.0 - eps_a) ** 2)),
+)
+_BEYOND_A1 = Between(("eps_a",), lambda eps_a: (eps_a, LAST_STRAIN), lambda eps_a: ((1.0, 0.0),))
+_STIFFNESSES = (math.log(0.3), math.log(300.0))
+
+
+def _functions() -> Functions:
+    from foamfit.springs.laws import followed
+
+    return followed.functions_of("bistable")
+
+
+LAW = Law(
+    kind="bistable",
+    title="bistable spring",
+    params=(
+        Param(
+            "k0", ("k", "0"), "Pa", "first slope of branch a", (3.0, "slope"), (1e-3, 1e4),
+            "stress", inner=_STIFFNESSES, branch="a", example="5.5 MPa",
+        ),
+        Param(
+            "kc", ("k", "c"), "Pa", "first slope of branch c", (20.0, "slope"), (1e-2, 1e5),
+            "stress", inner=_STIFFNESSES, branch="c", example="82.5 MPa",
+        ),
+        Param(
+            "dsigma", ("Δσ", ""), "Pa", "stress at C2 less that at A1", (-0.1, "stress"),
+            (-10.0, 0.0), "stress", _DROP, box=(0.0, 0.999), least_size=1.0,
+            admissible="zero or negative", neutral=0.0, branch="e", example="-0.18 MPa",
+        ),
+        Param(
+            "eps_a", ("ε", "a"), "", "strain at A1, where snapping starts", (0.15, "strain"),
+            (1e-3, 0.95), admissible="between 0 and 1", branch="d", example="0.14",
+        ),
+        Param(
+            "eps_c", ("ε", "c"), "", "strain at C2, where snap-back starts", (0.8, "strain"),
+            (2e-3, 0.999), "one", _BEYOND_A1, box=(0.002, 1.0), admissible="between 0 and 1",
+            branch="e", example="0.31",
+        ),
+        Param(
+            "kh_plus", ("k", "h+"), "Pa", "slope of branch d", (1.0, "slope"), (0.0, 100.0),
+            "slope", "value", (0.0, 50.0), (0.0, 4.0), 0.1, "zero or positive", 0.0, "d",
+            "14.3 MPa",
+        ),
+        Param(
+            "kh_minus", ("k", "h−"), "Pa", "slope of branch e", (0.3, "slope"), (0.0, 100.0),
+            "slope", "value", (0.0, 50.0), (0.0, 4.0), 0.1, "zero or positive", 0.0, "e",
+            "2.34 MPa",
+        ),
+    ),
+    numbered=BRANCH_NAMES,
+    functions=_functions,
+    branches={"a": "elastic", "d": "snap-buckling", "c": "densified", "e": "snap-back"},
+    spring=BistableSpring,
+    searched=("k0", "kc", "eps_a", "eps_c", "dsigma", "kh_plus", "kh_minus"),
+    read_off=read_off,
+    read_in_series=read_in_series,
+    ways=2,
+    onset=lambda values: _sigma_a(values[0], values[3]),
+    scanned="eps_a",
+    strata="eps_a",
+    neighbours=_neighbours,
+    exchanged=(_to_stresses, _from_stresses),
+    points=(
+        PointOf("sigma_a", ("σ", "a"), "stress at A1, where snapping starts", "Pa"),
+        PointOf("sigma_c", ("σ̄", "c"), "stress at C2, where snap-back starts", "Pa"),
+        PointOf("eps_star", ("ε", "*"), "strain at which branch c starts from zero stress", ""),
+        PointOf("eps_hat_a", ("ε̂", "a"), "strain at A2, where branches e and a meet", ""),
+        PointOf("eps_hat_c", ("ε̂", "c"), "strain at C1, where branches d and c meet", ""),
+        PointOf("sigma_hat_c", ("σ̂", "c"), "stress at C1", "Pa"),
+    ),
+    compared=(
+        Compared("k0", "MPa", ("k0",), lambda k0: k0 / 1e6),
+        Compared(
+            "Δσ/σ_a", "", ("dsigma", "k0", "eps_a"),
+            lambda dsigma, k0, eps_a: dsigma * (1.0 - eps_a) / (k0 * eps_a),
+        ),
+        Compared("η", "Pa·s", ("eta",), lambda eta: eta),
+        Compared("ε_a", "", ("eps_a",), lambda eps_a: eps_a),
+        Compared("ε_c", "", ("eps_c",), lambda eps_c: eps_c),
+        Compared("h", "mm", ("height",), lambda height: height / 1e-3),
+        Compared("k_h+/k0", "", ("kh_plus", "k0"), lambda slope, k0: slope / k0),
+        Compared("k_h−/k0", "", ("kh_minus", "k0"), lambda slope, k0: slope / k0),
+        Compared("k_c/k0", "", ("kc", "k0"), lambda kc, k0: kc / k0),
+    ),
+    note="A1 and C1 are where the spring starts to snap and has snapped on loading; C2 and A2 "
+    "where it starts to snap back and has recovered on unloading.",
+    inner_loops=False,
+    remembers=False,
+    published=True,
+)  # fmt: skip

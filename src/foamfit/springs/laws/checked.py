@@ -1,0 +1,114 @@
+"""What is asked of a law before it becomes known."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+from foamfit.arrays import Array
+from foamfit.errors import InputError
+from foamfit.springs.laws import followed
+from foamfit.springs.laws.record import ADMISSIBLE, COMMON, Between, Functions, Law, Param
+
+SCALES = {"one": 1.0, "strain": 0.5, "stress": 1e6, "slope": 2e6, "damping": 1e3, "duration": 1e-3}
+_UP = np.linspace(0.0, 0.5, 101)
+TRIED = np.concatenate([_UP, _UP[-2::-1]])  # strains of the trial: up and back to zero
+FALLS = 1e-9  # share of the largest stress by which a stress may fall on loading: rounding
+
+
+def _names(law: Law, taken: Sequence[str]) -> str | None:
+    """What is wrong with the names and numbers of a record."""
+    if not re.fullmatch(r"[a-z][a-z0-9-]*", law.kind):
+        return "its kind must be small letters, digits and hyphens, beginning with a letter"
+    if law.kind in taken:
+        return "the name is that of a law of foamfit; choose another"
+    if not law.params:
+        return "it has no parameters; give it at least one Param"
+    for param in law.params:
+        if (wrong := _param(law, param)) is not None:
+            return f"parameter '{param.name}': {wrong}"
+    return None
+
+
+def _param(law: Law, param: Param) -> str | None:
+    """What is wrong with one parameter."""
+    if not re.fullmatch(r"[a-z][a-z0-9_]*", param.name) or re.fullmatch(r"(g|tau)\d+", param.name):
+        return "the name must be small letters, digits and underscores, and not g1, tau1, …"
+    if param.name in COMMON or law.own.count(param.name) > 1:
+        return f"the name is taken; every spring has {', '.join(COMMON)} of its own"
+    if param.scale not in SCALES or param.start[1] not in SCALES:
+        return f"scale and start must name one of {', '.join(SCALES)}"
+    if param.admissible not in ADMISSIBLE:
+        return f"admissible must be one of {', '.join(map(repr, ADMISSIBLE))}"
+    if not param.bounds[0] < param.bounds[1]:
+        return "bounds must be (lower, upper)"
+    if param.is_logarithmic and param.bounds[0] <= 0.0:
+        return 'its coordinate is a logarithm, so bounds must be positive; or coordinate = "value"'
+    if unknown := [name for name in param.of if name not in law.own]:
+        return f"its coordinate is relative to '{unknown[0]}', which the law does not have"
+    return None
+
+
+def start_values(law: Law) -> Array:
+    """Own parameters at their start values, for a test of 1 MPa at a strain of 0.5."""
+    values: dict[str, float] = {}
+    for name in law.search_order:
+        param = law.by_name[name]
+        values[name] = param.start[0] * SCALES[param.start[1]]
+        if isinstance(param.coordinate, Between):
+            first, last = param.coordinate.ends(*(values[other] for other in param.of))
+            values[name] = first + 0.5 * (last - first)
+    return np.array([values[name] for name in law.own])
+
+
+def _missing(law: Law) -> str | None:
+    """What is wrong with the functions of a record."""
+    given = law.functions if isinstance(law.functions, Functions) else law.functions()
+    if not isinstance(given, Functions):
+        return "functions must be foamfit.Functions(fill, begin, leaves, switch, settle)"
+    absent = [name for name, one in given._asdict().items() if not callable(one)]
+    return f"the function {absent[0]} is missing" if absent else None
+
+
+def _trial(law: Law) -> str | None:
+    """What is wrong along a loading and unloading at start values."""
+    values = start_values(law)
+    shown = ", ".join(f"{n} = {v:g}" for n, v in zip(law.own, values, strict=True))
+    try:
+        if followed.row_of(law, values) is None:
+            return f"fill refuses its own start values ({shown}); give others"
+        stress, branches = followed.stress_along(law, values, TRIED)
+    except Exception as error:  # whatever the compiler finds in a function of the user's
+        told = " ".join(str(error).split())[:300]
+        return f"its functions cannot be compiled or run ({type(error).__name__}: {told})"
+    if not np.all(np.isfinite(stress)):
+        at = int(np.argmin(np.isfinite(stress)))
+        return f"the stress is not finite at the strain {TRIED[at]:g} ({shown})"
+    if branches.min() < 0 or branches.max() >= len(law.numbered or law.branches):
+        return f"a branch has the number {branches.max()}, but branches names {len(law.branches)}"
+    loading = stress[: _UP.size]
+    fall = np.diff(loading) < -FALLS * np.abs(loading).max()
+    if fall.any():
+        at = int(np.argmax(fall))
+        return (
+            f"the stress falls on loading between the strains {TRIED[at]:g} and {TRIED[at + 1]:g} "
+            f"({shown}); a branch must rise with the strain"
+        )
+    return None
+
+
+def check(law: Law, taken: Sequence[str]) -> None:
+    """Refuse a law with something wrong in it; `taken` are the names of the paper's laws.
+
+    Raises
+    ------
+    InputError
+        Naming the law and what would be right.
+    """
+    if not isinstance(law, Law):
+        raise InputError(f"{law!r} is not a foamfit.Law")
+    wrong = _names(law, taken) or _missing(law) or _trial(law)
+    if wrong:
+        raise InputError(f"law '{law.kind}': {wrong}")

@@ -1,0 +1,293 @@
+"""Springs of any law, followed by the functions of its record: compiled loops.
+
+The loops are made for the laws that a chain has, in their order, and kept. All springs are rows of
+numbers and states of numbers (`laws.record`); `step` takes one of them to a strain within a time
+and returns its whole stress, that of the law, of the relaxation terms and of the dashpot.
+"""
+
+# mypy: disallow-untyped-decorators=False, warn-return-any=False
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from foamfit.arrays import Array
+from foamfit.springs import kernels
+from foamfit.springs import microscale_kernels as micro
+from foamfit.springs.law import MICROSCALE
+from foamfit.springs.laws.record import BRANCH, EPS, SIGMA, Functions, Law
+
+Compiled = Callable[..., Any]
+compiled = njit(error_model="numpy")
+MOST_SWITCHES = 10_000  # of one spring on the way to one strain
+
+
+# ---------------------------------------------------------------- the paper's laws
+
+
+@kernels.compiled
+def _begin(row: Array, state: Array) -> None:
+    """Set the state of a spring at rest."""
+    if row[kernels.KIND] == MICROSCALE:
+        micro.begin(row, state)
+        return
+    state[:] = 0.0
+    branch = kernels.first_branch(row)
+    state[BRANCH] = branch
+    state[micro.LOW], state[micro.HIGH] = kernels.interval(row, branch)
+
+
+@kernels.compiled
+def _leaves(row: Array, state: Array, eps: float) -> bool:
+    """Whether a spring leaves its branch before it reaches a strain."""
+    if row[kernels.KIND] == MICROSCALE:
+        return micro.leaves(state, eps)
+    return eps > state[micro.HIGH] if eps > state[EPS] else eps < state[micro.LOW]
+
+
+@kernels.compiled
+def _settle(row: Array, state: Array, eps: float) -> None:
+    """Bring a spring to a strain that lies on its branch."""
+    if row[kernels.KIND] == MICROSCALE:
+        micro.settle(row, state, eps)
+    else:
+        state[EPS], state[SIGMA] = eps, kernels.stress_on(row, int(state[BRANCH]), eps)
+
+
+@kernels.compiled
+def _switch(row: Array, state: Array, up: bool) -> None:
+    """Go over to the next branch, at the end of this one or where the strain turns."""
+    if row[kernels.KIND] == MICROSCALE:
+        micro.switch(row, state, up)
+        return
+    branch = int(state[BRANCH])
+    state[EPS] = state[micro.HIGH] if up else state[micro.LOW]
+    branch = kernels.above(branch) if up else kernels.below(branch)
+    state[BRANCH] = branch
+    state[micro.LOW], state[micro.HIGH] = kernels.interval(row, branch)
+    state[SIGMA] = kernels.stress_on(row, branch, state[EPS])
+
+
+_FILL = {
+    "bistable": kernels.fill_bistable,
+    "microscale": micro.fill_microscale,
+    "linear": kernels.fill_linear,
+    "unilateral": kernels.fill_unilateral,
+}
+
+
+def functions_of(kind: str) -> Functions:
+    """Functions of one of the paper's laws."""
+    return Functions(_FILL[kind], _begin, _leaves, _switch, _settle)
+
+
+# ---------------------------------------------------------------- loops for any laws
+
+
+@cache
+def compiled_functions(law: Law) -> Functions:
+    """Functions of a law, compiled."""
+    given: Any = law.functions if isinstance(law.functions, Functions) else law.functions()
+    return Functions(*(one if hasattr(one, "py_func") else compiled(one) for one in given))
+
+
+def sizes_of(law: Law) -> tuple[int, int]:
+    """Length of a row and of a state of a law."""
+    if law.kind in _FILL:
+        return kernels.N_COLUMNS, micro.STATE
+    return law.columns or len(law.params), law.states
+
+
+def row_of(law: Law, values: ArrayLike) -> Array | None:
+    """Row of a spring of own parameters (eta may follow); None if they are not admissible."""
+    row = np.zeros(sizes_of(law)[0])
+    own = np.array(values, dtype=float)[: len(law.params)]
+    return row if compiled_functions(law).fill(own, row) else None
+
+
+def solver_row(law: Law, values: Array, terms: ArrayLike, room: int) -> Array | None:
+    """Row of one of the paper's laws as the solver takes it; None if it is not admissible.
+
+    `values` are own parameters and eta; g and τ of the relaxation `terms` follow the columns, with
+    room for so many.
+    """
+    row, pairs = np.zeros(kernels.N_COLUMNS + 2 * room), np.ravel(terms)
+    own, relaxing = row[: kernels.N_COLUMNS], row[kernels.N_COLUMNS :]
+    fine = compiled_functions(law).fill(values[:-1], own) and values[-1] >= 0.0
+    own[kernels.ETA] = values[-1]
+    relaxing[1::2] = np.inf  # no term
+    relaxing[: pairs.size] = pairs
+    g, tau = pairs[::2], pairs[1::2]
+    if fine and pairs.size:
+        fine = bool(np.all((g >= 0.0) & (g < np.inf) & (tau > 0.0) & (tau < np.inf)))
+    return row if fine else None
+
+
+# Columns of a relaxation term: strength g, time τ (s), and its memory y, see `solve.relaxation`.
+STRENGTH, TIME, MEMORY = range(3)
+
+
+class Loops(NamedTuple):
+    """Compiled loops of springs of some laws, base first.
+
+    start(i, row, state)
+        Spring i at rest.
+    step(i, row, state, terms, eta, strain, h) -> stress
+        Takes spring i to a strain within the time h (s; 0 at once), its stress taken for linear in
+        time by the relaxation terms (n, 3). Returns the whole stress, Pa; NaN where there is none.
+    to_stress(i, row, state, terms, eta, stress, h) -> strain
+        The inverse; NaN where no strain gives that stress.
+    """
+
+    start: Compiled
+    step: Compiled
+    to_stress: Compiled
+
+
+def _walker(law: Law) -> Compiled:
+    """Take one spring to a strain: over all branches on the way; returns its stress."""
+    _, _, leaves, switch, settle = compiled_functions(law)
+    columns, states = sizes_of(law)
+
+    @compiled
+    def walk(rows: Array, whole: Array, eps: float) -> float:
+        row, state = rows[:columns], whole[:states]  # arrays may have room for longer ones
+        for _ in range(MOST_SWITCHES):
+            if not leaves(row, state, eps):
+                settle(row, state, eps)
+                return state[SIGMA]
+            switch(row, state, eps > state[EPS])
+        return math.nan
+
+    return walk
+
+
+def _starter(law: Law) -> Compiled:
+    begin = compiled_functions(law).begin
+    columns, states = sizes_of(law)
+
+    @compiled
+    def start(rows: Array, whole: Array, eps: float) -> float:
+        whole[:] = 0.0
+        begin(rows[:columns], whole[:states])
+        return eps
+
+    return start
+
+
+def _chosen(functions: Sequence[Compiled]) -> Compiled:
+    """One function of those of several springs: called with i, it is the i-th of them."""
+    first = functions[0]
+
+    @compiled
+    def alone(i: int, row: Array, state: Array, eps: float) -> float:
+        return first(row, state, eps)
+
+    if len(functions) == 1:
+        return alone
+    rest = _chosen(functions[1:])
+
+    @compiled
+    def choose(i: int, row: Array, state: Array, eps: float) -> float:
+        return first(row, state, eps) if i == 0 else rest(i - 1, row, state, eps)
+
+    return choose
+
+
+@cache
+def loops_of(laws: tuple[Law, ...]) -> Loops:
+    """Loops of springs of these laws, base first."""
+    walk = _chosen([_walker(law) for law in laws])
+    start = _chosen([_starter(law) for law in laws])
+
+    @compiled
+    def step(
+        i: int, row: Array, state: Array, terms: Array, eta: float, eps: float, h: float
+    ) -> float:
+        before, from_eps = state[SIGMA], state[EPS]
+        sigma = walk(i, row, state, eps)
+        out = sigma
+        for term in terms:
+            x = h / term[TIME]
+            decay, late = math.exp(-x), 0.5 * x
+            if x > 1e-4:
+                late = 1.0 + math.expm1(-x) / x
+            early = -math.expm1(-x) - late
+            term[MEMORY] = decay * term[MEMORY] - early * before - late * sigma
+            out += term[STRENGTH] * (sigma + term[MEMORY])
+        return out + eta * (eps - from_eps) / h if h > 0.0 and eta > 0.0 else out
+
+    @compiled
+    def to_stress(
+        i: int, row: Array, state: Array, terms: Array, eta: float, sigma: float, h: float
+    ) -> float:
+        trial, memory = state.copy(), terms.copy()
+        low = high = state[EPS]
+        least = most = step(i, row, trial, memory, eta, low, h)
+        pace = 1e-3
+        for _ in range(80):  # strains between which the stress lies
+            if least <= sigma <= most:
+                break
+            up = sigma > most
+            eps = high + pace if up else low - pace
+            trial[:], memory[:] = state, terms
+            now = step(i, row, trial, memory, eta, eps, h)
+            if up:
+                low, least, high, most = high, most, eps, now if now == now else math.inf
+            else:
+                low, least, high, most = eps, now if now == now else -math.inf, low, least
+            pace *= 1.6
+        if not least <= sigma <= most:
+            return math.nan
+        eps = high
+        for turn in range(200):  # false position, every third step a bisection
+            eps = 0.5 * (low + high)
+            if turn % 3 and most - least < math.inf and most > least:
+                eps = low + (high - low) * (sigma - least) / (most - least)
+            trial[:], memory[:] = state, terms
+            now = step(i, row, trial, memory, eta, eps, h)
+            if now < sigma:
+                low, least = eps, now
+            else:
+                high, most = eps, now
+            if now == sigma or high - low <= 1e-15 * max(abs(low), abs(high), 1e-3):
+                break
+        step(i, row, state, terms, eta, eps, h)
+        return eps
+
+    return Loops(start, step, to_stress)
+
+
+_NO_TERMS = np.empty((0, 3))
+
+
+def _followed(law: Law, values: ArrayLike) -> tuple[Loops, Array, Array]:
+    """Loops, row and state of one spring at rest."""
+    row, loops, state = row_of(law, values), loops_of((law,)), np.empty(sizes_of(law)[1])
+    assert row is not None
+    loops.start(0, row, state, 0.0)
+    return loops, row, state
+
+
+def stress_along(law: Law, values: ArrayLike, strain: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Stress (Pa) and number of the branch along a strain history (n,), from rest."""
+    loops, row, state = _followed(law, values)
+    out, branches = np.empty(strain.size), np.empty(strain.size, np.int64)
+    for j, eps in enumerate(strain):
+        out[j] = loops.step(0, row, state, _NO_TERMS, 0.0, eps, 0.0)
+        branches[j] = int(state[BRANCH])
+    return out, branches
+
+
+def strain_along(law: Law, values: ArrayLike, stress: Array) -> Array:
+    """Strain along a stress history (n,), Pa, from rest; NaN where the law has no such stress."""
+    loops, row, state = _followed(law, values)
+    return np.array(
+        [loops.to_stress(0, row, state, _NO_TERMS, 0.0, sigma, 0.0) for sigma in stress]
+    )

@@ -1,0 +1,357 @@
+"""What a law is: one record, by which everything else goes.
+
+A law describes one kind of spring. Solver, search, statistics, report, page, scene file and options
+ask its record and never which law it is: `Param` says all about a parameter, `Functions` follow the
+spring along its strain, and the other fields of `Law` are optional.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from foamfit.arrays import Array
+from foamfit.errors import InputError
+from foamfit.springs.loop import Loop
+
+# The state of a spring along its strain begins with strain, stress (Pa) and the number of its
+# branch; what else a law remembers follows.
+EPS, SIGMA, BRANCH, OWN = 0, 1, 2, 3
+LAST_STRAIN = 0.999
+
+# What values of a parameter are admissible, in the words of a message.
+ADMISSIBLE: dict[str, Callable[[float], bool]] = {
+    "positive": lambda value: value > 0.0,
+    "zero or positive": lambda value: value >= 0.0,
+    "zero or negative": lambda value: value <= 0.0,
+    "between 0 and 1": lambda value: 0.0 < value < 1.0,
+    "at least 0 and less than 1": lambda value: 0.0 <= value < 1.0,
+    "finite": math.isfinite,
+}
+
+
+class Between(NamedTuple):
+    """Two ends that depend on other parameters: value = first + u (last - first).
+
+    `of` names the others, `ends` gives (first, last) of their values, `slopes` the derivatives of
+    both ends by each of them: ((dfirst, dlast), …).
+    """
+
+    of: tuple[str, ...]
+    ends: Callable[..., tuple[float, float]]
+    slopes: Callable[..., tuple[tuple[float, float], ...]]
+
+
+@dataclass(frozen=True)
+class Param:
+    """One parameter of a law.
+
+    Numbers are multiples of a scale of the test: "one", "strain" (the largest), "stress" (the
+    largest, Pa), "slope" (stress over strain, Pa), "damping" (Pa·s) or "duration" (s).
+
+    Parameters
+    ----------
+    name : str
+        As in s1_<name>.
+    symbol : tuple of str
+        Letter and index, ("ε", "a").
+    unit : str
+        SI, "" for a pure number.
+    what : str
+        What it is, in words for a table.
+    start : (float, str)
+        Start value, where nothing is known, and its scale.
+    bounds : (float, float)
+        Limits of the search.
+    scale : str
+        The scale of `bounds`.
+    coordinate : "logarithm", "value" or Between
+        What the search moves in.
+    box, inner : (float, float), optional
+        Limits of the coordinate, and those of random start values; by default those of `bounds`.
+    least_size : float
+        A value below this share of its scale is measured by that share when its uncertainty is
+        judged; so may a parameter that can be zero be.
+    admissible : str
+        One of `ADMISSIBLE`.
+    neutral : float, optional
+        The value at which the parameter has no effect.
+    branch : str
+        The branch that a test must reach for the parameter to leave a trace.
+    example : str
+        A value with its unit as a file states it.
+    """
+
+    name: str
+    symbol: tuple[str, str] = ("", "")
+    unit: str = ""
+    what: str = ""
+    start: tuple[float, str] = (1.0, "one")
+    bounds: tuple[float, float] = (1e-3, 1e3)
+    scale: str = "one"
+    coordinate: str | Between = "logarithm"
+    box: tuple[float, float] | None = None
+    inner: tuple[float, float] | None = None
+    least_size: float = 0.0
+    admissible: str = "positive"
+    neutral: float | None = None
+    branch: str = ""
+    example: str = ""
+
+    @property
+    def is_logarithmic(self) -> bool:
+        """Whether the search moves in the logarithm."""
+        return self.coordinate == "logarithm"
+
+    @property
+    def of(self) -> tuple[str, ...]:
+        """Parameters that its coordinate is relative to."""
+        return self.coordinate.of if isinstance(self.coordinate, Between) else ()
+
+    @cached_property
+    def limits(self) -> tuple[float, float]:
+        """Lowest and highest coordinate."""
+        if self.box is not None:
+            return self.box
+        low, high = self.bounds
+        return (math.log(low), math.log(high)) if self.is_logarithmic else (low, high)
+
+    @cached_property
+    def start_limits(self) -> tuple[float, float]:
+        """Lowest and highest coordinate of random start values."""
+        return self.limits if self.inner is None else self.inner
+
+    @property
+    def has_neutral(self) -> bool:
+        """Whether the parameter may be zero, so that its interval tells whether it is there."""
+        return self.neutral == 0.0
+
+
+class Functions(NamedTuple):
+    """How a spring is followed along its strain: functions that Numba compiles.
+
+    fill(values, row) -> bool
+        Writes the own parameters and what follows from them into `row`; False if they are not
+        admissible.
+    begin(row, state)
+        Sets the state of a spring at rest: strain, stress, branch, then what else the law
+        remembers.
+    leaves(row, state, strain) -> bool
+        Whether the spring leaves its branch before it reaches a strain.
+    switch(row, state, up)
+        Goes to the end of the branch, upwards or downwards in strain, and on to the next.
+    settle(row, state, strain)
+        Brings the state to a strain on its branch.
+    """
+
+    fill: Callable[..., bool]
+    begin: Callable[..., None]
+    leaves: Callable[..., bool]
+    switch: Callable[..., None]
+    settle: Callable[..., None]
+
+
+class PointOf(NamedTuple):
+    """A number that follows from the parameters, as the report lists it."""
+
+    attribute: str  # of the spring
+    symbol: tuple[str, str]
+    what: str
+    unit: str
+
+
+class Compared(NamedTuple):
+    """A row of the comparison with published parameters: a formula of parameters."""
+
+    label: str
+    unit: str
+    of: tuple[str, ...]
+    formula: Callable[..., Any]  # also of complex numbers, for its derivatives
+
+
+# k_c over the largest stress from which a search begins again.
+STEEP = np.geomspace(1.0, 1000.0, 7)
+
+
+def steeper(values: Array, kc: int, start: int, top: float, low: float) -> Iterator[Array]:
+    """Give springs with another k_c whose branch c has the same strain at the largest stress.
+
+    A steep branch c shows in few samples: where k_c alone changes, it misses them altogether. `kc`
+    and `start` are the places of k_c and of the strain where branch c begins, at the stress `low`.
+    """
+    for other in top * STEEP:
+        moved = values.copy()
+        moved[kc] = other
+        rises = [top / (k + top) - low / (k + low) for k in (values[kc], other)]
+        moved[start] += rises[0] - rises[1]
+        yield moved
+
+
+def _no_neighbours(values: Array, top: float) -> Iterator[Array]:
+    return iter(())
+
+
+@dataclass(frozen=True, eq=False)
+class Law:
+    """A kind of spring.
+
+    Parameters
+    ----------
+    kind : str
+        The word of a model's name: "bistable", "linear+bistable".
+    params : tuple of Param
+        Its own parameters, in the order of `Functions.fill`; dashpot, relaxation terms and height
+        come by themselves.
+    functions : Functions or callable that returns them
+        How it is followed.
+    columns, states : int
+        Length of a row and of a state; by default one number per parameter, and strain, stress and
+        branch alone.
+    branches : mapping
+        Branches by their number, the first at rest: name and what the spring does on it.
+    title : str
+        The spring in words, "bistable spring".
+    hysteretic : bool
+        Whether it has a loop, and may relax.
+    spring : callable, optional
+        Makes the spring of own parameters, eta, and relaxation=; `register` gives a `LawSpring`.
+    searched : tuple of str, optional
+        Order of the coordinates of the search; by default the parameters, those last that are
+        relative to others.
+    read_off : callable, optional
+        read_off(loop, marks, scales, way) gives the own parameters and eta, read off a measured
+        loop where `marks` (n,) in [0, 1] place them. Without one, start values are random.
+    read_in_series : callable, optional
+        The same for one of several springs: (loop, marks, share of the height).
+    marks, ways : int
+        Number of marks, and of ways to read a loop.
+    onset : callable, optional
+        Stress at which the spring starts to snap, of its own parameters; springs that can be
+        exchanged are ordered by it. By default the first parameter.
+    scanned, strata : str
+        A parameter along which the cost may have several minima, and one over whose range the
+        points from which the search descends are spread.
+    neighbours : callable
+        neighbours(values, largest stress) gives own parameters of springs with nearly the same
+        loop, from which the search begins again.
+    exchanged : pair of callables, optional
+        (values, height) to stresses and elongations, and back: what springs in series exchange.
+    points, compared : tuples
+        What the report lists beside the parameters, and what a comparison shows.
+    note : str
+        What the report says about the marks of the figure.
+    inner_loops, remembers : bool
+        Whether partial unloading leaves the branch; whether the spring remembers more than its
+        branch.
+    published : bool
+        Whether the paper publishes parameters of it.
+    numbered : tuple of str, optional
+        Names of the branches by their numbers; by default the order of `branches`.
+    """
+
+    kind: str
+    params: tuple[Param, ...]
+    functions: Functions | Callable[[], Functions]
+    columns: int = 0
+    states: int = OWN
+    branches: Mapping[str, str] = field(default_factory=lambda: {"line": "the law"})
+    title: str = ""
+    hysteretic: bool = True
+    spring: Callable[..., Any] | None = None
+    searched: tuple[str, ...] = ()
+    read_off: Callable[[Loop, Array, Any, int], Array] | None = None
+    read_in_series: Callable[[Loop, Array, float], Array] | None = None
+    marks: int = 5
+    ways: int = 1
+    onset: Callable[..., float] | None = None
+    scanned: str = ""
+    strata: str = ""
+    neighbours: Callable[[Array, float], Iterator[Array]] = _no_neighbours
+    exchanged: tuple[Callable[[Array, float], Array], Callable[[Array, float], Array]] | None = None
+    points: tuple[PointOf, ...] = ()
+    compared: tuple[Compared, ...] = ()
+    note: str = ""
+    inner_loops: bool = True
+    remembers: bool = True
+    published: bool = False
+    numbered: tuple[str, ...] = ()
+
+    @cached_property
+    def own(self) -> tuple[str, ...]:
+        """Names of its own parameters."""
+        return tuple(param.name for param in self.params)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of its own parameters and of its dashpot."""
+        return (*self.own, ETA.name)
+
+    @cached_property
+    def by_name(self) -> dict[str, Param]:
+        """Its own parameters and the dashpot by their names."""
+        return {param.name: param for param in (*self.params, ETA)}
+
+    @cached_property
+    def search_order(self) -> tuple[str, ...]:
+        """Its own parameters in an order in which each follows those that it is relative to."""
+        if self.searched:
+            return self.searched
+        return tuple(param.name for param in sorted(self.params, key=lambda param: len(param.of)))
+
+    @cached_property
+    def needed(self) -> tuple[str, ...]:
+        """Branches that some parameter needs a test to reach."""
+        shown = {param.branch for param in self.params}
+        return tuple(branch for branch in self.branches if branch in shown)
+
+    def make(self, values: Sequence[float], relaxation: Sequence[tuple[float, float]]) -> Any:
+        """Make the spring of its own parameters and eta.
+
+        Raises
+        ------
+        InputError
+            If they are not admissible, or the law is not registered yet.
+        """
+        if self.spring is None:
+            raise InputError(f"law '{self.kind}' is not known yet: register it first")
+        return self.spring(*values, **({"relaxation": relaxation} if self.hysteretic else {}))
+
+    def any_spring(self) -> Any:
+        """Make some spring of the law, whatever its numbers: of it only the law counts."""
+        values = {}
+        for param in sorted(self.params, key=lambda param: self.search_order.index(param.name)):
+            values[param.name] = abs(param.start[0]) or 1.0
+            if isinstance(param.coordinate, Between):
+                first, last = param.coordinate.ends(*(values[name] for name in param.of))
+                values[param.name] = first + 0.2 * (last - first)
+        return self.make([*(values[name] for name in self.own), 0.0], ())
+
+    def named_branch(self, number: int) -> str:
+        """Name of a branch by its number."""
+        return (self.numbered or tuple(self.branches))[number]
+
+
+# Parameters that a spring has whatever its law.
+ETA = Param(
+    "eta", ("η", ""), "Pa s", "dashpot in parallel", (0.0, "damping"), (0.0, 10.0), "damping",
+    "value", inner=(0.0, 0.3), least_size=0.1, admissible="zero or positive", neutral=0.0,
+    example="100 Pa*s",
+)  # fmt: skip
+STRENGTH = Param(
+    "g", ("g", ""), "", "strength of a relaxation term", (0.2, "one"), (0.0, 10.0), "one",
+    "value", inner=(0.0, 1.0), least_size=0.1, admissible="zero or positive", example="0.5",
+)  # fmt: skip
+RELAXATION_TIME = Param(
+    "tau", ("τ", ""), "s", "time of a relaxation term", (0.05, "duration"), (1e-4, 30.0),
+    "duration", inner=(math.log(0.002), math.log(1.0)), example="0.2 s",
+)  # fmt: skip
+HEIGHT = Param(
+    "height", ("h", ""), "m", "height of the spring", (1.0, "height"), (0.02, 0.98), "height",
+    "value", example="1 mm",
+)  # fmt: skip
+COMMON = {param.name: param for param in (ETA, STRENGTH, RELAXATION_TIME, HEIGHT)}

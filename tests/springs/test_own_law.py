@@ -1,0 +1,193 @@
+"""Laws of one's own: registered from a file, refused where wrong, simulated, fitted."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import foamfit as ff
+from foamfit.springs import laws
+from foamfit.springs.laws import Law
+
+FILE = Path(__file__).parents[2] / "notebooks" / "bouc_wen.py"
+VALUES = (2e6, 0.3, 0.1, 1.5, 0.0)
+HEIGHT, AREA = 1e-2, 1e-3
+
+
+@pytest.fixture(scope="module")
+def bouc_wen() -> Iterator[Law]:
+    before = dict(laws._LAWS)
+    (law,) = laws.load_file(FILE)
+    yield law
+    laws._LAWS.clear()
+    laws._LAWS.update(before)
+
+
+def chain_of(spring: ff.springs.spring.Spring, **more: float) -> ff.Chain:
+    return ff.Chain([spring], [HEIGHT], AREA, **more)
+
+
+def by_hand(time: np.ndarray, strain_rate: object) -> np.ndarray:
+    """Bouc-Wen stress along a strain rate of time, by scipy."""
+    k, alpha, limit, n, _ = VALUES
+
+    def rhs(t: float, y: np.ndarray) -> list[float]:
+        rate = strain_rate(t)  # type: ignore[operator]
+        held = (abs(y[1]) / limit) ** n if y[1] * rate > 0 else 0.0
+        return [rate, rate * (1.0 - held)]
+
+    found = solve_ivp(rhs, (time[0], time[-1]), [0.0, 0.0], t_eval=time, rtol=1e-10, atol=1e-12,
+                      max_step=time[-1] / 2000)  # fmt: skip
+    return alpha * k * found.y[0] + (1.0 - alpha) * k * found.y[1]
+
+
+def test_the_law_follows_a_motion_as_scipy_does(bouc_wen: Law) -> None:
+    time = np.linspace(0.0, 1.0, 401)
+    strain = 0.4 * np.sin(np.pi * time) ** 2
+    drive = ff.DisplacementDrive(HEIGHT * strain)
+    got = ff.simulate(chain_of(bouc_wen.make(VALUES, ())), drive, time)
+    want = by_hand(time, lambda t: 0.4 * np.pi * np.sin(2.0 * np.pi * t))
+    np.testing.assert_allclose(got.base_stress, want, rtol=0, atol=2e-5 * want.max())
+    np.testing.assert_allclose(
+        bouc_wen.make(VALUES, ()).strain(got.base_stress), strain, rtol=0, atol=1e-12
+    )
+
+
+def test_an_impact_agrees_with_scipy(bouc_wen: Law) -> None:
+    k, alpha, limit, n, _ = VALUES
+    mass, speed, time = 0.5, 2.0, np.linspace(0.0, 4e-3, 201)
+
+    def rhs(_: float, y: np.ndarray) -> list[float]:
+        w, v, z = y
+        held = (abs(z) / limit) ** n if z * v > 0 else 0.0
+        stress = alpha * k * w / HEIGHT + (1.0 - alpha) * k * z
+        return [v, -stress * AREA / mass, v / HEIGHT * (1.0 - held)]
+
+    want = solve_ivp(rhs, (0.0, time[-1]), [0.0, speed, 0.0], t_eval=time, rtol=1e-10, atol=1e-14,
+                     max_step=2e-6)  # fmt: skip
+    got = ff.simulate(chain_of(bouc_wen.make(VALUES, ())), ff.Impact(mass, speed), time)
+    np.testing.assert_allclose(got.displacement[0], want.y[0], rtol=0, atol=3e-6 * want.y[0].max())
+
+
+@functools.cache
+def copy_of(kind: str) -> Law:
+    """One of the paper's laws as if it were registered, so that the steps of any law follow it."""
+    copied = {"kind": f"{kind}-copy", "spring": None, "columns": 16, "states": 18}
+    return laws.register(dataclasses.replace(laws.law(kind), **copied))
+
+
+@pytest.mark.parametrize("kind", ["bistable", "microscale"])
+@pytest.mark.parametrize("relaxation", [(), [(0.4, 2e-4)]])
+@pytest.mark.parametrize("drive", ["impact", "stress", "displacement"])
+def test_steps_of_any_law_agree_with_the_solver_of_the_papers_laws(
+    bouc_wen: Law, kind: str, relaxation: list[tuple[float, float]], drive: str
+) -> None:
+    spring: ff.BistableSpring | ff.MicroscaleSpring = (
+        ff.BistableSpring(5.5e6, 82.5e6, -0.18e6, 0.14, 0.31, 14.3e6, 2.34e6, 50.0,
+                          relaxation=relaxation)
+        if kind == "bistable"
+        else ff.MicroscaleSpring(5.5e6, 2.5e6, 0.3, 1.3e6, 0.4, 5.5e5, 0.6, 50.0,
+                                 relaxation=relaxation)
+    )  # fmt: skip
+    clone = copy_of(kind)
+    time = np.linspace(0.0, 1.2e-3, 121)
+    shape = np.sin(np.pi * time / time[-1]) ** 2
+    given = {
+        "impact": ff.Impact(7e-3, 1.5),
+        "stress": ff.StressDrive(1.5e6 * shape),
+        "displacement": ff.DisplacementDrive(3.5e-4 * shape),
+    }[drive]
+    one, other = (
+        ff.simulate(ff.Chain([of], [1.19e-3], 1.9635e-5), given, time, 1e-5, sensitivities=NAMES)
+        for of in (spring, clone.make(spring.values, relaxation))
+    )
+    for a, b in ((one.base_stress, other.base_stress), (one.displacement, other.displacement)):
+        np.testing.assert_allclose(b, a, rtol=0, atol=2e-4 * np.abs(a).max())
+    for name in NAMES:
+        a, b = (r.sensitivities[name].displacement for r in (one, other))
+        np.testing.assert_allclose(b, a, rtol=0, atol=2e-2 * max(np.abs(a).max(), 1e-18))
+
+
+NAMES = ("s1_k0", "s1_eta")
+
+
+def test_a_law_stands_in_a_chain(bouc_wen: Law) -> None:
+    springs = [ff.LinearSpring(4e6), bouc_wen.make(VALUES, ())]
+    time = np.linspace(0.0, 1.0, 101)
+    moved = 3e-3 * np.sin(np.pi * time)
+    got = ff.simulate(ff.Chain(springs, [4e-3, 6e-3], AREA), ff.DisplacementDrive(moved), time)
+    np.testing.assert_allclose(got.displacement[-1], moved, rtol=0, atol=1e-9)
+    own = np.diff(got.displacement, axis=0, prepend=0.0) / np.array([[4e-3], [6e-3]])
+    for spring, strain in zip(springs, own, strict=True):
+        np.testing.assert_allclose(spring.stress(strain), got.base_stress, rtol=1e-8, atol=1.0)
+
+
+# ---------------------------------------------------------------------------- what is refused
+
+
+def changed(law: Law, **by: object) -> Law:
+    return dataclasses.replace(law, **by)  # type: ignore[arg-type]
+
+
+def _falling(row, state, strain):  # type: ignore[no-untyped-def]
+    state[0], state[1] = strain, -row[0] * strain
+
+
+def _infinite(row, state, strain):  # type: ignore[no-untyped-def]
+    state[0], state[1] = strain, row[0] * strain / (0.2 - 0.2)
+
+
+def test_a_wrong_law_gets_one_sentence(bouc_wen: Law) -> None:
+    of = bouc_wen.functions
+    assert isinstance(of, ff.Functions)
+    first = bouc_wen.params[0]
+    wrong = {
+        "the function settle is missing": changed(bouc_wen, functions=of._replace(settle=None)),
+        "the stress falls on loading": changed(bouc_wen, functions=of._replace(settle=_falling)),
+        "the stress is not finite": changed(bouc_wen, functions=of._replace(settle=_infinite)),
+        "the name is that of a law of foamfit": changed(bouc_wen, kind="bistable"),
+        "its kind must be small letters": changed(bouc_wen, kind="Bouc Wen"),
+        "it has no parameters": changed(bouc_wen, params=()),
+        "parameter 'eta': the name is taken": changed(
+            bouc_wen, params=(dataclasses.replace(first, name="eta"),)
+        ),
+        "parameter 'k': its coordinate is a logarithm": changed(
+            bouc_wen, params=(dataclasses.replace(first, bounds=(0.0, 1.0)),)
+        ),
+    }
+    for message, law in wrong.items():
+        with pytest.raises(ff.InputError, match=f"^law '{law.kind}': .*{message}") as caught:
+            ff.register(law)
+        assert "\n" not in str(caught.value)
+        assert laws.is_registered(law.kind) or law.kind == "bistable"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "no such file"),
+        ("x = 1\n", "the file defines no law"),
+        ("1 / 0\n", r"the file cannot be run \(ZeroDivisionError"),
+        ("def f(:\n", r"the file cannot be run \(SyntaxError"),
+    ],
+)
+def test_a_wrong_law_file_gets_one_sentence(tmp_path: Path, text: str | None, message: str) -> None:
+    path = tmp_path / "law.py"
+    if text is not None:
+        path.write_text(text)
+    known = laws.kinds()
+    with pytest.raises(ff.InputError, match=message) as caught:
+        laws.load_file(path)
+    assert str(path) in str(caught.value)
+    assert laws.kinds() == known
+
+
+def test_parameters_that_are_not_admissible_are_refused(bouc_wen: Law) -> None:
+    with pytest.raises(ff.InputError, match=r"^k = -1 is not admissible: it must be positive"):
+        bouc_wen.make((-1.0, *VALUES[1:]), ())
