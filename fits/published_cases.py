@@ -23,9 +23,7 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import foamfit as ff
-from foamfit.report.comparison import Comparison, compare
-from foamfit.report.comparison_plot import plot_comparison
-from foamfit.report.comparison_text import comparison_text
+from foamfit.report.comparison import Comparison, compare, comparison_text, plot_comparison
 from foamfit.report.folder import load_result
 
 HERE = Path(__file__).parent

@@ -16,8 +16,7 @@ from pathlib import Path
 
 import foamfit as ff
 from foamfit.api import FitResult
-from foamfit.report.comparison import compare
-from foamfit.report.comparison_plot import plot_comparison
+from foamfit.report.comparison import compare, plot_comparison
 from foamfit.report.plots import plot_fit
 
 HERE = Path(__file__).parent

@@ -14,10 +14,8 @@ import fabricated
 import foamfit as ff
 from conftest import synthetic_impact
 from foamfit.data.measurement import Outliers
-from foamfit.report.budget_plot import plot_budget
-from foamfit.report.comparison import compare
-from foamfit.report.comparison_plot import plot_comparison
-from foamfit.report.identifiability_plots import plot_insight
+from foamfit.report.comparison import compare, plot_comparison
+from foamfit.report.identifiability_plots import plot_budget, plot_insight
 from foamfit.report.plots import plot_fit, plot_response
 from foamfit.trust.identifiability import Insight
 

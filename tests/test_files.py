@@ -26,8 +26,7 @@ from conftest import EXPERIMENTS, without_pictures
 from foamfit.cli import main
 from foamfit.errors import InputError
 from foamfit.files import check_file, csv_bytes, replacing, sweep, write_file
-from foamfit.report.comparison import compare
-from foamfit.report.comparison_text import write_csv
+from foamfit.report.comparison import compare, write_csv
 from foamfit.report.folder import check_target, load_result
 from foamfit.report.plots import plot_fit
 from foamfit.report.result_figures import Images

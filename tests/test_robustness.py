@@ -24,8 +24,7 @@ from foamfit.data.measurement import Measurement, Outliers
 from foamfit.fitting.curves import default_weights
 from foamfit.fitting.losses import LOSSES, influence, soften
 from foamfit.fitting.objective import Objective
-from foamfit.report.comparison import compare
-from foamfit.report.comparison_text import comparison_text
+from foamfit.report.comparison import compare, comparison_text
 from foamfit.report.folder import load_result
 from foamfit.report.page import render_report
 from foamfit.report.plots import plot_fit

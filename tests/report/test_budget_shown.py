@@ -15,7 +15,7 @@ from conftest import AREA, HEIGHT, synthetic_impact, synthetic_loop
 from foamfit.cli import main
 from foamfit.data.describe import describe
 from foamfit.data.energy import audit
-from foamfit.report.budget_plot import plot_budget
+from foamfit.report.identifiability_plots import plot_budget
 from foamfit.report.page import render_report
 from foamfit.report.readable import readable
 from foamfit.report.result_figures import draw_all

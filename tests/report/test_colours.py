@@ -19,9 +19,9 @@ from matplotlib.colors import to_rgb
 
 import foamfit.report
 from drawn import figures
-from foamfit.report.budget_plot import LOOKS
+from foamfit.report.identifiability_plots import LOOKS
 from foamfit.report.plots import DASHES, MARKS
-from foamfit.report.studies import cycles, joint_plot, prediction
+from foamfit.report.studies import cycles, joint, prediction
 from foamfit.results import SOURCES
 
 EYES = {
@@ -125,7 +125,7 @@ def test_sources_of_a_budget_are_told_apart_by_colour_or_hatching() -> None:
     ("one", "other"),
     [
         (prediction.MEASURED, prediction.VERMILION),
-        (joint_plot.MEASURED, joint_plot.BLUE),
+        (joint.MEASURED, joint.BLUE),
         (cycles.BLUE, "white"),  # hollow marks
     ],
 )
@@ -157,10 +157,8 @@ def backgrounds(template: str) -> dict[str, tuple[str, str]]:
 @pytest.mark.parametrize(
     ("template", "states"),
     [
-        ("report.html", ("determined", "weak", "not-determined")),
-        ("report.html", ("ok", "warnings-state", "failed")),
-        ("joint.html", ("determined", "weak", "not-determined")),
-        ("summary.html", ("ok", "warnings", "failed")),
+        ("base.html", ("determined", "weak", "not-determined")),
+        ("base.html", ("ok", "warnings", "failed")),
     ],
 )
 def test_states_on_the_pages_are_told_apart_and_can_be_read(

@@ -24,11 +24,13 @@ from foamfit.report.comparison import (
     Pair,
     Row,
     compare,
+    comparison_text,
+    plot_comparison,
     recognised,
+    write_csv,
 )
-from foamfit.report.comparison_plot import plot_comparison
-from foamfit.report.comparison_text import comparison_text, write_csv
 from foamfit.results import Correlation
+from foamfit.springs import laws
 
 NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
 
@@ -407,8 +409,8 @@ def test_microscale_fits_stand_beside_each_other() -> None:
     ticks = [
         tick.get_text() for tick in plot_comparison(compare([one, one])).axes[0].get_yticklabels()
     ]
-    assert ticks[-2:] == ["$g_1$", r"$\tau_1$"]
-    assert r"$\sigma_+$" in ticks
+    assert ticks[-2:] == ["$g_{1}$", "$τ_{1}$"]
+    assert "$σ_{+}$" in ticks
 
 
 def test_a_law_that_relaxes_beside_one_that_does_not() -> None:
@@ -435,3 +437,22 @@ def test_a_result_with_an_odd_number_of_relaxation_terms_is_refused() -> None:
     content = fabricated.microscale_result().to_json_dict() | {"relaxation": "one"}
     with pytest.raises(InputError, match="'relaxation' cannot be 'one'; fit again"):
         compare([content, content])
+
+
+def test_a_law_of_ones_own_is_compared_parameter_by_parameter(monkeypatch) -> None:
+    params = (
+        ff.Param("k", ("k", "1"), "Pa"),
+        ff.Param("limit", ("z", "m")),
+    )
+    law = replace(laws.law("linear"), kind="own", params=params, compared=(), hysteretic=True)
+    monkeypatch.setitem(laws._LAWS, "own", replace(law, published=False))
+    made = {
+        "s1_k": fabricated.estimate("s1_k", 2e6),
+        "s1_limit": fabricated.estimate("s1_limit", 0.1),
+    }
+    one = replace(fabricated.result(), model="own", parameters=made)
+    pair = only(compare([one, one]))
+    assert [(row.label, row.unit, row.value) for row in pair.rows] == [
+        ("k_1", "MPa", pytest.approx(2.0)),
+        ("z_m", "", pytest.approx(0.1)),
+    ]

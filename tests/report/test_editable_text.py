@@ -12,8 +12,7 @@ import pytest
 
 import fabricated
 from drawn import figures
-from foamfit.report.comparison import compare
-from foamfit.report.comparison_plot import plot_comparison
+from foamfit.report.comparison import compare, plot_comparison
 from foamfit.report.figures import image
 from foamfit.report.plots import plot_fit
 

@@ -22,8 +22,7 @@ import fabricated
 from conftest import ROOT
 from foamfit.cli import main
 from foamfit.data.measurement import Dropped, RowCount
-from foamfit.report.comparison import compare
-from foamfit.report.comparison_text import comparison_text
+from foamfit.report.comparison import compare, comparison_text
 from foamfit.report.summary import summary_text
 from foamfit.results import Check, Fit, Ladder, Rung
 

@@ -13,11 +13,8 @@ from conftest import AREA, HEIGHT
 from foamfit.data.measurement import Measurement, Noise, Specimen
 from foamfit.fitting.links import Links
 from foamfit.fitting.problem import make_problem
-from foamfit.report.figures import STYLE, image, laid_out
-from foamfit.report.plotted import plotted, table
-from foamfit.report.studies.joint_page import joint_page
-from foamfit.report.studies.joint_plot import plot_joint
-from foamfit.report.studies.joint_text import joint_text
+from foamfit.report.figures import STYLE, image, laid_out, plotted, table
+from foamfit.report.studies.joint import joint_page, joint_text, plot_joint
 from foamfit.study.joint_estimates import common_covariance, parameters_of
 from foamfit.study.joint_fit import Alternative, fit_jointly
 from foamfit.study.joint_result import Alone, JointData
@@ -123,7 +120,7 @@ def test_ranges_are_told_where_there_are_some(found):
     page = joint_page(ranged, b"\x89PNG")
     assert "<th>range</th>" in page
     assert ">520 to 580 kPa<" in page
-    assert "the range is where it would lie (95 %)" in page
+    assert "where the value would lie (95 %)" in page
     assert "520.0 to 580.0 kPa" in joint_text(ranged)
 
 

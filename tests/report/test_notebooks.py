@@ -8,6 +8,7 @@ from conftest import ROOT
 
 NOTEBOOKS = ROOT / "notebooks"
 LISTED = (
+    "a_law_of_your_own.ipynb",
     "fit_a_new_test.ipynb",
     "fitted_against_published.ipynb",
     "what_changes_by_cycle.ipynb",

@@ -235,10 +235,10 @@ def test_what_a_microscale_spring_snapped_and_relaxes_is_told() -> None:
     assert "microscale model with 1 relaxation term, displacement drive" in words
     snapped = "96 % of the micro-springs snap in this test, at 230.8 kPa and a strain of 0.6000"
     assert snapped in words
-    assert "what the others would do is extrapolated" in words
-    assert "changes 1.500 times as much as in equilibrium, and relaxes: 33 % of it" in words
+    assert "the rest is extrapolated" in words
+    assert "changes 1.500 times as much as in equilibrium and then relaxes: 33 % of it" in words
     assert "time constant of 250 ms" in words
-    assert "68 % snap through between 68.27 and 164.6 kPa 106.0 kPa" in words
+    assert "68 % snap through at 68.27 to 164.6 kPa 106.0 kPa" in words
     assert "relaxes, with τ = 250.0 ms 0.3333" in words
     assert "snap-back · micro-springs snap back" in words
     assert "not reached" not in words

@@ -16,7 +16,7 @@ from foamfit.api import FitResult
 from foamfit.errors import InputError
 from foamfit.fitting.branches import Section
 from foamfit.report.figures import STYLE, image, laid_out
-from foamfit.report.identifiability_plots import _without_shakes
+from foamfit.report.identifiability_plots import without_shakes
 from foamfit.report.plots import origin_word, plot_fit, plot_residuals, plot_response
 from foamfit.report.readable import readable_unit
 from foamfit.results import Switch
@@ -318,7 +318,7 @@ def test_shakes_of_a_measured_motion_are_no_branch_of_their_own() -> None:
             ("held", 600, 640), ("snap-back", 640, 1000),
         )
     )  # fmt: skip
-    kept = _without_shakes(cuts, 1000)
+    kept = without_shakes(cuts, 1000)
     assert [(cut.branches, cut.start, cut.stop) for cut in kept] == [
         ("snap-through", 0, 600), ("held", 600, 640), ("snap-back", 640, 1000)
     ]  # fmt: skip

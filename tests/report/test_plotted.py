@@ -15,11 +15,10 @@ from matplotlib.image import imread
 import fabricated
 from drawn import figures, insight, with_outliers
 from foamfit.errors import InputError
-from foamfit.report.figures import MOST_POINTS, drawing, image
+from foamfit.report.figures import HEAD, MOST_POINTS, drawing, image, plotted
 from foamfit.report.identifiability_plots import plot_insight
 from foamfit.report.page import render_report
 from foamfit.report.plots import plot_fit, plot_residuals
-from foamfit.report.plotted import HEAD, plotted
 
 
 def series(figure: Figure) -> dict[tuple[str, str], np.ndarray]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import pickle
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -186,6 +187,13 @@ def test_a_wrong_law_file_gets_one_sentence(tmp_path: Path, text: str | None, me
         laws.load_file(path)
     assert str(path) in str(caught.value)
     assert laws.kinds() == known
+
+
+def test_a_law_is_pickled_by_its_name(bouc_wen: Law) -> None:
+    spring = bouc_wen.make(VALUES, [(0.1, 2.0)])
+    again = pickle.loads(pickle.dumps(spring))
+    assert again == spring
+    assert again.law is bouc_wen
 
 
 def test_parameters_that_are_not_admissible_are_refused(bouc_wen: Law) -> None:

@@ -22,6 +22,7 @@ from foamfit.fitting.branches import FLIGHT, Section
 from foamfit.fitting.problem import Problem, make_params, make_problem
 from foamfit.fitting.search import SearchRecord
 from foamfit.report import outlook as planning
+from foamfit.report.comparison import published_side
 from foamfit.report.identifiability_plots import (
     plot_insight,
 )
@@ -350,7 +351,7 @@ def test_trials_that_fail_and_masses_that_ring_are_asked_after() -> None:
     heavy = replace(test, specimen=Specimen(HEIGHT, AREA, 5.56e-6, item.chain.heights))
     params = make_params(heavy, "linear+bistable")
     problem = make_problem(heavy, "linear+bistable", None, params, None, interior_mass=True)
-    values, _ = planning.published_values(problem, "foam-1/model-3")
+    values = planning.known_values(problem, published_side("foam-1/model-3"))
     result = conclude(BestPoint(problem, values), SearchRecord(0, 8, 0.0, AGREED))
     assert answers(result)["vibration"] is False
     assert "determined" not in {p.state for p in result.parameters.values()}

@@ -76,8 +76,7 @@ def check(
     if model is None:
         say(description, newline=False)
         return
-    from foamfit.report.outlook import outlook_of
-    from foamfit.report.outlook_text import outlook_text
+    from foamfit.report.outlook import outlook_of, outlook_text
 
     with compiling(False, model, relaxation) as compile_rest:
         compile_rest()

@@ -34,8 +34,7 @@ def compare(
         foamfit compare fits/TEST/bistable --published foam-1/model-1 --plot comparison.png
     """
     from foamfit.report.comparison import compare as side_by_side
-    from foamfit.report.comparison_plot import plot_comparison
-    from foamfit.report.comparison_text import comparison_text, write_csv
+    from foamfit.report.comparison import comparison_text, plot_comparison, write_csv
 
     own = check_files(table, plot, [p / "fit.json" if p.is_dir() else p for p in results])
     comparison = side_by_side(results, name)

@@ -114,6 +114,6 @@ def _tell(result: JointResult, as_json: bool, quiet: bool) -> None:
 
         say(json.dumps(result.to_json_dict(), allow_nan=False))
     elif not quiet:
-        from foamfit.report.studies.joint_text import joint_text
+        from foamfit.report.studies.joint import joint_text
 
         say(joint_text(result))

@@ -198,8 +198,7 @@ def check_files(table: Path | None, plot: Path | None, inputs: Iterable[Path]) -
         raise InputError(f"{given[0]} cannot be two things; name two files")
     if plot is None:
         return False
-    from foamfit.report.figures import figure_format
-    from foamfit.report.plotted import check_table
+    from foamfit.report.figures import check_table, figure_format
 
     figure_format(plot)
     data = plot.with_suffix(".csv")

@@ -52,7 +52,7 @@ def simulate(
     microscale spring has k0, kc, eps_star, sigma_plus, spread_plus, sigma_minus and spread_minus;
     it and the bistable one may relax: relaxation = [{ g = 0.5, tau = "0.2 s" }].
     """
-    from foamfit.report.plotted import check_table
+    from foamfit.report.figures import check_table
     from foamfit.scene_file import RESPONSE, files_of_scene, read_scene, write_response
     from foamfit.solve.simulation import simulate as run
 

@@ -27,8 +27,7 @@ from foamfit.data.measurement import Measurement
 from foamfit.data.toml_file import toml_beside
 from foamfit.errors import InputError
 from foamfit.page.worker import Job, Worker, parsed
-from foamfit.report.comparison import compare
-from foamfit.report.comparison_text import comparison_text
+from foamfit.report.comparison import compare, comparison_text
 from foamfit.text import listed
 
 LARGEST = 64 * 1024 * 1024  # bytes of a file that is dropped

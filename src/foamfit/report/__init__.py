@@ -1,5 +1,5 @@
-"""What a person reads: the page, figures, comparisons, and the look ahead at a test.
+"""What a person reads: terminal, report, figures, comparisons, and the look ahead at a test.
 
-`page` makes the report, `result_figures` and `plots` its figures, `plotted` the table of what these
-show, `comparison` sets results beside published ones.
+The sentences stand in `templates`, `render` fills them in. `page` makes the report, `plots` and
+`result_figures` its figures; `comparison` sets results beside published ones.
 """

@@ -8,24 +8,48 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+import textwrap
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
 
 from foamfit.errors import InputError
-from foamfit.report.sides import Result, Side, published_side, side_of
-from foamfit.results import law_in_words
-from foamfit.springs import laws
-from foamfit.springs.published import MM, MPA
+from foamfit.files import csv_bytes, write_file
+from foamfit.report import figures
+from foamfit.report.figures import BLUE, GREY, TWO, VERMILION
+from foamfit.report.folder import load_result
+from foamfit.report.readable import readable
+from foamfit.report.render import sentences, words
+from foamfit.results import Fit, ParameterEstimate, law_in_words
+from foamfit.springs.laws import law
+from foamfit.springs.laws.record import ETA, RELAXATION_TIME, STRENGTH, Compared, Param
+from foamfit.springs.model import Model
+from foamfit.springs.published import PublishedSet
 from foamfit.springs.published import published as published_sets
+from foamfit.text import signed, significant
 
-NOTHING = 3.0  # standard error over value past which a difference means nothing
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Result = Fit | Mapping[str, Any] | str | Path
+
+MARKS = ((BLUE, "o"), (VERMILION, "s"), ("black", "^"), (GREY, "D"))  # of the results
+NOTHING = 3.0  # standard error over value beyond which a difference is meaningless
 WORST_FIRST = ("not determined", "weak", "determined", "fixed")
 ETA_PUBLISHED = (
     "the published η is numerical, it sets how the paper's relaxation under a held stress "
     "converges; an identified η is a viscosity in real time"
 )
 VAGUE = "its standard error is many times its value, so the test does not determine it"
+# What is read of a result, and of each of its parameters.
+_NUMBER = int | float | None
+CONTENT = {"test": str, "model": str, "drive": str, "status": str, "parameters": Mapping}
+ESTIMATE: dict[str, Any] = {"value": _NUMBER, "stderr": _NUMBER}
+ESTIMATE |= {"unit": str, "vary": bool, "state": str, "why": str}
 
 
 @dataclass(frozen=True)
@@ -73,10 +97,16 @@ class Row:
         return 100.0 * self.difference / abs(self.reference)
 
     @property
+    def spread(self) -> float:
+        """Standard error of the difference, those of both sides taken as independent."""
+        return math.hypot(self.stderr or 0.0, self.reference_stderr or 0.0)
+
+    @property
     def standard_errors(self) -> float | None:
-        """The difference in standard errors, those of both sides taken as independent."""
-        spread = math.hypot(self.stderr or 0.0, self.reference_stderr or 0.0)
-        return None if self.difference is None or spread == 0.0 else self.difference / spread
+        """The difference in standard errors."""
+        return (
+            self.difference / self.spread if self.spread and self.difference is not None else None
+        )
 
 
 @dataclass(frozen=True)
@@ -100,14 +130,6 @@ class Comparison:
     with_published: bool
 
 
-@dataclass(frozen=True)
-class _Value:
-    value: float | None = None
-    stderr: float | None = None
-    state: str = ""
-    why: str = ""
-
-
 def compare(results: Sequence[Result], published: str | None = None) -> Comparison:
     """Put fits, result folders or what `load_result` gives beside what was published.
 
@@ -115,108 +137,172 @@ def compare(results: Sequence[Result], published: str | None = None) -> Comparis
     where a test names none, all are put beside the first of them. InputError if a result cannot be
     read, the set is unknown, or there is nothing to compare with.
     """
-    names = ", ".join(published_sets)
-    if published is not None and published not in published_sets:
-        raise InputError(f"there is no published set '{published}'; there are {names}")
+    if published is not None:
+        published_side(published)  # refuses one that is not there
     sides = [side_of(result) for result in results]
     if not sides:
         raise InputError("nothing to compare; give at least one result folder")
-    belongs = [published or _published_of(side) for side in sides]
-    found = [name for name in belongs if name is not None]
+    belongs = [published or (None if _unpublished(s) else recognised(s.test)) for s in sides]
+    found = [published_side(name) for name in belongs if name is not None]
     if len(found) == len(sides):
-        pairs = zip(sides, [published_side(name) for name in found], strict=True)
+        pairs = zip(sides, found, strict=True)
         return Comparison(tuple(_pair(one, other) for one, other in pairs), with_published=True)
     if len(sides) == 1:
+        kind = _unpublished(sides[0])
         raise InputError(
-            "no published set has microscale springs; give a second result to compare with"
-            if "microscale" in sides[0].kinds
+            f"no published set has {kind} springs; give a second result to compare with"
+            if kind
             else f"the test '{sides[0].test}' names no published set; choose one by --published "
-            f"({names}), or give a second result"
+            f"({', '.join(published_sets)}), or give a second result"
         )
     return Comparison(tuple(_pair(side, sides[0]) for side in sides[1:]), with_published=False)
 
 
-def _published_of(side: Side) -> str | None:
-    """Return the published set that a result goes beside: none if it has microscale springs."""
-    return None if "microscale" in side.kinds else recognised(side.test)
-
-
 def recognised(test: str) -> str | None:
     """Return the published set that the name of a test contains, if there is one."""
-    plain = _plain(test)
+
+    def plain(text: str) -> str:
+        return re.sub(r"[\s/_-]+", "-", text.casefold())
+
     for name in sorted(published_sets, key=len, reverse=True):
-        if re.search(rf"(?<![a-z0-9]){_plain(name)}(?![0-9a-z])", plain):
+        if re.search(rf"(?<![a-z0-9]){plain(name)}(?![0-9a-z])", plain(test)):
             return name
     return None
 
 
-def _plain(text: str) -> str:
-    return re.sub(r"[\s/_-]+", "-", text.casefold())
+# ---------------------------------------------------------------- the sides
+
+
+@dataclass(frozen=True)
+class Side:
+    """The parameters of one side of a comparison: of a fit, or published."""
+
+    label: str
+    kinds: tuple[str, ...]
+    estimates: Mapping[str, ParameterEstimate]
+    correlation: Mapping[tuple[str, str], float]
+    drive: str = ""
+    status: str = ""
+    stopped: str | None = None
+    test: str = ""
+    sha: str = ""
+    source: PublishedSet | None = None
+    relaxation: int = 0  # terms of each hysteretic spring
+
+
+def side_of(result: Result) -> Side:
+    """Return the parameters of a fit; InputError if the result is not whole."""
+    if isinstance(result, Fit):
+        content: Mapping[str, Any] = result.to_json_dict()
+    else:
+        content = result if isinstance(result, Mapping) else load_result(result)
+    where = str(result) if isinstance(result, str | Path) else "the result"
+    given = _whole(content, CONTENT, where)
+    terms = given.get("relaxation", 0)
+    if type(terms) is not int or terms < 0:
+        raise _broken(where, f"'relaxation' cannot be {str(terms)[:40]!r}")
+    return Side(
+        label=f"{given['test']}: {law_in_words(given['model'], terms)}, {given['drive']} drive",
+        kinds=Model.parse(given["model"]).kinds,
+        relaxation=terms,
+        estimates={name: _estimate(p, where, name) for name, p in given["parameters"].items()},
+        correlation=_correlation(given.get("correlation"), where),
+        drive=given["drive"],
+        status=given["status"],
+        stopped=given.get("stopped"),
+        test=given["test"],
+        sha=str(given.get("data_sha256", "")),
+    )
+
+
+def _broken(where: str, fault: str) -> InputError:
+    return InputError(f"{where} is no whole result of a fit: {fault}; fit again")
+
+
+def _whole(content: Any, wanted: Mapping[str, Any], where: str) -> Mapping[str, Any]:
+    """Return the content of a result; InputError if a key is missing or of the wrong type."""
+    given = content if isinstance(content, Mapping) else {}
+    for key, kind in wanted.items():
+        fine = key in given and isinstance(given[key], kind)
+        if not fine or (kind is _NUMBER and isinstance(given[key], bool)):
+            fault = f"cannot be {str(given[key])[:40]!r}" if key in given else "is missing"
+            raise _broken(where, f"'{key}' {fault}")
+    return given
+
+
+def _estimate(content: Mapping[str, Any], where: str, name: str) -> ParameterEstimate:
+    """Read one parameter of a result."""
+    p = _whole(content, ESTIMATE, f"{where}: {name}")
+    value = math.nan if p["value"] is None else float(p["value"])
+    return ParameterEstimate(value, p["stderr"], None, p["unit"], p["vary"], p["state"], p["why"])
+
+
+def _correlation(content: Any, where: str) -> dict[tuple[str, str], float]:
+    if content is None:
+        return {}
+    try:
+        return {
+            (str(one), str(other)): float(value)
+            for one, row in zip(content["names"], content["matrix"], strict=True)
+            for other, value in zip(content["names"], row, strict=True)
+            if value is not None
+        }
+    except (KeyError, TypeError, ValueError):
+        fault = "'correlation' must have names and a square matrix of numbers"
+        raise _broken(where, fault) from None
+
+
+def published_side(name: str) -> Side:
+    """Return the parameters of a published set; InputError if there is none of that name."""
+    if name not in published_sets:
+        known = ", ".join(published_sets)
+        raise InputError(f"there is no published set '{name}'; there are {known}")
+    item = published_sets[name]
+    values = {} if item.eta is None else {"site_eta": item.eta}
+    for i, spring in enumerate(item.chain.springs, start=1):
+        values |= {f"s{i}_{name}": getattr(spring, name) for name in spring.law.own}
+        values[f"s{i}_height"] = item.chain.heights[i - 1]
+    estimates = {
+        name: ParameterEstimate(value, None, None, "", False, "published", "")
+        for name, value in values.items()
+    }
+    kinds = tuple(spring.law.kind for spring in item.chain.springs)
+    return Side(f"published {name}", kinds, estimates, {}, source=item)
+
+
+def _unpublished(side: Side) -> str:
+    """Return the first kind of spring without published parameters, "" if there is none."""
+    laws = map(law, side.kinds)
+    return next((one.kind for one in laws if one.hysteretic and not one.published), "")
 
 
 # ---------------------------------------------------------------- the quantities of the tables
 
 
-@dataclass(frozen=True)
-class _Quantity:
-    """A number of the paper's tables as a function of the parameters of one spring."""
-
-    name: str
-    unit: str
-    parts: tuple[str, ...]
-    formula: Callable[..., Any]  # of floats; also of complex numbers, for its derivatives
+def _quantities(kind: str, relaxation: int) -> Iterator[Compared]:
+    """Give the rows of a kind of spring."""
+    yield from law(kind).compared or map(_as_it_is, law(kind).params)
+    for k in range(1, relaxation + 1) if law(kind).hysteretic else ():
+        for param in (STRENGTH, RELAXATION_TIME):
+            yield Compared(f"{param.symbol[0]}_{k}", param.unit, (f"{param.name}{k}",), _total)
 
 
-def _ratio(part: Any, k0: Any) -> Any:
-    return part / k0
-
-
-def _drop(dsigma: Any, k0: Any, eps_a: Any) -> Any:
-    return dsigma * (1.0 - eps_a) / (k0 * eps_a)
+def _as_it_is(param: Param) -> Compared:
+    """Row of a parameter of a law that defines no rows of its own."""
+    factor, unit = (1e6, "MPa") if param.unit == "Pa" else (1.0, param.unit)
+    label = "_".join(filter(None, param.symbol)) or param.name
+    return Compared(label, unit, (param.name,), lambda value: value / factor)
 
 
 def _total(*parts: Any) -> Any:
     return sum(parts)
 
 
-_ETA = _Quantity("η", "Pa·s", ("eta",), _total)
-_K0 = _Quantity("k0", "MPa", ("k0",), lambda k0: k0 / MPA)
-_HEIGHT = _Quantity("h", "mm", ("height",), lambda h: h / MM)
-TABLE = (  # of a linear spring, those whose parameters it has
-    _K0,
-    _Quantity("Δσ/σ_a", "", ("dsigma", "k0", "eps_a"), _drop),
-    _ETA,
-    _Quantity("ε_a", "", ("eps_a",), _total),
-    _Quantity("ε_c", "", ("eps_c",), _total),
-    _HEIGHT,
-    _Quantity("k_h+/k0", "", ("kh_plus", "k0"), _ratio),
-    _Quantity("k_h−/k0", "", ("kh_minus", "k0"), _ratio),
-    _Quantity("k_c/k0", "", ("kc", "k0"), _ratio),
-)
-OF_MICROSCALE = (  # which the paper's tables do not have
-    _K0,
-    _Quantity("k_c", "MPa", ("kc",), lambda kc: kc / MPA),
-    _ETA,
-    _Quantity("ε_*", "", ("eps_star",), _total),
-    _Quantity("σ₊", "MPa", ("sigma_plus",), lambda sigma: sigma / MPA),
-    _Quantity("s₊", "", ("spread_plus",), _total),
-    _Quantity("σ₋", "MPa", ("sigma_minus",), lambda sigma: sigma / MPA),
-    _Quantity("s₋", "", ("spread_minus",), _total),
-    _HEIGHT,
-)
-
-
-def _quantities(kind: str, relaxation: int) -> tuple[_Quantity, ...]:
-    """Return the rows of a kind of spring; a linear spring leaves out what it does not have."""
-    table = OF_MICROSCALE if kind == "microscale" else TABLE
-    if not laws.law(kind).hysteretic:
-        return table
-    terms = [
-        _Quantity(f"{symbol}_{k}", unit, (f"{short}{k}",), _total)
-        for k in range(1, relaxation + 1)
-        for symbol, unit, short in (("g", "", "g"), ("τ", "s", "tau"))
-    ]
-    return (*table, *terms)
+class _Value(NamedTuple):
+    value: float | None = None
+    stderr: float | None = None
+    state: str = ""
+    why: str = ""
 
 
 def _evaluate(side: Side, names: Sequence[str], formula: Callable[..., Any]) -> _Value | None:
@@ -224,91 +310,42 @@ def _evaluate(side: Side, names: Sequence[str], formula: Callable[..., Any]) -> 
     if not names or any(name not in side.estimates for name in names):
         return None
     parts = [side.estimates[name] for name in names]
-    at = [part.value for part in parts]
+    at = np.array([part.value for part in parts])
     try:
-        value = float(formula(*at))
+        value = float(formula(*at.tolist()))
     except (ZeroDivisionError, ValueError):
         return None
-    state = min((part.state for part in parts), key=_rank)
-    why = next(part.why for part in parts if part.state == state)
-    if not any(part.stderr for part in parts) or state == "not determined":
-        return _Value(value, None, state, why)
-    errors = {  # derivatives by a complex step: exact, and the formula is written once
-        names[i]: (part.stderr or 0.0)
-        * (formula(*(x + 1e-30j * (i == j) for j, x in enumerate(at))).imag / 1e-30)
-        for i, part in enumerate(parts)
-    }
-    variance = sum(
-        a * b * (1.0 if one == other else side.correlation.get((one, other), 0.0))
-        for one, a in errors.items()
-        for other, b in errors.items()
-    )
-    return _Value(value, math.sqrt(max(variance, 0.0)) or None, state, why)
+    rank = {state: i for i, state in enumerate(WORST_FIRST)}
+    worst = min(parts, key=lambda part: rank.get(part.state, len(rank)))
+    if not any(part.stderr for part in parts) or worst.state == "not determined":
+        return _Value(value, None, worst.state, worst.why)
+    # Derivatives by a complex step: exact, and the formula is written once.
+    slopes = [formula(*(at + 1e-30j * row)).imag / 1e-30 for row in np.eye(len(parts))]
+    errors = np.array(slopes) * [part.stderr or 0.0 for part in parts]
+    known = [[side.correlation.get((a, b), float(a == b)) for b in names] for a in names]
+    np.fill_diagonal(correlation := np.array(known), 1.0)
+    variance = float(errors @ correlation @ errors)
+    return _Value(value, math.sqrt(max(variance, 0.0)) or None, worst.state, worst.why)
 
 
-def _rank(state: str) -> int:
-    return WORST_FIRST.index(state) if state in WORST_FIRST else len(WORST_FIRST)
-
-
-# ---------------------------------------------------------------------- one result, row by row
+# ---------------------------------------------------------------- one result, row by row
 
 
 def _pair(side: Side, other: Side) -> Pair:
     nothing = _incomparable(side, other)
     rows = (*_spring_rows(side, other, nothing), *_damping_rows(side, other, nothing))
-    remarks = [nothing[0].upper() + nothing[1:] + "."] if nothing else []
-    remarks += [
-        f"{one.label} was stopped by {one.stopped}: its numbers are the best until then, not the "
-        "end of a fit."
-        for one in (side, other)
-        if one.stopped
-    ]
-    if not nothing:
-        remarks += _remarks(side, other, any("/" in row.name for row in rows))
+    ratios = any("/" in row.name for row in rows)
+    remarks = sentences("remarks", side=side, other=other, nothing=nothing, ratios=ratios)
     status = f"{side.status}, stopped by {side.stopped}" if side.stopped else side.status
-    kinds = law_in_words("+".join(side.kinds), side.relaxation)
-    return Pair(side.test, kinds, side.drive, status, other.label, rows, tuple(remarks))
-
-
-def _remarks(side: Side, other: Side, ratios: bool) -> Iterator[str]:
-    """Say what is to be known of a comparison as a whole."""
-    if other.source is not None and side.drive != "stress":
-        yield (
-            f"The paper drove its model by the measured stress, this fit by the {side.drive}: the "
-            "springs' parameters mean the same in both, the damping does not."
-        )
-    if side.drive in ("stress", "displacement"):
-        yield (
-            f"The measured {side.drive} is the input of this fit: its noise can bias the "
-            "parameters, which the standard errors do not count."
-        )
-    if (side.relaxation > 0) != (other.relaxation > 0):
-        yield (
-            "Only one of the two laws relaxes: in the other one the springs' parameters take up "
-            "what relaxes."
-        )
-    if side.kinds != other.kinds:
-        yield (
-            f"A {'+'.join(side.kinds)} stands beside a {'+'.join(other.kinds)}: a unilateral "
-            "spring is a linear one that bears no tension."
-        )
-    if side.sha and side.sha == other.sha:
-        yield (
-            "Both fits are to the same data, so their errors are not independent, and the "
-            "deviations in standard errors are only a guide."
-        )
-    if ratios and any(one.source is None and not one.correlation for one in (side, other)):
-        yield (
-            "There is no correlation in fit.json: the errors of the ratios take the parameters as "
-            "independent."
-        )
+    model = law_in_words("+".join(side.kinds), side.relaxation)
+    return Pair(side.test, model, side.drive, status, other.label, rows, remarks)
 
 
 def _incomparable(side: Side, other: Side) -> str:
     """Return why no parameter can be compared, "" if some can."""
-    if other.source is not None and "microscale" in side.kinds:
+    if other.source is not None and (kind := _unpublished(side)):
         return (
-            "the published sets have no microscale springs, so there is nothing to compare these "
+            f"the published sets have no {kind} springs, so there is nothing to compare these "
             "parameters with"
         )
     if [*map(_family, side.kinds)] != [*map(_family, other.kinds)]:
@@ -321,7 +358,7 @@ def _incomparable(side: Side, other: Side) -> str:
 
 
 def _family(kind: str) -> str:
-    return kind if laws.law(kind).hysteretic else "linear"
+    return kind if law(kind).hysteretic else "linear"
 
 
 def _spring_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
@@ -329,18 +366,17 @@ def _spring_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
     for i, kind in enumerate(side.kinds, start=1):
         alike = i <= len(other.kinds) and _family(other.kinds[i - 1]) == _family(kind)
         for quantity in _quantities(kind, side.relaxation):
-            eta = quantity is _ETA
+            eta = quantity.of == (ETA.name,)
             if eta and not several:
                 continue  # of one spring, it stands with the onsite damper
-            names = [f"s{i}_{part}" for part in quantity.parts]
+            names = [f"s{i}_{part}" for part in quantity.of]
             value = _evaluate(side, names, quantity.formula)
             reference = _evaluate(other, names, quantity.formula) if alike else None
-            if value is None or (
-                eta and reference is None and (value.state, value.value) == ("fixed", 0.0)
-            ):
+            idle = eta and reference is None
+            if value is None or (idle and (value.state, value.value) == ("fixed", 0.0)):
                 continue
             remark = nothing or _remark(value, reference, eta, side, other)
-            yield _row(i if several else 0, quantity.name, quantity.unit, value, reference, remark)
+            yield _row(i if several else 0, quantity.label, quantity.unit, value, reference, remark)
 
 
 def _damping_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
@@ -355,7 +391,7 @@ def _damping_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
         return
     remark = nothing or _remark(value, reference, True, side, other)
     yield _row(0, "η" if one_spring else "site η", "Pa·s", value, reference, remark)
-    soft = [i for i, kind in enumerate(side.kinds, 1) if kind == "bistable"]
+    soft = [i for i, kind in enumerate(side.kinds, 1) if law(kind).hysteretic]
     if item is None or len(soft) != 1 or nothing:
         return
     # ρ H = m/A, so that 2 H √(ρ k_c) = 2 √(m H k_c/A).
@@ -366,9 +402,9 @@ def _damping_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
         lambda *at: _total(*at[:-1]) / (2.0 * (inertia * at[-1]) ** 0.5),
     )
     if ratio is not None:
-        # ζ is η over a root: it is known as well as η is, unless k_c is not known at all.
+        # ζ is η over a root, so it is known as well as η unless k_c is undetermined.
         if ratio.state != "not determined" or value.state == "fixed":
-            ratio = replace(ratio, state=value.state, why=value.why)
+            ratio = ratio._replace(state=value.state, why=value.why)
         lost = ratio.state == "not determined" != value.state
         remark = f"not determined: {ratio.why}" if lost and not remark else remark
         yield _row(0, "ζ", "", ratio, _Value(item.damping_ratio), remark)
@@ -377,8 +413,8 @@ def _damping_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
 def _row(
     spring: int, name: str, unit: str, value: _Value, reference: _Value | None, remark: str
 ) -> Row:
-    fitted, beside = (value.value, value.stderr, value.state), reference or _Value()
-    return Row(spring, name, unit, *fitted, beside.value, beside.stderr, remark)
+    beside = reference or _Value()
+    return Row(spring, name, unit, *value[:3], beside.value, beside.stderr, remark)
 
 
 def _remark(value: _Value, reference: _Value | None, eta: bool, side: Side, other: Side) -> str:
@@ -398,3 +434,191 @@ def _remark(value: _Value, reference: _Value | None, eta: bool, side: Side, othe
         if value.stderr > NOTHING * size:
             return VAGUE
     return ""
+
+
+# ---------------------------------------------------------------- as a text and as a CSV
+
+
+def comparison_text(comparison: Comparison) -> str:
+    """Return a comparison as aligned text, at most 100 columns wide, no newline at the end."""
+    reference = "published" if comparison.with_published else "reference"
+    titles = ("parameter", "unit", "fitted", reference, "deviation", "", "state")
+    pairs = []
+    for pair in comparison.pairs:
+        whole = {remark[:-1].casefold() for remark in pair.remarks}
+        apart = dict[str, list[str]]()
+        for row in pair.rows:
+            if row.remark and row.remark.casefold() not in whole:
+                apart.setdefault(row.remark, []).append(row.label)
+        zeta = None
+        if any(row.name == "ζ" for row in pair.rows):  # then it stands beside a published set
+            item = published_sets[pair.reference.removeprefix("published ")]
+            zeta = item.damping_ratio_by_formula(), item.damping_ratio
+        pairs.append((pair, [titles, *map(_cells, pair.rows)], apart, zeta))
+    return words("comparison", pairs=pairs, with_published=comparison.with_published)
+
+
+def _cells(row: Row) -> tuple[str, ...]:
+    off = "not compared" if row.remark and row.reference is not None else None
+    values = _with_error(row.value, row.stderr), _with_error(row.reference, row.reference_stderr)
+    deviation = off or _signed(row.percent, " %"), _signed(row.standard_errors, " s.e.")
+    return (row.label, row.unit or "–", *values, *deviation, row.state)
+
+
+def _signed(value: float | None, unit: str) -> str:
+    return "" if value is None else signed(value, 0 if abs(value) >= 99.5 else 1) + unit
+
+
+def _with_error(value: float | None, stderr: float | None) -> str:
+    """Return a number with its error, rounded to two digits of the error; "–" for none."""
+    if value is None:
+        return "–"
+    if stderr is None:
+        return f"{value:.4g}".replace("-", "−")
+    if max(abs(value), stderr) >= 1e5:
+        return f"{significant(value, 3)} ± {significant(stderr)}".replace("-", "−")
+    return readable("", ParameterEstimate(value, stderr, None, "", True, "", "")).with_error
+
+
+def write_csv(comparison: Comparison, path: str | Path) -> None:
+    """Write a comparison as a table, one parameter of one result per line."""
+    of_pair = ("test", "model", "drive", "reference")
+    of_row = {"spring": "spring", "parameter": "name"}
+    of_row |= {name: name for name in ("unit", "value", "stderr", "state")}
+    of_row |= {"reference_value": "reference", "reference_stderr": "reference_stderr"}
+    of_row |= {name: name for name in ("percent", "standard_errors", "remark")}
+    rows: list[list[Any]] = [[*of_pair, *of_row]]
+    for pair in comparison.pairs:
+        for row in pair.rows:
+            cells = [getattr(row, name) for name in of_row.values()]
+            rows.append([*(getattr(pair, name) for name in of_pair), cells[0] or "", *cells[1:]])
+    write_file(path, csv_bytes(rows))
+
+
+# ---------------------------------------------------------------- as a figure
+
+
+def plot_comparison(
+    comparison: Comparison, path: str | Path | None = None, *, width: str = TWO, table: bool = True
+) -> Figure:
+    """Draw how far each parameter is from its reference, in standard errors, and in percent.
+
+    One panel for each reference; shaded are one and three standard errors. What is not compared is
+    left out, what is not determined is named. For `path` and `width` see `plots.plot_fit`; without
+    `table` no CSV of what is plotted is written.
+    """
+    groups: dict[str, list[Pair]] = {}
+    for pair in comparison.pairs:
+        groups.setdefault(pair.reference, []).append(pair)
+    wide = figures.inches(width)
+    columns = figures.abreast(wide, min(len(groups), 2), 2.9)
+    lines = [max(len(_shown(pairs)), 1) * (len(_lanes(pairs)) + 1) for pairs in groups.values()]
+    rows = [max(lines[i : i + columns]) for i in range(0, len(lines), columns)]
+    with figures.drawing(wide, 0.5 + sum(0.6 + 0.12 * n for n in rows)) as figure:
+        ratios = [n + 2 for n in rows]
+        axes = figure.subplots(len(rows), columns, squeeze=False, height_ratios=ratios).ravel()
+        for ax in axes[len(groups) :]:
+            ax.remove()
+        for ax, (reference, pairs) in zip(axes, groups.items(), strict=False):
+            _draw_comparison(ax, pairs)
+            title = textwrap.fill(f"beside {reference}", int(16 * wide / columns))
+            ax.set_title(title, loc="left", fontsize=7.5, pad=4, weight="bold", parse_math=False)
+        for ax in figure.axes[-columns:]:  # the lowest ones
+            ax.set_xlabel("deviation (standard errors)")
+        _name_results(figure, list(groups.values()))
+    return figures.save(figure, path, table=table)
+
+
+def _is_shown(row: Row) -> bool:
+    return row.standard_errors is not None or row.lost
+
+
+def _shown(pairs: list[Pair]) -> list[str]:
+    """Return the parameters that at least one result can show, in order."""
+    rows = [row for pair in pairs for row in pair.rows]
+    there = {row.label for row in rows if _is_shown(row)}
+    return [label for label in dict.fromkeys(row.label for row in rows) if label in there]
+
+
+def _lanes(pairs: list[Pair]) -> list[int]:
+    """Return the indices of the results that have something to show; each gets a lane."""
+    return [k for k, pair in enumerate(pairs) if any(map(_is_shown, pair.rows))]
+
+
+def _draw_comparison(ax: Axes, pairs: list[Pair]) -> None:
+    """Draw one line per parameter and result, grouped by parameter."""
+    labels = _shown(pairs)
+    if not labels:
+        figures.say_nothing_there(ax)
+        return
+    found = [row.standard_errors for pair in pairs for row in pair.rows]
+    reach = max(4.0, 1.1 * max((abs(z) for z in found if z is not None), default=0.0))
+    for half, shade in ((3.0, "0.95"), (1.0, "0.88")):
+        ax.axvspan(-half, half, color=shade, lw=0, zorder=0)
+    ax.axvline(0.0, color=GREY, lw=0.6, zorder=1)
+    lanes = _lanes(pairs)
+    step = len(lanes) + 1
+    for lane, k in enumerate(lanes):
+        color, mark = MARKS[k % len(MARKS)]
+        side = f"{pairs[k].test}, {pairs[k].model}, {pairs[k].drive} drive"
+        for row in pairs[k].rows:
+            if row.label not in labels:
+                continue
+            y, z, name = labels.index(row.label) * step + lane, row.standard_errors, row.label
+            beside: dict[str, Any] = {"va": "center", "fontsize": 6.5, "color": color}
+            if row.lost:
+                beside |= {"ha": "center", "style": "italic", "label": f"_{side}: {name}:"}
+                ax.annotate("not determined", (0.0, y), **beside)
+            elif z is not None:
+                ax.plot([0.0, z], [y, y], color=color, lw=0.9, zorder=2)
+                face = "white" if row.state == "weak" else color
+                style: dict[str, Any] = {"ms": 3.4, "color": color, "mfc": face, "zorder": 3}
+                ax.plot(z, y, mark, label=f"_{side}: {name}", **style)
+                beside |= {"xycoords": ("axes fraction", "data"), "textcoords": "offset points"}
+                ax.annotate(_percent(row), (1.0, y), (2, 0), ha="left", **beside)
+    ax.set_xlim(-reach, reach)
+    ax.set_ylim(step * len(labels) - 0.5, -1.0)
+    ax.set_yticks(
+        [i * step + 0.5 * (step - 2) for i in range(len(labels))],
+        [_math(label) for label in labels],
+    )
+    ax.tick_params(axis="y", length=0)
+    ax.spines["left"].set_visible(False)
+
+
+def _name_results(figure: Figure, groups: list[list[Pair]]) -> None:
+    """Explain the colours once: by drive if the drives are the same in every panel."""
+    drives = [[f"{pair.drive} drive" for pair in pairs] for pairs in groups]
+    names = max(drives, key=len)
+    if len(groups) == 1 and len(set(names)) < len(names):
+        names = [f"{s.test}: {s.model}, {s.drive} drive" for s in groups[0]]
+    elif len(set(names)) < len(names) or any(d != names[: len(d)] for d in drives):
+        names = [f"result {k + 1}" for k in range(len(names))]
+    drawn = {k for pairs in groups for k in _lanes(pairs)}
+    entries = dict[str, Any]()
+    for k, name in enumerate(names):
+        color, mark = MARKS[k % len(MARKS)]
+        label = name if k in drawn else f"{name}: nothing to compare"
+        (entries[label],) = figure.axes[0].plot([], [], mark, ms=3.4, color=color, label=label)
+    if any(row.state == "weak" for group in groups for pair in group for row in pair.rows):
+        style: dict[str, Any] = {"ms": 3.4, "color": GREY, "mfc": "white"}
+        label = "hollow: weakly determined"
+        (entries[label],) = figure.axes[0].plot([], [], "o", label=label, **style)
+    figures.legend_below(figure, entries)
+
+
+def _math(label: str) -> str:
+    """Write the symbols of a label as formulas: "s2 k_h+/k0" gives "s2 $k_{h+}$/$k_{0}$"."""
+    *spring, name = label.split(" ")
+    parts = re.findall(r"(Δ?\w)_?([^/]*)/?", name.translate(str.maketrans("₊₋−", "+--")))
+    told = "/".join(f"${stem}_{{{index}}}$" if index else f"${stem}$" for stem, index in parts)
+    return " ".join([*spring, told])
+
+
+def _percent(row: Row) -> str:
+    """Return the difference with its standard error, in percent of the reference."""
+    if row.percent is None or not row.reference:
+        return ""
+    spread = 100.0 * row.spread / abs(row.reference)
+    places = 0 if spread >= 10.0 else 1 if spread >= 1.0 else 2
+    return f"{signed(row.percent, places)} ± {spread:.{places}f} %"

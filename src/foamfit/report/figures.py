@@ -1,32 +1,40 @@
-"""What all figures share: colours, style, one layout for all images of a figure, saving."""
+"""What all figures share: colours, style, one layout for all images, saving, a table of the data.
+
+The table of what is plotted is read off the figure itself, so any other program can draw it again.
+A line, band or mark is a series by its label (one that begins with "_" is left out of legends, and
+is a series all the same); what has no label is decoration. A panel has the name of its label, if it
+has one, or of its title.
+"""
 
 from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.errors import InputError
-from foamfit.files import write_file
-from foamfit.report import plotted
+from foamfit.files import csv_bytes, write_file
+from foamfit.text import wrapped
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from foamfit.arrays import Array
 
-GREY, BLUE, VERMILION = "#6b6b6b", "#0072B2", "#D55E00"  # of Okabe and Ito, told apart by all
-INSIDE = ("#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # of masses inside, from the base up
+GREY, BLUE, VERMILION = "#6b6b6b", "#0072B2", "#D55E00"  # by Okabe and Ito
+INSIDE = ("#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # of interior masses, from the base up
 STYLE: Any = {  # matplotlib types its keys one by one
-    "font.family": "DejaVu Sans",  # upright and regular: a PDF takes 0.1 s for every font
+    "font.family": "DejaVu Sans",  # one upright font: each further font costs 0.1 s per PDF
     "font.size": 7.5,
     "axes.labelsize": 8,
     "axes.titlesize": 8,
@@ -51,9 +59,13 @@ DPI = 250  # of a PNG
 TWO = "two"
 COLUMNS = {"one": 3.25, TWO: 7.0}
 NARROWEST, WIDEST = 2.5, 20.0
-# Points of a drawn line: a longer one is drawn through the first, last and extreme samples of so
-# many stretches, which no print tells from all samples.
+# Lines with more points are drawn through the first, last and extreme samples of this many
+# stretches, which looks the same in print.
 MOST_POINTS, STRETCHES = 3000, 500
+HEAD = ("panel", "series", "x axis", "y axis", "x", "y")
+_STANDS = "the data of the figure would be written, and is no such table; name the figure otherwise"
+# Names of the rows and columns of a matrix that is drawn as shaded cells.
+_CELLS = WeakKeyDictionary["Artist", tuple[Sequence[str], Sequence[str]]]()
 
 
 def inches(width: str) -> float:
@@ -73,21 +85,30 @@ def inches(width: str) -> float:
 
 
 def abreast(width: float, panels: int, least: float = 2.1) -> int:
-    """Return how many of the panels, each at least so many inches wide, stand side by side."""
+    """Return how many panels of at least `least` inches fit side by side."""
     return max(1, min(panels, int(width / least)))
 
 
+def title_lines(width: float, *parts: str) -> list[str]:
+    """Break the parts of a title into lines for a figure of a width in inches."""
+    return [line for part in parts for line in wrapped(part, 0, int(16 * width))]
+
+
 @contextmanager
-def drawing(width: float, height: float) -> Iterator[Figure]:
+def drawing(width: float, height: float, title: Sequence[str] = ()) -> Iterator[Figure]:
     """Give an empty figure of a size in inches, and the style of all figures to draw it in.
 
-    Long lines are thinned in the end to what can be seen of them.
+    Long lines are thinned at the end without a visible change. `title` is a list of lines.
     """
     import matplotlib
     from matplotlib.figure import Figure
 
     with matplotlib.rc_context(STYLE):
-        yield (figure := Figure(figsize=(width, height), layout="constrained"))
+        figure = Figure(figsize=(width, height), layout="constrained")
+        if title:  # a name may hold a dollar sign: it is no formula
+            style: Any = {"fontsize": 8, "parse_math": False}
+            figure.suptitle("\n".join(title), x=0.01, ha="left", **style)
+        yield figure
         for line in (line for ax in figure.axes for line in ax.lines):
             x, y = np.asarray(line.get_xdata()), np.asarray(line.get_ydata())
             if x.size > MOST_POINTS:
@@ -96,7 +117,7 @@ def drawing(width: float, height: float) -> Iterator[Figure]:
 
 
 def _seen(x: Array, y: Array) -> NDArray[np.intp]:
-    """Return the samples of a long line through which it looks as through all of them."""
+    """Return samples of a long line through which it looks the same as through all."""
     ends = np.linspace(0, x.size, STRETCHES + 1).astype(np.intp)
     kept = [ends[:-1], ends[1:] - 1]
     for values in (x, y):
@@ -107,27 +128,28 @@ def _seen(x: Array, y: Array) -> NDArray[np.intp]:
 
 
 def legend_below(figure: Figure, entries: dict[str, Any]) -> int:
-    """Name what is drawn in a legend below all panels; returns in how many lines it stands."""
+    """Draw a legend below all panels; returns its number of lines."""
     if not entries:
         return 0
     handles, names = list(entries.values()), list(entries)
-    # Typographic points: of a letter, and of a handle with what stands about it.
+    # In typographic points: width of a letter, and of a handle with its margins.
     sizes, room = [4.2 * len(name) + 33.0 for name in names], 72.0 * figure.get_figwidth()
     for columns in range(len(names), 0, -1):
         lines = -(-len(names) // columns)
         widths = [max(sizes[i : i + lines]) for i in range(0, len(names), lines)]
         if sum(widths) <= room:
             break
-    figure.legend(handles, names, loc="outside lower center", ncols=len(widths))
+    told = [name.replace("$", r"\$") for name in names]
+    figure.legend(handles, told, loc="outside lower center", ncols=len(widths))
     return lines
 
 
 @contextmanager
 def laid_out(figure: Figure, dpi: int = DPI) -> Iterator[None]:
-    """Keep one layout of a figure for all images that are made of it within.
+    """Keep one layout for all images of a figure that are made in the body.
 
-    Left to itself matplotlib lays a figure out anew for every image, and draws it once more for
-    that, unseen. `dpi` is the resolution at which its texts are measured.
+    By default matplotlib repeats the layout for every image, and draws the figure an extra time to
+    do so. `dpi` is the resolution at which texts are measured.
     """
     import matplotlib
 
@@ -139,7 +161,7 @@ def laid_out(figure: Figure, dpi: int = DPI) -> Iterator[None]:
         figure.dpi = dpi
         engine.execute(figure)
         figure.dpi = own_dpi
-        figure.set_layout_engine(None)  # "none" leaves a dummy, for which all is drawn twice
+        figure.set_layout_engine(None)  # "none" would leave a dummy engine
     try:
         yield
     finally:
@@ -148,7 +170,7 @@ def laid_out(figure: Figure, dpi: int = DPI) -> Iterator[None]:
 
 @contextmanager
 def _unnamed_letters() -> Iterator[None]:
-    """Let a test be named in letters that the font lacks: the figure is good without them."""
+    """Ignore letters in the name of a test that the font lacks."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing")
         yield
@@ -159,7 +181,7 @@ def image(figure: Figure, form: Literal["png", "pdf", "svg"], dpi: int = DPI) ->
     import matplotlib
 
     buffer = io.BytesIO()
-    # Without the date, the same fit gives the same file.
+    # No date, so that the same fit gives the same file.
     metadata = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(form)
     with laid_out(figure, dpi), matplotlib.rc_context(STYLE), _unnamed_letters():
         figure.savefig(buffer, format=form, dpi=dpi, metadata=metadata)
@@ -167,12 +189,12 @@ def image(figure: Figure, form: Literal["png", "pdf", "svg"], dpi: int = DPI) ->
 
 
 def write_haloed(ax: Axes, name: str, at: Array, offset: tuple[float, float], **style: Any) -> None:
-    """Write beside a place, in points from it, on a white rim that parts it from lines."""
+    """Write a text at an offset (points) from a place, with a white rim."""
     from matplotlib.patheffects import Stroke
     from matplotlib.text import Annotation
 
     class Haloed(Annotation):
-        """A text with a rim, for which matplotlib would make outlines of its letters."""
+        """A text with a rim; matplotlib's own rim would turn its letters into outlines."""
 
         def draw(self, renderer: Any) -> None:
             self.set_path_effects([Stroke(linewidth=1.5, foreground="white")])
@@ -184,10 +206,38 @@ def write_haloed(ax: Axes, name: str, at: Array, offset: tuple[float, float], **
     ax.add_artist(text)
 
 
-def say_nothing_there(ax: Axes) -> None:
+def draw_estimates(
+    ax: Axes, points: Sequence[tuple[float, Any]], factor: float, size: float = 3.5
+) -> tuple[list[float], list[float]]:
+    """Draw values of a parameter, hollow if not determined, and their 95 % intervals.
+
+    `points` are (x, estimate), `factor` is the unit; with a size of 0 there are intervals alone.
+    Returns the values and the ends as drawn.
+    """
+    bars = [(x, *p.ci95) for x, p in points if p.ci95 is not None and np.all(np.isfinite(p.ci95))]
+    ends = np.array(bars, dtype=float).reshape(-1, 3) / (1.0, factor, factor)
+    ax.vlines(*ends.T, color=GREY, linewidth=0.8, zorder=1, label="_95 % interval")
+    for sure, face in ((True, BLUE), (False, "white")) if size else ():
+        chosen = [(x, p.value / factor) for x, p in points if (p.state == "determined") == sure]
+        style: Any = {"color": BLUE, "markerfacecolor": face, "markersize": size}
+        style["label"] = "_determined" if sure else "_not well determined"
+        ax.plot(*np.array(chosen).reshape(-1, 2).T, "o", **style)
+    return [p.value / factor for _, p in points], ends[:, 1:].ravel().tolist()
+
+
+def limit(ax: Axes, values: Sequence[float], ends: Sequence[float]) -> None:
+    """Let wide intervals run out of a panel rather than flatten the values."""
+    low, high = min(values), max(values)
+    room = max(1.5 * (high - low), 0.1 * max(abs(low), abs(high)), 1e-12)
+    bottom, top = max(min([low, *ends]), low - room), min(max([high, *ends]), high + room)
+    edge = 0.08 * max(top - bottom, room)
+    ax.set_ylim(bottom - edge, top + 2.0 * edge)
+
+
+def say_nothing_there(ax: Axes, told: str = "no curve to compare") -> None:
     """Write into an empty panel that there is no curve."""
     ax.set_axis_off()
-    ax.text(0.5, 0.5, "no curve to compare", ha="center", va="center", transform=ax.transAxes)
+    ax.text(0.5, 0.5, told, ha="center", va="center", transform=ax.transAxes)
 
 
 def figure_format(path: str | Path) -> Literal["png", "pdf", "svg"]:
@@ -201,13 +251,113 @@ def figure_format(path: str | Path) -> Literal["png", "pdf", "svg"]:
 def save(figure: Figure, path: str | Path | None, *, table: bool = False) -> Figure:
     """Save a figure, if there is a path, in the format of its suffix; returns the figure.
 
-    With `table` what is plotted in it is written beside it as CSV; see `foamfit.report.plotted`.
+    With `table` what is plotted in it is written beside it as CSV; see `plotted`.
     """
     if path is not None:
         data = Path(path).with_suffix(".csv")
         if table:
-            plotted.check_table(data)
+            check_table(data)
         write_file(path, image(figure, figure_format(path)))
         if table:
-            write_file(data, plotted.table(figure))
+            write_file(data, csv_bytes(plotted(figure)))
     return figure
+
+
+# ---------------------------------------------------------------- the table of what is plotted
+
+
+def name_cells(picture: Artist, rows: Sequence[str], columns: Sequence[str]) -> None:
+    """Name the rows and columns of a matrix, which its axes need not show."""
+    _CELLS[picture] = tuple(rows), tuple(columns)
+
+
+def plotted(figure: Figure) -> Iterator[tuple[object, ...]]:
+    """Give the rows of the table, the header first, in the units of the axes.
+
+    x is empty for what lies across a panel, y for what stands upright in it. A band is its outline,
+    an interval its two ends, a cell of a matrix has the names of its row (the series) and column.
+    """
+    yield HEAD
+    for ax in figure.axes:
+        axes = _sides(ax)
+        titles = str(ax.get_label()), ax.get_title(loc="left"), ax.get_title()
+        panel = next(filter(None, titles), f"{axes[1]} over {axes[0]}")
+        for series, x, y in _series(ax):
+            yield from ((panel, series, *axes, *place) for place in zip(x, y, strict=True))
+
+
+def table(figure: Figure) -> bytes:
+    """Return the table as the bytes of a CSV file."""
+    return csv_bytes(plotted(figure))
+
+
+def check_table(path: Path, head: str = ",".join(HEAD), words: str = _STANDS) -> None:
+    """Raise InputError if the path holds a file that does not begin with this header."""
+    try:
+        with path.open(encoding="utf-8", errors="replace") as file:
+            known = file.readline().startswith(head)
+    except FileNotFoundError:
+        return
+    except OSError:
+        known = False
+    if not known:
+        raise InputError(f"{path} stands where {words}")
+
+
+def _sides(ax: Axes) -> tuple[str, str]:
+    """Labels of the axes of a panel, taken from a panel that shares them if it has none."""
+    found = []
+    for side, shared in (("x", ax.get_shared_x_axes()), ("y", ax.get_shared_y_axes())):
+        labels = [getattr(one, f"get_{side}label")() for one in (ax, *shared.get_siblings(ax))]
+        found.append(next(filter(None, labels), ""))
+    return found[0], found[1] or " ".join(ax.get_title().split())
+
+
+def _series(ax: Axes) -> Iterator[tuple[str, list[str], list[str]]]:
+    """Give the series of a panel, each with its places."""
+    from matplotlib.collections import LineCollection, PolyCollection
+    from matplotlib.text import Annotation
+
+    for line in ax.lines:
+        if name := _name(line):
+            yield name, *_columns(ax, line, np.asarray(line.get_xydata(), dtype=float))
+    for patch in ax.patches:
+        if name := _name(patch):
+            corners = patch.get_patch_transform().transform(patch.get_path().vertices)
+            yield name, *_columns(ax, patch, corners[:-1])
+    for drawn in ax.collections:
+        if (name := _name(drawn)) and isinstance(drawn, LineCollection | PolyCollection):
+            for path in drawn.get_paths():
+                yield name, *_columns(ax, drawn, np.asarray(path.vertices, dtype=float))
+    for text in ax.texts:
+        if isinstance(text, Annotation) and (name := _name(text)):
+            x, y = text.xy
+            yield f"{name} {text.get_text()}", [_cell(x)], [_cell(y)]
+    for picture in ax.images:
+        rows, columns = _CELLS[picture]
+        for row, values in zip(rows, np.asarray(picture.get_array()).tolist(), strict=True):
+            there = [(x, v) for x, v in zip(columns, values, strict=True) if np.isfinite(v)]
+            yield row, [x for x, _ in there], [_cell(v) for _, v in there]
+
+
+def _name(artist: Artist) -> str:
+    """Name of a series; "" for decoration, which matplotlib labels like "_child3"."""
+    label = str(artist.get_label() or "")
+    return "" if label.startswith("_child") else label.removeprefix("_")
+
+
+def _columns(ax: Axes, artist: Artist, places: Array) -> tuple[list[str], list[str]]:
+    """The coordinates as text; empty along an axis that the series spans."""
+    here = artist.get_transform().contains_branch_seperately(ax.transData)
+    if not all(here):  # both ends of a line across are the same
+        places = np.unique(places[:, [int(here[1])]], axis=0)[:, [0, 0]]
+    columns = [
+        [_cell(value) for value in column] if own else [""] * len(places)
+        for own, column in zip(here, places.T.tolist(), strict=True)
+    ]
+    return columns[0], columns[1]
+
+
+def _cell(value: float) -> str:
+    """A number with more digits than a figure can show; empty if it is not finite."""
+    return f"{value:.6g}" if np.isfinite(value) else ""

@@ -21,26 +21,24 @@ from foamfit.report.page import render_report
 from foamfit.report.result_figures import Mapped, draw_all
 from foamfit.results import SCHEMA, Curves, Fit, Intervals, ParameterEstimate, plain
 
-# All that `save_result` may write, and what `studies.cycles.save_cycles` writes beside the folders
-# of the cycles.
-RESULT_FILES = (
-    "fit.json", "parameters.csv", "curves.csv", "profiles.csv", "ladder.csv", "fit.png",
-    "fit.pdf", "fit.csv", "residuals.csv", "sensitivities.csv", "budget.csv", "report.html",
-)  # fmt: skip
-# What is plotted in cycles.png; cycles.csv is the table of all numbers by cycle.
+# All that `save_result` may write, what `studies` write beside the folders of cycles and tests, and
+# what is plotted in cycles.png (cycles.csv is the table of all numbers by cycle).
+RESULT_FILES = {
+    *("fit.json", "parameters.csv", "curves.csv", "profiles.csv", "ladder.csv", "fit.png"),
+    *("fit.pdf", "fit.csv", "residuals.csv", "sensitivities.csv", "budget.csv", "report.html"),
+}
 CYCLES_PLOTTED = "cycles-plotted.csv"
-CYCLES_FILES = ("cycles.json", "cycles.csv", "cycles.png", CYCLES_PLOTTED)
-JOINT_FILES = ("joint.json", "joint.html", "joint.png", "joint.csv")
-# What `studies.batch` writes beside the folders of the tests, and into each of them.
-BATCH_FILES = ("summary.csv", "summary.html", "batch.json")
-PREDICTION_FILES = ("prediction.json", "prediction.csv", "prediction.png", "prediction.pdf")
+CYCLES_FILES = {"cycles.json", "cycles.csv", "cycles.png", CYCLES_PLOTTED}
+JOINT_FILES = {"joint.json", "joint.html", "joint.png", "joint.csv"}
+BATCH_FILES = {"summary.csv", "summary.html", "batch.json"}
+PREDICTION_FILES = {"prediction.json", "prediction.csv", "prediction.png", "prediction.pdf"}
 # One of these is in every result.
 MARKS = ("fit.json", "cycles.json", "joint.json", "batch.json", "prediction.json")
-_FILES = (*RESULT_FILES, *CYCLES_FILES, *JOINT_FILES, *PREDICTION_FILES, "batch.json")
+_FILES = RESULT_FILES | CYCLES_FILES | JOINT_FILES | PREDICTION_FILES | {"batch.json"}
 
 
 class _TriedError(Exception):
-    """Ends what only tries whether a folder can be written."""
+    """Ends a trial of whether a folder can be written."""
 
 
 def save_result(
@@ -69,7 +67,7 @@ def save_whole(folder: str | Path, write: Callable[[Path], None], *, swept: bool
     try:
         with replacing(folder.resolve(), swept=swept) as fresh:
             write(fresh)
-            check_target(folder)  # what has been put there in the meantime stays
+            check_target(folder)  # files put there in the meantime are kept
     except OSError as error:
         raise InputError(
             f"the result cannot be written to {folder}: {reason(error)}; choose another folder"
@@ -78,7 +76,7 @@ def save_whole(folder: str | Path, write: Callable[[Path], None], *, swept: bool
 
 
 def try_target(folder: str | Path) -> None:
-    """Raise InputError unless a result can be written to `folder`: it is begun, and undone."""
+    """Raise InputError unless a result can be written to `folder`; the trial is undone."""
 
     def undo(_: Path) -> NoReturn:
         raise _TriedError
@@ -145,18 +143,18 @@ def check_target(folder: str | Path) -> None:
 
 
 def _check_replaceable(folder: Path, place: Path) -> None:
-    """Refuse a folder that is there, at `place`, and must not or cannot be replaced."""
+    """Refuse an existing folder at `place` that must not or cannot be replaced."""
     if place.is_mount():
         raise InputError(f"{folder} is a mount point and cannot be replaced; name a folder in it")
     there = sorted(place.iterdir())
-    if there and not any(_is_of_fit(place / name) for name in MARKS):
+    if there and not any(_content(place / name) for name in MARKS):
         raise InputError(
             f"{folder} is not empty and holds no foamfit result (no fit.json of foamfit), so it is "
             "not replaced; choose a new or an empty folder"
         )
-    tests = _tests_of(place)
+    tests = _content(place / "joint.json").get("tests")  # a joint fit's own folders
     for path in there:
-        if not is_written(path, tests):
+        if not is_written(path, tests if isinstance(tests, dict) else ()):
             raise InputError(
                 f"{folder} holds {path.name}, which foamfit did not write, so it is not replaced; "
                 "move that or choose another folder"
@@ -164,9 +162,9 @@ def _check_replaceable(folder: Path, place: Path) -> None:
 
 
 def is_written(path: Path, tests: Collection[str] = ()) -> bool:
-    """Whether something in a result folder is what a fit writes there.
+    """Whether a path in a result folder is one that foamfit writes.
 
-    `tests` are the names of the folders that a joint fit says to be its own.
+    `tests` are the names of the test folders of a joint fit.
     """
     if path.is_symlink():
         return False
@@ -176,21 +174,14 @@ def is_written(path: Path, tests: Collection[str] = ()) -> bool:
     return path.name in _FILES and path.is_file()
 
 
-def _tests_of(place: Path) -> Collection[str]:
-    """Names of the tests whose folders a joint fit has written here."""
-    if not _is_of_fit(place / "joint.json"):
-        return ()
-    tests = json.loads((place / "joint.json").read_text(encoding="utf-8")).get("tests")
-    return tests.keys() if isinstance(tests, dict) else ()
-
-
-def _is_of_fit(path: Path) -> bool:
-    """Whether a fit.json is that of a fit, of this version or another one."""
+def _content(path: Path) -> dict[str, Any]:
+    """Content of a fit.json, of this version or another one; empty if it is none."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):  # neither UTF-8 nor JSON
-        return False
-    return isinstance(content, dict) and {"schema", "foamfit"} <= content.keys()
+        return {}
+    known = isinstance(content, dict) and {"schema", "foamfit"} <= content.keys()
+    return content if known else {}
 
 
 def load_result(folder: str | Path) -> dict[str, Any]:
@@ -223,10 +214,8 @@ def write_result(
     result: Fit, folder: Path, *, pages: bool = True, width: str = TWO, mapped: Mapped = map
 ) -> None:
     """Write all files of a result into a folder that is there; the report and figures if wanted."""
-    figures = draw_all(result, width, mapped) if pages else ()
-    text = json.dumps(result.to_json_dict(), indent=2, ensure_ascii=False, allow_nan=False)
-    # A non-UTF-8 name keeps its bytes as a JSON escape.
-    (folder / "fit.json").write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
+    figures = draw_all(result, width, mapped) if pages else ()  # which begins to draw
+    write_json(folder / "fit.json", result.to_json_dict())
     write_table(folder / "parameters.csv", _parameter_rows(result.parameters))
     write_table(folder / "curves.csv", _curve_rows(result.curves, result.measurement))
     if result.intervals is not None and result.intervals.profiles:
@@ -237,12 +226,17 @@ def write_result(
         write_table(folder / "ladder.csv", result.ladder.rows())
     drawn = dict(figures)
     for name, images in drawn.items():
-        if images is not None:
-            for form, content in images.files():
-                (folder / f"{name}.{form}").write_bytes(content)
+        for form, content in () if images is None else images.files():
+            (folder / f"{name}.{form}").write_bytes(content)
     if pages:
         page = render_report(result, drawn)
         (folder / "report.html").write_text(page, encoding="utf-8", errors="replace")
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write plain types as JSON; a non-UTF-8 name keeps its bytes as a JSON escape."""
+    text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
+    path.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
 
 
 def write_table(path: Path, rows: Iterable[Iterable[object]]) -> None:
@@ -251,13 +245,12 @@ def write_table(path: Path, rows: Iterable[Iterable[object]]) -> None:
 
 
 def _parameter_rows(parameters: Mapping[str, ParameterEstimate]) -> Iterator[list[object]]:
-    yield [
-        "name", "value", "stderr", "ci95_low", "ci95_high", "range_low", "range_high",
-        "systematic", "unit", "state", "why", "ci95_method",
-    ]  # fmt: skip
+    ends = (f"{span}_{end}" for span in ("ci95", "range") for end in ("low", "high"))
+    rest = ("systematic", "unit", "state", "why", "ci95_method")
+    yield ["name", "value", "stderr", *ends, *rest]
     for name, p in parameters.items():
-        ends = (*(p.ci95 or (None, None)), *(p.range or (None, None)))
-        numbers = (plain(number) for number in (p.value, p.stderr, *ends, p.systematic))
+        spans = (*(p.ci95 or (None, None)), *(p.range or (None, None)))
+        numbers = plain([p.value, p.stderr, *spans, p.systematic])
         yield [name, *numbers, p.unit, p.state, p.why, p.ci95_method]
 
 

@@ -1,29 +1,19 @@
-"""Figures of what a test determines: sensitivities, information, correlation, profiles."""
+"""Figures of what a test determines: sensitivities, correlation, profiles, uncertainty budget."""
 
 from __future__ import annotations
 
 import textwrap
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.report.figures import (
-    BLUE,
-    GREY,
-    INSIDE,
-    TWO,
-    VERMILION,
-    abreast,
-    drawing,
-    inches,
-    save,
-    say_nothing_there,
-)
-from foamfit.report.plotted import name_cells
+from foamfit.report import figures
+from foamfit.report.figures import BLUE, GREY, INSIDE, TWO, VERMILION, name_cells
 from foamfit.report.readable import readable_unit
+from foamfit.text import percent
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,18 +21,28 @@ if TYPE_CHECKING:
     from matplotlib.image import AxesImage
 
     from foamfit.fitting.branches import Section
-    from foamfit.results import Fit, ParameterEstimate, Profile
+    from foamfit.results import Budget, Fit, ParameterEstimate, Profile
     from foamfit.trust.identifiability import Insight
 
-# Of one spring's branches.
-SHADES = {
-    "a": "#eef3f7", "d": "#fbeedd", "c": "#e6ddd5", "e": "#e3f1ea",
-    "snap-through": "#fbeedd", "held": "#e6ddd5", "snap-back": "#e3f1ea",
-}  # fmt: skip
-OTHERS = ("#f3f3f3", "#e4e4e4")  # of several springs' branches, in turn
+# Shades of the branches of one spring; alternating shades for several springs.
+SHADES = {"a": "#eef3f7", "d": "#fbeedd", "c": "#e6ddd5", "e": "#e3f1ea"}
+SHADES |= {"snap-through": "#fbeedd", "held": "#e6ddd5", "snap-back": "#e3f1ea"}
+OTHERS = ("#f3f3f3", "#e4e4e4")
 STRIP, LOW_STRIP = 0.4, 0.28  # height of a strip, and where panels stand above others, in
 CELL = 0.24  # height of a cell, in
 SIDE_BY_SIDE = 5.0  # in, from which on two matrices stand side by side
+ROW = 0.2  # height of a bar with its gap, in
+# Colour and hatching of each source: what is fitted is plain, what the TOML states is hatched.
+LOOKS = {
+    "noise": ("#0B2F4F", ""),
+    "contact and zero": ("#D55E00", ""),
+    "velocity": ("#9AD0F5", ""),
+    "mass": ("#5B2C6F", "////"),
+    "height": ("#008F6B", "////"),
+    "area": ("#E69F00", "////"),
+    "calibration": ("#F5E9B8", "////"),
+    "law": ("#BDBDBD", "...."),
+}
 
 
 def plot_insight(
@@ -59,25 +59,22 @@ def plot_insight(
     the parameter's scale. `correlation` is (k, k), where it is better known than from `insight`.
     For `path` and `width` see `plots.plot_fit`.
     """
-    wide = inches(width)
-    rows = -(-len(insight.curves) // abreast(wide, len(insight.curves)))
+    wide = figures.inches(width)
+    rows = -(-len(insight.curves) // figures.abreast(wide, len(insight.curves)))
     heights = [
         rows * (0.75 + (STRIP if rows == 1 else LOW_STRIP) * len(insight.names)),
         (1.15 + CELL * len(insight.names)) * (1 if wide >= SIDE_BY_SIDE else 2),
     ]
     title = textwrap.fill(title, int(12 * wide))
-    with drawing(wide, sum(heights) + 0.15 * (title.count("\n") + 2) * bool(title)) as figure:
+    more = 0.15 * (title.count("\n") + 2) * bool(title)
+    with figures.drawing(wide, sum(heights) + more) as figure:
         if title:
-            figure.suptitle(
-                title, x=0.012, ha="left", fontsize=8.5, weight="bold", parse_math=False
-            )
+            style: Any = {"fontsize": 8.5, "weight": "bold", "parse_math": False}
+            figure.suptitle(title, x=0.012, ha="left", **style)
         halves = figure.subfigures(2, 1, height_ratios=heights, squeeze=False)[:, 0]
         _draw_sensitivities(halves[0], insight, wide)
         _draw_information(halves[1], insight, correlation, wide)
-    return save(figure, path, table=True)
-
-
-# ---------------------------------------------------------------- profiles
+    return figures.save(figure, path, table=True)
 
 
 def plot_profiles(result: Fit, path: str | Path | None = None) -> Figure:
@@ -87,18 +84,17 @@ def plot_profiles(result: Fit, path: str | Path | None = None) -> Figure:
     """
     profiles = result.intervals.profiles if result.intervals is not None else ()
     rows = max(-(-len(profiles) // 4), 1)
-    with drawing(7.0, 0.35 + 1.55 * rows) as figure:
+    with figures.drawing(7.0, 0.35 + 1.55 * rows) as figure:
         axes = figure.subplots(rows, 4, squeeze=False, sharey=True).ravel()
-        for ax, profile in zip(axes, profiles, strict=False):
-            _draw_profile(ax, profile, result.parameters[profile.name])
         for ax in axes[len(profiles) :]:
             ax.set_axis_off()
         for at, (ax, profile) in enumerate(zip(axes, profiles, strict=False)):
+            _draw_profile(ax, profile, result.parameters[profile.name])
             ax.set_ylabel("rise of χ²", visible=at % 4 == 0)
             ax.set_label(profile.name)
         if not profiles:
-            say_nothing_there(axes[0])
-    return save(figure, path, table=True)
+            figures.say_nothing_there(axes[0])
+    return figures.save(figure, path, table=True)
 
 
 def _draw_profile(ax: Axes, profile: Profile, estimate: ParameterEstimate) -> None:
@@ -127,12 +123,11 @@ def _draw_profile(ax: Axes, profile: Profile, estimate: ParameterEstimate) -> No
 
 
 def _draw_sensitivities(figure: FigureBase, insight: Insight, width: float) -> None:
-    """Set all rows of a curve in one panel: as panels of their own they take seconds to lay out."""
+    """Draw all rows of a curve in one panel; separate panels would take seconds to lay out."""
     from matplotlib.transforms import Affine2D
 
-    k = len(insight.names)
-    n = len(insight.curves)
-    across = abreast(width, n)
+    k, n = len(insight.names), len(insight.curves)
+    across = figures.abreast(width, n)
     axes = figure.subplots(-(-n // across), across, sharey=True, squeeze=False).ravel()
     for ax in axes[n:]:
         ax.set_axis_off()
@@ -147,12 +142,10 @@ def _draw_sensitivities(figure: FigureBase, insight: Insight, width: float) -> N
         _shade(ax, x, insight.sections)
         for i, name in enumerate(insight.names):
             ax.axhline(i, color=GREY, lw=0.5)
-            # The row's own numbers, moved to its place.
+            # The numbers of the row, shifted to its place.
             moved = Affine2D().scale(1.0, -0.44 / (reach[name] or 1.0)).translate(0.0, i)
-            ax.plot(
-                x, rows[name][j], color=_color(curve), lw=1.0, transform=moved + ax.transData,
-                label=f"_{name}",
-            )  # fmt: skip
+            style: Any = {"color": _color(curve), "lw": 1.0, "transform": moved + ax.transData}
+            ax.plot(x, rows[name][j], label=f"_{name}", **style)
         for i in range(1, k):
             ax.axhline(i - 0.5, color="white", lw=1.6, zorder=1)
         ax.set_xlim(x[0], x[-1])
@@ -160,31 +153,29 @@ def _draw_sensitivities(figure: FigureBase, insight: Insight, width: float) -> N
         ax.set_title(curve.replace("_", "-"), loc="left", fontsize=7.5, pad=11)
         ax.set_xlabel(f"time ({unit})" if unit else "sample")
         ax.set_ylabel("noise s.d. per 1 %", visible=False)
-        ax.tick_params(axis="y", length=0)
-        ax.spines["left"].set_visible(False)
+        _without_left_edge(ax)
     axes[0].set_yticks(range(k), [f"{name}\n±{reach[name]:.2g}" for name in insight.names])
     figure.supylabel("noise s.d. per 1 % of the parameter", fontsize=6.5)
 
 
 def _shade(ax: Axes, x: Array, cuts: tuple[Section, ...]) -> None:
-    for turn, cut in enumerate(_without_shakes(cuts, x.size)):
+    """Shade the branches, and write their names above where there is room."""
+    for turn, cut in enumerate(without_shakes(cuts, x.size)):
         left, right = x[cut.start], x[min(cut.stop, x.size - 1)]
         flies = " " in cut.branches
         shade = SHADES.get(cut.branches, "white" if flies else OTHERS[turn % 2])
         name = "flight" if flies else cut.branches
         ax.axvspan(left, right, color=shade, lw=0, zorder=0, label=f"_branch {name}")
         if right - left > 0.03 * (x[-1] - x[0]):
-            ax.annotate(
-                name, (0.5 * (left + right), 1.0), (0, 2),
-                xycoords=("data", "axes fraction"), textcoords="offset points",
-                ha="center", va="bottom", fontsize=6.5, color=GREY,
-            )  # fmt: skip
+            style: Any = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
+            style |= {"ha": "center", "va": "bottom", "fontsize": 6.5, "color": GREY}
+            ax.annotate(name, (0.5 * (left + right), 1.0), (0, 2), **style)
 
 
-def _without_shakes(cuts: tuple[Section, ...], samples: int) -> list[Section]:
-    """Leave out what lasts for less than a hundredth of the test between two of one name.
+def without_shakes(cuts: tuple[Section, ...], samples: int) -> list[Section]:
+    """Drop sections shorter than a hundredth of the test between two of the same name.
 
-    Micro-springs are held wherever a measured motion shakes.
+    A shaking measured motion makes a spring leave its branch for a moment.
     """
     out: list[Section] = []
     for i, cut in enumerate(cuts):
@@ -201,6 +192,11 @@ def _without_shakes(cuts: tuple[Section, ...], samples: int) -> list[Section]:
 def _color(curve: str) -> str:
     inside = INSIDE[0] if curve.startswith("displacement") else VERMILION
     return BLUE if curve == "displacement_time" else inside
+
+
+def _without_left_edge(ax: Axes) -> None:
+    ax.tick_params(axis="y", length=0)
+    ax.spines["left"].set_visible(False)
 
 
 # ---------------------------------------------------------------- information and correlation
@@ -225,26 +221,24 @@ def _draw_information(
     labels = ["flight" if " " in branch else branch for _, branch in parts]
     longest = max(map(len, labels), default=0)
     left.set_xticks(range(len(parts)), labels, rotation=90 if longest > 6 else 0)
+    beneath = -16.0 if longest <= 6 else -4.0 - 4.0 * longest
+    style: Any = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
+    style |= {"ha": "center", "va": "top", "fontsize": 7, "annotation_clip": False}
     for curve in dict.fromkeys(curve for curve, _ in parts):
         at = [c for c, part in enumerate(parts) if part[0] == curve]
         if at[0]:
             left.axvline(at[0] - 0.5, color="black", lw=0.8)
-        beneath = -16.0 if longest <= 6 else -4.0 - 4.0 * longest
-        left.annotate(
-            curve.replace("_", "-"), (float(np.mean(at)), 0.0), (0, beneath),
-            xycoords=("data", "axes fraction"), textcoords="offset points", ha="center", va="top",
-            fontsize=7, color=_color(curve), annotation_clip=False,
-        )  # fmt: skip
+        place = float(np.mean(at)), 0.0
+        name = curve.replace("_", "-")
+        left.annotate(name, place, (0, beneath), color=_color(curve), **style)
     matrix = insight.correlation if correlation is None else correlation
     below = np.where(np.tri(k, dtype=bool), matrix, np.nan)
     picture = _cells(right, below, "RdBu_r", (-1.4, 1.4), "{:.2f}")
     name_cells(picture, insight.names, insight.names)
     right.set_title("correlation of the estimates", loc="left", fontsize=7.5, pad=4)
     right.set_xticks(range(k), insight.names, rotation=90)
-    if width >= SIDE_BY_SIDE:
-        right.set_yticks([])
-    else:
-        right.set_yticks(range(k), insight.names)
+    beside = width >= SIDE_BY_SIDE  # then the names stand on the left
+    right.set_yticks([] if beside else range(k), [] if beside else insight.names)
 
 
 def _cells(
@@ -258,7 +252,43 @@ def _cells(
             shown = {"−.00": "0", ".00": "0", "1.00": "1", "−0": "0", "0": ""}.get(shown, shown)
             color = "white" if abs(value) > 0.6 * limits[1] else "black"
             text = ax.text(j, i, shown, ha="center", va="center", fontsize=5.5, color=color)
-            text.set_in_layout(False)  # inside its cell anyway; to measure each takes long
+            text.set_in_layout(False)  # inside its cell; measuring is slow
     ax.tick_params(length=0, labelsize=6.5)
     ax.spines[:].set_visible(False)
     return picture
+
+
+# ---------------------------------------------------------------- uncertainty budget
+
+
+def plot_budget(budget: Budget, *, width: str = TWO) -> Figure:
+    """Draw the share of each source in the variance of each parameter, and the combined error.
+
+    The combined standard deviation, on the right, is in percent of the scale of the parameter.
+    """
+    names, wide = list(budget.contributions), figures.inches(width)
+    combined = np.array([budget.combined(name) for name in names])
+    totals = 100.0 * combined / [budget.scales[name] for name in names]
+    with figures.drawing(wide, 0.9 + ROW * len(names)) as figure:
+        shares, right = figure.subplots(1, 2, sharey=True, width_ratios=[3.0, 1.4])
+        left, entries = np.zeros(len(names)), dict[str, object]()
+        for source in budget.sources:
+            colour, hatch = LOOKS[source]
+            parts = np.array([budget.contributions[name][source] for name in names])
+            share = 100.0 * parts**2 / np.where(combined > 0.0, combined, 1.0) ** 2
+            style: Any = {"color": colour, "hatch": hatch, "edgecolor": "white", "linewidth": 0.5}
+            entries[source] = shares.barh(range(len(names)), share, 0.72, left, **style)
+            left = left + share
+        shares.set(xlim=(0.0, 100.0), xlabel="share of the variance (%)")
+        _without_left_edge(shares)
+        right.barh(range(len(names)), totals, 0.72, color=GREY)
+        for i, total in enumerate(totals.tolist()):
+            offset: Any = {"textcoords": "offset points", "va": "center", "fontsize": 6.5}
+            right.annotate(percent(0.01 * total), (total, i), (3, 0), **offset)
+        right.set(xlim=(0.0, 1.5 * totals.max()), xlabel="combined (%)")
+        right.locator_params(axis="x", nbins=3)
+        right.tick_params(axis="y", length=0)
+        shares.set_yticks(range(len(names)), names)
+        shares.set_ylim(len(names) - 0.4, -0.6)
+        figures.legend_below(figure, entries)
+    return figure

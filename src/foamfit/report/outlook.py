@@ -9,7 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,56 +23,59 @@ from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.branches import visited
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.search import Tracker, search
-from foamfit.report.folder import load_result
-from foamfit.report.sides import published_side
-from foamfit.results import ParameterEstimate, snapping_of
+from foamfit.report.comparison import Side, published_side, side_of
+from foamfit.report.readable import readable
+from foamfit.report.render import words
+from foamfit.results import ParameterEstimate, law_in_words, snapping_of
 from foamfit.solve.simulation import Response, simulate
 from foamfit.springs import kernels
 from foamfit.springs.chain import Chain, Impact
+from foamfit.springs.laws import law
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE, split_name, unit_of
-from foamfit.springs.published import published
+from foamfit.text import aligned, labelled, wrapped
 from foamfit.trust import covariance
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.budget import response
+from foamfit.trust.checklist import ESTIMATED
 from foamfit.trust.conclude import state_of
 from foamfit.trust.identifiability import Insight, look
 
-# Descents of the quick search for start values, for each spring.
+# Descents per spring in the quick search for start values.
 QUICK_STARTS = 4
-# Velocities tried for closing a loop, over the planned one; and how well it is found.
+# Range of velocities tried for closing a loop, over the planned one, and relative tolerance.
 SLOWEST, FASTEST, CLOSE = 1e-2, 30.0, 1e-5
-# A test is looked at this much faster than what closes its loop.
+# The faster test exceeds the closing velocity by this factor.
 BEYOND = 1.05
-# Of a planned test: samples, and noise over the range where none is stated.
+# Samples of a planned test, and its noise over the range if none is stated.
 SAMPLES, NOISE = 501, 0.01
-GUESSED = "the best"  # how a source begins that is no knowledge
+GUESSED = "the best"  # beginning of the source of start values that are a guess
 
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """What to expect of an experiment with one velocity of the striker."""
+    """What to expect of an experiment at one velocity of the striker."""
 
     velocity: float | None  # m/s; None in other drives than the impact
-    estimates: dict[str, ParameterEstimate]  # What varies, with expected standard errors
-    visited: dict[str, tuple[str, ...]]  # Branches of each spring
+    estimates: dict[str, ParameterEstimate]  # what varies, with expected standard errors
+    visited: dict[str, tuple[str, ...]]  # branches of each spring
     insight: Insight | None  # None if no parameter changes the curves
-    snapped: dict[str, float]  # Largest fraction of micro-springs that snaps, of each spring
+    snapped: dict[str, float]  # largest fraction of micro-springs that snaps, of each spring
 
 
 @dataclass(frozen=True, eq=False)
 class Outlook:
-    """What is to be said of an experiment before it is fitted."""
+    """What can be said about an experiment before it is fitted."""
 
     problem: Problem
-    values: Array  # SI; all that is said holds there
-    source: str  # Where these come from
+    values: Array  # SI; everything is evaluated there
+    source: str  # where these come from
     planned: Expected
-    # Velocity (m/s) from which on the loop of each bistable spring closes, None if none up to 30
+    # Velocity (m/s) from which on the loop of each spring closes, None if none up to 30
     # times the planned one does; empty in other drives than the impact.
     closing: dict[str, float | None]
     faster: Expected | None  # 5 % faster than what closes all loops, where one is left open
-    noise: dict[str, NoiseLevel]  # Of each counted curve
+    noise: dict[str, NoiseLevel]  # of each counted curve
     # Of each quantity that the TOML gives without a ±: the parameter that 1 % of it moves farthest
     # in standard errors by noise, by how many of these, and by which share of its scale.
     exact: dict[str, tuple[str, float, float]]
@@ -91,7 +96,7 @@ def make_outlook(problem: Problem, values: Array, source: str) -> Outlook:
         closing = {
             f"s{i}": closing_velocity(chain, impact, i)
             for i, kind in enumerate(problem.model.kinds, start=1)
-            if kind == "bistable"
+            if not law(kind).inner_loops and law(kind).hysteretic
         }
         fast = max((v for v in closing.values() if v is not None), default=0.0)
         if fast > impact.velocity:
@@ -104,7 +109,7 @@ def make_outlook(problem: Problem, values: Array, source: str) -> Outlook:
 def _moved_farthest(
     best: BestPoint, expected: Mapping[str, ParameterEstimate]
 ) -> dict[str, tuple[str, float, float]]:
-    """What 1 % of each quantity without a ± does, most telling first; see `Outlook.exact`."""
+    """Effect of 1 % of each quantity without a ±, largest first; see `Outlook.exact`."""
     found, sizes = {}, dict(zip(best.names, best.sizes.tolist(), strict=True))
     for quantity in taken_for_exact(best.problem.measurement):
         change = response(best, quantity, 0.01)
@@ -143,44 +148,35 @@ def start_values(problem: Problem, seed: int = 0) -> tuple[Array, str]:
     )
 
 
-def published_values(problem: Problem, name: str) -> tuple[Array, str]:
-    """Start values of a published set, its heights scaled to the specimen, without its damping."""
-    if name not in published:
-        known = ", ".join(published)
-        raise InputError(f"there is no published set '{name}'; there are {known}")
-    item, side, values = published[name], published_side(name), problem.vector()
-    if [k == "bistable" for k in problem.model.kinds] != [k == "bistable" for k in side.kinds]:
-        raise InputError(f"{name} is a {item.model}, not a {problem.model.name}; give --model")
-    for full in problem.model.names:
-        short = split_name(full)[1]
-        new = 0.0 if short == "eta" else side.estimates[full].value
-        if short == "height":
-            new = new / item.chain.height * problem.measurement.specimen.height
-        if problem.params[full].vary or short == "eta":
-            values[problem.model.index[full]] = new
-    return problem.space().complete(values), f"published {name}, without its numerical damping"
+def known_values(problem: Problem, side: Side) -> Array:
+    """Start values of the springs of an earlier result or of a published set.
 
-
-def result_values(problem: Problem, folder: Path) -> tuple[Array, str]:
-    """Start values of the springs of an earlier result, from its folder or its fit.json."""
-    content = load_result(folder)
-    given, springs = content.get("parameters", {}), problem.model.names
-    missing = [name for name in springs if name not in given]
-    if missing:
-        raise InputError(
-            f"{folder} has no {missing[0]}; it is a {content.get('model')}, not a "
-            f"{problem.model.name}"
-        )
+    Heights are scaled to the specimen; the damping of a published set is numerical and left out.
+    """
+    model, known = problem.model, dict(side.estimates)
+    if side.source is not None:
+        zero = ParameterEstimate(0.0, None, None, "", False, "published", "")
+        known |= {name: zero for name in model.names if name.endswith("_eta")}
+    families = [[law(kind).hysteretic for kind in kinds] for kinds in (model.kinds, side.kinds)]
+    if families[0] != families[1]:
+        kinds = side.source.model if side.source else "+".join(side.kinds)
+        raise InputError(f"{side.label} is a {kinds}, not a {model.name}; give --model")
+    if missing := [name for name in model.names if name not in known]:
+        raise InputError(f"{side.label} has no {missing[0]}, which {model.name} needs")
+    total = sum(p.value for name, p in known.items() if name.endswith("_height"))
     values = problem.vector()
-    values[: len(springs)] = [float(given[name]["value"]) for name in springs]
-    return problem.space().complete(values), f"the result in {folder}"
+    for name in model.names:
+        scale = problem.measurement.specimen.height / total if name.endswith("_height") else 1.0
+        if side.source is None or problem.params[name].vary or name.endswith("_eta"):
+            values[model.index[name]] = scale * known[name].value
+    return problem.space().complete(values)
 
 
 # ---------------------------------------------------------------- a test that is not made yet
 
 
 def planned_test(settings_file: Path) -> Measurement:
-    """Make a test without curves of what a TOML plans; `simulated_test` fills them in."""
+    """Make a test from a TOML that plans one; `simulated_test` fills in the curves."""
     settings = read_settings(settings_file, settings_file, channels=())
     striker = settings.striker or Striker()
     for key, value in (("mass", striker.mass), ("velocity", striker.velocity)):
@@ -219,17 +215,15 @@ def simulated_test(like: Measurement, chain: Chain, drive: Impact) -> Measuremen
         like.noise.displacement or NOISE * float(np.ptp(motion)),
     )
     inside = {node: response.displacement[node - 1] for node in like.interior}
-    slowed = -np.gradient(np.gradient(motion, time), time)
-    return replace(
-        like, time=time, stress=stress, displacement=motion, interior=inside, noise=noise,
-        acceleration=None if like.acceleration is None else slowed,
-        striker=Striker(drive.mass, drive.velocity), outliers={}, sampled={}, block=1,
-        contact="file",
-    )  # fmt: skip
+    measured = like.acceleration is not None
+    slowed = -np.gradient(np.gradient(motion, time), time) if measured else None
+    made = replace(like, time=time, stress=stress, displacement=motion, acceleration=slowed)
+    made = replace(made, interior=inside, striker=Striker(drive.mass, drive.velocity), noise=noise)
+    return replace(made, outliers={}, sampled={}, block=1, contact="file")
 
 
 def _runs(chain: Chain, drive: Impact) -> Iterator[Response]:
-    """Give runs of an impact that last longer and longer, up to one that ends its contact."""
+    """Give runs of an impact of growing duration, up to one in which contact ends."""
     end = 4.0 * chain.height / drive.velocity
     for _ in range(20):
         response = simulate(chain, drive, np.linspace(0.0, end, 16))
@@ -254,31 +248,28 @@ def closing_velocity(chain: Chain, impact: Impact, spring: int) -> float | None:
     By bisection of forward runs, to 1e-5, from the planned impact; springs count from 1 at the
     base. None if no velocity from a hundredth to thirty times the planned one parts the two.
     """
+
+    def closes(velocity: float) -> bool:
+        """Whether the spring comes to branch e."""
+        try:
+            switches = [one.switches for one in _runs(chain, Impact(impact.mass, velocity))]
+        except SimulationError:  # past the end of a branch: nothing is closed there
+            return False
+        return any(np.any((s[:, 1] == spring - 1) & (s[:, 3] == kernels.E)) for s in switches)
+
     low = high = impact.velocity
-    while _closes(chain, Impact(impact.mass, low), spring):
+    while closes(low):
         high, low = low, low / 1.25
         if low < SLOWEST * impact.velocity:
             return None
-    while not _closes(chain, Impact(impact.mass, high), spring):
+    while not closes(high):
         low, high = high, high * 1.25
         if high > FASTEST * impact.velocity:
             return None
     while high - low > CLOSE * high:
         middle = 0.5 * (low + high)
-        closed = _closes(chain, Impact(impact.mass, middle), spring)
-        low, high = (low, middle) if closed else (middle, high)
+        low, high = (low, middle) if closes(middle) else (middle, high)
     return high
-
-
-def _closes(chain: Chain, drive: Impact, spring: int) -> bool:
-    """Whether a spring (1 at the base) comes to branch e in an impact."""
-    try:
-        return any(
-            np.any((response.switches[:, 1] == spring - 1) & (response.switches[:, 3] == kernels.E))
-            for response in _runs(chain, drive)
-        )
-    except SimulationError:  # past the end of a branch: nothing is closed there
-        return False
 
 
 def _faster(
@@ -288,23 +279,20 @@ def _faster(
 
     Its curves are simulated, and its nuisance parameters those of such a record.
     """
-    test, springs = problem.measurement, problem.model.names
-    given = {problem.objective.channel(name): value for name, value in noise.items()}
-    moved = next((given[name] for name in given if name.startswith("displacement")), None)
-    estimated = {
-        name: level for name, level in test.noise.estimated.items() if name == "acceleration"
-    }
-    test = replace(test, noise=Noise(given.get("stress"), moved, estimated))
+    test = problem.measurement
+    known = {problem.objective.channel(name): value for name, value in noise.items()}
+    moved = next((value for name, value in known.items() if name.startswith("displacement")), None)
+    estimated = {name: x for name, x in test.noise.estimated.items() if name == "acceleration"}
+    test = replace(test, noise=Noise(known.get("stress"), moved, estimated))
     impact = Impact(_impact(test).mass, velocity)
     test = simulated_test(test, chain_of(problem, values), impact)
     params = problem.params.copy()
     for name in problem.objective.nuisance:
         del params[name]
-    faster = make_problem(
-        test, problem.model.name, "impact", params, problem.objective.weights,
-        problem.objective.interior_mass, relaxation=problem.model.relaxation,
-    )  # fmt: skip
-    own = values[: len(springs)]
+    model, objective = problem.model, problem.objective
+    given = (test, model.name, "impact", params, objective.weights, objective.interior_mass)
+    faster = make_problem(*given, relaxation=model.relaxation)
+    own = values[: len(model.names)]
     return faster, np.append(own, faster.vector()[own.size :])
 
 
@@ -337,7 +325,7 @@ def expect(problem: Problem, values: Array, noise: Mapping[str, float]) -> Expec
 
 
 def _snapped(best: BestPoint) -> dict[str, float]:
-    """Largest fraction of micro-springs that snaps, of each microscale spring where it is known."""
+    """Largest fraction of micro-springs that snaps, by spring, where it is known."""
     problem, curves = best.problem, best.simulated.curves
     test, drive = problem.measurement, problem.objective.drive
     moved = curves.get("displacement_time", test.displacement)
@@ -387,20 +375,106 @@ def outlook_of(
         raise InputError(
             f"{test} plans a test without data; say by --published or --params what foam it is"
         )
+
+    def problem_of(measurement: Measurement) -> Problem:
+        return make_problem(
+            measurement, model, drive, None, None, interior_mass=False, relaxation=relaxation
+        )
+
     measurement = read_test(test, specimen) if made else planned_test(test)
-    problem = make_problem(
-        measurement, model, drive, None, None, interior_mass=False, relaxation=relaxation
-    )
+    problem = problem_of(measurement)
     if published_set is not None:
-        values, source = published_values(problem, published_set)
+        values = known_values(problem, published_side(published_set))
+        source = f"published {published_set}, without its numerical damping"
     elif result is not None:
-        values, source = result_values(problem, result)
+        values, source = known_values(problem, side_of(result)), f"the result in {result}"
     else:
         values, source = start_values(problem)
     if not made:
         chain = chain_of(problem, values)
-        measurement = simulated_test(measurement, chain, _impact(measurement))
-        problem = make_problem(
-            measurement, model, drive, None, None, interior_mass=False, relaxation=relaxation
-        )
+        problem = problem_of(simulated_test(measurement, chain, _impact(measurement)))
     return make_outlook(problem, values, source)
+
+
+# ---------------------------------------------------------------- in words
+
+
+def outlook_text(outlook: Outlook) -> str:
+    """Write an outlook for people: at most 100 columns wide, no newline at the end."""
+    problem, planned = outlook.problem, outlook.planned
+    objective, insight = problem.objective, planned.insight
+    rms = objective.rms(objective.differences(outlook.values))
+    times = {name: rms[name] / level.sigma for name, level in outlook.noise.items() if name in rms}
+    ratios = {} if insight is None else worth(insight)
+    gains = {name: 1.0 - float(np.mean([*row.values()])) for name, row in ratios.items() if row}
+    told = words(
+        "outlook",
+        outlook=outlook,
+        problem=problem,
+        planned=planned,
+        law=law_in_words(problem.model.name, problem.model.relaxation),
+        larger={name: one for name, one in times.items() if one > ESTIMATED},
+        loops=list(_loops(outlook)),
+        guessed=outlook.source.startswith(GUESSED),
+        gains=gains,
+        best=max(gains, key=gains.__getitem__, default=""),
+    )
+    lines = (line.partition("|") for line in told.splitlines())
+    items = groupby(((label, text) for label, _, text in lines), key=lambda item: item[0])
+    whys = [
+        line
+        for name, item in planned.estimates.items()
+        if item.state != "determined" and name not in NUISANCE
+        for line in wrapped(f"{name}: {item.state}, {item.why}.")
+    ]
+    shown = labelled((label, [text for _, text in group]) for label, group in items)
+    return "\n".join([shown, "", *_table(outlook), "", *whys]).rstrip()
+
+
+def _loops(outlook: Outlook) -> Iterator[dict[str, Any]]:
+    """How far each hysteretic spring goes, and what would close its loop."""
+    planned = outlook.planned
+    for name, seen in planned.visited.items():
+        own = outlook.problem.model.laws[int(name[1:]) - 1]
+        if not own.hysteretic:
+            continue
+        closes = not own.inner_loops
+        yield {
+            "number": name[1:],
+            "seen": seen,
+            "closes": closes,
+            "snaps": "snap-through" in own.branches,
+            "most": planned.snapped.get(name),
+            "closing": outlook.closing.get(name),
+            "needed": _needed(outlook, int(name[1:])) if closes and not planned.velocity else None,
+            "lost": [
+                parameter
+                for parameter, item in planned.estimates.items()
+                if "reached" in item.why and parameter.startswith(f"{name}_")
+            ],
+        }
+
+
+def _needed(outlook: Outlook, spring: int) -> tuple[float, float]:
+    """Overall strain, and stress (Pa), at which a spring of a slow chain comes to its C1."""
+    chain = chain_of(outlook.problem, outlook.values)
+    strain, stress = chain.springs[spring - 1].corners["C1"]
+    path = np.linspace(0.0, stress, 400)
+    strains = [
+        strain if i == spring - 1 else float(np.asarray(other.strain(path))[-1])
+        for i, other in enumerate(chain.springs)
+    ]
+    return float(np.dot(chain.heights, strains)) / chain.height, stress
+
+
+def _table(outlook: Outlook) -> list[str]:
+    """Align the expected standard errors, beside those of the faster test where there is one."""
+    shown = [readable(*item) for item in outlook.planned.estimates.items()]
+    columns = [["parameter", *(p.label for p in shown)], ["unit", *(p.unit for p in shown)]]
+    for test in (outlook.planned, outlook.faster):
+        if test is not None:
+            at = "" if test.velocity is None else f" at {test.velocity:.4g} m/s"
+            shown = [readable(name, test.estimates[name]) for name in outlook.planned.estimates]
+            columns.append([f"expected{at}", *(p.with_error for p in shown)])
+            columns.append(["state", *(p.state for p in shown)])
+    return aligned(list(zip(*columns, strict=True)))

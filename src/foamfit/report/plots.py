@@ -6,6 +6,7 @@ import math
 import re
 import textwrap
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -14,22 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.arrays import Array
-from foamfit.report.figures import (
-    BLUE,
-    GREY,
-    INSIDE,
-    TWO,
-    VERMILION,
-    abreast,
-    drawing,
-    inches,
-    legend_below,
-    save,
-    say_nothing_there,
-    write_haloed,
-)
+from foamfit.report import figures
+from foamfit.report.figures import BLUE, GREY, INSIDE, TWO, VERMILION
 from foamfit.report.readable import readable_unit
-from foamfit.springs.laws import LinearSpring
 from foamfit.terminal import printable
 
 if TYPE_CHECKING:
@@ -39,22 +27,19 @@ if TYPE_CHECKING:
     from foamfit.results import Fit
     from foamfit.solve.simulation import Response
 
-POINTS = {
-    ("a", "d"): "A1", ("d", "a"): "A1",
-    ("d", "c"): "C1",
-    ("c", "e"): "C2", ("e", "c"): "C2",
-    ("e", "a"): "A2",
-}  # fmt: skip
+# Points at which a spring changes between two branches, in either order.
+POINTS = {"ad": "A1", "da": "A1", "dc": "C1", "ce": "C2", "ec": "C2", "ea": "A2"}
 # Where the name of a point stands, in points from it: beside its curve, off the others.
 IN_LOOP = {"A1": (-4, 5), "C1": (-5, 3), "C2": (5, -3), "A2": (4, -7), "σ₊": (-4, 5), "σ₋": (5, -5)}
 IN_TIME = {"A1": (5, -4), "C1": (-5, 3), "C2": (5, 3), "A2": (5, 4), "σ₊": (5, -4), "σ₋": (5, 4)}
-LIGHT = {"a": (-4.0, 3.0), "c": (5.0, -4.0)}  # of branches that are drawn lightly
-IN_WORDS = {"snap-through": (-6.0, 6.0), "held": (-6.0, 4.0), "snap-back": (7.0, -6.0)}
-BESIDE = {"a": (-6, 4), "d": (-6, 4), "c": (7, -3), "e": (4, -7)}  # points from the branch
-MARKERS = 60  # of a measured curve: more of them blot
+# The same of a branch, if not to the upper left; of an elastic one that is drawn lightly, behind
+# the share of its length at which the name stands.
+BESIDE = {"c": (7.0, -3.0), "e": (4.0, -7.0), "snap-back": (7.0, -6.0)}
+LIGHT = {"a": (0.9, (-4.0, 3.0)), "c": (0.5, (5.0, -4.0))}
+MARKERS = 60  # markers on a measured curve; more would blot
 PALE = "#A6CEE3"
 STOOD = "#F2DC6B"  # where the gauge stood still
-# Of masses inside, from the base up: beside their colours, for who sees or prints grey.
+# Dashes and marks of interior masses, from the base up, for readers without colour.
 DASHES: Any = ((0, (5, 1.2)), (0, (2.5, 1.2)), (0, (1, 1)), (0, (5, 1.2, 1, 1.2)))
 MARKS = ("^", "v", "D", "p")
 # Typographic points: height of a panel beside others and above others, what its labels take beside
@@ -71,31 +56,19 @@ def plot_fit(result: Fit, path: str | Path | None = None, *, width: str = TWO) -
     and a figure of fewer panels is no wider than these need. Saved at `path`, if one is given, in
     the format of its suffix, with what is plotted in a CSV beside it.
     """
-    panels = list(_panels(result))
-    wide = min(inches(width), MOST_WIDE[len(panels)])
-    across = abreast(wide, max(len(panels), 1))
-    rows = -(-max(len(panels), 1) // across)
-    size = 72.0 * wide / across - BESIDE_IT, HEIGHT if rows == 1 else STACKED
-    with drawing(wide, (rows * (size[1] + BELOW_IT) + AROUND) / 72.0) as figure:
-        axes = figure.subplots(rows, across, squeeze=False).ravel()
-        for ax in axes[len(panels) :]:
-            ax.set_axis_off()
-        if not panels:
-            say_nothing_there(axes[0])
+    panels = _panels(result)
+    with _panelled(panels, width) as (figure, axes, size):
         for ax, panel in zip(axes, panels, strict=False):
-            ax.set_label(panel.key.replace("_", "-"))
-            _draw(ax, panel)
             _mark_outliers(ax, panel, result)
             _shade_standstills(ax, panel, result)
             labels = _Labels(ax, panel, size)
-            if panel.key == "stress_strain":
+            if panel.is_loop:
                 _draw_law(labels, result)
             _mark_switches(labels, panel, result)
-            if panel.key == "stress_strain":
+            if panel.is_loop:
                 _name_branches(labels, panel, result)
         _head(figure, result)
-        figure.align_ylabels()
-    return save(figure, path, table=True)
+    return figures.save(figure, path, table=True)
 
 
 def plot_residuals(result: Fit, path: str | Path | None = None) -> Figure:
@@ -105,7 +78,7 @@ def plot_residuals(result: Fit, path: str | Path | None = None) -> Figure:
     curve that has nothing to compare is left out. Saved at `path`, if one is given.
     """
     strips = list(_residuals(result))
-    with drawing(7.0, 0.45 + 0.85 * max(len(strips), 1)) as figure:
+    with figures.drawing(7.0, 0.45 + 0.85 * max(len(strips), 1)) as figure:
         column = figure.subplots(max(len(strips), 1), 1, sharex=True, squeeze=False)[:, 0]
         time = result.curves.time
         for ax, (name, residual) in zip(column, strips, strict=False):
@@ -117,8 +90,8 @@ def plot_residuals(result: Fit, path: str | Path | None = None) -> Figure:
             ax.set_title(f"{name}: fitted − measured", loc="left", fontsize=7.5, pad=3)
             column[-1].set_xlabel(f"time ({unit})" if unit else "sample")
         if not strips:
-            say_nothing_there(column[0])
-    return save(figure, path, table=True)
+            figures.say_nothing_there(column[0])
+    return figures.save(figure, path, table=True)
 
 
 def plot_response(
@@ -129,46 +102,33 @@ def plot_response(
     For `path` and `width` see `plot_fit`; without `table` no CSV of what is plotted is written.
     """
     time, stress, nodes = response.time, response.base_stress, response.displacement
-    wide = min(inches(width), MOST_WIDE[3])
-    across = abreast(wide, 3)
-    rows = -(-3 // across)
-    tall = rows * ((HEIGHT if rows == 1 else STACKED) + BELOW_IT) + AROUND
-    with drawing(wide, tall / 72.0) as figure:
-        axes = figure.subplots(rows, across, squeeze=False).ravel()
-        for ax in axes[3:]:
-            ax.set_axis_off()
-        ft, t_unit = readable_unit(_size(time), "s")
-        fs, s_unit = readable_unit(_size(stress), "Pa")
-        fw, w_unit = readable_unit(_size(nodes), "m")
-        last: Any = {"color": VERMILION, "lw": 1.3}
-        axes[0].plot(time / ft, stress / fs, **last, label="_base stress")
-        # From the base up: light to dark, the top in the colour of what is simulated.
-        shades = np.linspace(0.7, 0.35, max(len(nodes) - 1, 1))
-        for i, node in enumerate(nodes[:-1]):
-            axes[1].plot(time / ft, node / fw, color=str(shades[i]), lw=1.0, label=f"node {i + 1}")
-        axes[1].plot(time / ft, nodes[-1] / fw, label="top", **last)
-        end = response.contact_end
-        loop = time <= (np.inf if end is None else end)  # then the striker flies
-        axes[2].plot(response.strain[loop], stress[loop] / fs, **last, label="_base stress")
-        x, base = f"time ({t_unit})", f"base stress ({s_unit})"
-        names = "stress-time", "displacement-time", "stress-strain"
-        for ax, name in zip(axes, names, strict=False):
-            ax.set_label(name)
-        axes[0].set(xlabel=x, ylabel=base, xmargin=0.05, ymargin=0.11)
-        axes[1].set(xlabel=x, ylabel=f"displacement ({w_unit})", xmargin=0.05, ymargin=0.11)
-        axes[2].set(xlabel="overall strain (–)", ylabel=base, xmargin=0.05, ymargin=0.11)
+    end = response.contact_end
+    loop = time <= (np.inf if end is None else end)  # then the striker flies
+    # From the base up: light to dark, the top in the colour of what is simulated.
+    shades = np.linspace(0.7, 0.35, max(len(nodes) - 1, 1))
+    last = {"color": VERMILION, "lw": 1.3}
+    moving = [
+        _Line(time, node, f"node {i}", {"color": str(shade), "lw": 1.0})
+        for i, (node, shade) in enumerate(zip(nodes[:-1], shades, strict=False), start=1)
+    ] + [_Line(time, nodes[-1], "top", last)]
+    pushed = [_Line(time, stress, "_base stress", last)]
+    looped = [_Line(response.strain[loop], stress[loop], "_base stress", last)]
+    panels = [
+        _Panel("stress_time", "time", "s", "base stress", "Pa", pushed),
+        _Panel("displacement_time", "time", "s", "displacement", "m", moving),
+        _Panel("stress_strain", "overall strain", "–", "base stress", "Pa", looped),
+    ]
+    with _panelled(panels, width) as (figure, axes, _):
         if end is not None:
+            at = end / panels[0].scale()[0]
             for ax in axes[:2]:
-                ax.axvline(end / ft, color=GREY, lw=0.6, ls=(0, (2, 2)), label="_end of contact")
-            axes[0].annotate(
-                "end of contact", (end / ft, 1.0), (-3, -3),
-                xycoords=("data", "axes fraction"), textcoords="offset points",
-                ha="right", va="top", rotation=90, color=GREY, fontsize=6.5,
-            )  # fmt: skip
+                ax.axvline(at, color=GREY, lw=0.6, ls=(0, (2, 2)), label="_end of contact")
+            style: Any = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
+            style |= {"ha": "right", "va": "top", "rotation": 90, "color": GREY, "fontsize": 6.5}
+            axes[0].annotate("end of contact", (at, 1.0), (-3, -3), **style)
         if len(nodes) > 1:
             axes[1].legend(loc="best", handlelength=1.4)
-        figure.align_ylabels()
-    return save(figure, path, table=table)
+    return figures.save(figure, path, table=table)
 
 
 def origin_word(result: Fit) -> str | None:
@@ -178,13 +138,19 @@ def origin_word(result: Fit) -> str | None:
     return match and {"reconstruct": "reconstruction"}.get(match[1], match[1])
 
 
+# ------------------------------------------------------------------------------- the panels
+
+
 @dataclass(frozen=True)
 class _Line:
+    """A curve of a panel, SI; `marked` draws it as marks through which all samples run thinly."""
+
     x: Array
     y: Array
-    kind: Literal["measured", "fitted", "along"]
+    label: str
+    style: dict[str, Any]
+    kind: Literal["measured", "fitted", "other"] = "other"
     node: int = 0  # the mass inside that it belongs to, 0 = the top
-    source: str = "measured"  # where the motion of a measured line came from
 
 
 @dataclass(frozen=True)
@@ -196,6 +162,10 @@ class _Panel:
     y_unit: str
     lines: list[_Line]
 
+    @property
+    def is_loop(self) -> bool:
+        return self.key == "stress_strain"
+
     def scale(self) -> tuple[float, str, float, str]:
         """Return factor and axis label of x, then of y."""
         x, x_unit = readable_unit(max(_size(line.x) for line in self.lines), self.x_unit)
@@ -203,72 +173,97 @@ class _Panel:
         return x, f"{self.x_name} ({x_unit})", y, f"{self.y_name} ({y_unit})"
 
 
-def _panels(result: Fit) -> Iterator[_Panel]:
+def _panels(result: Fit) -> list[_Panel]:
     c, height = result.curves, result.measurement.specimen.height
-    # What a drive prescribes, the fitted loop has too, whether or not it is kept twice.
+    # The fitted loop includes the prescribed curve even if only the measured copy is kept.
     pushed = c.measured_stress if result.drive == "stress" and c.stress is None else c.stress
     moved = c.displacement
     if result.drive == "displacement" and moved is None:
         moved = c.measured_displacement
-    measured_strain = None if c.measured_displacement is None else c.measured_displacement / height
+    strain = None if c.measured_displacement is None else c.measured_displacement / height
     motion = result.measurement.motion or "measured"
-
-    def lines(source: str, *curves: tuple[Any, Any, Any]) -> list[_Line]:
-        there = [curve for curve in curves if curve[1] is not None and curve[2] is not None]
-        return [_Line(x, y, kind, source=source) for kind, x, y in there]
-
-    in_time = lines(
-        motion, ("measured", c.time, c.measured_displacement), ("fitted", c.time, c.displacement)
-    )
-    if c.time is not None:
-        for node, (measured, fitted) in c.interior.items():
-            in_time.append(_Line(c.time, measured, "measured", node))
-            in_time.append(_Line(c.time, fitted, "fitted", node))
-    stress = lines(
-        "measured", ("measured", c.time, c.measured_stress), ("fitted", c.time, c.stress)
-    )
-    loop = lines(
-        motion,
-        ("measured", measured_strain, c.measured_stress),
-        ("fitted", None if moved is None else moved / height, pushed),
-        ("along", measured_strain, c.stress_along),
-    )
+    moving = [_measured(c.time, c.measured_displacement, motion), _fitted(c.time, c.displacement)]
+    for node, (measured, fitted) in c.interior.items():
+        moving += [_measured(c.time, measured, node=node), _fitted(c.time, fitted, node)]
+    loop = [
+        _measured(strain, c.measured_stress, motion),
+        _fitted(None if moved is None else moved / height, pushed),
+    ]
+    if strain is not None and c.stress_along is not None:
+        # Wide and pale below the others, with which it coincides where the fit is good.
+        pale = {"color": PALE, "lw": 3.2, "zorder": 2}
+        loop.append(_Line(strain, c.stress_along, "springs along measured strain", pale))
+    pushing = [_measured(c.time, c.measured_stress), _fitted(c.time, c.stress)]
     panels = (
-        _Panel("stress_time", "time", "s", "stress", "Pa", stress),
-        _Panel("displacement_time", "time", "s", "displacement", "m", in_time),
-        _Panel("stress_strain", "strain", "–", "stress", "Pa", loop),
+        ("stress_time", "time", "s", "stress", "Pa", pushing),
+        ("displacement_time", "time", "s", "displacement", "m", moving),
+        ("stress_strain", "strain", "–", "stress", "Pa", loop),
     )
-    yield from (panel for panel in panels if panel.lines)
+    made = (
+        _Panel(key, x, x_unit, y, y_unit, [line for line in lines if line])
+        for key, x, x_unit, y, y_unit, lines in panels
+    )
+    return [panel for panel in made if panel.lines]
+
+
+def _measured(
+    x: Array | None, y: Array | None, motion: str = "measured", node: int = 0
+) -> _Line | None:
+    if x is None or y is None:
+        return None
+    label, mark, edge = "measured", "o", "0.6"
+    if node:
+        mark, edge = MARKS[(node - 1) % len(MARKS)], INSIDE[(node - 1) % len(INSIDE)]
+        label = f"_measured, mass {node}"
+    elif motion != "measured":
+        label, mark = f"measured, motion {motion}", "s"
+    style = {"marker": mark, "mfc": "white", "mec": edge, "mew": 0.6, "ms": 3.4, "zorder": 3}
+    return _Line(x, y, label, style, "measured", node)
+
+
+def _fitted(x: Array | None, y: Array | None, node: int = 0) -> _Line | None:
+    if x is None or y is None:
+        return None
+    style = {"color": VERMILION, "ls": "-", "lw": 0.9, "zorder": 4}
+    if node:
+        at = node - 1
+        style |= {"color": INSIDE[at % len(INSIDE)], "ls": DASHES[at % len(DASHES)]}
+    return _Line(x, y, f"mass {node}" if node else "fitted", style, "fitted", node)
+
+
+@contextmanager
+def _panelled(
+    panels: list[_Panel], width: str
+) -> Iterator[tuple[Figure, list[Axes], tuple[float, float]]]:
+    """Give a figure with its panels drawn, their axes, and about how large one is, in points."""
+    wide = min(figures.inches(width), MOST_WIDE[len(panels)])
+    across = figures.abreast(wide, max(len(panels), 1))
+    rows = -(-max(len(panels), 1) // across)
+    size = 72.0 * wide / across - BESIDE_IT, HEIGHT if rows == 1 else STACKED
+    with figures.drawing(wide, (rows * (size[1] + BELOW_IT) + AROUND) / 72.0) as figure:
+        axes = figure.subplots(rows, across, squeeze=False).ravel().tolist()
+        for ax in axes[len(panels) :]:
+            ax.set_axis_off()
+        if not panels:
+            figures.say_nothing_there(axes[0])
+        for ax, panel in zip(axes, panels, strict=False):
+            ax.set_label(panel.key.replace("_", "-"))
+            _draw(ax, panel)
+        yield figure, axes, size
+        figure.align_ylabels()
 
 
 def _draw(ax: Axes, panel: _Panel) -> None:
     fx, x_label, fy, y_label = panel.scale()
     for line in panel.lines:
-        x, y = line.x / fx, line.y / fy
-        color = INSIDE[(line.node - 1) % len(INSIDE)] if line.node else VERMILION
-        dashes = DASHES[(line.node - 1) % len(DASHES)] if line.node else "-"
+        x, y, style = line.x / fx, line.y / fy, line.style
         if line.kind == "measured":
-            some = _evenly(x, y, MARKERS)
-            mark, name, edge = "o", "measured", "0.6"
-            if line.node:
-                mark, edge = MARKS[(line.node - 1) % len(MARKS)], color
-                name = f"_measured, mass {line.node}"
-            elif line.source != "measured":
-                mark, name = "s", f"measured, motion {line.source}"
-            every = f"_{name.removeprefix('_')}, all samples"
+            every = f"_{line.label.removeprefix('_')}, all samples"
             ax.plot(x, y, color="0.82", lw=0.5, zorder=1, label=every)
-            ax.plot(
-                x[some], y[some], mark, label=name, ms=3.4, mfc="white", mec=edge, mew=0.6,
-                zorder=3,
-            )  # fmt: skip
-        elif line.kind == "fitted":
-            name = f"mass {line.node}" if line.node else "fitted"
-            ax.plot(x, y, color=color, ls=dashes, lw=0.9, zorder=4, label=name)
-        else:
-            # Wide and pale below the others, with which it coincides where the fit is good.
-            ax.plot(x, y, color=PALE, lw=3.2, zorder=2, label="springs along measured strain")
-    ax.set_xlabel(x_label)
-    ax.set_ylabel(y_label)
+            some = _evenly(x, y, MARKERS)
+            x, y, style = x[some], y[some], {"ls": "none", **style}
+        ax.plot(x, y, label=line.label, **style)
+    ax.set(xlabel=x_label, ylabel=y_label)
     ax.margins(0.05, 0.11)
 
 
@@ -288,22 +283,18 @@ def _mark_outliers(ax: Axes, panel: _Panel, result: Fit) -> None:
     fx, _, fy, _ = panel.scale()
     own = "displacement" if panel.key == "displacement_time" else "stress"
     for channel, found in test.outliers.items():
-        elsewhere = panel.key != "stress_strain" and test.time is None
-        if not channel.startswith(own) or elsewhere or not found.at.size:
+        x, motion = found.at, test.displacement
+        if not channel.startswith(own) or not x.size:
             continue
-        x = found.at
-        if panel.key == "stress_strain":
-            motion = test.displacement
-            if motion is None:
-                continue
+        if panel.is_loop and motion is not None:
             time = np.arange(motion.size) if test.time is None else test.time
-            x = np.interp(found.at, time, motion) / test.specimen.height
+            x = np.interp(x, time, motion) / test.specimen.height
+        elif panel.is_loop or test.time is None:
+            continue
         low, high = ax.get_ylim()  # fixed: a wild sample must not shrink the curves
+        style: Any = {"ms": 4.0, "mew": 1.0, "color": "black", "zorder": 6, "clip_on": False}
         y = np.clip(found.values / fy, low, high)
-        ax.plot(
-            x / fx, y, "x", ms=4.0, mew=1.0, color="black", zorder=6, clip_on=False,
-            label="outlier, not fitted",
-        )  # fmt: skip
+        ax.plot(x / fx, y, "x", label="outlier, not fitted", **style)
         ax.set_ylim(low, high)
 
 
@@ -313,7 +304,7 @@ def _shade_standstills(ax: Axes, panel: _Panel, result: Fit) -> None:
     fx, _, fy, _ = panel.scale()
     style: Any = {"color": STOOD, "zorder": 0.5, "label": "gauge stands still, bridged"}
     for start, end in test.standstills:
-        if panel.key != "stress_strain":
+        if not panel.is_loop:
             ax.axvspan(start / fx, end / fx, lw=0.0, **style)
             continue
         for line in panel.lines:
@@ -321,6 +312,9 @@ def _shade_standstills(ax: Axes, panel: _Panel, result: Fit) -> None:
             if line.kind == "measured":
                 at = (instants >= start) & (instants <= end)
                 ax.plot(line.x[at] / fx, line.y[at] / fy, lw=7.0, solid_capstyle="butt", **style)
+
+
+# ---------------------------------------------------------------------------- names in a panel
 
 
 class _Labels:
@@ -333,18 +327,17 @@ class _Labels:
         self.corner, self.size = low, size
         limits = np.array([np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim())])
         self.span = np.array(size) / limits  # points per unit
-        self.curves = [
-            np.column_stack((s.x / self.fx, s.y / self.fy))[_evenly(s.x, s.y, 4 * MARKERS)]
-            for s in panel.lines
-            if s.kind == "fitted"
-        ]
-        self.marks: list[Array] = []
+        self.drawn = [np.empty((0, 2))]  # places that names are to leave free
+        for line in panel.lines:
+            if line.kind == "fitted":
+                seen = _evenly(line.x, line.y, 4 * MARKERS)
+                self.drawn.append(np.column_stack((line.x / self.fx, line.y / self.fy))[seen])
         self.taken: list[Array] = []
 
     def mark(self, name: str, places: Array) -> None:
         """Draw dots at places (n, 2), in the units of the axes, that names are to leave free."""
         self.ax.plot(*places.T, "o", ms=3.2, color="black", zorder=5, label=f"_{name}")
-        self.marks += [places, places]
+        self.drawn += [places, places]
 
     def has_room(self, name: str, at: Array, wanted: tuple[float, float]) -> bool:
         """Whether a name beside a place stays in the width of the panel."""
@@ -354,147 +347,126 @@ class _Labels:
     def write(
         self, name: str, at: Array, wanted: tuple[float, float], *, stay: bool = False, **style: Any
     ) -> None:
-        """Write a name beside a place; `stay`: on no other side of it than is wanted."""
-        avoid = np.concatenate([np.empty((0, 2)), *self.curves, *self.marks])
-        anchor, avoid = (at - self.corner) * self.span, (avoid - self.corner) * self.span
-        offset = _free_offset(anchor, name, wanted, avoid, self.taken, self.size, stay=stay)
+        """Write a name beside a place, `wanted` points from it or where it covers least.
+
+        With `stay` it stands on the side that is wanted.
+        """
+        anchor = (at - self.corner) * self.span
+        avoid = (np.concatenate(self.drawn) - self.corner) * self.span
+        (x, y), size = wanted, np.array([4.2 * len(name), 9.0])
+        best, offset, box = math.inf, wanted, np.zeros(4)  # left, low, right, high
+        for factor in (1.0, 2.5, 4.0):
+            sides = ((x, factor * y), (-x, -factor * y), (x, -factor * y), (-x, factor * y))
+            for dx, dy in sides[:1] if stay else sides:
+                low = np.add(anchor, (dx - (size[0] if dx < 0 else 0.0), dy - 0.5 * size[1]))
+                high = low + size
+                names = sum(bool(np.all((low < b[2:]) & (b[:2] < high))) for b in self.taken)
+                beyond = bool(np.any((low < 0.0) | (high > self.size)))
+                inside = int(np.all((avoid > low) & (avoid < high), axis=1).sum())
+                cost = 1000 * names + 50 * beyond + inside + 2.0 * factor
+                if cost < best:
+                    best, offset, box = cost, (dx, dy), np.concatenate((low, high))
+        self.taken.append(box)
         side = "left" if offset[0] > 0 else "right"
-        write_haloed(self.ax, name, at, offset, zorder=6, ha=side, va="center", **style)
+        figures.write_haloed(self.ax, name, at, offset, zorder=6, ha=side, va="center", **style)
 
 
 def _mark_switches(labels: _Labels, panel: _Panel, result: Fit) -> None:
     """Mark what happens to the springs, and name each mark where it first stands."""
     at: dict[str, list[tuple[float, float]]] = {}
-    for name, x, y in (*_switches(panel, result), *_halves(panel, result)):
+    for spring, point, x, y in (*_switches(panel, result), *_halves(panel, result)):
+        name = f"{spring} {point}" if len(result.chain.springs) > 1 else point
         at.setdefault(name, []).append((x / labels.fx, y / labels.fy))
-    wanted = IN_LOOP if panel.key == "stress_strain" else IN_TIME
+    wanted = IN_LOOP if panel.is_loop else IN_TIME
     for name, places in at.items():
         labels.mark(name, np.array(places))
     for name, places in at.items():
         labels.write(name, np.array(places[0]), wanted.get(name[-2:], (5, 5)), fontsize=7)
 
 
-def _switches(panel: _Panel, result: Fit) -> Iterator[tuple[str, float, float]]:
-    """Give the points where a bistable spring changes its branch: name and place, SI."""
-    micro = result.microscale_springs
+def _switches(panel: _Panel, result: Fit) -> Iterator[tuple[str, str, float, float]]:
+    """Give the points at which a spring changes its branch: spring, name and place, SI."""
     for switch in result.switches:
-        if f"s{switch.spring}" in micro:
+        ends = switch.source, switch.target
+        name = POINTS.get("".join(ends))
+        if name is None and result.chain.springs[switch.spring - 1].law.remembers:
             continue
-        point = POINTS.get((switch.source, switch.target), f"{switch.source}→{switch.target}")
-        name = f"s{switch.spring} {point}" if len(result.chain.springs) > 1 else point
         x = switch.time
-        if panel.key == "stress_strain":
+        if panel.is_loop:
             x = switch.displacement / result.measurement.specimen.height
-        y = switch.displacement if panel.key == "displacement_time" else switch.stress
         if x is not None:
-            yield name, x, y
+            y = switch.displacement if panel.key == "displacement_time" else switch.stress
+            yield f"s{switch.spring}", name or "→".join(ends), x, y
 
 
-def _halves(panel: _Panel, result: Fit) -> Iterator[tuple[str, float, float]]:
-    """Give where half of the micro-springs have snapped, and snapped back: name and place, SI."""
+def _halves(panel: _Panel, result: Fit) -> Iterator[tuple[str, str, float, float]]:
+    """Give where half of the micro-springs have snapped, and snapped back."""
     fitted = next((line for line in panel.lines if line.kind == "fitted" and not line.node), None)
     for spring, snapped in result.snapping.items():
         for symbol, sample in zip(("σ₊", "σ₋"), snapped.halves, strict=True):
             if sample is not None and fitted is not None and sample < fitted.x.size:
-                name = f"{spring} {symbol}" if len(result.chain.springs) > 1 else symbol
-                yield name, float(fitted.x[sample]), float(fitted.y[sample])
+                yield spring, symbol, float(fitted.x[sample]), float(fitted.y[sample])
 
 
 def _draw_law(labels: _Labels, result: Fit) -> None:
-    """Draw branches a and c of the only spring, if it is microscale, and its equilibrium."""
-    if len(result.chain.springs) > 1 or not result.microscale_springs:
+    """Draw the elastic branches of the only spring, if it has any, and its equilibrium."""
+    spring, ax = result.chain.springs[0], labels.ax
+    if len(result.chain.springs) > 1 or not hasattr(spring, "elastic_branches"):
         return
-    spring, ax = result.microscale_springs["s1"], labels.ax
     (left, right), (low, top) = ax.get_xlim(), ax.get_ylim()
-    ax.set(xlim=(left, right), ylim=(low, top))  # the branches go on beyond
+    ax.set(xlim=(left, right), ylim=(low, top))  # the branches extend beyond the panel
     stress = np.linspace(0.0, top * labels.fy, 200)
-    on_a = stress / (spring.k0 + stress)
-    on_c = spring.eps_star + stress / (spring.kc + stress)
-    for name, strain, along in (("a", on_a, 0.9), ("c", on_c, 0.5)):
+    for name, strain in spring.elastic_branches(stress).items():
         line = np.column_stack((strain, stress / labels.fy))[strain < right]
         if len(line):  # branch c may lie beyond all that the test reached
             ax.plot(*line.T, color="0.72", lw=0.7, zorder=1.5, label=f"_branch {name}")
+            along, wanted = LIGHT[name]
             at = line[int(along * (len(line) - 1))]
-            labels.write(name, at, LIGHT[name], color=GREY, fontsize=7)
+            labels.write(name, at, wanted, color=GREY, fontsize=7)
     if spring.relaxation and "s1" in result.snapping and result.strain is not None:
-        equilibrium = result.snapping["s1"].stress
-        ax.plot(
-            result.strain, equilibrium / labels.fy, color="0.35", lw=0.7, ls=(0, (4, 2)),
-            zorder=3.5, label="equilibrium",
-        )  # fmt: skip
-
-
-def _free_offset(
-    anchor: Array,
-    name: str,
-    wanted: tuple[float, float],
-    avoid: Array,
-    taken: list[Array],
-    panel: tuple[float, float],
-    *,
-    stay: bool = False,
-) -> tuple[float, float]:
-    """Return where a name stands beside its anchor: on no other name, on little of the curves.
-
-    All in typographic points; the box of the name (left, low, right, high) is added to `taken`.
-    """
-    x, y = wanted
-    size, best, found = np.array([4.2 * len(name), 9.0]), math.inf, (wanted, np.zeros(4))
-    for factor in (1.0, 2.5, 4.0):
-        sides = ((x, factor * y), (-x, -factor * y), (x, -factor * y), (-x, factor * y))
-        for dx, dy in sides[:1] if stay else sides:
-            low = np.add(anchor, (dx - (size[0] if dx < 0 else 0.0), dy - 0.5 * size[1]))
-            high = low + size
-            names = sum(bool(np.all((low < b[2:]) & (b[:2] < high))) for b in taken)
-            beyond = bool(np.any((low < 0.0) | (high > panel)))
-            inside = int(np.all((avoid > low) & (avoid < high), axis=1).sum())
-            cost = 1000 * names + 50 * beyond + inside + 2.0 * factor
-            if cost < best:
-                best, found = cost, ((dx, dy), np.concatenate((low, high)))
-    taken.append(found[1])
-    return found[0]
+        style: Any = {"color": "0.35", "lw": 0.7, "ls": (0, (4, 2)), "zorder": 3.5}
+        held = result.snapping["s1"].stress / labels.fy
+        ax.plot(result.strain, held, label="equilibrium", **style)
 
 
 def _name_branches(labels: _Labels, panel: _Panel, result: Fit) -> None:
     """Write beside the curve of the only spring on which branch it is."""
     fitted = next((line for line in panel.lines if line.kind == "fitted"), None)
     springs = result.chain.springs
-    if len(springs) > 1 or isinstance(springs[0], LinearSpring) or fitted is None:
+    if len(springs) > 1 or not springs[0].law.hysteretic or fitted is None:
         return
     for branch, start, end in _first_visits(result, fitted):
         x, y = fitted.x[start : end + 1] / labels.fx, fitted.y[start : end + 1] / labels.fy
-        middle = _evenly(x, y, 3)[1]
-        if branch in BESIDE and result.bistable_springs:
-            labels.ax.annotate(
-                branch, (x[middle], y[middle]), BESIDE[branch], textcoords="offset points",
-                ha="center", va="center", zorder=6, color=BLUE, label="_on branch",
-            )  # fmt: skip
-        elif branch in IN_WORDS:
-            inner = np.column_stack((x, y))[_evenly(x, y, 9)]
-            around = sorted(inner, key=lambda at: float(abs(at[0] - x[middle])))
-            wanted = IN_WORDS[branch]
-            at = next((at for at in around if labels.has_room(branch, at, wanted)), around[0])
-            labels.write(branch, at, wanted, stay=True, fontsize=7, color=BLUE, label="_on branch")
+        inner = np.column_stack((x, y))[_evenly(x, y, 9)]
+        middle = x[_evenly(x, y, 3)[1]]
+        around = sorted(inner, key=lambda at: float(abs(at[0] - middle)))
+        wanted = BESIDE.get(branch, (-6.0, 5.0))
+        at = next((at for at in around if labels.has_room(branch, at, wanted)), around[0])
+        size = 7.5 if len(branch) == 1 else 7.0
+        labels.write(branch, at, wanted, stay=True, fontsize=size, color=BLUE, label="_on branch")
 
 
 def _first_visits(result: Fit, fitted: _Line) -> Iterator[tuple[str, int, int]]:
     """Give each branch of the only spring, and the samples of its first stretch on it.
 
-    Micro-springs are held wherever a measured motion shakes: a stretch that goes back by less than
-    a fiftieth of the largest strain is part of the one before it.
+    A spring leaves its branch wherever a measured motion shakes: a stretch of less than a fiftieth
+    of the largest strain is part of the one before it.
     """
     starts = [0, *_switch_samples(result, fitted), fitted.x.size - 1]
-    branches = [switch.source for switch in result.switches[:1]] or ["a"]
+    at_rest = next(iter(result.chain.springs[0].law.branches))
+    branches = [switch.source for switch in result.switches[:1]] or [at_rest]
     branches += [switch.target for switch in result.switches]
     stretches: list[tuple[str, int, int]] = []
     for branch, start, end in zip(branches, starts, starts[1:], strict=False):
-        shakes = branch == "held" and np.ptp(fitted.x[start : end + 1]) < 0.02 * np.ptp(fitted.x)
+        if end <= start:
+            continue
+        shakes = np.ptp(fitted.x[start : end + 1]) < 0.02 * np.ptp(fitted.x)
         if stretches and (shakes or branch == stretches[-1][0]):
             stretches[-1] = (stretches[-1][0], stretches[-1][1], end)
         elif not shakes:
             stretches.append((branch, start, end))
     for i, (branch, start, end) in enumerate(stretches):
-        if end > start and branch not in [one for one, *_ in stretches[:i]]:
+        if branch not in [one for one, *_ in stretches[:i]]:
             yield branch, start, end
 
 
@@ -513,39 +485,38 @@ def _switch_samples(result: Fit, loop: _Line) -> list[int]:
 
 
 def _head(figure: Figure, result: Fit) -> None:
+    """Write the title above all panels and the legend below them, and make room for both."""
     name = printable(" ".join(result.measurement.name.split()))
     name = name if len(name) <= 60 else name[:59] + "…"
-    title = f"{name} · {result.law} · {result.drive} drive"
     word = origin_word(result)
-    if word and word not in name.lower():
-        title += f" · {word}"
-    if result.stopped:
-        title += f" · stopped by {result.stopped}"
-    # A dot stays with what is before it.
-    title = textwrap.fill(title.replace(" · ", "\u00a0· "), int(12 * figure.get_figwidth()))
+    more = [word] if word and word not in name.lower() else []
+    more += [f"stopped by {result.stopped}"] if result.stopped else []
+    # No line begins with a dot.
+    title = "\u00a0· ".join([name, result.law, f"{result.drive} drive", *more])
+    title = textwrap.fill(title, int(12 * figure.get_figwidth()))
     # A name may hold a dollar sign: it is no formula.
     figure.suptitle(title, x=0.012, ha="left", fontsize=8.5, parse_math=False)
     entries: dict[str, Any] = {}
     for ax in figure.axes:
         entries |= dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
-    lines = legend_below(figure, entries)
-    more = 11.0 * max(lines - 1, 0) + 11.0 * title.count("\n")
-    figure.set_figheight(figure.get_figheight() + more / 72.0)
+    lines = figures.legend_below(figure, entries)
+    extra = 11.0 * max(lines - 1, 0) + 11.0 * title.count("\n")
+    figure.set_figheight(figure.get_figheight() + extra / 72.0)
 
 
 def _residuals(result: Fit) -> Iterator[tuple[str, Array]]:
+    """Give fitted − measured over the measured range, of each curve that is compared."""
     c = result.curves
-    for key, name, fitted, measured in (
-        ("stress_time", "stress-time", c.stress, c.measured_stress),
-        ("displacement_time", "displacement-time", c.displacement, c.measured_displacement),
-        ("stress_strain", "stress-strain", c.stress_along, c.measured_stress),
-    ):
-        compared = result.misfit.get(key) is not None  # else the drive prescribes this curve
-        if compared and fitted is not None and measured is not None:
+    pairs: dict[str, tuple[Array | None, Array | None]] = {
+        "stress-time": (c.measured_stress, c.stress),
+        "displacement-time": (c.measured_displacement, c.displacement),
+        "stress-strain": (c.measured_stress, c.stress_along),
+    }
+    pairs = {n: p for n, p in pairs.items() if result.misfit.get(n.replace("-", "_")) is not None}
+    pairs |= {f"displacement-time of mass {node}": pair for node, pair in c.interior.items()}
+    for name, (measured, fitted) in pairs.items():
+        if measured is not None and fitted is not None:
             yield name, (fitted - measured) / (float(np.ptp(measured)) or 1.0)
-    for node, (measured, fitted) in c.interior.items():
-        off = (fitted - measured) / (float(np.ptp(measured)) or 1.0)
-        yield f"displacement-time of mass {node}", off
 
 
 def _size(values: Array) -> float:

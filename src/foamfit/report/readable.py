@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import math
-import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from foamfit import text
 from foamfit.results import ParameterEstimate
+from foamfit.springs.parameters import any_param, family, split_name
 
+# Symbols of parameters that belong to no spring; those of springs are in the records of laws.
 SYMBOLS = {
-    "k0": ("k", "0"), "kc": ("k", "c"), "dsigma": ("Δσ", ""), "eps_a": ("ε", "a"),
-    "eps_c": ("ε", "c"), "kh_plus": ("k", "h+"), "kh_minus": ("k", "h−"), "eta": ("η", ""),
-    "height": ("h", ""), "site_eta": ("η", "site"), "time_shift": ("Δt", ""),
-    "eps_star": ("ε", "*"), "sigma_plus": ("σ", "+"), "spread_plus": ("s", "+"),
-    "sigma_minus": ("σ", "−"), "spread_minus": ("s", "−"), "contact_time": ("t", "0"),
-    "displacement_zero": ("w", "0"), "stress_zero": ("σ", "0"), "acceleration_zero": ("a", "0"),
-    "velocity": ("v", "0"), "striker_mass": ("m", ""),
-}  # fmt: skip
-# What a nuisance parameter is called where people read it.
+    "site_eta": ("η", "site"),
+    "contact_time": ("t", "0"),
+    "displacement_zero": ("w", "0"),
+    "stress_zero": ("σ", "0"),
+    "acceleration_zero": ("a", "0"),
+    "velocity": ("v", "0"),
+    "striker_mass": ("m", ""),
+    "time_shift": ("Δt", ""),
+}
+# Names of nuisance parameters in reports.
 LABELS = {
     "contact_time": "contact time t₀",
     "displacement_zero": "zero of the motion w₀",
@@ -65,7 +68,7 @@ class Readable:
 
     @property
     def label(self) -> str:
-        """What it is called: of a parameter of the springs its name."""
+        """Its name in reports; for a parameter of a spring its own name."""
         return LABELS.get(self.name, self.name)
 
     @property
@@ -73,14 +76,18 @@ class Readable:
         """The value with its standard error, where there is one."""
         return f"{self.value} ± {self.stderr}" if self.stderr else self.value
 
+    def with_unit(self, told: str) -> str:
+        """Numbers of this parameter with its unit, where there are any."""
+        return f"{told} {self.unit}".removesuffix(" –") if told else ""
+
     @property
     def matters(self) -> bool:
-        """Whether its reason is to be read: it is not determined, or more is said of it."""
+        """Whether its reason is worth reading: it is not determined, or there is a remark."""
         return self.state != "fixed" and (self.state != "determined" or ";" in self.why)
 
 
 def readable(name: str, p: ParameterEstimate) -> Readable:
-    """Return a parameter as it is to be read.
+    """Return a parameter in readable form.
 
     It is shown with the digits that its standard error leaves (two of the error), or with four.
     """
@@ -94,15 +101,32 @@ def readable(name: str, p: ParameterEstimate) -> Readable:
         shown, stderr, places = _rounded(value, p.stderr / factor)
         if p.ci95 is not None:
             interval = " to ".join(_fixed(bound / factor, places) for bound in p.ci95)
-    if p.range is not None:  # an error of the law leaves two digits
+    if p.range is not None:  # a range is good to two digits
         ends = (float(f"{bound / factor + 0.0:.2g}") for bound in p.range)
         span = " to ".join(f"{end:g}".replace("-", "−") for end in ends)
     unit = {"": "–", "1": "–", "-": "–", "Pa s": "Pa·s", "Pa*s": "Pa·s"}.get(unit, unit)
     scale = f"{p.systematic / factor:.2g}" if p.systematic > 0.0 else ""
-    return Readable(
-        name, symbol(name), shown, stderr, interval, unit, p.state, p.why, p.ci95_method or "",
-        span, scale,
-    )  # fmt: skip
+    told = (p.state, p.why, p.ci95_method or "", span, scale)
+    return Readable(name, symbol(name), shown, stderr, interval, unit, *told)
+
+
+def quantity(value: float, unit: str) -> tuple[str, str]:
+    """Return a number in the unit in which it reads well, and that unit; "–" for none."""
+    factor, name = readable_unit(value, unit)
+    return number(value / factor), name or "–"
+
+
+def own_name(name: str, model: str) -> str:
+    """Name of a parameter, without the spring where there is only one."""
+    return name if "+" in model else name.removeprefix("s1_")
+
+
+def in_unit(values: Sequence[float], unit: str) -> str:
+    """Write one value, or the ends of an interval, in the unit in which they read well."""
+    if not values:
+        return ""
+    factor, name = readable_unit(max(map(abs, values)), unit)
+    return f"{' to '.join(number(value / factor) for value in values)} {name}".rstrip()
 
 
 def number(value: float | None) -> str:
@@ -114,13 +138,12 @@ def number(value: float | None) -> str:
 
 def symbol(name: str) -> tuple[str, str]:
     """Return the symbol of a parameter and its index: k and "c,2" of s2_kc."""
-    spring, _, base = name.partition("_")
-    term = re.fullmatch(r"(g|tau)(\d+)", base)
-    known = SYMBOLS | ({base: ("τ" if term[1] == "tau" else "g", term[2])} if term else {})
-    if name in known or base not in known:
-        return known.get(name, (name, ""))
-    stem, index = known[base]
-    return stem, ",".join(part for part in (index, spring.removeprefix("s")) if part)
+    spring, short = split_name(name)
+    if name in SYMBOLS or spring < 0:
+        return SYMBOLS.get(name, (name, ""))
+    stem, index = any_param(short).symbol
+    term = short.removeprefix(family(short))  # of relaxation
+    return stem, ",".join(filter(None, (index, term, str(spring + 1))))
 
 
 def _rounded(value: float, stderr: float) -> tuple[str, str, int]:

@@ -7,18 +7,21 @@ from dataclasses import dataclass, fields
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from foamfit.report.budget_plot import plot_budget
-from foamfit.report.figures import DPI, TWO, image, inches, laid_out
-from foamfit.report.identifiability_plots import plot_insight, plot_profiles
+from foamfit.report.figures import DPI, TWO, image, inches, laid_out, table
+from foamfit.report.identifiability_plots import plot_budget, plot_insight, plot_profiles
 from foamfit.report.plots import plot_fit, plot_residuals
-from foamfit.report.plotted import table
 from foamfit.results import Fit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Mapped = Callable[..., Iterable[Any]]  # as the built-in `map`
-COARSE = 160  # dots per inch of what is only on the page, and should not take long
+COARSE = 160  # dots per inch of a figure that is only on the page, to save time
+# In the order in which they are begun: what takes longest first. "shown" is the fit on the page,
+# two columns wide as all others there.
+_NAMES = ("fit", "shown", "sensitivities", "residuals", "profiles", "budget")
+# What is plotted in profiles and budget is in profiles.csv and budget.csv.
+_TABLES = ("fit", "sensitivities", "residuals")
 
 
 @dataclass(frozen=True)
@@ -33,8 +36,7 @@ class Images:
     def files(self) -> Iterator[tuple[str, bytes]]:
         """Suffix and content of the files that are kept beside the report."""
         if self.pdf is not None:
-            yield "png", self.png
-            yield "pdf", self.pdf
+            yield from (("png", self.png), ("pdf", self.pdf))
         if self.table is not None:
             yield "csv", self.table
 
@@ -45,29 +47,26 @@ def draw_all(
     """Draw all figures of a result by a `map`; one that the result does not have is None.
 
     A `map` of an executor draws them in its processes: it begins at once, and what is given is
-    waited for when it is asked for. `width` is that of "fit" (`foamfit.report.plots.plot_fit`);
-    the others are on the report, two columns wide, and there "shown" is the fit.
+    waited for when it is asked for. `width` is that of "fit" (`foamfit.report.plots.plot_fit`).
     """
     again = inches(width) != inches(TWO)
-    names = [name for name in _DRAWN if again or name != "shown"]
+    names = [name for name in _NAMES if again or name != "shown"]
     drawn: dict[str, Any] = {field.name: getattr(result, field.name) for field in fields(Fit)}
-    # No figure shows them, and another process would import lmfit, which takes it longest.
+    # No figure needs them, and unpickling them would import lmfit, the slowest import.
     drawn["params"] = None
-    return _with_shown(names, mapped(partial(_draw, Fit(**drawn), width), names))
+    images = mapped(partial(_draw, Fit(**drawn), width), names)  # begins before it is asked for
 
+    def given() -> Iterator[tuple[str, Images | None]]:
+        for name, one in zip(names, images, strict=True):
+            yield name, one
+            if name == "fit" and not again:
+                yield "shown", Images(one.png, one.dpi)
 
-def _with_shown(
-    names: list[str], images: Iterable[Images | None]
-) -> Iterator[tuple[str, Images | None]]:
-    for name, one in zip(names, images, strict=True):
-        yield name, one
-        if name == "fit" and "shown" not in names:
-            assert one is not None
-            yield "shown", Images(one.png, one.dpi)
+    return given()
 
 
 def _draw(result: Fit, width: str, name: str) -> Images | None:
-    figure = _DRAWN[name](result, width)
+    figure = _figure(result, width, name)
     if figure is None:
         return None
     dpi = COARSE if name == "sensitivities" else DPI
@@ -77,28 +76,15 @@ def _draw(result: Fit, width: str, name: str) -> Images | None:
     return Images(png, dpi, pdf, table(figure) if name in _TABLES else None)
 
 
-def _insight(result: Fit) -> Figure | None:
-    matrix = None if result.correlation is None else result.correlation.matrix
-    return None if result.insight is None else plot_insight(result.insight, matrix)
-
-
-def _profiles(result: Fit) -> Figure | None:
-    there = result.intervals is not None and result.intervals.profiles
-    return plot_profiles(result) if there else None
-
-
-def _budget(result: Fit) -> Figure | None:
-    return plot_budget(result.budget) if result.budget and result.budget.telling else None
-
-
-# In the order in which they are begun: what takes longest first.
-_DRAWN: dict[str, Callable[[Fit, str], Figure | None]] = {
-    "fit": lambda result, width: plot_fit(result, width=width),
-    "shown": lambda result, _: plot_fit(result),
-    "sensitivities": lambda result, _: _insight(result),
-    "residuals": lambda result, _: plot_residuals(result),
-    "profiles": lambda result, _: _profiles(result),
-    "budget": lambda result, _: _budget(result),
-}
-# What is plotted in profiles and budget is in profiles.csv and budget.csv.
-_TABLES = ("fit", "sensitivities", "residuals")
+def _figure(result: Fit, width: str, name: str) -> Figure | None:
+    """Draw one of the figures, if the result has it."""
+    if name == "residuals":
+        return plot_residuals(result)
+    if name == "sensitivities":
+        matrix = None if result.correlation is None else result.correlation.matrix
+        return None if result.insight is None else plot_insight(result.insight, matrix)
+    if name == "profiles":
+        return plot_profiles(result) if result.intervals and result.intervals.profiles else None
+    if name == "budget":
+        return plot_budget(result.budget) if result.budget and result.budget.telling else None
+    return plot_fit(result, width=width if name == "fit" else TWO)

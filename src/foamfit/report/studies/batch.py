@@ -15,11 +15,11 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.files import csv_bytes, write_file
-from foamfit.report.page import environment
 from foamfit.report.readable import readable_unit, symbol
-from foamfit.results import Fit, ParameterEstimate, plain
+from foamfit.report.render import page, words
+from foamfit.results import Fit, plain
 from foamfit.springs.parameters import springs_first
-from foamfit.text import aligned, counted, listed, number, percent, wrapped
+from foamfit.text import counted, listed, number, percent
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -30,6 +30,14 @@ PARTS = ("", "_stderr", "_lo", "_hi", "_state")
 REFUSED, OPEN = "refused", "not fitted"
 # Points of a sketched curve, its size in pixels, and how many tests the page shows.
 POINTS, WIDTH, HEIGHT = 40, 116, 76
+STRIP_WIDTH, STRIP_HEIGHT = 900, 110  # of the strip of a parameter
+_STATUS = {
+    "ok": "fitted",
+    "warnings": "fitted with warnings",
+    "failed": "without an acceptable fit",
+    REFUSED: "refused",
+    OPEN: "not fitted yet",
+}
 _MISFITS = {"stress_strain": "loop", "stress_time": "σ(t)", "displacement_time": "u(t)"}
 MOST_ON_PAGE = 5000
 _MOST_REFUSALS = 20  # that the terminal names
@@ -79,20 +87,12 @@ def row_of(test: str, file: str, result: Fit) -> Row:
     if result.status == "failed":
         told = [w for check in fatal for w in (check.warnings or (check.sentence,))]
         error = " ".join(["no acceptable fit was found:", *(told or result.warnings)[:1]])
-    return Row(
-        test,
-        file,
-        result.status,
-        error,
-        dict(plain(result.misfit)),
-        plain(result.runtime_s),
-        {name: plain(_cells(p)) for name, p in result.parameters.items()},
-        _sketch(result),
-    )
-
-
-def _cells(p: ParameterEstimate) -> list[Any]:
-    return [p.value, p.stderr, *(p.ci95 or (None, None)), p.state, p.unit, *(p.range or ())]
+    cells = {}
+    for name, p in result.parameters.items():
+        ends = (*(p.ci95 or (None, None)), p.state, p.unit, *(p.range or ()))
+        cells[name] = plain([p.value, p.stderr, *ends])
+    misfit, runtime = plain(result.misfit), plain(result.runtime_s)
+    return Row(test, file, result.status, error, misfit, runtime, cells, _sketch(result))
 
 
 # ------------------------------------------------------------------------------- the table
@@ -135,11 +135,7 @@ def write_summary(rows: Sequence[Row], folder: Path) -> None:
 def counts_in_words(rows: Sequence[Row]) -> str:
     """Say how many tests there are and what became of them."""
     found = Counter(row.status for row in rows)
-    said = {
-        "ok": "fitted", "warnings": "fitted with warnings", "failed": "without an acceptable fit",
-        REFUSED: "refused", OPEN: "not fitted yet",
-    }  # fmt: skip
-    parts = [f"{found[status]} {words}" for status, words in said.items() if found[status]]
+    parts = [f"{found[status]} {told}" for status, told in _STATUS.items() if found[status]]
     told = counted(len({row.test.partition("/")[0] for row in rows}), "test")
     if cycles := sum("/" in row.test for row in rows):
         told += f", {counted(cycles, 'cycle')}"
@@ -148,17 +144,15 @@ def counts_in_words(rows: Sequence[Row]) -> str:
 
 def summary_words(rows: Sequence[Row]) -> str:
     """Return what the command prints of a batch."""
-    lines = [counts_in_words(rows)]
     wrong = [row for row in rows if not row.has_fit]
-    for row in wrong[:_MOST_REFUSALS]:
-        lines += ["", *wrapped(f"{row.test}: {row.error}")]
-    if len(wrong) > _MOST_REFUSALS:
-        more = counted(len(wrong) - _MOST_REFUSALS, "other test")
-        lines += ["", f"and {more} without a fit, each with its sentence in summary.csv"]
     fitted = [row for row in rows if row.has_fit]
-    if fitted:
-        lines += ["", *aligned(list(_parameter_rows(fitted)), right=(1, 2, 3, 4))]
-    return "\n".join(lines)
+    return words(
+        "batch",
+        counts=counts_in_words(rows),
+        wrong=wrong[:_MOST_REFUSALS],
+        more=max(len(wrong) - _MOST_REFUSALS, 0),
+        parameters=list(_parameter_rows(fitted)) if fitted else [],
+    )
 
 
 def _parameter_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
@@ -211,7 +205,7 @@ def _sketch(result: Fit) -> Sketch | None:
 
 
 def _path(x: Array, y: Array) -> str:
-    """Draw a curve in few points, equally far from each other along it, in whole pixels."""
+    """Draw a curve through a few points at equal distances along it, in whole pixels."""
     if x.size < 2:
         return ""
     length = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
@@ -222,29 +216,16 @@ def _path(x: Array, y: Array) -> str:
     return f"M{points[0, 0]} {points[0, 1]}l{' '.join(moved)}" if moved else ""
 
 
-@dataclass(frozen=True)
-class Column:
-    """A parameter in the page's table, in the unit in which it reads well."""
-
-    name: str
-    symbol: tuple[str, str]
-    unit: str
-    factor: float
-    ranges: str  # path of SVG: the ranges of all tests side by side
-    strip: str  # and their intervals
-    dots: str  # the values that are determined
-    unsure: str  # and those that are not
-    ends: tuple[str, str]  # of the strip's axis
-
-
 def write_page(rows: Sequence[Row], folder: Path, title: str) -> None:
     """Write summary.html whole: one file that needs nothing else."""
     shown = rows
-    if len(rows) > MOST_ON_PAGE:  # what has no fit must be seen
+    if len(rows) > MOST_ON_PAGE:  # tests without a fit are always shown
         first = {id(row) for row in rows[:MOST_ON_PAGE]}
         shown = [row for row in rows if id(row) in first or not row.has_fit][: 2 * MOST_ON_PAGE]
     columns = list(_columns(shown))
-    page = environment().get_template("summary.html").render(
+    measured = {name for row in shown for name, off in row.misfit.items() if off is not None}
+    text = page(
+        "summary",
         title=title,
         version=version("foamfit"),
         counts=counts_in_words(rows),
@@ -254,23 +235,22 @@ def write_page(rows: Sequence[Row], folder: Path, title: str) -> None:
         reports=[(folder / row.test / "report.html").is_file() for row in shown],
         columns=columns,
         cells=[[_cell(row, column) for column in columns] for row in shown],
-        misfits={
-            curve: told for curve, told in _MISFITS.items()
-            if any(row.misfit.get(curve) is not None for row in shown)
-        },
-        width=WIDTH, height=HEIGHT, strip=(STRIP_WIDTH, STRIP_HEIGHT),
-    )  # fmt: skip
-    write_file(folder / "summary.html", page.encode("utf-8", "replace"))
+        misfits={curve: told for curve, told in _MISFITS.items() if curve in measured},
+        width=WIDTH,
+        height=HEIGHT,
+        strip=(STRIP_WIDTH, STRIP_HEIGHT),
+    )
+    write_file(folder / "summary.html", text.encode("utf-8", "replace"))
 
 
-STRIP_WIDTH, STRIP_HEIGHT = 900, 110
+def _columns(rows: Sequence[Row]) -> Iterator[dict[str, Any]]:
+    """The parameters that any test varied, each in the unit in which it reads well.
 
-
-def _columns(rows: Sequence[Row]) -> Iterator[Column]:
-    """The parameters that any test varied, with their values and intervals side by side."""
+    `paths` are SVG over all tests side by side, by the class that draws them; `ends` is the axis.
+    """
     for name in names_of(rows):
-        there = [(i, row.parameters[name]) for i, row in enumerate(rows) if name in row.parameters]
-        there = [(i, cell) for i, cell in there if cell[0] is not None]
+        every = ((i, row.parameters.get(name)) for i, row in enumerate(rows))
+        there = [(i, cell) for i, cell in every if cell is not None and cell[0] is not None]
         if not there or all(cell[4] == "fixed" for _, cell in there):
             continue
         values = np.array([cell[0] for _, cell in there])
@@ -286,29 +266,29 @@ def _columns(rows: Sequence[Row]) -> Iterator[Column]:
             y = STRIP_HEIGHT * (high - min(max(value, low), high)) / (high - low)
             return round(y, 1)
 
-        ranges, bars, dots, unsure = list[str](), list[str](), list[str](), list[str]()
+        paths: dict[str, str] = dict.fromkeys(("ranges", "bars", "dots", "dots unsure"), "")
         for i, cell in there:
             x = round((i + 0.5) * STRIP_WIDTH / len(rows), 1)
-            for ends, lines in ((cell[6:8], ranges), (cell[2:4], bars)):
+            for ends, line in ((cell[6:8], "ranges"), (cell[2:4], "bars")):
                 if ends and ends[0] is not None:
-                    lines.append(f"M{x:g} {pixel(ends[0]):g}V{pixel(ends[1]):g}")
-            mark = f"M{x:g} {pixel(cell[0]):g}h0"
-            (unsure if cell[4] in ("weak", "not determined") else dots).append(mark)
-        band, line, dot, grey = map("".join, (ranges, bars, dots, unsure))
-        axis = number(high / factor), number(low / factor)
-        yield Column(name, symbol(name), unit, factor, band, line, dot, grey, axis)
+                    paths[line] += f"M{x:g} {pixel(ends[0]):g}V{pixel(ends[1]):g}"
+            unsure = " unsure" if cell[4] in ("weak", "not determined") else ""
+            paths[f"dots{unsure}"] += f"M{x:g} {pixel(cell[0]):g}h0"
+        ends = number(high / factor), number(low / factor)
+        column = {"name": name, "symbol": symbol(name), "unit": unit, "factor": factor}
+        yield column | {"paths": paths, "ends": ends}
 
 
-def _cell(row: Row, column: Column) -> tuple[str, str, str, str]:
+def _cell(row: Row, column: Mapping[str, Any]) -> tuple[str, str, str, str]:
     """Value, what to sort by, interval and state of a parameter of a test."""
-    found = row.parameters.get(column.name)
+    found = row.parameters.get(column["name"])
     if found is None or found[0] is None:
         return "", "", "", ""
-    value, _, low, high, state, _, *span = found
 
     def shown(*ends: float) -> str:
-        return " to ".join(f"{end / column.factor:.4g}" for end in ends).replace("-", "−")
+        return " to ".join(f"{end / column['factor']:.4g}" for end in ends).replace("-", "−")
 
+    value, _, low, high, state, _, *span = found
     interval = "" if low is None or high is None else shown(low, high)
     interval += f"; range {shown(*span)}" if span else ""
     return shown(value), f"{value:.6g}", interval, state

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import json
-import textwrap
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from foamfit.report.figures import BLUE, GREY, TWO, VERMILION, abreast, drawing, image, inches
-from foamfit.report.folder import CYCLES_PLOTTED, save_whole, write_result, write_table
-from foamfit.report.plotted import table
-from foamfit.text import aligned, percent, wrapped
+from foamfit.report import figures
+from foamfit.report.figures import BLUE, TWO, VERMILION, image, table
+from foamfit.report.folder import CYCLES_PLOTTED, save_whole, write_json, write_result, write_table
+from foamfit.report.readable import own_name, readable_unit
+from foamfit.report.render import words
+from foamfit.text import percent
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,14 +24,19 @@ if TYPE_CHECKING:
 COLUMNS, PANEL = 4, (1.85, 1.5)  # of the picture; inches
 LEAST = 1.55  # in, of a panel
 MOST_LOOPS = 12
+MOST_NAMES = 12  # of parameters on the terminal; those of a chain are in cycles.csv
 DPI = 200
 FAR = 20  # a last cycle that is so many times the first is drawn on a logarithmic axis
 
 
 def save_cycles(
-    found: FittedCycles, folder: str | Path, *, report: bool = True, width: str = TWO,
+    found: FittedCycles,
+    folder: str | Path,
+    *,
+    report: bool = True,
+    width: str = TWO,
     mapped: Mapped = map,
-) -> Path:  # fmt: skip
+) -> Path:
     """Write the folder whole, replacing an older result at the end; returns it.
 
     For `report`, `width` and `mapped` see `foamfit.report.folder.save_result`.
@@ -47,64 +51,40 @@ def write_cycles(
 ) -> None:
     """Write all files of the cycles into a folder that is there; reports and pictures if wanted."""
     for number, result in found.results.items():
-        (folder / f"cycle-{number}").mkdir()
         inner = folder / f"cycle-{number}"
+        inner.mkdir()
         write_result(result, inner, pages=pages, width=width, mapped=mapped)
     write_table(folder / "cycles.csv", found.rows())
-    text = json.dumps(found.to_json_dict(), indent=2, ensure_ascii=False, allow_nan=False)
-    (folder / "cycles.json").write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
+    write_json(folder / "cycles.json", found.to_json_dict())
     if pages:
         figure = plot_cycles(found, width=width)
         (folder / "cycles.png").write_bytes(image(figure, "png", DPI))
         (folder / CYCLES_PLOTTED).write_bytes(table(figure))
 
 
-# ------------------------------------------------------------------------------- in words
-
-
 def cycles_text(found: FittedCycles) -> str:
     """Return what the command prints of the cycles of a record."""
-    n = len(found.recorded)
-    fitted = f"{len(found.results)} of {n} {'cycle' if n == 1 else 'cycles'} fitted"
-    lines = [f"{found.test}: {found.model}: {fitted}", ""]
-    lines += _table(found)
-    for number, why in sorted(found.refused.items()):
-        lines += ["", *wrapped(f"cycle {number}: {why}")]
-    if found.selection is not None:
-        lines += ["", "fitted together, what each cycle has of its own:"]
-        lines += _steps(found)
-    for sentence in found.sentences:
-        lines += ["", *wrapped(sentence)]
-    return "\n".join(lines)
-
-
-def _table(found: FittedCycles) -> list[str]:
-    names = found.varied
-    rows = [["cycle", "start strain", "misfit", *(name.removeprefix("s1_") for name in names)]]
+    names = found.varied if len(found.varied) <= MOST_NAMES else []
+    rows = [["cycle", "start strain", "misfit", *(own_name(name, found.model) for name in names)]]
     for number, one in sorted(found.results.items()):
         off = one.misfit.get("stress_strain") or one.misfit.get("stress_time")
-        cells = [f"{one.parameters[name].value:.3g}" for name in names]
-        strain = percent(one.measurement.start_strain)
-        rows.append([str(number), strain, "–" if off is None else percent(off), *cells])
-    if len(names) > 12:  # a chain: the table is in cycles.csv
-        rows = [row[:3] for row in rows]
-    return aligned(rows)
+        shown = [percent(one.measurement.start_strain), "–" if off is None else percent(off)]
+        rows.append([str(number), *shown, *(f"{one.parameters[n].value:.3g}" for n in names)])
+    return words("cycles", found=found, table=rows, steps=_steps(found))
 
 
-def _steps(found: FittedCycles) -> list[str]:
-    assert found.selection is not None
-    content = found.to_json_dict()["together"]
+def _steps(found: FittedCycles) -> list[list[str]]:
+    """Table of what was tried together, the header first."""
+    if (content := found.to_json_dict()["together"]) is None:
+        return []
     rows = [["", "of each cycle", "parameters", "BIC", *(f"misfit {n}" for n in found.together)]]
     last = content["alone"] | {"own": ["all (each alone)"], "chosen": False}
     for step in (*content["steps"], last):
-        own = ", ".join(name.removeprefix("s1_") for name in step["own"]) or "nothing"
+        own = ", ".join(own_name(name, found.model) for name in step["own"]) or "nothing"
         off = [percent(m) if m is not None else "–" for m in step["misfit"].values()]
         mark = "*" if step["chosen"] else ""
         rows.append([mark, own, str(step["n_vary"]), f"{step['bic']:.1f}", *off])
-    return aligned(rows)
-
-
-# ------------------------------------------------------------------------------- the picture
+    return rows
 
 
 def plot_cycles(found: FittedCycles, *, width: str = TWO) -> Figure:
@@ -116,35 +96,46 @@ def plot_cycles(found: FittedCycles, *, width: str = TWO) -> Figure:
     """
     results = dict(sorted(found.results.items()))
     varied = found.varied
-    panels, wide = 3 + len(varied), inches(width)
-    columns = max(abreast(wide, COLUMNS, LEAST), 2)
+    panels, wide = 3 + len(varied), figures.inches(width)
+    columns = max(figures.abreast(wide, COLUMNS, LEAST), 2)
     rows = 2 + max(0, -(-(panels - 2 * (columns - 2)) // columns))
     told = "points: each cycle alone with 95 % interval, hollow if weak or not determined"
     told += "; lines: fitted together" if found.selection is not None else ""
-    lines = [
-        line for part in (f"{found.test} · {found.model}", told)
-        for line in textwrap.wrap(part, int(16 * wide))
-    ]  # fmt: skip
-    with drawing(wide, rows * PANEL[1] + 0.13 * len(lines) + 0.1) as figure:
+    lines = figures.title_lines(wide, f"{found.test} · {found.model}", told)
+    with figures.drawing(wide, rows * PANEL[1] + 0.13 * len(lines) + 0.1, lines) as figure:
         grid = figure.add_gridspec(rows, columns)
         _loops(figure.add_subplot(grid[:2, :2]), found)
         places = [(i, j) for i in range(rows) for j in range(columns) if i > 1 or j > 1]
         axes = [figure.add_subplot(grid[place]) for place in places[:panels]]
-        if results:
-            _by_cycle(axes[0], {n: 100 * r.measurement.start_strain for n, r in results.items()})
-            energy = {n: r.energy.get("dissipated_energy") for n, r in results.items()}
-            _by_cycle(axes[1], {n: e / 1e3 for n, e in energy.items() if e is not None})
-            off = {n: r.misfit.get("stress_strain") for n, r in results.items()}
-            _by_cycle(axes[2], {n: 100 * m for n, m in off.items() if m is not None})
-        titles = ("start strain (%)", "dissipated (kJ/m³)", "misfit of the loop (%)")
-        for ax, title in zip(axes[:3], titles, strict=True):
+        by_cycle: dict[str, dict[int, float | None]] = {
+            "start strain (%)": {n: 100 * r.measurement.start_strain for n, r in results.items()},
+            "dissipated (kJ/m³)": {
+                n: _scaled(r.energy.get("dissipated_energy"), 1e-3) for n, r in results.items()
+            },
+            "misfit of the loop (%)": {
+                n: _scaled(r.misfit.get("stress_strain"), 100.0) for n, r in results.items()
+            },
+        }
+        for ax, (title, values) in zip(axes, by_cycle.items(), strict=False):
+            there = [(n, value) for n, value in values.items() if value is not None]
+            style: dict[str, Any] = {"color": BLUE, "markersize": 3, "linewidth": 0.8}
+            if there:
+                ax.plot(*np.array(there).T, "o-", label="_each cycle alone", **style)
             ax.set_title(title)
         for ax, name in zip(axes[3:], varied, strict=True):
             _parameter(ax, found, name)
         for ax in axes:
-            _axis(ax, sorted(results))
-        figure.suptitle("\n".join(lines), x=0.01, ha="left", fontsize=8, parse_math=False)
+            ax.set_xlabel("cycle")
+            numbers = list(results)
+            if numbers and numbers[-1] >= FAR * numbers[0]:
+                ax.set_xscale("log")
+            elif len(numbers) <= 8:
+                ax.set_xticks(numbers)
     return figure
+
+
+def _scaled(value: float | None, factor: float) -> float | None:
+    return None if value is None else factor * value
 
 
 def _loops(ax: Axes, found: FittedCycles) -> None:
@@ -169,75 +160,24 @@ def _loops(ax: Axes, found: FittedCycles) -> None:
         if fitted is not None and number in (shown[0], shown[-1]):
             label = f"_cycle {number}, fitted"
             ax.plot(strain, fitted / 1e3, ":", color="black", linewidth=0.8, label=label)
-    ax.set_xlabel("strain from the first contact")
-    ax.set_ylabel("stress (kPa)")
+    ax.set(xlabel="strain from the first contact", ylabel="stress (kPa)")
     ax.set_title("measured; first and last fitted (dotted)")
     if shown:
         ax.legend(loc="upper left", fontsize=6.5, handlelength=1.2, labelspacing=0.25)
 
 
-def _by_cycle(ax: Axes, values: dict[int, float]) -> None:
-    style: dict[str, Any] = {"color": BLUE, "markersize": 3, "linewidth": 0.8}
-    ax.plot(list(values), list(values.values()), "o-", label="_each cycle alone", **style)
-
-
-def _short(name: str, found: FittedCycles) -> str:
-    """Name of a parameter, without the spring where there is one alone."""
-    return name if "+" in found.model else name.removeprefix("s1_")
-
-
-def _scale(values: Sequence[float], unit: str) -> tuple[float, str]:
-    """Factor and unit in which values are drawn."""
-    largest = max((abs(value) for value in values), default=0.0)
-    if unit == "Pa":
-        return (1e-6, "MPa") if largest >= 1e6 else (1e-3, "kPa")
-    return 1.0, unit
-
-
 def _parameter(ax: Axes, found: FittedCycles, name: str) -> None:
     """One parameter with its 95 % intervals against the cycle."""
-    points = [
-        (n, r.parameters[name]) for n, r in sorted(found.results.items()) if name in r.parameters
-    ]
-    unit = points[0][1].unit
-    factor, shown = _scale([p.value for _, p in points], unit)
-    ax.set_title(_short(name, found) + (f" ({shown})" if shown else ""))
-    for number, p in points:
-        sure = p.state == "determined"
-        if p.ci95 is not None and np.all(np.isfinite(p.ci95)):
-            ends = [factor * end for end in p.ci95]
-            ax.plot([number] * 2, ends, color=GREY, linewidth=0.8, label="_95 % interval")
-        face, label = BLUE if sure else "white", f"_each cycle alone, {p.state}"
-        ax.plot(
-            number, factor * p.value, "o", color=BLUE, markerfacecolor=face, markersize=3.5,
-            label=label,
-        )  # fmt: skip
+    results = sorted(found.results.items())
+    points = [(n, r.parameters[name]) for n, r in results if name in r.parameters]
+    factor, unit = readable_unit(max(abs(p.value) for _, p in points), points[0][1].unit)
+    ax.set_title(own_name(name, found.model) + (f" ({unit})" if unit else ""))
+    values, ends = figures.draw_estimates(ax, points, factor)
     if found.selection is not None:
         best = found.selection.best.fits[0]
         if name in (*best.shared, *found.selection.best.own):
-            values = factor * np.array(best.value(name))
-            label = "_fitted together"
-            ax.plot(found.together, values, color=VERMILION, linewidth=0.9, zorder=0, label=label)
-    _limit(ax, factor, [p for _, p in points], found, name)
-
-
-def _limit(ax: Axes, factor: float, points: Sequence[Any], found: FittedCycles, name: str) -> None:
-    """Let wide intervals run out of the panel rather than flatten the values."""
-    values = [factor * p.value for p in points]
-    if found.selection is not None and name in found.selection.best.fits[0].shared:
-        values += [factor * v for v in found.selection.best.fits[0].value(name)]
-    ends = [factor * end for p in points for end in (p.ci95 or ()) if np.isfinite(end)]
-    low, high = min(values), max(values)
-    room = max(1.5 * (high - low), 0.25 * max(abs(low), abs(high)), 1e-12)
-    ax.set_ylim(
-        max(min([low, *ends]), low - room) - 0.06 * room,
-        min(max([high, *ends]), high + room) + 0.06 * room,
-    )
-
-
-def _axis(ax: Axes, numbers: Sequence[int]) -> None:
-    ax.set_xlabel("cycle")
-    if numbers and numbers[-1] >= FAR * numbers[0]:
-        ax.set_xscale("log")
-    elif len(numbers) <= 8:
-        ax.set_xticks(list(numbers))
+            together = (np.array(best.value(name)) / factor).tolist()
+            style: Any = {"color": VERMILION, "linewidth": 0.9, "zorder": 0}
+            ax.plot(found.together, together, label="_fitted together", **style)
+            values += together
+    figures.limit(ax, values, ends)

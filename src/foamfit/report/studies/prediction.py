@@ -2,27 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from foamfit.errors import InputError
-from foamfit.report.figures import (
-    BLUE,
-    INSIDE,
-    TWO,
-    VERMILION,
-    abreast,
-    drawing,
-    image,
-    inches,
-    laid_out,
-)
-from foamfit.report.folder import PREDICTION_FILES, check_target, save_whole, write_table
+from foamfit.report import figures
+from foamfit.report import folder as results
+from foamfit.report.figures import BLUE, INSIDE, TWO, VERMILION, image
 from foamfit.report.readable import readable_unit
-from foamfit.text import aligned, percent, wrapped
+from foamfit.report.render import words
+from foamfit.text import percent
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -41,6 +32,13 @@ COLOURS: dict[str, tuple[str, Any]] = {
     "motion": (VERMILION, (0, (1, 1.2))),
     "law_error": (INSIDE[0], (0, (5, 1.2, 1, 1.2))),
 }
+# Styles of the lines and of the band.
+LINES: dict[str, dict[str, Any]] = {
+    "measured": {"color": MEASURED, "linewidth": 1.4},
+    "predicted": {"color": VERMILION, "linewidth": 0.9},
+    "half width: all": {"color": "black", "linestyle": ":", "linewidth": 0.9},
+}
+BAND: Any = {"color": VERMILION, "alpha": 0.18, "linewidth": 0.0}
 
 
 def save_prediction(
@@ -52,20 +50,17 @@ def save_prediction(
     """
 
     def write(fresh: Path) -> None:
-        text = json.dumps(found.to_json_dict(), indent=2, ensure_ascii=False, allow_nan=False)
-        (fresh / "prediction.json").write_text(
-            text + "\n", encoding="utf-8", errors="backslashreplace"
-        )
-        write_table(fresh / "prediction.csv", found.rows())
+        results.write_json(fresh / "prediction.json", found.to_json_dict())
+        results.write_table(fresh / "prediction.csv", found.rows())
         if not report:
             return
         figure = plot_prediction(found, width=width)
-        with laid_out(figure):
+        with figures.laid_out(figure):
             (fresh / "prediction.png").write_bytes(image(figure, "png"))
             (fresh / "prediction.pdf").write_bytes(image(figure, "pdf"))
 
     check_replaceable(folder)
-    return save_whole(folder, write)
+    return results.save_whole(folder, write)
 
 
 def check_replaceable(folder: str | Path) -> None:
@@ -73,60 +68,39 @@ def check_replaceable(folder: str | Path) -> None:
 
     A result of another kind is not replaced: it may be the one that is predicted from.
     """
-    check_target(folder)
+    results.check_target(folder)
     place = Path(folder)
     there = sorted(path.name for path in place.iterdir()) if place.is_dir() else []
-    if others := [name for name in there if name not in PREDICTION_FILES]:
+    if others := [name for name in there if name not in results.PREDICTION_FILES]:
         raise InputError(
             f"{folder} holds {others[0]}, which is no part of a prediction, so it is not replaced; "
             "choose a new or an empty folder"
         )
 
 
-# ------------------------------------------------------------------------------- in words
-
-
 def prediction_text(found: PredictedTest) -> str:
-    """Return what the command prints of a prediction."""
-    kind = "joint fit" if found.joint else "fit"
-    lines = wrapped(f"{found.measurement.name}: predicted from the {kind} {found.source!r}")
-    lines += wrapped(f"{found.law}, {found.drive} drive; {_rates(found)}")
-    lines += ["", *_table(found)]
-    for sentence in (*found.sentences, *(f"Warning: {one}" for one in found.warnings)):
-        lines += ["", *wrapped(sentence)]
-    return "\n".join(lines)
+    """Return what the command prints of a prediction.
+
+    Its table has misfit, share inside and half widths of each curve, over its measured range.
+    """
+    there = [part for part in COLOURS if any(part in one.parts for one in found.curves.values())]
+    rows = [["curve", "misfit", "inside", "band", *(part.replace("_", " ") for part in there)]]
+    for name, curve in found.curves.items():
+        off = found.misfit.get(name)
+        shown = ["–" if off is None else percent(off), percent(curve.inside, 3)]
+        widths = [curve.half_width, *map(curve.half_width_of, there)]
+        rows.append([name, *shown, *(f"±{percent(width / curve.range)}" for width in widths)])
+    source, rates = repr(found.source), _rates(found)
+    return words("prediction", found=found, source=source, rates=rates, table=rows)
 
 
 def _rates(found: PredictedTest) -> str:
     rates = found.fitted_rates
     if found.rate is None:
         return "rate not known"
-    if not rates:
-        return f"rate {found.rate:.3g} 1/s"
-    low, high = min(rates), max(rates)
-    fitted = f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
-    return f"rate {found.rate:.3g} 1/s, fitted at {fitted} 1/s"
-
-
-def _table(found: PredictedTest) -> list[str]:
-    """Misfit, share inside and half widths of each curve, over its measured range."""
-    there = [part for part in COLOURS if any(part in one.parts for one in found.curves.values())]
-    rows = [["curve", "misfit", "inside", "band", *(part.replace("_", " ") for part in there)]]
-    for name, curve in found.curves.items():
-        off = found.misfit.get(name)
-        widths = [curve.half_width, *(curve.half_width_of(part) for part in there)]
-        rows.append(
-            [
-                name,
-                "–" if off is None else percent(off),
-                percent(curve.inside, 3),
-                *(f"±{percent(width / curve.range)}" for width in widths),
-            ]
-        )
-    return aligned(rows)
-
-
-# ------------------------------------------------------------------------------- the picture
+    ends = dict.fromkeys(f"{choose(rates):.3g}" for choose in (min, max)) if rates else ()
+    fitted = f", fitted at {' to '.join(ends)} 1/s" if ends else ""
+    return f"rate {found.rate:.3g} 1/s{fitted}"
 
 
 def plot_prediction(found: PredictedTest, *, width: str = TWO) -> Figure:
@@ -137,65 +111,53 @@ def plot_prediction(found: PredictedTest, *, width: str = TWO) -> Figure:
     others stands below them.
     """
     curves = list(found.curves.values())
-    wide = min(inches(width), PANEL[0] * (1 + len(curves)))
-    across = abreast(wide, 1 + len(curves))
+    wide = min(figures.inches(width), PANEL[0] * (1 + len(curves)))
+    across = figures.abreast(wide, 1 + len(curves))
     bands = -(-(1 + len(curves)) // across)  # each a row of panels with a lower one beneath
-    lines = [line for part in _title(found) for line in wrapped(part, 0, int(16 * wide))]
+    inside = ", ".join(f"{c.channel} {percent(c.inside, 3)}" for c in curves)
+    lines = figures.title_lines(
+        wide,
+        f"{found.measurement.name}, predicted from {found.source}; {_rates(found)}",
+        f"inside the 95 % band: {inside}",
+    )
     tall = bands * 1.7 * PANEL[1] + 0.4 + 0.15 * max(len(lines) - 2, 0)
-    with drawing(wide, tall) as figure:
-        axes = figure.subplots(
-            2 * bands, across, squeeze=False, height_ratios=(1.0, 0.6) * bands,
-            gridspec_kw={"hspace": 0.06},
-        )  # fmt: skip
-        places = [(2 * (i // across), i % across) for i in range(bands * across)]
-        _loop(axes[places[0]], found)
-        for (row, column), curve in zip(places[1:], curves, strict=False):
-            _in_time(axes[row, column], axes[row + 1, column], found, curve)
-        for row, column in places[1 + len(curves) :]:
-            axes[row, column].set_axis_off()
-            axes[row + 1, column].set_axis_off()
-        _legend(axes[1, 0], found)
-        figure.suptitle("\n".join(lines), x=0.01, ha="left", fontsize=8, parse_math=False)
+    with figures.drawing(wide, tall, lines) as figure:
+        grid = {"hspace": 0.06, "height_ratios": (1.0, 0.6) * bands}
+        axes = figure.subplots(2 * bands, across, squeeze=False, gridspec_kw=grid)
+        # Each place has a panel above and one below it.
+        places = [axes[i : i + 2, j] for i in range(0, 2 * bands, 2) for j in range(across)]
+        _loop(places[0][0], found)
+        for (above, below), curve in zip(places[1:], curves, strict=False):
+            _in_time(above, below, found, curve)
+        for ax in [ax for place in places[1 + len(curves) :] for ax in place]:
+            ax.set_axis_off()
+        _legend(places[0][1], found)
         figure.align_ylabels()
     return figure
 
 
-def _title(found: PredictedTest) -> tuple[str, str]:
-    inside = ", ".join(f"{c.channel} {percent(c.inside, 3)}" for c in found.curves.values())
-    return (
-        f"{found.measurement.name}, predicted from {found.source}; {_rates(found)}",
-        f"inside the 95 % band: {inside}",
-    )
-
-
 def _loop(ax: Axes, found: PredictedTest) -> None:
     """Stress against displacement; with the band of the stress where the motion is measured."""
-    m = found.measurement
-    stress = next((c for c in found.curves.values() if c.channel == "stress"), None)
-    moved = next((c for c in found.curves.values() if c.channel == "displacement"), None)
+    m, predicted = found.measurement, {c.channel: c for c in found.curves.values()}
+    stress, moved = predicted.get("stress"), predicted.get("displacement")
     motion = m.displacement if moved is None else moved.predicted
     if m.displacement is None or motion is None or m.stress is None:
-        ax.set_axis_off()
-        ax.text(0.5, 0.5, "no motion", ha="center", va="center", transform=ax.transAxes)
+        figures.say_nothing_there(ax, "no motion")
         return
     pressed = m.stress if stress is None else stress.predicted
     height = m.specimen.height
     factor, unit = readable_unit(float(np.max(m.stress)), "Pa")
-    ax.plot(m.displacement / height, m.stress / factor, color=MEASURED, linewidth=1.4)
-    ax.plot(motion / height, pressed / factor, color=VERMILION, linewidth=0.9)
+    ax.plot(m.displacement / height, m.stress / factor, **LINES["measured"])
+    ax.plot(motion / height, pressed / factor, **LINES["predicted"])
     if stress is not None and moved is None:
         turn = int(np.argmax(motion))
         for part in (slice(None, turn + 1), slice(turn, None)):
             _band(ax, motion[part] / height, stress, factor, part)
-    ax.set_xlabel("strain")
-    ax.set_ylabel(f"stress ({unit})")
+    ax.set(xlabel="strain", ylabel=f"stress ({unit})")
 
 
 def _band(ax: Axes, x: Array, curve: PredictedCurve, factor: float, part: slice) -> None:
-    ax.fill_between(
-        x, curve.lo[part] / factor, curve.hi[part] / factor, color=VERMILION, alpha=0.18,
-        linewidth=0.0,
-    )  # fmt: skip
+    ax.fill_between(x, curve.lo[part] / factor, curve.hi[part] / factor, **BAND)
 
 
 def _in_time(above: Axes, below: Axes, found: PredictedTest, curve: PredictedCurve) -> None:
@@ -208,40 +170,29 @@ def _in_time(above: Axes, below: Axes, found: PredictedTest, curve: PredictedCur
         x, label = time / scale, f"time ({unit})"
     factor, unit = readable_unit(float(np.max(np.abs(curve.measured))), curve.unit)
     _band(above, x, curve, factor, slice(None))
-    above.plot(x, curve.measured / factor, color=MEASURED, linewidth=1.4)
-    above.plot(x, curve.predicted / factor, color=VERMILION, linewidth=0.9)
+    above.plot(x, curve.measured / factor, **LINES["measured"])
+    above.plot(x, curve.predicted / factor, **LINES["predicted"])
     above.set_ylabel(f"{curve.channel.replace('_', ' ')} ({unit})")
     for part, (colour, dashes) in COLOURS.items():
         if part in curve.parts and np.any(curve.parts[part]):
             style: Any = {"color": colour, "linestyle": dashes, "linewidth": 0.9}
             below.plot(x, curve.parts[part] / factor, **style)
-    below.plot(x, 0.5 * (curve.hi - curve.lo) / factor, ":", color="black", linewidth=0.9)
+    below.plot(x, 0.5 * (curve.hi - curve.lo) / factor, **LINES["half width: all"])
     below.set_ylim(bottom=0.0)
-    below.set_ylabel(f"half width ({unit})")
-    below.set_xlabel(label)
+    below.set(xlabel=label, ylabel=f"half width ({unit})")
 
 
 def _legend(ax: Axes, found: PredictedTest) -> None:
-    """What the lines are, in a panel of their own."""
+    """Explain the lines in a panel of its own."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     ax.set_axis_off()
-    handles: list[Line2D | Patch] = [
-        Line2D([], [], color=MEASURED, linewidth=1.4, label="measured"),
-        Line2D([], [], color=VERMILION, label="predicted"),
-        Patch(color=VERMILION, alpha=0.18, label="95 % band"),
-        Line2D([], [], color="black", linestyle=":", label="half width: all"),
-    ]
-    for part, (colour, dashes) in COLOURS.items():
-        if any(np.any(curve.parts.get(part, 0.0)) for curve in found.curves.values()):
-            handles.append(
-                Line2D(
-                    [],
-                    [],
-                    color=colour,
-                    linestyle=dashes,
-                    label=f"half width: {part.replace('_', ' ')}",
-                )
-            )
+    shown = LINES | {
+        f"half width: {part.replace('_', ' ')}": {"color": colour, "linestyle": dashes}
+        for part, (colour, dashes) in COLOURS.items()
+        if any(np.any(curve.parts.get(part, 0.0)) for curve in found.curves.values())
+    }
+    handles: list[Any] = [Line2D([], [], label=name, **style) for name, style in shown.items()]
+    handles.insert(2, Patch(label="95 % band", **BAND))
     ax.legend(handles=handles, loc="upper left", fontsize=7, borderaxespad=0.0)

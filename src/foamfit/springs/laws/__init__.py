@@ -5,8 +5,10 @@
 
 from __future__ import annotations
 
+import copyreg
 import importlib.util
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -40,6 +42,14 @@ def law(kind: str) -> Law:
     if kind not in _LAWS:
         raise InputError(f"'{kind}' is not a spring; it must be one of {', '.join(kinds())}")
     return _LAWS[kind]
+
+
+def _by_kind(one: Law) -> tuple[Callable[[str], Law], tuple[str]]:
+    """Pickle a record as its name: its functions stay where they are."""
+    return law, (one.kind,)
+
+
+copyreg.pickle(Law, _by_kind)
 
 
 def kinds() -> tuple[str, ...]:

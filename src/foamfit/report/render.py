@@ -1,0 +1,58 @@
+"""The templates: pages in HTML, and what the terminal prints."""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import TYPE_CHECKING, Any
+
+from foamfit import text
+from foamfit.report.readable import number
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+
+@functools.cache
+def environment() -> Environment:
+    """Return the templates of all pages and texts, with the filters that write numbers."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+
+    made = Environment(
+        loader=PackageLoader("foamfit.report"),
+        extensions=["jinja2.ext.do"],
+        autoescape=select_autoescape(("html",)),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    filters = (text.percent, text.engineering, text.significant, text.counted, text.listed, number)
+    made.filters.update({one.__name__: one for one in filters})
+    made.filters.update(paragraphs=_paragraphs, aligned=_aligned, exp=math.exp)
+    made.filters["spoken"] = lambda name: name.replace("_", "-")
+    return made
+
+
+def page(name: str, **values: Any) -> str:
+    """Return a page in HTML."""
+    return environment().get_template(f"{name}.html").render(**values)
+
+
+def words(name: str, **values: Any) -> str:
+    """Return a text for the terminal, without a newline at its end."""
+    return environment().get_template(f"{name}.txt").render(**values).rstrip("\n")
+
+
+def sentences(name: str, **values: Any) -> tuple[str, ...]:
+    """Return the lines of a text, a sentence each."""
+    return tuple(words(name, **values).splitlines())
+
+
+def _paragraphs(told: str, indent: int = 2) -> str:
+    """Wrap each line of a text as a paragraph of its own; empty lines stay."""
+    lines = (text.wrapped(one, indent) or [""] for one in told.split("\n"))
+    return "\n".join(line for paragraph in lines for line in paragraph)
+
+
+def _aligned(rows: Any, **options: Any) -> str:
+    return "\n".join(text.aligned(list(rows), **options))
