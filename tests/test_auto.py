@@ -15,7 +15,7 @@ from scipy.signal import lfilter
 
 import fabricated
 import foamfit as ff
-from conftest import DATA, needs_data, synthetic_impact, synthetic_loop
+from conftest import needs_data, synthetic_impact, synthetic_loop
 from foamfit import auto, one_model
 from foamfit.cli import main
 from foamfit.data.measurement import Measurement, Outliers, Specimen, Striker
@@ -375,10 +375,10 @@ def test_without_the_time_for_a_prediction_the_fitted_misfit_stands_in(given):
 
 
 @needs_data
-def test_a_running_shoe_foam_ends_below_one_percent(tmp_path, monkeypatch):
+def test_a_running_shoe_foam_ends_below_one_percent(thin_foams, tmp_path, monkeypatch):
     toml = tmp_path / "specimen.toml"
     toml.write_text('[specimen]\nheight = "10.53 mm"\ndiameter = "7.63 mm"\n')
-    test = ff.read_test(DATA / "shoe-foam" / "turbo-comp-1_cycle1.csv", toml)
+    test = ff.read_test(thin_foams / "shoe-foam" / "turbo-comp-1_cycle1.csv", toml)
     few = (*groups("bistable", "microscale"), *groups("microscale", relaxation=1))
     monkeypatch.setattr(auto, "LADDER", few)  # for time
     result = ff.fit(test, model="auto", starts=4, intervals="local")

@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 from scipy.stats import binom
 
 import foamfit as ff
-from conftest import DATA, EXPERIMENTS, needs_data
+from conftest import EXPERIMENTS, needs_data
 from foamfit.api import FitResult
 from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
 from foamfit.fitting.box import Scales
@@ -373,8 +373,8 @@ def test_the_search_finds_the_soft_branch_c():
 
 
 @needs_data
-def test_twins_get_the_same_states():
-    rows = law_error.twins(DATA, ("turbo-comp", "leap-comp", "worn-heel-comp"))
+def test_twins_get_the_same_states(thin_foams):
+    rows = law_error.twins(thin_foams, ("turbo-comp", "leap-comp", "worn-heel-comp"), starts=4)
     cells = law_error.repeat(rows)
     assert cells["same"].sum() >= 0.85 * cells["specimens"].sum()
     near, close = cells[cells["scatter"] <= 0.15], cells[cells["scatter"] <= 0.10]
